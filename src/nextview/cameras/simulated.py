@@ -1,0 +1,75 @@
+"""A camera that looks at a mesh by ray casting with Embree."""
+
+from __future__ import annotations
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
+
+from nextview.cloud import visible_points
+from nextview.mesh import Mesh
+from nextview.observation import Observation, pinhole
+from nextview.viewsphere import DISTANCE
+
+AMBIENT = 0.15
+"""Brightness of a surface seen edge-on, so that it stays apart from the black background."""
+
+
+class SimulatedCamera:
+    """Looks at one mesh from any pose.
+
+    The image is lit by a headlight: a pixel's brightness grows with the cosine between the viewing ray and the
+    surface normal.
+
+    Args:
+        mesh: a normalised mesh.
+        size: side of the square image, pixels.
+        distance: distance at which the unit sphere just fills the image, object radii.
+        seed: decides which visible pixels become points.
+    """
+
+    def __init__(self, mesh: Mesh, size: int = 224, distance: float = DISTANCE, seed: int = 0) -> None:
+        self.size = size
+        self.seed = seed
+        self.intrinsics = pinhole(size, distance)
+        self._vertices = mesh.vertices.astype(np.float32)
+        self._scene = EmbreeScene()
+        TriangleMesh(self._scene, self._vertices, np.ascontiguousarray(mesh.faces, dtype=np.int32))
+        centres = (np.arange(size, dtype=np.float32) + 0.5 - size / 2) / self.intrinsics[0, 0].astype(np.float32)
+        self._rays = np.empty((size, size, 3), np.float32)  # z = 1, so that Embree's distance is the depth
+        self._rays[..., 0], self._rays[..., 1], self._rays[..., 2] = centres[None, :], centres[:, None], 1.0
+        self._ray_length = np.linalg.norm(self._rays, axis=-1)
+
+    def observe(self, pose: NDArray[np.float64]) -> Observation:
+        """Look from a camera-to-world pose, (4, 4), OpenCV axes, object radii."""
+        rotation, origin = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
+        image = np.zeros((self.size, self.size), np.uint8)
+        depth = np.zeros((self.size, self.size), np.float32)
+        # Only pixels inside the object's projected bound can hit anything: cast no others.
+        bound = self._bound(rotation, origin)
+        rays = self._rays[bound].reshape(-1, 3) @ rotation.T
+        if len(rays):
+            hits = self._scene.run(np.broadcast_to(origin, rays.shape).copy(), rays, output=1)
+            seen = hits["primID"] >= 0
+            normals = hits["Ng"]
+            cosine = np.abs(np.einsum("ij,ij->i", normals, rays))
+            cosine /= np.sqrt(np.einsum("ij,ij->i", normals, normals)) * self._ray_length[bound].ravel() + 1e-30
+            shade = np.where(seen, 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5, 0).astype(np.uint8)
+            shape = depth[bound].shape
+            image[bound] = shade.reshape(shape)
+            depth[bound] = np.where(seen, hits["tfar"], 0).reshape(shape)
+        points = visible_points(depth, pose, self.intrinsics, self.seed)
+        return Observation(image, depth, points, pose, self.intrinsics)
+
+    def _bound(self, rotation: NDArray[np.float32], origin: NDArray[np.float32]) -> tuple[slice, slice]:
+        """Rows and columns that hold the projection of every vertex; the whole image if one is behind the camera."""
+        x, y, z = ((self._vertices - origin) @ rotation).T
+        if z.min() <= 1e-6:
+            return slice(0, self.size), slice(0, self.size)
+        focal, centre = self.intrinsics[0, 0], self.size / 2
+        spans = []
+        for projected in (y / z, x / z):
+            low, high = projected.min() * focal + centre, projected.max() * focal + centre
+            spans.append(slice(*np.clip([int(np.floor(low)) - 1, int(np.ceil(high)) + 1], 0, self.size)))
+        return spans[0], spans[1]

@@ -1,0 +1,81 @@
+"""``nextview train``: recogniser and map networks from a view store."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import tyro
+
+from nextview.training.recipes import LemRecipe, RecogniserRecipe
+
+Positional = tyro.conf.Positional
+
+
+def train_recogniser(
+    store: Positional[Path],
+    out: Positional[Path],
+    deformed: Path | None = None,
+    recipe: tyro.conf.OmitArgPrefixes[RecogniserRecipe] = RecogniserRecipe(),  # noqa: B008
+) -> None:
+    """Train the recogniser on a store's training split. Resumes if OUT holds a run that was cut off.
+
+    Args:
+        store: view store made by nextview render.
+        out: folder for checkpoints, logs and network.pt.
+        deformed: a store of the same objects, stretched and turned (nextview render --stretch .25 --turn).
+        recipe: how to train.
+    """
+    import numpy as np
+    import torch
+
+    from nextview.cli.progress import track
+    from nextview.data.split import split_training
+    from nextview.data.store import ViewStore
+    from nextview.training import recogniser
+    from nextview.training.inputs import load_inputs, prepare_inputs
+
+    views = ViewStore.open(store)
+    training, validation = split_training(views, recipe.validation, recipe.seed)
+    sources = []
+    for path in filter(None, (store, deformed)):
+        other = ViewStore.open(path)
+        track(prepare_inputs(path, recipe.size), int(other.done.sum()), f"inputs of {path.name}")
+        row = {name: i for i, name in enumerate(other.names)}
+        sources.append((load_inputs(path, recipe.size), np.array([row.get(name, -1) for name in views.names])))
+        missing = [views.names[i] for i in training if sources[-1][1][i] < 0]
+        if missing:
+            raise ValueError(f"{path}: lacks {len(missing)} of the training objects, {missing[0]} among them")
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "recipe.json").write_text(json.dumps(asdict(recipe), indent=1) + "\n")
+    network = recogniser.train(sources, views.labels, training, validation, recipe, out)
+    torch.save(network.state_dict(), out / "network.pt")
+
+
+def train_lem(
+    store: Positional[Path],
+    out: Positional[Path],
+    recipe: tyro.conf.OmitArgPrefixes[LemRecipe] = LemRecipe(),  # noqa: B008
+) -> None:
+    """Train the LEM on a store's training split. Resumes if OUT holds a run that was cut off.
+
+    Args:
+        store: view store made by nextview render, with the 40 views.
+        out: folder for checkpoints, logs and network.pt.
+        recipe: how to train.
+    """
+    import torch
+
+    from nextview.data.split import split_training
+    from nextview.data.store import ViewStore
+    from nextview.measures.depth_entropy import normalise_per_object
+    from nextview.training import lem
+
+    views = ViewStore.open(store)
+    training, validation = split_training(views, recipe.validation, recipe.seed)
+    maps = normalise_per_object(views.measure())[:, views.sphere.windows]
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "recipe.json").write_text(json.dumps(asdict(recipe), indent=1) + "\n")
+    network = lem.train(views.all_points(), maps, views.sphere.poses, training, validation, recipe, out)
+    torch.save(network.state_dict(), out / "network.pt")

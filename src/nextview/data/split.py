@@ -1,0 +1,44 @@
+"""Which objects train and which validate: by object, stratified by class, identical meshes together."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.folders import DatasetError
+from nextview.data.store import ViewStore
+
+
+def split_training(
+    store: ViewStore, share: float = 0.1, seed: int = 0
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Divide the rendered objects of the training split.
+
+    Meshes that are byte-identical look identical, so equal depth-entropy from all views marks them; they stay on one
+    side whatever their labels. Objects of a store without a training split all count as training.
+
+    Args:
+        store: the views.
+        share: part of every class that validates.
+        seed: decides which.
+
+    Returns:
+        Indices of the objects that train and of those that validate, sorted.
+    """
+    usable = np.flatnonzero(store.done & (store.splits != "test"))
+    if len(usable) == 0:
+        raise DatasetError(f"{store.path}: holds no rendered object of the training split")
+    _, twin = np.unique(store.measure()[usable], axis=0, return_inverse=True)
+    labels = store.labels[usable]
+    rng = np.random.default_rng(seed)
+    validates = np.zeros(len(usable), bool)
+    for label in np.unique(labels):
+        members = rng.permutation(np.flatnonzero(labels == label))
+        validates[members[: round(share * len(members))]] = True
+    validates = np.isin(twin, twin[validates])
+    return usable[~validates], usable[validates]
+
+
+def test_objects(store: ViewStore) -> NDArray[np.int64]:
+    """Indices of the rendered objects of the test split."""
+    return np.flatnonzero(store.done & (store.splits == "test"))

@@ -1,0 +1,135 @@
+"""The view store: every view of every object of a dataset, in one Zarr group, one chunk an object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import BloscCodec
+
+from nextview.data.folders import DatasetError, Entry
+from nextview.observation import POINTS, pinhole
+from nextview.viewsphere import ViewSphere
+
+FORMAT = 1
+DEPTH_UNIT = 1e-4
+"""Depth is stored as uint16 in steps of this many object radii."""
+POINT_UNIT = 1 / 32767
+"""Points are stored as int16 in steps of this many object radii."""
+PENDING, DONE, FAILED = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class ViewStore:
+    """Views of N objects from the V views of a sphere.
+
+    Arrays of the group, sharded by object (axis 0): ``image`` (N, V, S, S) uint8; ``depth`` (N, V, S, S) uint16 in
+    DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object frame; ``measures/depth_entropy`` (N, V)
+    float32, bits; ``status`` (N,) uint8. Names, labels, splits and what was rendered how are attributes.
+    """
+
+    path: Path
+    group: zarr.Group
+
+    @classmethod
+    def create(cls, path: Path, entries: list[Entry], sphere: ViewSphere, size: int, recipe: dict) -> ViewStore:
+        """Make an empty store; ``recipe`` is kept in the attributes as it is (JSON values)."""
+        group = zarr.open_group(path, mode="w-")
+        n, v = len(entries), len(sphere)
+        codec = BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle")
+
+        def array(name: str, shape: tuple[int, ...], dtype: str) -> None:
+            group.create_array(name, shape=(n, *shape), chunks=(1, *shape), dtype=dtype, compressors=codec)
+
+        array("image", (v, size, size), "uint8")
+        array("depth", (v, size, size), "uint16")
+        array("points", (v, POINTS, 3), "int16")
+        array("measures/depth_entropy", (v,), "float32")
+        array("status", (), "uint8")
+        group.attrs.update(
+            {
+                "format": FORMAT,
+                "names": [e.name for e in entries],
+                "labels": [e.label for e in entries],
+                "splits": [e.split for e in entries],
+                "elevations": list(sphere.elevations),
+                "azimuths": sphere.azimuths,
+                "distance": sphere.distance,
+                "size": size,
+                **recipe,
+            }
+        )
+        return cls(path, group)
+
+    @classmethod
+    def open(cls, path: str | Path) -> ViewStore:
+        """Open a store for reading.
+
+        Raises:
+            DatasetError: there is none, or it is of another format.
+        """
+        path = Path(path)
+        if not (path / "zarr.json").exists():
+            raise DatasetError(f"{path}: there is no view store; make one with nextview render")
+        group = zarr.open_group(path, mode="r+")
+        if group.attrs.get("format") != FORMAT:
+            raise DatasetError(f"{path}: not a view store of format {FORMAT}; render it again")
+        return cls(path, group)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def names(self) -> list[str]:
+        return self.group.attrs["names"]
+
+    @property
+    def classes(self) -> list[str]:
+        return sorted(set(self.group.attrs["labels"]))
+
+    @property
+    def labels(self) -> NDArray[np.int64]:
+        """Class of each object as an index into ``classes``, (N,) int64."""
+        return np.array([self.classes.index(label) for label in self.group.attrs["labels"]])
+
+    @property
+    def splits(self) -> NDArray[np.str_]:
+        """"train", "test" or "" for each object, (N,)."""
+        return np.array(self.group.attrs["splits"])
+
+    @property
+    def sphere(self) -> ViewSphere:
+        a = self.group.attrs
+        return ViewSphere(tuple(a["elevations"]), a["azimuths"], a["distance"])
+
+    @property
+    def intrinsics(self) -> NDArray[np.float64]:
+        return pinhole(self.group.attrs["size"], self.sphere.distance)
+
+    @property
+    def done(self) -> NDArray[np.bool_]:
+        """Objects that are rendered, (N,)."""
+        return self.group["status"][:] == DONE
+
+    def image(self, i: int) -> NDArray[np.uint8]:
+        """All views of object i, (V, S, S) uint8."""
+        return self.group["image"][i]
+
+    def depth(self, i: int) -> NDArray[np.float32]:
+        """Depth of all views of object i, (V, S, S) float32, object radii, 0 = no object."""
+        return self.group["depth"][i].astype(np.float32) * np.float32(DEPTH_UNIT)
+
+    def points(self, i: int) -> NDArray[np.float32]:
+        """Clouds of all views of object i, (V, 1024, 3) float32, object frame."""
+        return self.group["points"][i].astype(np.float32) * np.float32(POINT_UNIT)
+
+    def all_points(self) -> NDArray[np.int16]:
+        """Clouds of all views of all objects as stored, (N, V, 1024, 3) int16: 240 kB an object."""
+        return self.group["points"][:]
+
+    def measure(self, name: str = "depth_entropy") -> NDArray[np.float32]:
+        """A view measure of all objects, (N, V) float32."""
+        return self.group[f"measures/{name}"][:]

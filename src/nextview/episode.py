@@ -1,0 +1,186 @@
+"""The loop: observe, believe, stop or choose, move. One implementation for one robot and for a hundred thousand replays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.policies.base import EpisodeState, Evidence, Policy
+from nextview.recognition import Stopping, fuse
+from nextview.viewsphere import ViewSphere
+
+
+class PolicyError(ValueError):
+    """A policy that answered with something that is not a next view; the message names it."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One look in the episodes that were still running, A of them.
+
+    Attributes:
+        episodes: which ones, (A,) int64.
+        views: the view taken, (A,) int64.
+        evidence: what the models said of it.
+        belief: fused after it, (A, classes).
+        stopped: whether the episode ended here, (A,) bool.
+        next_views: where it goes next, (A,) int64; -1 where it ended.
+    """
+
+    episodes: NDArray[np.int64]
+    views: NDArray[np.int64]
+    evidence: Evidence
+    belief: NDArray[np.float64]
+    stopped: NDArray[np.bool_]
+    next_views: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How B episodes ended.
+
+    Attributes:
+        answer: most believed class, (B,) int64.
+        confidence: its belief, (B,) float64.
+        looks: views taken, (B,) int64.
+        confident: whether the threshold was reached (else the views ran out), (B,) bool.
+        travel: sum over the moves in grid cells, (B,) float64.
+        arc: sum over the moves in radians, (B,) float64.
+        views: the views in order, (B, max looks) int64, -1 after the end.
+    """
+
+    answer: NDArray[np.int64]
+    confidence: NDArray[np.float64]
+    looks: NDArray[np.int64]
+    confident: NDArray[np.bool_]
+    travel: NDArray[np.float64]
+    arc: NDArray[np.float64]
+    views: NDArray[np.int64]
+
+
+class Episodes:
+    """B episodes side by side. Give ``tell`` what was seen from ``current``, until ``running`` is empty.
+
+    Args:
+        sphere: the viewpoints.
+        policy: chooses where to go.
+        starts: first view of each episode, (B,).
+        stopping: when an episode ends; a sphere with fewer views than ``max_views`` ends it too.
+        rng: for policies that draw.
+    """
+
+    def __init__(
+        self,
+        sphere: ViewSphere,
+        policy: Policy,
+        starts: NDArray[np.int64],
+        stopping: Stopping,
+        rng: np.random.Generator,
+    ) -> None:
+        self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
+        self.running = np.arange(len(starts))
+        self.current = np.array(starts, np.int64)
+        if ((self.current < 0) | (self.current >= len(sphere))).any():
+            raise ValueError(f"a first view has to be one of the {len(sphere)} views, 0 to {len(sphere) - 1}")
+        self.steps: list[Step] = []
+        self._visited = np.zeros((len(starts), len(sphere)), bool)
+        self._total: NDArray[np.float64] | None = None
+
+    def tell(self, evidence: Evidence) -> Step:
+        """Take in the evidence of one look in every running episode; stop or choose its next view."""
+        if self._total is None:
+            self._total = np.zeros((len(self.current), evidence.logits.shape[1]))
+        now, views = self.running, self.current[self.running]
+        self._visited[now, views] = True
+        self._total[now] += evidence.logits
+        belief = fuse(self._total[now, None])
+        looks = len(self.steps) + 1
+        stopped = belief.max(1) >= self.stopping.threshold
+        if looks >= min(self.stopping.max_views, len(self.sphere)):
+            stopped[:] = True
+        going = ~stopped
+        next_views = np.full(len(now), -1)
+        if going.any():
+            state = EpisodeState(
+                views[going], self._visited[now[going]], belief[going], select(evidence, going), looks
+            )
+            chosen = np.asarray(self.policy.next_views(state, self.rng))
+            self._check(chosen, state)
+            next_views[going] = chosen
+            self.current[now[going]] = chosen
+        step = Step(now, views, evidence, belief, stopped, next_views)
+        self.steps.append(step)
+        self.running = now[going]
+        return step
+
+    def _check(self, chosen: NDArray, state: EpisodeState) -> None:
+        name = type(self.policy).__name__
+        if chosen.shape != state.current.shape or not np.issubdtype(chosen.dtype, np.integer):
+            raise PolicyError(f"policy {name} has to return {len(state.current)} integers, one for each episode")
+        if ((chosen < 0) | (chosen >= len(self.sphere))).any():
+            raise PolicyError(f"policy {name} chose a view that is not on the sphere: {chosen.min()} .. {chosen.max()}")
+        again = state.visited[np.arange(len(chosen)), chosen]
+        if again.any():
+            raise PolicyError(f"policy {name} chose view {chosen[again][0]}, which was visited before")
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the episodes ended.
+
+        Raises:
+            ValueError: some are still running.
+        """
+        if len(self.running) or not self.steps:
+            raise ValueError("the episodes are still running")
+        b = len(self.current)
+        views = np.full((b, len(self.steps)), -1)
+        answer, looks, confidence = np.zeros(b, np.int64), np.zeros(b, np.int64), np.zeros(b)
+        for k, step in enumerate(self.steps):
+            views[step.episodes, k] = step.views
+            answer[step.episodes] = step.belief.argmax(1)
+            confidence[step.episodes] = step.belief.max(1)
+            looks[step.episodes] = k + 1
+        moved = views[:, 1:] >= 0
+        legs = (views[:, :-1], views[:, 1:])
+        return Outcome(
+            answer,
+            confidence,
+            looks,
+            confidence >= self.stopping.threshold,
+            (self.sphere.travel[legs] * moved).sum(1),
+            (self.sphere.arc[legs] * moved).sum(1),
+            views,
+        )
+
+
+def select(evidence: Evidence, keep: NDArray[np.bool_]) -> Evidence:
+    """The evidence of some of the episodes."""
+    features = None if evidence.features is None else evidence.features[keep]
+    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, features)
+
+
+def run_episodes(
+    observe: Callable[[NDArray[np.int64], NDArray[np.int64]], Evidence],
+    sphere: ViewSphere,
+    policy: Policy,
+    starts: NDArray[np.int64],
+    stopping: Stopping,
+    rng: np.random.Generator,
+) -> Episodes:
+    """Run episodes to their end.
+
+    Args:
+        observe: evidence of looking, in the given episodes (A,), from the given views (A,).
+        sphere: the viewpoints.
+        policy: chooses where to go.
+        starts: first view of each episode, (B,).
+        stopping: when an episode ends.
+        rng: for policies that draw.
+    """
+    episodes = Episodes(sphere, policy, starts, stopping, rng)
+    while len(episodes.running):
+        episodes.tell(observe(episodes.running, episodes.current[episodes.running]))
+    return episodes

@@ -1,0 +1,38 @@
+"""Depth-entropy, the thesis's measure of how much a view shows (section 4.1.2, equation 3)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import entr
+
+QUANTUM = 1e-3
+"""Depth values closer than this count as equal, object radii."""
+
+
+def depth_entropy(depth: NDArray[np.floating]) -> float:
+    """Shannon entropy, in bits, of the distribution of depth values in a depth image, background included.
+
+    Args:
+        depth: (H, W), object radii, 0 where there is no object.
+
+    Returns:
+        0 for an image of one value, at most log2 of the number of pixels.
+    """
+    values = np.rint(np.asarray(depth, np.float64).ravel() / QUANTUM).astype(np.int64)
+    counts = np.bincount(values)
+    return float(entr(counts[counts > 0] / values.size).sum() / np.log(2))
+
+
+def normalise_per_object(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Scale a measure over an object's views to [0, 1], along the last axis; all 0 where the views do not differ.
+
+    Args:
+        values: (..., V), one value for each view.
+
+    Returns:
+        (..., V) float32.
+    """
+    low = values.min(-1, keepdims=True)
+    span = values.max(-1, keepdims=True) - low
+    return np.where(span > 0, (values - low) / np.where(span > 0, span, 1), 0).astype(np.float32)

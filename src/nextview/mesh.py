@@ -1,0 +1,134 @@
+"""Read a mesh file and bring it into the object frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.off import read_off
+
+FORMATS = (".off", ".obj", ".ply", ".stl", ".glb")
+
+
+class MeshError(ValueError):
+    """A mesh that cannot be used; the message is one sentence that names the file and the reason."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex at radius 1.
+
+    Attributes:
+        vertices: (V, 3) float64, object radii.
+        faces: (F, 3) int32, indices into the vertices.
+        centre: bounding-box centre in the file's frame, (3,) float64, the file's units.
+        radius: object radius in the file's units; ``vertices * radius + centre`` are the file's positions.
+        name: what to call it in messages.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    centre: NDArray[np.float64]
+    radius: float
+    name: str = "mesh"
+
+
+def make_mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], name: str = "mesh") -> Mesh:
+    """Check raw arrays and normalise them.
+
+    Args:
+        vertices: (V, 3), any unit.
+        faces: (F, 3), indices into the vertices.
+        name: used in messages.
+
+    Returns:
+        The mesh in the object frame, without the vertices that no face uses.
+
+    Raises:
+        MeshError: no faces, an index out of range, a position that is not finite, or no extent.
+    """
+    vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
+    faces = np.asarray(faces).reshape(-1, 3)
+    if len(vertices) == 0:
+        raise MeshError(f"{name}: the mesh has no vertices")
+    if len(faces) == 0:
+        raise MeshError(f"{name}: the mesh has no faces")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        worst = int(faces.min() if faces.min() < 0 else faces.max())
+        raise MeshError(f"{name}: a face refers to vertex {worst}, but there are only {len(vertices)} vertices")
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    if not used.all():
+        faces = (np.cumsum(used) - 1)[faces]
+        vertices = vertices[used]
+    if not np.isfinite(vertices).all():
+        raise MeshError(f"{name}: {int((~np.isfinite(vertices)).any(1).sum())} vertices are NaN or infinite")
+    low, high = vertices.min(0), vertices.max(0)
+    # Halves first: the sum or difference of two very large finite numbers may not be finite.
+    centre = low / 2 + high / 2
+    vertices = vertices - centre
+    reach = np.abs(vertices).max()
+    if not reach > 1e-9 * np.abs(centre).max() or reach < np.finfo(float).tiny:
+        raise MeshError(f"{name}: the mesh has no extent, all its vertices are in one place")
+    vertices /= reach
+    radius = np.sqrt((vertices**2).sum(1).max())
+    return Mesh(vertices / radius, faces.astype(np.int32), centre, float(radius * reach), name)
+
+
+def load_mesh(path: str | Path, up: str | None = None) -> Mesh:
+    """Read an OFF, OBJ, PLY, STL or GLB file; the parts of a scene are joined.
+
+    Args:
+        path: the file; its suffix tells the format.
+        up: the file's up axis, "y" or "z". By default z, but y for GLB, whose standard says so.
+
+    Returns:
+        The mesh in the object frame.
+
+    Raises:
+        MeshError: what is wrong with the file, in one sentence.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if up not in (None, "y", "z"):
+        raise MeshError(f"{path}: the up axis is y or z, not {up!r}")
+    if path.is_dir():
+        raise MeshError(f"{path}: is a folder, not a mesh file")
+    if not path.exists():
+        raise MeshError(f"{path}: there is no such file")
+    if suffix not in FORMATS:
+        raise MeshError(f"{path}: not a mesh format nextview reads ({', '.join(FORMATS)})")
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise MeshError(f"{path}: cannot be read ({error.strerror})") from None
+    if not data.strip():
+        raise MeshError(f"{path}: the file is empty")
+    try:
+        vertices, faces = read_off(data) if suffix == ".off" else _read_with_trimesh(data, suffix)
+    except Exception as error:  # parsers raise whatever a broken file makes them raise
+        reason = str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
+        raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({reason})") from None
+    if (up or ("y" if suffix == ".glb" else "z")) == "y":
+        vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)
+    return make_mesh(vertices, faces, str(path))
+
+
+def _read_with_trimesh(data: bytes, suffix: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    import io
+
+    import trimesh  # a third of a second to import, and OFF does not need it
+
+    if suffix == ".stl" and len(data) > 84 and not data.lstrip()[:5].lower() == b"solid":
+        facets = int.from_bytes(data[80:84], "little")
+        if len(data) < 84 + 50 * facets:
+            raise ValueError(f"the file is cut short, {facets} faces announced, {(len(data) - 84) // 50} found")
+    loaded = trimesh.load(io.BytesIO(data), file_type=suffix[1:], process=False)
+    if isinstance(loaded, trimesh.Scene):
+        loaded = loaded.to_mesh()
+    if not isinstance(loaded, trimesh.Trimesh):
+        return np.asarray(loaded.vertices, float), np.zeros((0, 3), np.int64)  # a point cloud: no faces
+    return np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces, np.int64)

@@ -1,0 +1,128 @@
+"""Run the networks with ONNX Runtime."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from nextview.models.card import Card, ModelError, file_hash, find_card
+from nextview.models.cloud_input import cloud_input
+from nextview.models.geometry_input import geometry_input
+from nextview.observation import Observation
+from nextview.policies.base import Evidence
+
+RECOGNISER = "resnet18-modelnet10"
+MAPS = {"lem": "lem-modelnet10"}
+
+
+def open_weights(card: Card, threads: int = 0) -> ort.InferenceSession:
+    """Check a model's hash and hand it to ONNX Runtime.
+
+    Args:
+        card: the model.
+        threads: of ONNX Runtime, 0 for one on each core.
+
+    Raises:
+        ModelError: the file is not the one that the card describes, or ONNX Runtime refuses it.
+    """
+    if file_hash(card.path) != card.sha256:
+        raise ModelError(f"{card.path}: is not the file that its card describes (the SHA-256 differs)")
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    try:
+        return ort.InferenceSession(str(card.path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # the runtime has a class of exception for every reason
+        raise ModelError(f"{card.path}: not a usable ONNX model ({str(error).splitlines()[0]})") from None
+
+
+class Recogniser:
+    """Names the object in each view.
+
+    Args:
+        model: name of a bundled model, or path of a card.
+        threads: of ONNX Runtime, 0 for one on each core.
+    """
+
+    def __init__(self, model: str | Path = RECOGNISER, threads: int = 0) -> None:
+        self.card = find_card(model)
+        if self.card.kind != "recogniser":
+            raise ModelError(f"model {self.card.name} is a {self.card.kind}, not a recogniser")
+        self.classes: tuple[str, ...] = tuple(self.card.facts["classes"])
+        self.size: int = self.card.facts["input_size"]
+        self._session = open_weights(self.card, threads)
+
+    def __call__(self, observations: Sequence[Observation]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Calibrated logits (B, classes) and pooled features (B, D) of looks from one camera."""
+        return self.from_inputs(
+            geometry_input(
+                np.stack([o.depth for o in observations]),
+                np.stack([o.pose for o in observations]),
+                observations[0].intrinsics,
+                self.size,
+            )
+        )
+
+    def from_inputs(self, inputs: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The same from prepared inputs, (B, 4, size, size) uint8."""
+        logits, features = self._session.run(["logits", "features"], {"input": inputs})
+        return logits, features
+
+
+class MapNetwork:
+    """Predicts the local map around each view from its partial cloud.
+
+    Args:
+        model: name of a bundled model, or path of a card.
+        threads: of ONNX Runtime, 0 for one on each core.
+    """
+
+    def __init__(self, model: str | Path, threads: int = 0) -> None:
+        self.card = find_card(model)
+        if self.card.kind == "recogniser":
+            raise ModelError(f"model {self.card.name} is a recogniser, not a map network")
+        self.valley_classes: tuple[str, ...] = tuple(self.card.facts.get("valley_classes", ()))
+        self._session = open_weights(self.card, threads)
+
+    def __call__(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
+        """Maps (B, rings, 3); rows are rings, columns azimuth -1, 0, +1."""
+        points = np.stack([o.points for o in observations])
+        return self.from_clouds(cloud_input(points, np.stack([o.pose for o in observations])))
+
+    def from_clouds(self, clouds: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The same from prepared clouds, (B, P, 3) float32."""
+        return self._session.run(["map"], {"cloud": clouds})[0]
+
+
+@dataclass(frozen=True)
+class Models:
+    """The recogniser and the map networks that a policy needs."""
+
+    recogniser: Recogniser
+    maps: dict[str, MapNetwork]
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        return self.recogniser.classes
+
+    def evidence(self, observations: Sequence[Observation]) -> Evidence:
+        """What the models say of looks from one camera."""
+        logits, features = self.recogniser(observations)
+        return Evidence(logits, {name: network(observations) for name, network in self.maps.items()}, features)
+
+
+def load_models(maps: Sequence[str] = ("lem",), recogniser: str | Path = RECOGNISER, threads: int = 0) -> Models:
+    """The bundled recogniser, or the one whose card is given, and the bundled map networks of the given names.
+
+    Raises:
+        ModelError: a model is missing, damaged or of the wrong kind.
+    """
+    unknown = [name for name in maps if name not in MAPS]
+    if unknown:
+        raise ModelError(f"no map is called {unknown[0]!r}; there are {', '.join(MAPS)}")
+    return Models(Recogniser(recogniser, threads), {name: MapNetwork(MAPS[name], threads) for name in maps})

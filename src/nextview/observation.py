@@ -1,0 +1,53 @@
+"""What one look yields, and what can take a look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+POINTS = 1024
+"""Points in the partial cloud of one look (thesis, section 4.1.2)."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One look at an object.
+
+    Attributes:
+        image: grey image, (H, W) uint8, 0 where there is no object.
+        depth: distance along the optical axis, (H, W) float32, object radii, 0 where there is no object.
+        points: points on the visible surface, (1024, 3) float32, object frame, object radii; all zero if nothing is visible.
+        pose: camera-to-world, (4, 4) float64, OpenCV axes (x right, y down, z forward).
+        intrinsics: pinhole matrix, (3, 3) float64, pixels; the centre of pixel (row, column) is at (column + 0.5, row + 0.5).
+    """
+
+    image: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    points: NDArray[np.float32]
+    pose: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
+
+
+class Camera(Protocol):
+    """Anything that can look at the object from a given pose."""
+
+    def observe(self, pose: NDArray[np.float64]) -> Observation:
+        """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""
+        ...
+
+
+def pinhole(size: int, distance: float) -> NDArray[np.float64]:
+    """Intrinsics of a square image that just holds the unit sphere seen from a distance.
+
+    Args:
+        size: side of the image, pixels.
+        distance: from the sphere's centre, object radii, greater than 1.
+
+    Returns:
+        (3, 3) float64.
+    """
+    focal = size / 2 * np.sqrt(distance**2 - 1)  # size/2 over the tangent of the half angle asin(1/distance)
+    return np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])

@@ -1,0 +1,85 @@
+"""The contract of a policy: what it sees, and what it answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.viewsphere import ViewSphere
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the models say of one look in each of B episodes.
+
+    Attributes:
+        logits: (B, classes) float.
+        maps: predicted local maps by name ("lem"), each (B, rings, 3) float; those that the policy needs.
+        features: pooled image features, (B, D) float.
+    """
+
+    logits: NDArray[np.floating]
+    maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
+    features: NDArray[np.floating] | None = None
+
+
+@dataclass(frozen=True)
+class EpisodeState:
+    """Where B episodes stand when the next view is to be chosen. The true label is not part of it.
+
+    Attributes:
+        current: the view just taken, (B,) int64.
+        visited: views taken so far, the current one included, (B, V) bool.
+        belief: fused over all looks, (B, classes) float64.
+        evidence: of the current look.
+        step: looks taken so far, 1 or more.
+    """
+
+    current: NDArray[np.int64]
+    visited: NDArray[np.bool_]
+    belief: NDArray[np.float64]
+    evidence: Evidence
+    step: int
+
+
+class Policy(Protocol):
+    """Chooses where to look next, in many episodes at once."""
+
+    needs: tuple[str, ...]
+    """Names of the maps it wants in the evidence."""
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """The next view of each episode, (B,) int64: one not visited yet, as long as there is any."""
+        ...
+
+
+def best_in_window(
+    sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]
+) -> NDArray[np.int64]:
+    """The unvisited view of the local window with the highest score.
+
+    Where the whole window is visited, the unvisited view with the shortest travel; where all views are, the window's best.
+
+    Args:
+        sphere: the viewpoints.
+        state: B episodes.
+        scores: of the windows' cells, (B, rings, 3), finite.
+
+    Returns:
+        (B,) int64.
+    """
+    b = len(state.current)
+    rows = np.arange(b)
+    window = sphere.windows[state.current].reshape(b, -1)
+    flat = np.asarray(scores, np.float64).reshape(b, -1)
+    free = ~state.visited[rows[:, None], window]
+    chosen = window[rows, np.where(free, flat, -np.inf).argmax(1)]
+    stuck = ~free.any(1)
+    if stuck.any():
+        near = np.where(state.visited[stuck], np.inf, sphere.travel[state.current[stuck]])
+        left = np.isfinite(near).any(1)
+        chosen[stuck] = np.where(left, near.argmin(1), window[stuck, flat[stuck].argmax(1)])
+    return chosen

@@ -1,0 +1,58 @@
+"""Policies that climb a predicted local map (thesis, section 4.2.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.policies.base import EpisodeState, best_in_window
+from nextview.viewsphere import ViewSphere
+
+
+def local_peaks(maps: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Cells that no neighbour exceeds (3x3 maximum filter; nothing lies beyond the border).
+
+    Args:
+        maps: (B, rows, columns).
+
+    Returns:
+        (B, rows, columns) bool.
+    """
+    padded = np.pad(maps, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
+    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2))
+    return np.asarray(maps) >= around.max((-2, -1))
+
+
+def peaks_first(maps: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Scores that put every local peak before every other cell, each group by value; same shape as the maps."""
+    maps = np.asarray(maps, np.float64)
+    span = np.ptp(maps, axis=(1, 2), keepdims=True) + 1.0
+    return maps + span * local_peaks(maps)
+
+
+@dataclass(frozen=True)
+class MapPeak:
+    """Go to the highest unvisited peak of a predicted map, or the deepest valley where the belief says so.
+
+    Attributes:
+        sphere: the viewpoints.
+        map_name: the map in the evidence, "lem".
+        valley_classes: classes (indices) for which the lowest valley is the better view. What counts is the class
+            *believed* at that moment; the true one is unknown to a robot.
+    """
+
+    sphere: ViewSphere
+    map_name: str = "lem"
+    valley_classes: tuple[int, ...] = ()
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return (self.map_name,)
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See ``Policy.next_views``."""
+        maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
+        valley = np.isin(state.belief.argmax(1), self.valley_classes)
+        return best_in_window(self.sphere, state, peaks_first(np.where(valley[:, None, None], -maps, maps)))

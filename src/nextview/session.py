@@ -1,0 +1,166 @@
+"""Live use: hand in what the camera sees, get told what it is or where to look next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.episode import Episodes
+from nextview.models.networks import Models
+from nextview.observation import Camera, Observation
+from nextview.policies.base import Policy
+from nextview.recognition import Stopping, fuse
+from nextview.viewsphere import ViewSphere
+
+
+@dataclass(frozen=True)
+class Look:
+    """One look and what followed from it.
+
+    Attributes:
+        view: where it was taken from.
+        observation: what was seen.
+        guess: what this image alone says, (classes,) float64.
+        belief: fused over all looks so far, (classes,) float64.
+        maps: predicted local maps by name, each (rings, 3).
+        next_view: where to look next; None where the episode ends.
+        travel: so far, in grid cells.
+        arc: so far, in radians.
+    """
+
+    view: int
+    observation: Observation
+    guess: NDArray[np.float64]
+    belief: NDArray[np.float64]
+    maps: dict[str, NDArray[np.floating]]
+    next_view: int | None
+    travel: float
+    arc: float
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """The end of an episode.
+
+    Attributes:
+        looks: in order.
+        classes: their names.
+        confident: whether the threshold was reached (else the views ran out).
+    """
+
+    looks: tuple[Look, ...]
+    classes: tuple[str, ...]
+    confident: bool
+
+    @property
+    def answer(self) -> str:
+        return self.classes[int(self.looks[-1].belief.argmax())]
+
+    @property
+    def confidence(self) -> float:
+        return float(self.looks[-1].belief.max())
+
+    @property
+    def travel(self) -> float:
+        return self.looks[-1].travel
+
+
+class Session:
+    """One object under way; the caller moves the camera.
+
+    >>> session = Session(models, policy, sphere, start=0)                      # doctest: +SKIP
+    >>> while not session.done:                                                 # doctest: +SKIP
+    ...     look = session.tell(my_camera.observe(session.pose))
+
+    Args:
+        models: recogniser and map networks.
+        policy: chooses the next view.
+        sphere: the viewpoints.
+        start: the first view.
+        stopping: when to stop.
+        rng: for policies that draw; seed 0 by default.
+    """
+
+    def __init__(
+        self,
+        models: Models,
+        policy: Policy,
+        sphere: ViewSphere,
+        start: int = 0,
+        stopping: Stopping = Stopping(),
+        rng: np.random.Generator | None = None,
+    ) -> None:
+        missing = [name for name in policy.needs if name not in models.maps]
+        if missing:
+            raise ValueError(f"this policy needs the map {missing[0]!r}; load it with the models")
+        self.models, self.sphere = models, sphere
+        self.looks: list[Look] = []
+        self._episodes = Episodes(sphere, policy, np.array([start]), stopping, rng or np.random.default_rng(0))
+
+    @property
+    def done(self) -> bool:
+        return len(self._episodes.running) == 0
+
+    @property
+    def view(self) -> int:
+        """Where to look now."""
+        return int(self._episodes.current[0])
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """Where to look now, as a camera-to-world pose (4, 4), OpenCV axes, object radii."""
+        return self.sphere.poses[self.view]
+
+    def tell(self, observation: Observation) -> Look:
+        """Take in what was seen from ``pose``.
+
+        Raises:
+            ValueError: the episode has ended.
+        """
+        if self.done:
+            raise ValueError("this session has ended; begin another one")
+        step = self._episodes.tell(self.models.evidence([observation]))
+        view, to = int(step.views[0]), int(step.next_views[0])
+        travel, arc = (self.looks[-1].travel, self.looks[-1].arc) if self.looks else (0.0, 0.0)
+        if self.looks:
+            travel += float(self.sphere.travel[self.looks[-1].view, view])
+            arc += float(self.sphere.arc[self.looks[-1].view, view])
+        look = Look(
+            view,
+            observation,
+            fuse(step.evidence.logits[:, None])[0],
+            step.belief[0],
+            {name: values[0] for name, values in step.evidence.maps.items()},
+            None if to < 0 else to,
+            travel,
+            arc,
+        )
+        self.looks.append(look)
+        return look
+
+    @property
+    def result(self) -> Recognition:
+        """How it ended.
+
+        Raises:
+            ValueError: it has not.
+        """
+        return Recognition(tuple(self.looks), self.models.classes, bool(self._episodes.outcome.confident[0]))
+
+
+def recognise(
+    camera: Camera,
+    models: Models,
+    policy: Policy,
+    sphere: ViewSphere,
+    start: int = 0,
+    stopping: Stopping = Stopping(),
+    rng: np.random.Generator | None = None,
+) -> Recognition:
+    """Look at an object until its class is believed or the views run out. Arguments as for ``Session``."""
+    session = Session(models, policy, sphere, start, stopping, rng)
+    while not session.done:
+        session.tell(camera.observe(session.pose))
+    return session.result

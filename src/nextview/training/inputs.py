@@ -1,0 +1,61 @@
+"""The recogniser's inputs for a whole store, computed once and kept beside the store as one array."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.store import ViewStore
+from nextview.models.geometry_input import CHANNELS, geometry_input
+
+
+def inputs_path(store: Path, size: int) -> Path:
+    """Where the inputs of a store are kept."""
+    return store.with_name(f"{store.name}.inputs{size}.npy")
+
+
+def prepare_inputs(path: Path, size: int, workers: int | None = None) -> Iterator[int]:
+    """Compute the inputs of every object (N, V, 4, size, size) uint8, unless they are there.
+
+    Yields:
+        Objects done so far. The file appears under its name only when it is whole.
+    """
+    target = inputs_path(path, size)
+    if target.exists():
+        return
+    store = ViewStore.open(path)
+    shape = (len(store), len(store.sphere), len(CHANNELS), size, size)
+    part = target.with_suffix(".part")
+    np.lib.format.open_memmap(part, "w+", np.uint8, shape).flush()
+    with ProcessPoolExecutor(workers or os.cpu_count(), get_context("spawn")) as pool:
+        jobs = [
+            pool.submit(_prepare, path, part, objects, size)
+            for objects in np.array_split(np.flatnonzero(store.done), max(1, len(store) // 25))
+        ]
+        total = 0
+        for job in as_completed(jobs):
+            total += job.result()
+            yield total
+    part.rename(target)
+
+
+def load_inputs(path: Path, size: int) -> NDArray[np.uint8]:
+    """The inputs of a store, memory-mapped, (N, V, 4, size, size) uint8."""
+    return np.load(inputs_path(path, size), mmap_mode="r")
+
+
+def _prepare(path: Path, part: Path, objects: NDArray[np.int64], size: int) -> int:
+    store = ViewStore.open(path)
+    inputs = np.lib.format.open_memmap(part, "r+")
+    poses, intrinsics = store.sphere.poses, store.intrinsics
+    for i in objects:
+        depth = store.depth(int(i))
+        for v, pose in enumerate(poses):  # one view at a time stays in the cache
+            inputs[i, v] = geometry_input(depth[v : v + 1], pose[None], intrinsics, size)[0]
+    return len(objects)

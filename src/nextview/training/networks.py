@@ -1,0 +1,140 @@
+"""The networks: ResNet with torchvision's parameter names, and PointNet with its two transforms."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+RESNETS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
+"""Blocks in the four stages of each ResNet (He et al., CVPR 2016, table 1)."""
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions and a shortcut."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(outputs)
+        self.relu = nn.ReLU(inplace=True)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(outputs)
+        self.downsample = None
+        if stride != 1 or inputs != outputs:
+            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+
+    def forward(self, x: Tensor) -> Tensor:
+        shortcut = x if self.downsample is None else self.downsample(x)
+        x = self.relu(self.bn1(self.conv1(x)))
+        return self.relu(self.bn2(self.conv2(x)) + shortcut)
+
+
+class ResNet(nn.Module):
+    """ResNet-18 or -34; ``forward`` returns (logits (B, classes), pooled features (B, 512)).
+
+    Args:
+        depth: 18 or 34.
+        classes: outputs.
+        channels: of the input image (B, channels, H, W), values in 0 .. 1.
+    """
+
+    def __init__(self, depth: int, classes: int, channels: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, 64, 7, 2, 3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.relu = nn.ReLU(inplace=True)
+        self.maxpool = nn.MaxPool2d(3, 2, 1)
+        width = 64
+        for stage, blocks in enumerate(RESNETS[depth]):
+            outputs = 64 << stage
+            layer = []
+            for block in range(blocks):
+                layer.append(BasicBlock(width, outputs, 2 if stage and not block else 1))
+                width = outputs
+            setattr(self, f"layer{stage + 1}", nn.Sequential(*layer))
+        self.avgpool = nn.AdaptiveAvgPool2d(1)
+        self.fc = nn.Linear(width, classes)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        for module in self.modules():
+            if isinstance(module, BasicBlock):  # each block begins as the identity, which steadies large rates
+                nn.init.zeros_(module.bn2.weight)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        x = self.maxpool(self.relu(self.bn1(self.conv1(x))))
+        for stage in (self.layer1, self.layer2, self.layer3, self.layer4):
+            x = stage(x)
+        features = self.avgpool(x).flatten(1)
+        return self.fc(features), features
+
+
+class PointLayer(nn.Module):
+    """The same fully connected layer, with batch norm over all points, for every point of clouds (B, P, inputs)."""
+
+    def __init__(self, inputs: int, outputs: int, relu: bool = True) -> None:
+        super().__init__()
+        self.linear = nn.Linear(inputs, outputs)
+        self.norm = nn.BatchNorm1d(outputs)
+        self.relu = relu
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.norm(self.linear(x).flatten(0, 1)).unflatten(0, x.shape[:2])
+        return torch.relu(x) if self.relu else x
+
+
+class Transform(nn.Module):
+    """T-Net: a k x k matrix from a cloud of k-dimensional points (B, P, k), beginning as the identity."""
+
+    def __init__(self, k: int) -> None:
+        super().__init__()
+        self.k = k
+        self.points = nn.Sequential(PointLayer(k, 64), PointLayer(64, 128), PointLayer(128, 1024))
+        self.head = nn.Sequential(
+            nn.Linear(1024, 512), nn.BatchNorm1d(512), nn.ReLU(inplace=True),
+            nn.Linear(512, 256), nn.BatchNorm1d(256), nn.ReLU(inplace=True),
+        )  # fmt: skip
+        self.matrix = nn.Linear(256, k * k)
+        nn.init.zeros_(self.matrix.weight)
+        with torch.no_grad():
+            self.matrix.bias.copy_(torch.eye(k).flatten())
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.matrix(self.head(self.points(x).amax(1))).unflatten(1, (self.k, self.k))
+
+
+class PointNet(nn.Module):
+    """PointNet (Qi et al., CVPR 2017) that predicts a map of rings x 3 values from a cloud (B, P, 3) in [0, 1].
+
+    ``forward`` returns the map (B, rings, 3) and the two transforms, (B, 3, 3) and (B, 64, 64).
+    """
+
+    def __init__(self, rings: int, dropout: float = 0.3) -> None:
+        super().__init__()
+        self.input_transform = Transform(3)
+        self.first = PointLayer(3, 64)
+        self.feature_transform = Transform(64)
+        self.second = PointLayer(64, 128)
+        self.third = PointLayer(128, 1024, relu=False)
+        self.head = nn.Sequential(
+            nn.Linear(1024, 512), nn.BatchNorm1d(512), nn.ReLU(inplace=True),
+            nn.Linear(512, 256), nn.Dropout(dropout), nn.BatchNorm1d(256), nn.ReLU(inplace=True),
+            nn.Linear(256, rings * 3),
+        )  # fmt: skip
+        # A ReLU whose input begins below zero stays dead: begin inside the range of the targets.
+        nn.init.constant_(self.head[-1].bias, 0.5)
+        self.rings = rings
+
+    def forward(self, cloud: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        a = self.input_transform(cloud)
+        x = self.first(torch.bmm(cloud, a))
+        b = self.feature_transform(x)
+        x = self.third(self.second(torch.bmm(x, b))).amax(1)
+        return torch.relu(self.head(x)).unflatten(1, (self.rings, 3)), a, b
+
+
+def orthogonality(matrix: Tensor) -> Tensor:
+    """How far matrices (B, k, k) are from orthogonal: mean Frobenius norm of I - A A^T (thesis, equation 2)."""
+    gram = torch.bmm(matrix, matrix.transpose(1, 2))
+    eye = torch.eye(matrix.shape[1], device=matrix.device)
+    return (gram - eye).flatten(1).norm(dim=1).mean()
