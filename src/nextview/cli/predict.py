@@ -1,0 +1,47 @@
+"""``nextview predict``: what the models say of every view of a store, into one file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+
+def predict(
+    store: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    /,
+    split: Literal["train", "test"] | None = None,
+    recogniser: str | None = None,
+    maps: tuple[str, ...] = ("lem",),
+    batch: int = 8,
+    workers: int | None = None,
+) -> None:
+    """Run the recogniser and the map networks over every view of a store, once. Resumes where it was.
+
+    Args:
+        store: view store made by nextview render.
+        out: predictions to make (.npz), from which nextview benchmark replays policies.
+        split: only this split.
+        recogniser: name of a bundled model or path of a card; the bundled one by default.
+        maps: maps to predict with the bundled networks, or NAME=CARD for others.
+        batch: views a call of the networks.
+        workers: processes; one for each core by default.
+    """
+    from nextview.cli.progress import track
+    from nextview.data import predict as job
+    from nextview.models.card import ModelError, find_card
+    from nextview.models.networks import MAPS, RECOGNISER
+
+    if out.suffix != ".npz":
+        raise ValueError(f"{out}: predictions are one .npz file; end the name in .npz")
+    cards = {}
+    for item in maps:
+        name, _, card = item.partition("=")
+        if not card and name not in MAPS:
+            raise ModelError(f"no bundled network predicts the map {name!r}; there are {', '.join(MAPS)}")
+        cards[name] = find_card(card or MAPS[name])
+    steps = job.predict(store, out, find_card(recogniser or RECOGNISER), cards, split, batch, workers)
+    _, total = next(steps)
+    track((done for done, _ in steps), total, f"predicting {store.name}")

@@ -1,0 +1,139 @@
+"""What the models say of every view of every object: the table from which policies are replayed."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.viewsphere import ViewSphere
+
+FORMAT = 1
+
+
+class PredictionsError(ValueError):
+    """Predictions that cannot be used; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """What the models say of N objects from the V views of a sphere; C classes, R rings.
+
+    Attributes:
+        logits: of the recogniser for each view alone, (N, V, C) float32.
+        maps: predicted local maps around each view by name ("lem"), each (N, V, R, 3) float32.
+        depth_entropy: the true measure, bits, (N, V) float32.
+        names: of the objects, unique.
+        labels: true class of each as an index into ``classes``, (N,) int64.
+        classes: their names, in the order of the logits.
+        splits: "train", "test" or "" for each object, (N,).
+        conflicting: objects that are the very mesh of another one with another label, in any split, (N,) bool.
+        sphere: the viewpoints.
+        models: name and SHA-256 of the recogniser ("recogniser") and of each map network ("lem").
+        valley_classes: for each map, the classes for which its card says that the valley is the better view.
+
+    Raises:
+        PredictionsError: shapes that do not fit, nothing inside, or a number that is not finite.
+    """
+
+    logits: NDArray[np.float32]
+    maps: dict[str, NDArray[np.float32]]
+    depth_entropy: NDArray[np.float32]
+    names: tuple[str, ...]
+    labels: NDArray[np.int64]
+    classes: tuple[str, ...]
+    splits: NDArray[np.str_]
+    conflicting: NDArray[np.bool_]
+    sphere: ViewSphere
+    models: dict[str, tuple[str, str]]
+    valley_classes: dict[str, tuple[str, ...]]
+
+    def __post_init__(self) -> None:
+        n, v, c = len(self.names), len(self.sphere), len(self.classes)
+        if n == 0:
+            raise PredictionsError("these predictions hold no objects")
+        if c == 0:
+            raise PredictionsError("these predictions name no classes")
+        wanted = {"logits": (n, v, c), "depth_entropy": (n, v), "labels": (n,), "splits": (n,), "conflicting": (n,)}
+        arrays = {name: getattr(self, name) for name in wanted}
+        for name, values in self.maps.items():
+            wanted[f"map {name}"], arrays[f"map {name}"] = (n, v, self.sphere.rings, 3), values
+        for name, shape in wanted.items():
+            if arrays[name].shape != shape:
+                raise PredictionsError(f"{name} of these predictions has the shape {arrays[name].shape}, not {shape}")
+            if arrays[name].dtype.kind == "f" and not np.isfinite(arrays[name]).all():
+                bad = self.names[int(np.flatnonzero(~np.isfinite(arrays[name].reshape(n, -1)).all(1))[0])]
+                raise PredictionsError(f"{name} of object {bad} is not a finite number")
+        if len(set(self.names)) < n:
+            raise PredictionsError("two objects of these predictions have the same name")
+        if ((self.labels < 0) | (self.labels >= c)).any():
+            raise PredictionsError(f"a label of these predictions is not one of the {c} classes")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def save(self, path: Path) -> None:
+        """Write one .npz file, aside and then renamed, so that it is whole or not there."""
+        arrays: dict[str, Any] = {
+            "format": FORMAT,
+            "logits": self.logits,
+            "depth_entropy": self.depth_entropy,
+            "names": np.array(self.names),
+            "labels": self.labels,
+            "classes": np.array(self.classes),
+            "splits": self.splits,
+            "conflicting": self.conflicting,
+            "elevations": np.array(self.sphere.elevations),
+            "azimuths": self.sphere.azimuths,
+            "distance": self.sphere.distance,
+            "models": np.array([(kind, *model) for kind, model in self.models.items()]).reshape(-1, 3),
+        }
+        arrays |= {f"map/{name}": values for name, values in self.maps.items()}
+        arrays |= {f"valley/{name}": np.array(classes, np.str_) for name, classes in self.valley_classes.items()}
+        part = path.with_name(path.name + ".part.npz")
+        np.savez_compressed(part, **arrays)
+        os.replace(part, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Predictions:
+        """Read what ``save`` wrote. Nothing is unpickled.
+
+        Raises:
+            PredictionsError: there is no such file, it is damaged, or what it holds does not fit together.
+        """
+        try:
+            with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+                f = {name: file[name] for name in file.files}
+        except FileNotFoundError:
+            raise PredictionsError(f"{path}: there is no such file; make one with nextview predict") from None
+        except (OSError, EOFError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+            raise PredictionsError(f"{path}: not a predictions file ({error or 'it is empty'})") from None
+        if "format" not in f or int(f["format"]) != FORMAT:
+            raise PredictionsError(f"{path}: not a predictions file of format {FORMAT}; make it again")
+
+        def group(prefix: str) -> dict[str, NDArray]:
+            return {name.removeprefix(prefix): values for name, values in f.items() if name.startswith(prefix)}
+
+        try:
+            return cls(
+                f["logits"],
+                group("map/"),
+                f["depth_entropy"],
+                tuple(f["names"].tolist()),
+                f["labels"],
+                tuple(f["classes"].tolist()),
+                f["splits"],
+                f["conflicting"],
+                ViewSphere(tuple(f["elevations"].tolist()), int(f["azimuths"]), float(f["distance"])),
+                {kind: (name, sha) for kind, name, sha in f["models"].tolist()},
+                {name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
+            )
+        except KeyError as error:
+            raise PredictionsError(f"{path}: {error.args[0]}") from None
+        except ValueError as error:
+            raise PredictionsError(f"{path}: {error}") from None

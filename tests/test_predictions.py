@@ -1,0 +1,184 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from tiny_models import make_map_network, make_recogniser
+
+from nextview.data.folders import DatasetError
+from nextview.data.predict import predict
+from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.render import render
+from nextview.data.store import ViewStore
+from nextview.models.card import read_card
+from nextview.models.networks import MapNetwork, Recogniser
+from nextview.observation import Observation
+from nextview.viewsphere import ViewSphere
+
+CLASSES = ["ball", "box", "pillar"]
+
+
+def some_predictions(n: int = 6, seed: int = 0) -> Predictions:
+    rng = np.random.default_rng(seed)
+    sphere = ViewSphere.named("40")
+    return Predictions(
+        rng.normal(size=(n, 40, 3)).astype(np.float32),
+        {"lem": rng.random((n, 40, 5, 3)).astype(np.float32)},
+        rng.random((n, 40)).astype(np.float32),
+        tuple(f"thing_{i}" for i in range(n)),
+        np.arange(n) % 3,
+        tuple(CLASSES),
+        np.array(["test"] * n),
+        np.zeros(n, bool),
+        sphere,
+        {"recogniser": ("r", "0" * 64), "lem": ("l", "1" * 64)},
+        {"lem": ("box",)},
+    )
+
+
+@pytest.fixture(scope="module")
+def shop(tmp_path_factory):
+    """Rendered meshes, one of them under two labels, and tiny networks."""
+    folder = tmp_path_factory.mktemp("shop")
+    rng = np.random.default_rng(0)
+    for label, split in [("ball", "train"), ("ball", "test"), ("box", "test"), ("pillar", "train"), ("pillar", "test")]:
+        mesh = trimesh.creation.icosphere(2) if label == "ball" else trimesh.creation.box()
+        mesh.apply_scale(rng.uniform(0.5, 2, 3) * ([1, 1, 4] if label == "pillar" else 1))
+        path = folder / "meshes" / label / split / f"{label}_{split}.off"
+        path.parent.mkdir(parents=True)
+        mesh.export(path)
+    same = folder / "meshes/box/train/box_train.off"
+    same.parent.mkdir()
+    same.write_bytes((folder / "meshes/pillar/test/pillar_test.off").read_bytes())
+    list(render(folder / "meshes", folder / "views.zarr", ViewSphere.named("40"), 32, workers=1))
+    make_recogniser(folder, CLASSES)
+    make_map_network(folder, valleys=("box",))
+    return folder
+
+
+def cards(shop: Path) -> tuple:
+    return read_card(shop / "tiny.json"), {"lem": read_card(shop / "tiny-lem.json")}
+
+
+def test_what_is_saved_is_what_is_loaded(tmp_path):
+    saved = some_predictions()
+    saved.save(tmp_path / "p.npz")
+    loaded = Predictions.load(tmp_path / "p.npz")
+    for name in ("logits", "depth_entropy", "labels", "splits", "conflicting"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(saved, name))
+        assert getattr(loaded, name).dtype == getattr(saved, name).dtype
+    np.testing.assert_array_equal(loaded.maps["lem"], saved.maps["lem"])
+    for name in ("names", "classes", "sphere", "models", "valley_classes"):
+        assert getattr(loaded, name) == getattr(saved, name)
+    assert [p.name for p in tmp_path.iterdir()] == ["p.npz"]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"names": ()}, "hold no objects"),
+        ({"classes": ()}, "name no classes"),
+        ({"classes": ("ball", "box")}, r"logits .* has the shape \(6, 40, 3\), not \(6, 40, 2\)"),
+        ({"labels": np.full(6, 3)}, "not one of the 3 classes"),
+        ({"names": ("a",) * 6}, "the same name"),
+        ({"maps": {"lem": np.zeros((6, 40, 5, 2), np.float32)}}, "map lem"),
+        ({"sphere": ViewSphere.named("12")}, "logits"),
+    ],
+)
+def test_predictions_that_do_not_fit_together_are_refused(change, sentence):
+    with pytest.raises(PredictionsError, match=sentence):
+        replace(some_predictions(), **change)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_logit_that_is_not_finite_names_its_object(value):
+    logits = some_predictions().logits.copy()
+    logits[4, 7, 1] = value
+    with pytest.raises(PredictionsError, match="logits of object thing_4"):
+        replace(some_predictions(), logits=logits)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut off"])
+def test_a_file_that_is_no_predictions_is_refused_in_one_sentence(tmp_path, content):
+    (tmp_path / "p.npz").write_bytes(content)
+    with pytest.raises(PredictionsError, match=r"p\.npz: not a predictions file"):
+        Predictions.load(tmp_path / "p.npz")
+    with pytest.raises(PredictionsError, match="there is no such file"):
+        Predictions.load(tmp_path / "q.npz")
+
+
+def test_a_missing_array_is_named(tmp_path):
+    some_predictions().save(tmp_path / "p.npz")
+    with np.load(tmp_path / "p.npz") as file:
+        kept = {name: file[name] for name in file.files if name != "labels"}
+    np.savez(tmp_path / "p.npz", **kept)
+    with pytest.raises(PredictionsError, match="labels"):
+        Predictions.load(tmp_path / "p.npz")
+
+
+def test_nothing_is_unpickled(tmp_path):
+    np.savez(tmp_path / "p.npz", format=1, logits=np.array([{"a": 1}], object))
+    with pytest.raises(PredictionsError, match="not a predictions file"):
+        Predictions.load(tmp_path / "p.npz")
+
+
+def test_predictions_are_what_the_networks_say_of_each_look(shop):
+    recogniser, maps = cards(shop)
+    *_, last = predict(shop / "views.zarr", shop / "all.npz", recogniser, maps, workers=2)
+    assert last == (6, 6)
+    found, store = Predictions.load(shop / "all.npz"), ViewStore.open(shop / "views.zarr")
+    assert found.names == tuple(store.names)
+    assert found.models["lem"] == ("tiny-lem", maps["lem"].sha256)
+    assert found.valley_classes == {"lem": ("box",)}
+    i, v = 3, 17
+    look = Observation(
+        store.image(i)[v], store.depth(i)[v], store.points(i)[v], store.sphere.poses[v], store.intrinsics
+    )
+    logits, _ = Recogniser(shop / "tiny.json")([look])
+    np.testing.assert_allclose(found.logits[i, v], logits[0], atol=1e-5)
+    np.testing.assert_allclose(found.maps["lem"][i, v], MapNetwork(shop / "tiny-lem.json")([look])[0], atol=1e-5)
+
+
+def test_the_same_mesh_under_two_labels_is_marked_across_splits(shop):
+    recogniser, maps = cards(shop)
+    list(predict(shop / "views.zarr", shop / "test.npz", recogniser, maps, "test", workers=1))
+    found = Predictions.load(shop / "test.npz")
+    assert dict(zip(found.names, found.conflicting, strict=True)) == {
+        "ball_test": False, "box_test": False, "pillar_test": True,
+    }  # fmt: skip
+
+
+def test_a_killed_run_goes_on_where_it_was(shop):
+    recogniser, maps = cards(shop)
+    out = shop / "again.npz"
+    steps = predict(shop / "views.zarr", out, recogniser, maps, workers=1)
+    while next(steps)[0] < 2:
+        pass
+    steps.close()
+    assert not out.exists()
+    steps = predict(shop / "views.zarr", out, recogniser, maps, workers=1)
+    assert next(steps)[0] >= 2
+    list(steps)
+    assert not out.with_name("again.npz.part").exists()
+    list(predict(shop / "views.zarr", shop / "whole.npz", recogniser, maps, workers=1))
+    np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(shop / "whole.npz").logits)
+
+
+def test_predictions_of_other_models_are_not_overwritten(shop):
+    recogniser, maps = cards(shop)
+    list(predict(shop / "views.zarr", shop / "kept.npz", recogniser, {}, workers=1))
+    with pytest.raises(PredictionsError, match="other objects or models"):
+        list(predict(shop / "views.zarr", shop / "kept.npz", recogniser, maps, workers=1))
+
+
+def test_a_class_that_the_recogniser_does_not_know_is_named(shop, tmp_path):
+    card = read_card(make_recogniser(tmp_path, ["ball", "box"]))
+    with pytest.raises(DatasetError, match="'pillar'"):
+        list(predict(shop / "views.zarr", tmp_path / "p.npz", card, {}))
+
+
+def test_a_split_without_objects_is_named(shop, tmp_path):
+    recogniser, maps = cards(shop)
+    with pytest.raises(DatasetError, match="'validation'"):
+        list(predict(shop / "views.zarr", tmp_path / "p.npz", recogniser, maps, "validation"))
