@@ -14,7 +14,11 @@ from nextview.viewsphere import ViewSphere
 
 
 class PolicyError(ValueError):
-    """A policy that answered with something that is not a next view; the message names it."""
+    """A policy that failed or gave something that is not a next view; the message names it, ``episode`` is where."""
+
+    def __init__(self, message: str, episode: int | None = None) -> None:
+        super().__init__(message)
+        self.episode = episode
 
 
 @dataclass(frozen=True)
@@ -104,27 +108,52 @@ class Episodes:
         going = ~stopped
         next_views = np.full(len(now), -1)
         if going.any():
-            state = EpisodeState(
-                views[going], self._visited[now[going]], belief[going], select(evidence, going), looks
-            )
-            chosen = np.asarray(self.policy.next_views(state, self.rng))
-            self._check(chosen, state)
+            left = now[going]
+            state = EpisodeState(views[going], self._visited[left], belief[going], select(evidence, going), looks, left)
+            chosen = self._choose(state)
             next_views[going] = chosen
-            self.current[now[going]] = chosen
+            self.current[left] = chosen
         step = Step(now, views, evidence, belief, stopped, next_views)
         self.steps.append(step)
         self.running = now[going]
         return step
 
-    def _check(self, chosen: NDArray, state: EpisodeState) -> None:
+    def _choose(self, state: EpisodeState) -> NDArray[np.int64]:
         name = type(self.policy).__name__
+        try:
+            chosen = np.asarray(self.policy.next_views(state, self.rng))
+        except Exception as error:  # whatever a user's policy may raise
+            reason = f"policy {name} raised {type(error).__name__}: {error}"
+            raise PolicyError(reason, self._first_to_fail(state)) from error
         if chosen.shape != state.current.shape or not np.issubdtype(chosen.dtype, np.integer):
             raise PolicyError(f"policy {name} has to return {len(state.current)} integers, one for each episode")
-        if ((chosen < 0) | (chosen >= len(self.sphere))).any():
-            raise PolicyError(f"policy {name} chose a view that is not on the sphere: {chosen.min()} .. {chosen.max()}")
+        off = (chosen < 0) | (chosen >= len(self.sphere))
+        if off.any():
+            where = int(state.episodes[off][0])
+            raise PolicyError(f"policy {name} chose view {chosen[off][0]}, which is not on the sphere", where)
         again = state.visited[np.arange(len(chosen)), chosen]
         if again.any():
-            raise PolicyError(f"policy {name} chose view {chosen[again][0]}, which was visited before")
+            where = int(state.episodes[again][0])
+            raise PolicyError(f"policy {name} chose view {chosen[again][0]}, which was visited before", where)
+        return chosen
+
+    def _first_to_fail(self, state: EpisodeState) -> int | None:
+        """The first episode for which the policy raises even if asked for it alone."""
+        for episode in state.episodes:
+            here = state.episodes == episode
+            alone = EpisodeState(
+                state.current[here],
+                state.visited[here],
+                state.belief[here],
+                select(state.evidence, here),
+                state.step,
+                state.episodes[here],
+            )
+            try:
+                self.policy.next_views(alone, self.rng)
+            except Exception:
+                return int(episode)
+        return None
 
     @property
     def outcome(self) -> Outcome:

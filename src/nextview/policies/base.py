@@ -36,6 +36,7 @@ class EpisodeState:
         belief: fused over all looks, (B, classes) float64.
         evidence: of the current look.
         step: looks taken so far, 1 or more.
+        episodes: which episodes these are, (B,) int64: where an oracle looks up its truth. Live there is one, 0.
     """
 
     current: NDArray[np.int64]
@@ -43,22 +44,23 @@ class EpisodeState:
     belief: NDArray[np.float64]
     evidence: Evidence
     step: int
+    episodes: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
 
 
 class Policy(Protocol):
-    """Chooses where to look next, in many episodes at once."""
+    """Chooses where to look next, in many episodes at once, in each by itself: no row may depend on another."""
 
-    needs: tuple[str, ...]
-    """Names of the maps it wants in the evidence."""
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the maps it wants in the evidence."""
+        ...
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """The next view of each episode, (B,) int64: one not visited yet, as long as there is any."""
         ...
 
 
-def best_in_window(
-    sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]
-) -> NDArray[np.int64]:
+def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]) -> NDArray[np.int64]:
     """The unvisited view of the local window with the highest score.
 
     Where the whole window is visited, the unvisited view with the shortest travel; where all views are, the window's best.

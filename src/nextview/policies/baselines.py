@@ -24,6 +24,18 @@ class Random:
 
 
 @dataclass(frozen=True)
+class RandomAll:
+    """Any unvisited view of the whole sphere, with equal chance: the far looks that a local window rules out."""
+
+    sphere: ViewSphere
+    needs: tuple[str, ...] = ()
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See ``Policy.next_views``."""
+        return np.where(state.visited, -1.0, rng.random(state.visited.shape)).argmax(1)
+
+
+@dataclass(frozen=True)
 class Furthest:
     """The unvisited view of the local window with the largest grid distance; equal ones with equal chance."""
 

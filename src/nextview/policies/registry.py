@@ -1,20 +1,24 @@
-"""Policies by name."""
+"""Policies by name, or by the import path of a user's own."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 
 from nextview.policies.base import Policy
-from nextview.policies.baselines import Furthest, Random, Unidirectional
+from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
 from nextview.policies.maps import MapPeak
 from nextview.viewsphere import ViewSphere
 
 POLICIES: dict[str, Callable[[ViewSphere, tuple[int, ...]], Policy]] = {
     "random": lambda sphere, valleys: Random(sphere),
+    "random-all": lambda sphere, valleys: RandomAll(sphere),
     "furthest": lambda sphere, valleys: Furthest(sphere),
     "unidirectional": lambda sphere, valleys: Unidirectional(sphere),
     "lem": lambda sphere, valleys: MapPeak(sphere, "lem", valleys),
     "lem-peak": lambda sphere, valleys: MapPeak(sphere, "lem"),
+    "lcm": lambda sphere, valleys: MapPeak(sphere, "lcm", valleys),
+    "lcm-peak": lambda sphere, valleys: MapPeak(sphere, "lcm"),
 }
 
 
@@ -22,13 +26,27 @@ def make_policy(name: str, sphere: ViewSphere, valley_classes: Sequence[int] = (
     """A policy by name.
 
     Args:
-        name: one of POLICIES.
+        name: one of POLICIES, or "module:Class" for one of your own, which is called with the sphere alone.
         sphere: the viewpoints.
-        valley_classes: classes (indices) whose believers go to the map's valley; only "lem" uses it.
+        valley_classes: classes (indices) whose believers go to the map's valley; only "lem" and "lcm" use it.
 
     Raises:
-        ValueError: there is no such policy.
+        ValueError: there is no such policy, or it cannot be made.
     """
+    if ":" in name:
+        return _import_policy(name, sphere)
     if name not in POLICIES:
         raise ValueError(f"no policy is called {name!r}; there are {', '.join(POLICIES)}")
     return POLICIES[name](sphere, tuple(valley_classes))
+
+
+def _import_policy(path: str, sphere: ViewSphere) -> Policy:
+    module, _, attribute = path.partition(":")
+    try:
+        policy = getattr(importlib.import_module(module), attribute)(sphere)
+    except Exception as error:  # whatever a user's module may raise
+        raise ValueError(f"policy {path} cannot be made ({type(error).__name__}: {error})") from error
+    for part in ("next_views", "needs"):
+        if not hasattr(policy, part):
+            raise ValueError(f"policy {path} has no {part}; see nextview.policies.base.Policy")
+    return policy
