@@ -1,0 +1,139 @@
+"""Who can take part in the benchmark, by name: policies, oracles, fixed views, and a user's own."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_softmax
+
+from nextview.data.predictions import Predictions
+from nextview.measures.depth_entropy import normalise_per_object
+from nextview.policies.base import Policy
+from nextview.policies.fixed import orbit, ranked
+from nextview.policies.maps import MapPeak
+from nextview.policies.oracle import OracleGain, OracleValley
+from nextview.policies.registry import POLICIES, make_policy
+
+
+@dataclass(frozen=True)
+class Trials:
+    """The E episodes that every contestant has to go through: the same objects from the same first views.
+
+    Attributes:
+        predictions: what the models say, and the truth.
+        objects: row of each episode's object, (E,) int64.
+        starts: first view of each, (E,) int64.
+        valley_classes: classes (indices) for which the map's valley is taken to be the better view.
+    """
+
+    predictions: Predictions
+    objects: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    valley_classes: tuple[int, ...]
+
+    @property
+    def labels(self) -> NDArray[np.int64]:
+        """True class of each episode's object, (E,) int64."""
+        return self.predictions.labels[self.objects]
+
+
+ORACLES: dict[str, Callable[[Trials], Policy]] = {
+    "oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes),
+    "true-lem": lambda t: MapPeak(t.predictions.sphere, "true-lem", t.valley_classes),
+    "true-lem-peak": lambda t: MapPeak(t.predictions.sphere, "true-lem"),
+    "true-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes, "true-lem"),
+    "lcm-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes, "lcm"),
+    "true-lcm": lambda t: MapPeak(t.predictions.sphere, "true-lcm"),
+    "oracle-gain": lambda t: _gain(t, anywhere=False),
+    "oracle-gain-all": lambda t: _gain(t, anywhere=True),
+}
+"""Policies that are told the truth, or climb the true map."""
+
+FIXED = {
+    "best": "the views in which the true class has the most confidence",
+    "worst": "those in which it has the least",
+    "high-entropy": "the views with the highest true depth-entropy",
+    "low-entropy": "those with the lowest",
+    "random-fixed": "any views",
+    "orbit": "round the ring of the first view, then the next ring",
+}
+"""Fixed views by name, to be followed by how many: "best-5", "orbit-8". They go on to the end whatever is believed."""
+
+
+def _gain(t: Trials, anywhere: bool) -> Policy:
+    p = t.predictions
+    return OracleGain(p.sphere, p.logits, p.labels, t.objects, anywhere)
+
+
+def default_contestants(trials: Trials) -> list[str]:
+    """All that these predictions allow."""
+    sphere = trials.predictions.sphere
+    n, v = sphere.azimuths, len(sphere)
+    names = [name for name in [*POLICIES, *ORACLES] if not _lacking(_make(name, trials), trials)]
+    names += [f"{kind}-{min(5, v)}" for kind in FIXED if kind != "orbit"]
+    return names + [f"orbit-{k}" for k in sorted({n, v})]
+
+
+def contestant_policy(name: str, trials: Trials) -> Policy:
+    """The policy of that name.
+
+    Raises:
+        ValueError: there is none, it cannot be made, or it needs a map that the predictions lack.
+    """
+    policy = _make(name, trials)
+    lacking = _lacking(policy, trials)
+    if lacking:
+        raise ValueError(f"policy {name} needs the map {lacking[0]!r}, which these predictions lack")
+    return policy
+
+
+def _make(name: str, trials: Trials) -> Policy:
+    if name in ORACLES:
+        return ORACLES[name](trials)
+    if name in POLICIES or ":" in name:
+        return make_policy(name, trials.predictions.sphere, trials.valley_classes)
+    names = [*POLICIES, *ORACLES, *(f"{kind}-K" for kind in FIXED)]
+    raise ValueError(f"no policy is called {name!r}; there are {', '.join(names)}")
+
+
+def _lacking(policy: Policy, trials: Trials) -> list[str]:
+    return [wanted for wanted in policy.needs if wanted not in {*trials.predictions.maps, *TRUE_MAPS}]
+
+
+def fixed_views(name: str, trials: Trials, rng: np.random.Generator) -> NDArray[np.int64] | None:
+    """The views of each episode in order, (E, k) int64; None if the name is not one of fixed views."""
+    match = re.fullmatch(rf"({'|'.join(FIXED)})-(\d+)", name)
+    if not match:
+        return None
+    p, objects, kind, k = trials.predictions, trials.objects, match[1], int(match[2])
+    if not 1 <= k <= len(p.sphere):
+        raise ValueError(f"{name}: the sphere has {len(p.sphere)} views, so between 1 and {len(p.sphere)} can be taken")
+    if kind == "orbit":
+        return orbit(p.sphere, trials.starts, k)
+    if kind == "random-fixed":
+        return ranked(rng.random((len(objects), len(p.sphere))), k)
+    if kind in ("high-entropy", "low-entropy"):
+        values = p.depth_entropy.astype(np.float64)
+    else:
+        values = log_softmax(p.logits.astype(np.float64), axis=2)[np.arange(len(p)), :, p.labels]
+    return ranked(values if kind in ("high-entropy", "best") else -values, k)[objects]
+
+
+def true_lem(p: Predictions) -> NDArray[np.float32]:
+    """Local windows of the true entropy map, (N, V, R, 3)."""
+    return normalise_per_object(p.depth_entropy)[:, p.sphere.windows]
+
+
+def true_lcm(p: Predictions) -> NDArray[np.float64]:
+    """Local windows of the recogniser's confidence, 0 where it is wrong (section 4.2.2), (N, V, R, 3)."""
+    sure = np.exp(log_softmax(p.logits.astype(np.float64), axis=2)).max(2)
+    right = p.logits.argmax(2) == p.labels[:, None]
+    return np.where(right, sure, 0)[:, p.sphere.windows]
+
+
+TRUE_MAPS: dict[str, Callable[[Predictions], NDArray]] = {"true-lem": true_lem, "true-lcm": true_lcm}
+"""Maps that no model predicts."""

@@ -1,0 +1,138 @@
+"""The folder of results: every episode in Parquet, the tables in CSV, and all that is needed to run it again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from nextview.benchmark.replay import Ends
+from nextview.benchmark.run import Grid
+from nextview.benchmark.summary import Tables
+from nextview.data.predictions import Predictions
+
+
+class ResultsError(ValueError):
+    """A folder that holds no results, or should not be written; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """What ``save`` wrote.
+
+    Attributes:
+        folder: where it lies.
+        settings: how it was run.
+        predictions: from which.
+        tables: see ``summary.Tables``.
+    """
+
+    folder: Path
+    settings: dict[str, Any]
+    predictions: Predictions
+    tables: Tables
+
+    def episodes(self, policy: str, threshold: float | None) -> pd.DataFrame:
+        """The episodes of one cell, one a row: run by run, in each the objects in the order of the predictions."""
+        cell = [("policy", "==", policy)] + ([] if threshold is None else [("threshold", "==", threshold)])
+        return pq.read_table(self.folder / "episodes.parquet", filters=cell).to_pandas()
+
+
+def save(folder: Path, grid: Grid, tables: Tables, settings: dict[str, Any]) -> None:
+    """Write results aside and put them in place when they are whole. Earlier results of that name are replaced.
+
+    Raises:
+        ResultsError: the folder is there and holds something else.
+    """
+    check_target(folder)
+    part = folder.with_name(folder.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    _write_episodes(part / "episodes.parquet", grid)
+    for name, table in tables.named().items():
+        table.to_csv(part / f"{name}.csv", index=False)
+    grid.trials.predictions.save(part / "predictions.npz")
+    (part / "benchmark.json").write_text(json.dumps(settings, indent=1) + "\n")
+    shutil.rmtree(folder, ignore_errors=True)
+    part.rename(folder)
+
+
+def check_target(folder: Path) -> None:
+    """Refuse to replace anything but earlier results."""
+    if folder.exists() and not (folder / "benchmark.json").exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ResultsError(f"{folder}: is there and holds no benchmark results; give another folder")
+
+
+def load(folder: Path) -> Results:
+    """Read a folder of results.
+
+    Raises:
+        ResultsError: it is none, or a part of it is missing.
+    """
+    try:
+        settings = json.loads((folder / "benchmark.json").read_text())
+        tables = Tables(**{name: pd.read_csv(folder / f"{name}.csv") for name in Tables.__dataclass_fields__})
+        if not (folder / "episodes.parquet").exists():
+            raise FileNotFoundError
+    except FileNotFoundError:
+        raise ResultsError(f"{folder}: holds no benchmark results; make some with nextview benchmark") from None
+    except ValueError as error:
+        raise ResultsError(f"{folder}: these benchmark results are damaged ({error})") from None
+    return Results(folder, settings, Predictions.load(folder / "predictions.npz"), tables)
+
+
+def _write_episodes(path: Path, grid: Grid) -> None:
+    """One row an episode, one row group a cell."""
+    p, runs = grid.trials.predictions, grid.runs
+    names = pa.DictionaryArray.from_arrays(pa.array(grid.trials.objects, pa.int32()), pa.array(p.names))
+    labels = pa.DictionaryArray.from_arrays(pa.array(grid.trials.labels, pa.int32()), pa.array(p.classes))
+    run = pa.array(np.repeat(np.arange(runs, dtype=np.int32), len(p)))
+    writer = None
+    for policy, threshold, ends in grid.cells():
+        fixed = grid.paths[policy].fixed
+        table = pa.table(
+            {
+                "object": names,
+                "label": labels,
+                "run": run,
+                "policy": _constant(policy, len(names)),
+                "threshold": pa.array(np.full(len(names), np.nan if threshold is None else threshold)),
+                "views": _lists(grid.paths[policy].views, ends.looks),
+                "stop": _stops(ends, fixed),
+                "answer": pa.DictionaryArray.from_arrays(pa.array(ends.answer, pa.int32()), pa.array(p.classes)),
+                "confidence": pa.array(ends.confidence),
+                "looks": pa.array(ends.looks, pa.int32()),
+                "travel": pa.array(ends.travel),
+                "arc": pa.array(ends.arc),
+            }
+        )
+        writer = writer or pq.ParquetWriter(path, table.schema, compression="zstd")
+        writer.write_table(table)
+    if writer is not None:
+        writer.close()
+
+
+def _constant(text: str, n: int) -> pa.DictionaryArray:
+    return pa.DictionaryArray.from_arrays(pa.array(np.zeros(n, np.int32)), pa.array([text]))
+
+
+STOPS = ("views ran out", "confident", "fixed views")
+
+
+def _stops(ends: Ends, fixed: bool) -> pa.DictionaryArray:
+    return pa.DictionaryArray.from_arrays(pa.array(np.where(fixed, 2, ends.confident), pa.int32()), pa.array(STOPS))
+
+
+def _lists(views: NDArray[np.int64], looks: NDArray[np.int64]) -> pa.ListArray:
+    """The first so many views of each row, as lists."""
+    taken = np.arange(views.shape[1]) < looks[:, None]
+    offsets = np.concatenate([[0], np.cumsum(looks)]).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(views[taken].astype(np.int16)))

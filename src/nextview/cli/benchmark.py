@@ -1,0 +1,90 @@
+"""``nextview benchmark``: compare policies by replay."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tyro
+
+
+def benchmark(
+    predictions: tyro.conf.Positional[Path],
+    /,
+    out: Path = Path("benchmark"),
+    policies: tuple[str, ...] = (),
+    thresholds: tuple[float, ...] = (0.85, 0.9, 0.95, 0.97, 0.99),
+    runs: int = 10,
+    max_views: int = 5,
+    reference: str = "random",
+    valley_classes: tuple[str, ...] | None = None,
+    samples: int = 2000,
+    seed: int = 0,
+) -> None:
+    """Run every policy under every threshold from the same first views, and write episodes, tables and tests.
+
+    Args:
+        predictions: made by nextview predict.
+        out: folder for the results; earlier results there are replaced.
+        policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
+        thresholds: of the belief.
+        runs: random first views of each object.
+        max_views: looks at most.
+        reference: the policy that the others are compared with.
+        valley_classes: classes whose map valley is the better view; those of the map network's card by default.
+        samples: of the bootstrap.
+        seed: decides first views, random policies and the bootstrap.
+    """
+    import sys
+    import time
+
+    from nextview.benchmark.contestants import default_contestants
+    from nextview.benchmark.replay import ContestantError, make_trials
+    from nextview.benchmark.run import Grid, run_grid
+    from nextview.cli.extra import needs_extra
+    from nextview.cli.progress import console, track
+    from nextview.data.predictions import Predictions
+    from nextview.models.card import file_hash
+    from nextview.recognition import Stopping
+
+    with needs_extra("benchmark"):
+        from nextview.benchmark.results import check_target, save
+        from nextview.benchmark.summary import summarise
+    import numpy as np
+
+    began = time.perf_counter()
+    check_target(out)
+    if not thresholds:
+        raise ValueError("at least one threshold is needed")
+    for threshold in thresholds:
+        Stopping(threshold, max_views)  # says what is wrong with it
+    table = Predictions.load(predictions)
+    unknown = [name for name in valley_classes or () if name not in table.classes]
+    if unknown:
+        raise ValueError(f"{predictions}: knows no class {unknown[0]!r}; there are {', '.join(table.classes)}")
+    valleys = None if valley_classes is None else tuple(map(table.classes.index, valley_classes))
+    trials = make_trials(table, runs, seed, valleys)
+    sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
+    names = list(dict.fromkeys([*([reference] if policies else []), *(policies or default_contestants(trials))]))
+    grid = Grid(trials, runs, tuple(sorted(set(thresholds))), max_views, seed)
+    track(run_grid(grid, names), len(names), "replaying policies")
+    if grid.paths:
+        tables = summarise(grid, reference, samples, np.random.default_rng([seed, 1]))
+        settings = {
+            "predictions": predictions.name,
+            "predictions_sha256": file_hash(predictions),
+            "models": table.models,
+            "policies": names,
+            "failures": grid.failures,
+            "reference": reference,
+            "thresholds": grid.thresholds,
+            "runs": runs,
+            "max_views": max_views,
+            "valley_classes": [table.classes[i] for i in trials.valley_classes],
+            "samples": samples,
+            "seed": seed,
+        }
+        save(out, grid, tables, settings)
+        episodes = runs * len(table) * len(list(grid.cells()))
+        console.print(f"{episodes:,} episodes in {time.perf_counter() - began:.1f} s; results in {out}")
+    if grid.failures:
+        raise ContestantError("\n".join(grid.failures.values()))
