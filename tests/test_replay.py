@@ -1,0 +1,293 @@
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.special import softmax
+from test_predictions import some_predictions
+from tiny_models import make_map_network, make_recogniser
+
+from nextview.benchmark.contestants import default_contestants, true_lcm, true_lem
+from nextview.benchmark.replay import ContestantError, cut, make_trials, replay
+from nextview.benchmark.run import Grid, run_grid
+from nextview.cameras.simulated import SimulatedCamera
+from nextview.data.predict import predict
+from nextview.data.predictions import Predictions
+from nextview.data.render import render
+from nextview.episode import run_episodes
+from nextview.mesh import load_mesh
+from nextview.models.card import read_card
+from nextview.models.networks import MapNetwork, Models, Recogniser
+from nextview.policies.base import Evidence
+from nextview.policies.registry import make_policy
+from nextview.recognition import Stopping
+from nextview.session import recognise
+from nextview.viewsphere import ViewSphere
+
+
+@pytest.fixture(scope="module")
+def trials():
+    return make_trials(some_predictions(30), runs=4, seed=0)
+
+
+def evidence_of(predictions: Predictions, objects: np.ndarray):
+    def observe(episodes, views):
+        rows = objects[episodes]
+        return Evidence(predictions.logits[rows, views], {"lem": predictions.maps["lem"][rows, views]})
+
+    return observe
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.7, 0.9, 0.99])
+@pytest.mark.parametrize("name", ["lem", "lem-peak", "unidirectional"])
+def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(trials, name, threshold):
+    p = trials.predictions
+    policy = make_policy(name, p.sphere, trials.valley_classes)
+    episodes = run_episodes(
+        evidence_of(p, trials.objects), p.sphere, policy, trials.starts, Stopping(threshold), np.random.default_rng(0)
+    ).outcome
+    paths = replay(name, trials, max_views=5, seed=0)
+    ends = cut(paths, threshold)
+    for field in ("answer", "confidence", "looks", "confident", "travel", "arc"):
+        np.testing.assert_allclose(getattr(ends, field), getattr(episodes, field), atol=1e-12, err_msg=field)
+    taken = np.arange(5) < ends.looks[:, None]
+    width = episodes.views.shape[1]
+    np.testing.assert_array_equal(np.where(taken, paths.views, -1)[:, :width], episodes.views)
+
+
+def test_all_policies_begin_with_the_same_views(trials):
+    for name in default_contestants(trials):
+        paths = replay(name, trials, max_views=3, seed=0)
+        if not paths.fixed or name.startswith("orbit"):
+            np.testing.assert_array_equal(paths.views[:, 0], trials.starts)
+
+
+def test_what_a_policy_does_depends_on_the_seed_and_on_nobody_else(trials):
+    alone = replay("random", trials, 5, seed=3).views
+    grid = Grid(trials, 4, (0.9,), 5, seed=3)
+    list(run_grid(grid, ["furthest", "random-all", "random"]))
+    np.testing.assert_array_equal(grid.paths["random"].views, alone)
+    assert (replay("random", trials, 5, seed=4).views != alone).any()
+
+
+def test_the_policy_is_asked_once_for_all_episodes_of_a_look(trials, monkeypatch):
+    calls = []
+    real = Asked.next_views
+    monkeypatch.setattr(Asked, "next_views", lambda self, *a: calls.append(len(a[0].current)) or real(self, *a))
+    replay("test_replay:Asked", trials, 5, seed=0)
+    assert calls == [len(trials.objects)] * 4
+
+
+def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(trials):
+    p = trials.predictions
+    for name, everywhere in [("oracle-gain", False), ("oracle-gain-all", True)]:
+        views = replay(name, trials, 3, seed=0).views
+        for e in range(0, len(views), 7):
+            i, seen = trials.objects[e], list(views[e, :2])
+            around = range(40) if everywhere else p.sphere.windows[seen[-1]].ravel()
+            belief = {
+                v: softmax(p.logits[i, [*seen, v]].astype(float).sum(0))[p.labels[i]] for v in around if v not in seen
+            }
+            assert belief[views[e, 2]] == pytest.approx(max(belief.values()), abs=1e-9)
+
+
+def test_oracle_valley_differs_from_the_peak_for_valley_classes_alone(trials):
+    valley = trials.labels == trials.predictions.classes.index("box")
+    peak, oracle = (replay(name, trials, 2, 0).views[:, 1] for name in ("lem-peak", "oracle-valley"))
+    np.testing.assert_array_equal(peak[~valley], oracle[~valley])
+    assert (peak[valley] != oracle[valley]).all()
+
+
+def test_true_maps_are_the_truth_around_each_view():
+    p = some_predictions(4)
+    i, v = 2, 9
+    for ring in range(5):
+        for column in range(3):
+            seen = p.sphere.windows[v, ring, column]
+            low, high = p.depth_entropy[i].min(), p.depth_entropy[i].max()
+            assert true_lem(p)[i, v, ring, column] == pytest.approx((p.depth_entropy[i, seen] - low) / (high - low))
+            belief = softmax(p.logits[i, seen].astype(float))
+            right = belief.argmax() == p.labels[i]
+            assert true_lcm(p)[i, v, ring, column] == pytest.approx(belief.max() if right else 0)
+
+
+def test_fixed_views_are_the_ones_their_name_says(trials):
+    p = trials.predictions
+    sure = softmax(p.logits.astype(float), axis=2)[np.arange(len(p)), :, p.labels][trials.objects]
+    entropy = p.depth_entropy[trials.objects]
+    for name, values in [
+        ("best-5", sure),
+        ("worst-5", -sure),
+        ("high-entropy-5", entropy),
+        ("low-entropy-5", -entropy),
+    ]:
+        paths = replay(name, trials, max_views=3, seed=0)
+        taken = np.take_along_axis(values, paths.views, 1)
+        np.testing.assert_allclose(np.sort(taken), np.sort(values)[:, -5:], err_msg=name)
+        total = np.take_along_axis(p.logits[trials.objects], paths.views[..., None], 1).sum(1)
+        ends = cut(paths, 0.1)
+        np.testing.assert_array_equal(ends.looks, 5)  # whatever is believed
+        np.testing.assert_array_equal(ends.answer, total.argmax(1))
+        np.testing.assert_allclose(ends.confidence, softmax(total.astype(float), axis=1).max(1), rtol=1e-5)
+
+
+def test_orbits_go_round_their_ring_and_then_over_the_whole_sphere(trials):
+    ring, sphere = replay("orbit-8", trials, 5, 0), trials.predictions.sphere
+    assert (sphere.ring[ring.views] == sphere.ring[trials.starts][:, None]).all()
+    np.testing.assert_allclose(cut(ring, None).travel, 7)
+    everywhere = replay("orbit-40", trials, 5, 0)
+    np.testing.assert_array_equal(np.sort(everywhere.views), np.tile(np.arange(40), (len(trials.objects), 1)))
+    best = cut(everywhere, None).answer == trials.predictions.logits.sum(1).argmax(1)[trials.objects]
+    assert best.all()
+
+
+def test_random_all_reaches_every_other_view_equally_often():
+    p = some_predictions(1)
+    trials = make_trials(p, runs=20_000, seed=0)
+    steps = (replay("random-all", trials, 2, 0).views[:, 1] - trials.starts) % 40
+    counts = np.bincount(steps, minlength=40)
+    assert counts[0] == 0
+    assert counts[1:].std() < 4 * np.sqrt(20_000 / 39)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A user's policy: the next view by number."""
+
+    sphere: ViewSphere
+    needs: tuple[str, ...] = ()
+
+    def next_views(self, state, rng):
+        return (state.current + 1) % len(self.sphere)
+
+
+class Backwards(Asked):
+    def next_views(self, state, rng):
+        return state.current
+
+
+class Beyond(Asked):
+    def next_views(self, state, rng):
+        return np.where(state.episodes == 7, 40, super().next_views(state, rng))
+
+
+class Raises(Asked):
+    def next_views(self, state, rng):
+        if (state.episodes == 11).any():
+            raise RuntimeError("no idea")
+        return super().next_views(state, rng)
+
+
+class Short(Asked):
+    def next_views(self, state, rng):
+        return np.array([1])
+
+
+class Unmakeable:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("Backwards", r"chose view \d+, which was visited before \(object thing_0\)"),
+        ("Beyond", r"chose view 40, which is not on the sphere \(object thing_7\)"),
+        ("Raises", r"raised RuntimeError: no idea \(object thing_11\)"),
+        ("Short", "has to return 120 integers"),
+        ("Unmakeable", "cannot be made"),
+        ("Missing", "cannot be made"),
+    ],
+)
+def test_a_policy_that_fails_is_named_with_the_object_and_the_others_are_kept(trials, name, sentence):
+    grid = Grid(trials, 4, (0.9,), 5, 0)
+    path = f"test_replay:{name}"
+    assert list(run_grid(grid, ["furthest", path, "test_replay:Asked"])) == [1, 2, 3]
+    assert set(grid.paths) == {"furthest", "test_replay:Asked"}
+    with pytest.raises(ValueError, match=sentence):
+        raise ContestantError(grid.failures[path])
+    assert path in grid.failures[path]
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("clever", "no policy is called 'clever'; there are random, .*best-K"),
+        ("lcm", "needs the map 'lcm'"),
+        ("best-41", "between 1 and 40"),
+        ("best-0", "between 1 and 40"),
+    ],
+)
+def test_a_contestant_that_cannot_take_part_is_refused(trials, name, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        replay(name, trials, 5, 0)
+
+
+def test_the_contestants_are_those_that_the_predictions_allow(trials):
+    names = default_contestants(trials)
+    assert {"lem", "oracle-valley", "true-lcm", "orbit-8", "orbit-40"} <= set(names)
+    assert not any(name.startswith("lcm") for name in names)
+    p = trials.predictions
+    with_lcm = make_trials(replace(p, maps={**p.maps, "lcm": p.maps["lem"]}), 1, 0)
+    assert {"lcm", "lcm-peak", "lcm-oracle-valley"} <= set(default_contestants(with_lcm))
+    without = make_trials(replace(p, maps={}), 1, 0)
+    assert not {"lem", "lem-peak", "oracle-valley"} & set(default_contestants(without))
+    for name in default_contestants(with_lcm):
+        replay(name, with_lcm, 2, 0)
+
+
+def sample_meshes(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    makers = {
+        "ball": lambda: trimesh.creation.icosphere(2),
+        "box": trimesh.creation.box,
+        "pillar": lambda: trimesh.creation.capsule(count=[12, 12]),
+    }
+    for label, make in makers.items():
+        for n in range(2):
+            mesh = make()
+            mesh.apply_scale(rng.uniform(0.5, 2, 3))
+            path = folder / label / "test" / f"{label}_{n}.off"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            mesh.export(path)
+
+
+def real_meshes(folder: Path) -> None:
+    if "NEXTVIEW_DATA" not in os.environ:
+        pytest.skip("NEXTVIEW_DATA names no folder with ModelNet10")
+    for label in ("chair", "desk", "toilet"):
+        for source in sorted((Path(os.environ["NEXTVIEW_DATA"]) / "ModelNet10" / label / "test").glob("*.off"))[:2]:
+            target = folder / label / "test" / source.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.symlink_to(source.resolve())
+
+
+@pytest.mark.parametrize("meshes", [sample_meshes, real_meshes])
+def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(meshes, tmp_path):
+    meshes(tmp_path / "meshes")
+    sphere = ViewSphere.named("40")
+    list(render(tmp_path / "meshes", tmp_path / "views.zarr", sphere, 64, workers=1))
+    classes = sorted(path.name for path in (tmp_path / "meshes").iterdir())
+    recogniser = make_recogniser(tmp_path, classes, size=32)
+    lem = make_map_network(tmp_path, valleys=(classes[0],))
+    cards = read_card(recogniser), {"lem": read_card(lem)}
+    list(predict(tmp_path / "views.zarr", tmp_path / "p.npz", *cards, workers=1))
+    p = Predictions.load(tmp_path / "p.npz")
+    trials = make_trials(p, runs=2, seed=0)
+    models = Models(Recogniser(recogniser, 1), {"lem": MapNetwork(lem, 1)})
+    # A threshold that some reach: the middle of all confidences after two looks.
+    threshold = float(np.median(replay("lem", trials, 2, 0).confidences[:, 1]))
+    for name in ("lem", "lem-peak", "unidirectional"):
+        policy = make_policy(name, sphere, trials.valley_classes)
+        paths = replay(name, trials, 5, 0)
+        ends = cut(paths, threshold)
+        for e, (i, start) in enumerate(zip(trials.objects, trials.starts, strict=True)):
+            label = classes[p.labels[i]]
+            mesh = load_mesh(tmp_path / "meshes" / label / "test" / f"{p.names[i]}.off")
+            camera = SimulatedCamera(mesh, 64, sphere.distance)
+            live = recognise(camera, models, policy, sphere, int(start), Stopping(threshold))
+            assert [look.view for look in live.looks] == paths.views[e, : ends.looks[e]].tolist()
+            assert live.answer == classes[ends.answer[e]]
+            assert live.confident == ends.confident[e]
+            assert live.travel == pytest.approx(ends.travel[e])
