@@ -1,0 +1,194 @@
+import json
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_predictions import some_predictions
+
+from nextview.benchmark import results
+from nextview.benchmark.published import ACCURACY, TRAVEL, published, read_table
+from nextview.benchmark.replay import ContestantError, cut, make_trials, replay
+from nextview.benchmark.statistics import calibration_error
+from nextview.cli.benchmark import benchmark
+from nextview.data.predictions import PredictionsError
+
+TEN = tuple(read_table(ACCURACY[10]))
+
+
+@pytest.fixture(scope="module")
+def predictions():
+    some = some_predictions(40, seed=2)
+    conflicting = np.zeros(40, bool)
+    conflicting[[3, 8]] = True
+    return replace(some, conflicting=conflicting)
+
+
+@pytest.fixture(scope="module")
+def folder(predictions, tmp_path_factory):
+    where = tmp_path_factory.mktemp("benchmark")
+    predictions.save(where / "p.npz")
+    benchmark(where / "p.npz", out=where / "out", thresholds=(0.7, 0.9), runs=3, samples=200)
+    return where
+
+
+def test_every_episode_is_a_row_and_is_what_it_says(folder, predictions):
+    rows = pd.read_parquet(folder / "out" / "episodes.parquet")
+    assert len(rows) == 3 * 40 * rows[["policy", "threshold"]].drop_duplicates().shape[0]
+    row_of = {name: i for i, name in enumerate(predictions.names)}
+    for row in rows.sample(200, random_state=0).itertuples():
+        i, views = row_of[row.object], list(row.views)
+        assert len(set(views)) == len(views) == row.looks
+        total = np.exp(predictions.logits[i, views].astype(float).sum(0))
+        belief = total / total.sum()
+        assert row.label == predictions.classes[predictions.labels[i]]
+        assert row.answer == predictions.classes[belief.argmax()]
+        assert row.confidence == pytest.approx(belief.max())
+        legs = list(pairwise(views))
+        assert row.travel == pytest.approx(sum(predictions.sphere.travel[leg] for leg in legs))
+        assert row.arc == pytest.approx(sum(predictions.sphere.arc[leg] for leg in legs))
+        if np.isnan(row.threshold):
+            assert row.stop == "fixed views"
+        else:
+            assert row.stop == ("confident" if belief.max() >= row.threshold else "views ran out")
+            before = [np.exp(predictions.logits[i, views[:k]].astype(float).sum(0)) for k in range(1, len(views))]
+            assert all((b / b.sum()).max() < row.threshold for b in before)
+
+
+def test_the_summary_is_what_pandas_makes_of_the_episodes(folder, predictions):
+    rows = pd.read_parquet(folder / "out" / "episodes.parquet")
+    rows["right"] = rows["answer"].astype(str) == rows["label"].astype(str)
+    rows["clean"] = ~rows["object"].isin(np.array(predictions.names)[predictions.conflicting])
+    summary = pd.read_csv(folder / "out" / "summary.csv").set_index(["policy", "threshold", "measure"])["value"]
+    for (policy, threshold), cell in rows.groupby(["policy", "threshold"], observed=True):
+        moved, sure = cell[cell.looks > 1], cell[cell.stop == "confident"]
+        by_class = cell.groupby("label", observed=True)
+        wanted = {
+            "accuracy": cell.right.mean(),
+            "clean_accuracy": cell.right[cell.clean].mean(),
+            "class_accuracy": by_class.right.mean().mean(),
+            "class_accuracy_std": by_class.right.mean().std(ddof=0),
+            "looks": cell.looks.mean(),
+            "travel_all": cell.travel.mean(),
+            "travel_moved": moved.travel.mean(),
+            "class_travel_moved": moved.groupby("label", observed=True).travel.mean().mean(),
+            "arc_all": cell.arc.mean(),
+            "confident": len(sure) / len(cell),
+            "confident_accuracy": sure.right.mean(),
+            "calibration_error": calibration_error(cell.confidence.to_numpy(), cell.right.to_numpy()),
+        }
+        for measure, value in wanted.items():
+            assert summary[policy, threshold, measure] == pytest.approx(value, nan_ok=True), (policy, measure)
+
+
+def test_intervals_hold_their_values_and_tests_have_the_sign_of_the_difference(folder):
+    summary = pd.read_csv(folder / "out" / "summary.csv").dropna(subset=["low"])
+    assert ((summary.low <= summary.value + 1e-9) & (summary.value <= summary.high + 1e-9)).mean() > 0.98
+    tests = pd.read_csv(folder / "out" / "tests.csv")
+    assert "random" not in set(tests.policy)
+    assert (tests.p_holm >= tests.p - 1e-12).all()
+    gain = tests[(tests.policy == "oracle-gain") & (tests.measure == "accuracy")]
+    assert (gain.low > 0).all()  # seeing the true logits helps beyond doubt
+    assert (gain.mcnemar_holm < 0.001).all()
+
+
+def test_areas_lie_between_the_first_look_and_the_best(folder, predictions):
+    areas = pd.read_csv(folder / "out" / "areas.csv").set_index(["policy", "budget"])["value"]
+    trials = make_trials(predictions, 3, 0)
+    for name in ("random", "lem", "oracle-gain"):
+        curve = [(cut(replay(name, trials, 5, 0), t).answer == trials.labels).mean() for t in np.linspace(0, 1, 21)]
+        for budget in ("looks", "travel_all"):
+            assert min(curve) <= areas[name, budget] <= max(curve)
+    assert areas["oracle-gain", "looks"] > areas["random", "looks"]
+
+
+def test_the_same_seed_gives_the_same_results_to_the_bit(folder):
+    benchmark(folder / "p.npz", out=folder / "again", thresholds=(0.7, 0.9), runs=3, samples=200)
+    for path in (folder / "out").iterdir():
+        if path.suffix in (".csv", ".json", ".parquet"):
+            assert path.read_bytes() == (folder / "again" / path.name).read_bytes(), path.name
+
+
+def test_results_are_read_back_whole(folder, predictions):
+    found = results.load(folder / "out")
+    assert found.settings["thresholds"] == [0.7, 0.9]
+    np.testing.assert_array_equal(found.predictions.logits, predictions.logits)
+    assert len(found.episodes("lem", 0.9)) == 120
+    assert len(found.episodes("best-5", None)) == 120
+
+
+def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes_nothing_from_it(folder, capsys):
+    names = ("test_replay:Asked", "test_replay:Raises", "lcm", "best-99")
+    with pytest.raises(ContestantError) as caught:
+        benchmark(folder / "p.npz", out=folder / "own", policies=names, runs=1, samples=50)
+    sentences = str(caught.value).splitlines()
+    assert len(sentences) == 3
+    assert "Raises" in sentences[0]
+    assert "thing_11" in sentences[0]
+    found = results.load(folder / "own")
+    assert set(found.tables.summary.policy) == {"random", "test_replay:Asked"}
+    assert set(found.settings["failures"]) == {"test_replay:Raises", "lcm", "best-99"}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"thresholds": (1.5,)}, "between 0 and 1, not 1.5"),
+        ({"thresholds": ()}, "at least one threshold"),
+        ({"runs": 0}, "at least one run"),
+        ({"max_views": 0}, "at least one view"),
+        ({"valley_classes": ("sofa",)}, "no class 'sofa'"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(folder, wrong, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        benchmark(folder / "p.npz", out=folder / "none", **wrong)
+    assert not (folder / "none").exists()
+
+
+def test_a_folder_with_something_else_in_it_is_left_alone(folder):
+    (folder / "mine").mkdir()
+    (folder / "mine" / "thesis.txt").write_text("years of work")
+    with pytest.raises(results.ResultsError, match="holds no benchmark results"):
+        benchmark(folder / "p.npz", out=folder / "mine")
+    assert (folder / "mine" / "thesis.txt").read_text() == "years of work"
+    with pytest.raises(results.ResultsError, match="holds no benchmark results"):
+        results.load(folder / "mine")
+    with pytest.raises(PredictionsError, match="there is no such file"):
+        benchmark(folder / "q.npz", out=folder / "none")
+
+
+def test_a_benchmark_of_one_view_has_no_travel(folder):
+    benchmark(folder / "p.npz", out=folder / "one", policies=("random", "furthest"), max_views=1, runs=2, samples=50)
+    summary = results.load(folder / "one").tables.summary
+    assert (summary[summary.measure == "looks"].value == 1).all()
+    assert (summary[summary.measure == "travel_all"].value == 0).all()
+    assert summary[summary.measure == "travel_moved"].value.isna().all()
+
+
+def test_settings_tell_how_to_run_it_again(folder):
+    settings = json.loads((folder / "out" / "benchmark.json").read_text())
+    assert settings["seed"] == 0
+    assert settings["models"]["recogniser"] == ["r", "0" * 64]
+    assert settings["valley_classes"] == ["box"]
+
+
+@pytest.mark.parametrize(("policy", "column"), [("oracle-valley", "LEM10"), ("furthest", "furthest")])
+def test_the_published_tables_agree_with_each_other(policy, column):
+    # Table 5 prints the class averages of tables 8 and 9.
+    table5 = read_table("table5_nbv_modelnet10")
+    assert published(policy, 0.99, "class_accuracy", TEN) == pytest.approx(table5["class_accuracy"][column], abs=2e-4)
+    assert published(policy, 0.99, "class_travel_moved", TEN) == pytest.approx(table5["class_travel"][column], abs=2e-4)
+    assert published(policy, 0.99, "accuracy", TEN) == table5["instance_accuracy"][column]
+
+
+def test_published_values_stand_only_beside_the_cells_they_were_published_for():
+    assert published("random", 0.97, "accuracy", TEN) == 0.8988
+    assert published("random", 0.99, "accuracy", TEN) is None
+    assert published("lem", 0.99, "accuracy", TEN) is None
+    assert published("random", 0.97, "accuracy", ("cat", "dog")) is None
+    assert published("random", 0.97, "travel_moved", TEN, "desk") == read_table(TRAVEL[10])["desk"]["random"]
+    assert published("best-5", None, "accuracy", TEN, "table") == 1.0
+    forty = tuple(read_table(ACCURACY[40]))
+    assert published("furthest", 0.99, "accuracy", forty, "sink") == 0.89
