@@ -1,0 +1,34 @@
+"""``nextview report``: a folder of benchmark results as one HTML page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tyro
+
+
+def report(
+    results: tyro.conf.Positional[Path],
+    /,
+    out: Path | None = None,
+    store: Path | None = None,
+) -> None:
+    """Write one self-contained HTML page: tables, curves, failures, and a viewer to step through episodes.
+
+    Args:
+        results: folder made by nextview benchmark.
+        out: the page; RESULTS/report.html by default.
+        store: the view store of the predictions, for pictures of the objects.
+    """
+    from nextview.cli.extra import needs_extra
+    from nextview.cli.progress import console
+    from nextview.data.store import ViewStore
+
+    with needs_extra("benchmark"):
+        from nextview.benchmark.results import load
+        from nextview.report.html import write_report
+        from nextview.report.trajectories import Pictures
+
+    target = out or results / "report.html"
+    write_report(load(results), target, Pictures(ViewStore.open(store) if store else None))
+    console.print(f"{target}: {target.stat().st_size / 1e6:.1f} MB")

@@ -1,0 +1,168 @@
+"""Episodes to step through in the 3D viewer, as JSON: where each policy went, and what was believed after each look."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from PIL import Image
+
+from nextview.benchmark.contestants import Trials
+from nextview.benchmark.published import COLUMNS
+from nextview.benchmark.replay import cut, replay
+from nextview.benchmark.results import Results
+from nextview.data.store import ViewStore
+from nextview.measures.depth_entropy import normalise_per_object
+from nextview.recognition import fuse
+
+CLOUD = 1500
+"""Points of an object in the viewer."""
+PICTURE = 112
+"""Side of a view's picture, pixels."""
+THESIS = ("table_0444", 13)
+"""Object and first view of the thesis's figures 16, 17 and 29 to 31."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What the objects look like, from the store they were rendered into; without one there are none."""
+
+    store: ViewStore | None
+
+    def row(self, name: str) -> int | None:
+        """Where an object is in the store."""
+        if self.store is None or name not in self.store.names:
+            return None
+        return self.store.names.index(name)
+
+    def cloud(self, name: str) -> str | None:
+        """Points of all views together, (CLOUD, 3) int8 in 1/127 radii, base64."""
+        row = self.row(name)
+        if row is None or self.store is None:
+            return None
+        points = self.store.points(row).reshape(-1, 3)
+        points = points[np.random.default_rng(0).choice(len(points), CLOUD, replace=False)]
+        return base64.b64encode(np.rint(127 * points.clip(-1, 1)).astype(np.int8).tobytes()).decode()
+
+    def views(self, name: str, views: list[int]) -> dict[int, str]:
+        """Shaded images of some views, as data URIs."""
+        row = self.row(name)
+        if row is None or self.store is None:
+            return {}
+        images = self.store.image(row)
+        return {view: _data_uri(images[view]) for view in views}
+
+
+def _data_uri(image: NDArray[np.uint8]) -> str:
+    file = BytesIO()
+    Image.fromarray(image).resize((PICTURE, PICTURE), Image.Resampling.LANCZOS).save(file, "WEBP", quality=70)
+    return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:
+    """Objects that a policy gets wrong in the most runs, then with the most confidence: object, wrong, confidence, run.
+
+    ``run`` is the run in which it was wrong with the most confidence.
+    """
+    wrong = episodes[episodes["answer"].astype(str) != episodes["label"].astype(str)]
+    wrong = wrong.assign(object=wrong["object"].astype(str)).sort_values("confidence", ascending=False, kind="stable")
+    groups = wrong.groupby("object", sort=False)
+    table = groups.agg(wrong=("run", "size"), confidence=("confidence", "mean"), run=("run", "first")).reset_index()
+    return table.sort_values(["wrong", "confidence"], ascending=False, kind="stable").head(most)
+
+
+def gains(ours: pd.DataFrame, theirs: pd.DataFrame, most: int = 4) -> pd.DataFrame:
+    """Objects that one policy gets right in more runs than another: object, gain, run (one that differs)."""
+    right = [t["answer"].astype(str).to_numpy() == t["label"].astype(str).to_numpy() for t in (ours, theirs)]
+    table = pd.DataFrame(
+        {"object": ours["object"].astype(str), "run": ours["run"], "gain": right[0].astype(int) - right[1]}
+    ).sort_values("gain", ascending=False, kind="stable")
+    table = table.groupby("object", sort=False).agg(gain=("gain", "sum"), run=("run", "first")).reset_index()
+    return table[table["gain"] > 0].sort_values("gain", ascending=False, kind="stable").head(most)
+
+
+def trajectories(
+    results: Results, policies: list[str], wanted: list[tuple[str, int, str]], threshold: float, pictures: Pictures
+) -> dict[str, Any]:
+    """All that the viewer shows.
+
+    Args:
+        results: of the benchmark.
+        policies: to compare.
+        wanted: object, run, and why it is shown.
+        threshold: that stops the episodes.
+        pictures: of the objects.
+    """
+    p = results.predictions
+    row = {name: i for i, name in enumerate(p.names)}
+    scenes = []
+    if THESIS[0] in row and len(p.sphere) == 40:
+        scenes.append(
+            _scene(results, *THESIS, "the thesis's figures 16, 17, 29-31", _thesis_paths(results, row), pictures)
+        )
+    taken = {policy: _views_taken(results.episodes(policy, threshold)) for policy in policies}
+    for name, run, why in wanted:
+        paths = {policy: views[name, run] for policy, views in taken.items()}
+        scenes.append(_scene(results, name, paths[policies[0]][0], why, paths, pictures))
+    return {
+        "directions": p.sphere.directions.round(4).tolist(),
+        "angles": [p.sphere.angles(v) for v in range(len(p.sphere))],
+        "azimuths": p.sphere.azimuths,
+        "classes": p.classes,
+        "scenes": scenes,
+    }
+
+
+def _views_taken(episodes: pd.DataFrame) -> dict[tuple[str, int], list[int]]:
+    keys = zip(episodes["object"].astype(str), episodes["run"].tolist(), strict=True)
+    return {key: list(map(int, views)) for key, views in zip(keys, episodes["views"], strict=True)}
+
+
+def _thesis_paths(results: Results, row: dict[str, int]) -> dict[str, list[int]]:
+    p, seed = results.predictions, results.settings["seed"]
+    valleys = tuple(p.classes.index(name) for name in results.settings["valley_classes"])
+    trials = Trials(p, np.array([row[THESIS[0]]]), np.array([THESIS[1]]), valleys)
+    names = [name for name in (*COLUMNS, "lem") if name in set(results.tables.sweep["policy"])]
+    paths = {}
+    for name in names:
+        path = replay(name, trials, results.settings["max_views"], seed)
+        paths[name] = path.views[0, : cut(path, 0.99).looks[0]].tolist()
+    return paths
+
+
+def _scene(
+    results: Results, name: str, start: int, why: str, paths: dict[str, list[int]], pictures: Pictures
+) -> dict[str, Any]:
+    p = results.predictions
+    i = p.names.index(name)
+    seen = sorted({view for views in paths.values() for view in views})
+    return {
+        "name": name,
+        "label": int(p.labels[i]),
+        "start": start,
+        "why": why,
+        "entropy": normalise_per_object(p.depth_entropy[i]).round(3).tolist(),
+        "cloud": pictures.cloud(name),
+        "pictures": pictures.views(name, seen),
+        "episodes": [_episode(results, i, policy, views) for policy, views in paths.items()],
+    }
+
+
+def _episode(results: Results, i: int, policy: str, views: list[int]) -> dict[str, Any]:
+    p = results.predictions
+    beliefs = [fuse(p.logits[i, views[:k]]) for k in range(1, len(views) + 1)]
+    top = [np.argsort(-belief, kind="stable")[:3] for belief in beliefs]
+    travel = [0.0, *np.cumsum(p.sphere.travel[views[:-1], views[1:]])]
+    return {
+        "policy": policy,
+        "views": views,
+        "travel": [round(float(t), 2) for t in travel],
+        "beliefs": [
+            [[int(c), round(float(belief[c]), 4)] for c in best] for belief, best in zip(beliefs, top, strict=True)
+        ],
+    }
