@@ -1,0 +1,187 @@
+"""Downloads from a real server on this machine: one that cuts, lies, or serves what it should not."""
+
+import hashlib
+import io
+import stat
+import threading
+import zipfile
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import numpy as np
+import pytest
+
+from nextview.data.download import Archive, download
+from nextview.data.folders import DatasetError
+from nextview.data.lock import only_one
+
+MESH = b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+
+
+def zipped(members: dict[str, bytes], links: dict[str, str] | None = None) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, data in members.items():
+            file.writestr(name, data)
+        for name, target in (links or {}).items():
+            info = zipfile.ZipInfo(name)
+            info.external_attr = (stat.S_IFLNK | 0o777) << 16
+            file.writestr(info, target)
+    return out.getvalue()
+
+
+NOISE = np.random.default_rng(0).bytes(600_000)
+GOOD = zipped(
+    {"Shapes/chair/train/a.off": MESH, "Shapes/chair/test/noise.bin": NOISE, "__MACOSX/x": b"no", "r.txt": b""}
+)
+
+
+class Server:
+    """Serves ``data``; each connection follows the next of ``plans``, the last one from then on."""
+
+    def __init__(self, data: bytes, *plans: dict):
+        self.data, self.plans, self.ranges = data, list(plans) or [{}], []
+        outer = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self):
+                plan = outer.plans.pop(0) if len(outer.plans) > 1 else outer.plans[0]
+                outer.ranges.append(self.headers.get("Range"))
+                if status := plan.get("status"):
+                    self.send_error(status)
+                    return
+                asked = self.headers.get("Range") if plan.get("ranges", True) else None
+                start = int(asked.removeprefix("bytes=").rstrip("-")) if asked else 0
+                body = outer.data[start:]
+                self.send_response(206 if asked else 200)
+                announced = plan.get("announce", len(outer.data)) - start
+                if plan.get("length", True):
+                    self.send_header("Content-Length", str(announced))
+                self.end_headers()
+                self.wfile.write(body[: plan.get("cut", len(body))])
+
+            def log_message(self, *args):
+                pass
+
+        self.http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self.http.server_address[1]}/shapes.zip"
+
+    def __enter__(self):
+        threading.Thread(target=self.http.serve_forever, args=(0.01,), daemon=True).start()
+        return self
+
+    def __exit__(self, *error):
+        self.http.shutdown()
+        self.http.server_close()
+
+    def archive(self, of: bytes | None = None) -> Archive:
+        published = self.data if of is None else of
+        return Archive(self.url, len(published), hashlib.sha256(published).hexdigest(), "Shapes")
+
+
+def left(folder) -> list[str]:
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file() and p.suffix != ".lock")
+
+
+def test_download_unpacks_only_its_folder_and_leaves_nothing_else(tmp_path):
+    with Server(GOOD) as server:
+        steps = list(download(server.archive(), tmp_path))
+        assert (tmp_path / "Shapes/chair/train/a.off").read_bytes() == MESH
+        assert (tmp_path / "Shapes/chair/test/noise.bin").read_bytes() == NOISE
+        assert left(tmp_path) == ["Shapes/chair/test/noise.bin", "Shapes/chair/train/a.off"]
+        assert list(dict.fromkeys(s[0] for s in steps)) == ["downloading", "verifying", "unpacking"]
+        assert steps[-1][1] == steps[-1][2] == len(MESH) + len(NOISE)
+        assert list(download(server.archive(), tmp_path)) == []  # there already
+        assert len(server.ranges) == 1
+
+
+def test_a_cut_connection_is_resumed_from_where_it_was(tmp_path):
+    with Server(GOOD, {"cut": 200_000}, {"cut": 100_000}, {"status": 503}, {}) as server:
+        list(download(server.archive(), tmp_path))
+        assert server.ranges == [None, "bytes=200000-", "bytes=300000-", "bytes=300000-"]
+    assert (tmp_path / "Shapes/chair/test/noise.bin").read_bytes() == NOISE
+
+
+def test_a_stopped_download_goes_on_in_the_next_run(tmp_path):
+    with Server(GOOD, {"cut": 200_000}, {"cut": 0}) as server:
+        with pytest.raises(DatasetError, match=f"200000 of {len(GOOD)} bytes are kept"):
+            list(download(server.archive(), tmp_path))
+        assert left(tmp_path) == ["Shapes.zip.part"]
+        server.plans = [{}]
+        server.ranges.clear()
+        list(download(server.archive(), tmp_path))
+        assert server.ranges == ["bytes=200000-"]
+    assert (tmp_path / "Shapes/chair/train/a.off").read_bytes() == MESH
+
+
+def test_a_server_without_ranges_starts_over(tmp_path):
+    with Server(GOOD, {"cut": 200_000}, {"ranges": False}) as server:
+        list(download(server.archive(), tmp_path))
+    assert (tmp_path / "Shapes/chair/test/noise.bin").read_bytes() == NOISE
+
+
+@pytest.mark.parametrize("announce", [len(GOOD) - 1, len(GOOD) + 1])
+def test_a_wrong_announced_size_is_refused(tmp_path, announce):
+    with Server(GOOD, {"announce": announce}) as server, pytest.raises(DatasetError, match=f"announces {announce} "):
+        list(download(server.archive(), tmp_path))
+    assert left(tmp_path) == []
+
+
+def test_more_bytes_than_published_are_not_read(tmp_path):
+    with Server(GOOD + b"x" * 1_000_000, {"length": False}) as server:
+        list(download(server.archive(of=GOOD), tmp_path))
+    assert (tmp_path / "Shapes/chair/train/a.off").read_bytes() == MESH
+
+
+def test_other_bytes_of_the_same_size_are_refused_and_removed(tmp_path):
+    with Server(GOOD[:-1] + b"!") as server, pytest.raises(DatasetError, match="SHA-256 differs"):
+        list(download(server.archive(of=GOOD), tmp_path))
+    assert left(tmp_path) == []
+
+
+def test_missing_file_and_missing_server(tmp_path):
+    with Server(GOOD, {"status": 404}) as server, pytest.raises(DatasetError, match="404"):
+        list(download(server.archive(), tmp_path))
+    with pytest.raises(DatasetError, match="the connection fails"):  # the server is gone now
+        list(download(server.archive(), tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("members", "links"),
+    [
+        ({"Shapes/a.off": MESH, "../outside.off": MESH}, {}),
+        ({"Shapes/a.off": MESH, "Shapes/../../outside.off": MESH}, {}),
+        ({"Shapes/a.off": MESH, "/tmp/nextview-outside.off": MESH}, {}),
+        ({"Shapes/a.off": MESH, "..\\outside.off": MESH}, {}),
+        ({"Shapes/a.off": MESH, "C:/outside.off": MESH}, {}),
+        ({"Shapes/a.off": MESH}, {"Shapes/link": "/etc"}),
+        ({"Other/a.off": MESH}, {}),
+    ],
+)
+def test_hostile_archives_leave_nothing(tmp_path, members, links):
+    destination = tmp_path / "in" / "here"
+    with Server(zipped(members, links)) as server, pytest.raises(DatasetError, match=r"refused|holds no folder"):
+        list(download(server.archive(), destination))
+    assert left(tmp_path) in ([], ["in/here/Shapes.zip.part"])
+    assert not (destination / "Shapes").exists()
+    assert not (destination / "Shapes.part").exists()
+
+
+def test_a_damaged_member_leaves_no_partial_tree(tmp_path):
+    data = bytearray(GOOD)
+    data[len(data) // 2] ^= 0xFF  # inside the noise: its CRC no longer fits
+    with Server(bytes(data)) as server, pytest.raises(DatasetError, match="cannot be unpacked"):
+        list(download(server.archive(), tmp_path))
+    assert not (tmp_path / "Shapes").exists()
+    assert not (tmp_path / "Shapes.part").exists()
+
+
+def test_an_archive_that_would_not_fit_is_not_unpacked(tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda path: type("Usage", (), {"free": 1000}))
+    with Server(GOOD) as server, pytest.raises(DatasetError, match="only 1000 are free"):
+        list(download(server.archive(), tmp_path))
+    assert left(tmp_path) == ["Shapes.zip.part"]
+
+
+def test_two_downloads_to_one_place_refuse_each_other(tmp_path):
+    with Server(GOOD) as server, only_one(tmp_path / "Shapes"), pytest.raises(DatasetError, match="another run"):
+        list(download(server.archive(), tmp_path))
