@@ -106,8 +106,8 @@ def _headline(results: Results, best: str, at: float) -> str:
     return (
         f"{_verdict(results, best, at)}"
         f"<p>{len(p):,} objects of {len(set(p.labels.tolist()))} classes, {settings['runs']} first views each, "
-        f"threshold {at:g}, at most {settings['max_views']} looks. All intervals are 95&nbsp;% bootstrap intervals over "
-        f'objects.</p><div class="cards">{"".join(cards)}</div>'
+        f"threshold {at:g}, at most {settings['max_views']} looks. All intervals are 95&nbsp;% bootstrap intervals "
+        f'over objects.</p><div class="cards">{"".join(cards)}</div>'
     )
 
 

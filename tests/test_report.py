@@ -1,0 +1,149 @@
+import re
+import shutil
+import subprocess
+from contextlib import nullcontext
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_predictions import some_predictions
+
+from nextview.benchmark import results
+from nextview.benchmark.replay import ContestantError
+from nextview.cli.benchmark import benchmark
+from nextview.cli.report import report
+from nextview.data.folders import Entry
+from nextview.data.store import DONE, ViewStore
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Results and a store with pictures, one object of which has a name that would break careless HTML."""
+    folder = tmp_path_factory.mktemp("report")
+    p = some_predictions(20, seed=1)
+    p = replace(p, names=("<script>alert(1)</script>&", *p.names[1:]))
+    p.save(folder / "p.npz")
+    benchmark(folder / "p.npz", out=folder / "out", thresholds=(0.8, 0.97), runs=3, samples=100)
+    entries = [Entry(Path("none"), name, p.classes[i], "test") for name, i in zip(p.names, p.labels, strict=True)]
+    store = ViewStore.create(folder / "views.zarr", entries, p.sphere, 32, {})
+    store.group["image"][:] = np.random.default_rng(0).integers(0, 255, store.group["image"].shape, np.uint8)
+    store.group["status"][:] = DONE
+    report(folder / "out", store=folder / "views.zarr")
+    return folder
+
+
+class Page(HTMLParser):
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.images, self.links, self.ids, self.open, self.texts = [], [], [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        attributes = dict(attributes)
+        if tag == "img":
+            self.images.append(attributes)
+        self.links += [attributes[a] for a in ("src", "href") if a in attributes]
+        self.ids += [attributes["id"]] if "id" in attributes else []
+        if tag not in ("img", "meta", "br", "link"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append((self.open[-1] if self.open else "", data))
+
+
+def test_the_page_is_whole_and_needs_nothing_from_outside(made):
+    text = (made / "out" / "report.html").read_text()
+    page = Page(text)
+    assert page.open == []  # every element is closed in its order
+    assert len(page.ids) == len(set(page.ids))
+    assert all(link.startswith(("#", "data:")) for link in page.links)
+    assert all(link[1:] in page.ids for link in page.links if link.startswith("#"))
+    assert not re.search(r"@import|url\(|https?://(?!www\.w3\.org)", text)
+    assert len(page.images) > 8
+    assert all(len(image["alt"]) > 10 for image in page.images)
+    assert not list((made / "out").glob("*.part"))
+
+
+def test_names_from_the_data_are_text_and_never_markup(made):
+    page = Page((made / "out" / "report.html").read_text())
+    assert not any(data.strip() == "alert(1)" for _, data in page.texts)
+
+
+def test_the_tables_show_the_numbers_of_the_results(made):
+    text = (made / "out" / "report.html").read_text()
+    summary = results.load(made / "out").tables.summary
+    for policy in ("random", "lem", "oracle-gain"):
+        row = re.search(rf'<tr><th scope="row">{policy}\b.*?</tr>', text)[0]
+        cells = re.findall(r"<td>([\d.]+)", row)
+        of = summary.query("policy == @policy and threshold == 0.97").set_index("measure")["value"]
+        assert cells[:4] == [f"{of[m]:.3f}" for m in ("accuracy", "clean_accuracy", "class_accuracy")] + [
+            f"{of['looks']:.2f}"
+        ]
+
+
+@pytest.mark.parametrize("policies", [("random",), ("lem", "best-3"), ("test_replay:Raises", "unidirectional")])
+def test_a_report_of_few_policies(made, policies):
+    out = made / "-".join(name.replace(":", ".") for name in policies)
+    fails = "Raises" in policies[0]
+    with pytest.raises(ContestantError) if fails else nullcontext():
+        benchmark(made / "p.npz", out=out, policies=policies, thresholds=(0.9,), runs=2, max_views=3, samples=20)
+    report(out)
+    Page((out / "report.html").read_text())
+    assert ("Left out: test_replay:Raises" in (out / "report.html").read_text()) == fails
+
+
+def test_a_report_without_results_is_refused(made):
+    with pytest.raises(results.ResultsError, match="holds no benchmark results"):
+        report(made)
+
+
+def browse(page: Path, address: str = "") -> str:
+    """The document as it stands after its scripts have run in a headless browser."""
+    if BROWSER is None:
+        pytest.skip("no Chromium on this machine")
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2000", "--dump-dom"]
+    command += ["--allow-file-access-from-files", "--enable-logging=stderr", f"--user-data-dir={page.parent}/profile"]
+    done = subprocess.run([*command, page.as_uri() + address], capture_output=True, text=True, timeout=60, check=True)
+    assert "Uncaught" not in done.stderr
+    return done.stdout
+
+
+def test_the_viewer_steps_through_an_episode_in_a_browser(made):
+    seen = set()
+    for step in (0, 1):
+        page = browse(made / "out" / "report.html", f"#scene=1&policy=unidirectional&step={step}")
+        verdict = re.search(r'id="verdict".*?>(.*?)<', page)[1]
+        assert verdict.startswith(f"unidirectional, look {step + 1} of ")
+        start = re.search(r'<option value="1"[^>]*>.*? from view (\d+)<', page)[1]
+        views = re.findall(r"Look \d+: view (\d+), elevation", page)
+        ring, azimuth = divmod(int(start), 8)
+        assert list(map(int, views[:2])) == [int(start), ring * 8 + (azimuth + 1) % 8]
+        assert page.count('aria-current="step"') == 1
+        seen.add(verdict)
+    assert len(seen) == 2
+
+
+def test_the_viewer_draws_and_the_page_fits_a_phone(made):
+    host = made / "out" / "phone.html"
+    host.write_text(
+        """<iframe id="phone" src="report.html" style="width:360px;height:780px;border:0"></iframe><p id="said"></p>
+        <script>document.getElementById("phone").onload = () => {
+          const page = document.getElementById("phone").contentDocument, canvas = page.getElementById("sphere");
+          const p = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+          let path = 0;
+          for (let i = 0; i < p.length; i += 4) path += p[i] === 255 && p[i + 1] === 209 && p[i + 2] === 102;
+          document.getElementById("said").textContent =
+            `${page.documentElement.scrollWidth} ${canvas.clientWidth} ${path}`;
+        };</script>"""
+    )
+    page_width, canvas_width, path = map(int, re.search(r'id="said">(\d+) (\d+) (\d+)<', browse(host)).groups())
+    assert page_width <= 360  # nothing but the tables' own boxes scrolls sideways
+    assert 250 < canvas_width < 360
+    assert path > 100  # the camera's place is drawn
