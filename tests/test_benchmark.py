@@ -167,6 +167,15 @@ def test_a_benchmark_of_one_view_has_no_travel(folder):
     assert summary[summary.measure == "travel_moved"].value.isna().all()
 
 
+def test_training_objects_are_never_mixed_with_test_objects(folder, predictions):
+    both = replace(predictions, splits=np.array(["train", "test"] * 20))
+    both.save(folder / "both.npz")
+    with pytest.raises(ValueError, match="choose with --split"):
+        benchmark(folder / "both.npz", out=folder / "mixed")
+    benchmark(folder / "both.npz", out=folder / "half", split="test", policies=("random",), runs=1, samples=20)
+    assert results.load(folder / "half").predictions.names == both.names[1::2]
+
+
 def test_settings_tell_how_to_run_it_again(folder):
     settings = json.loads((folder / "out" / "benchmark.json").read_text())
     assert settings["seed"] == 0

@@ -117,6 +117,16 @@ def test_a_missing_array_is_named(tmp_path):
         Predictions.load(tmp_path / "p.npz")
 
 
+def test_a_split_is_its_objects_and_nothing_else():
+    some = replace(some_predictions(), splits=np.array(["train", "test"] * 3))
+    test = some.of_split("test")
+    assert test.names == ("thing_1", "thing_3", "thing_5")
+    np.testing.assert_array_equal(test.logits, some.logits[1::2])
+    np.testing.assert_array_equal(test.maps["lem"], some.maps["lem"][1::2])
+    with pytest.raises(PredictionsError, match="no objects of the split 'train', only of 'test'"):
+        test.of_split("train")
+
+
 def test_nothing_is_unpickled(tmp_path):
     np.savez(tmp_path / "p.npz", format=1, logits=np.array([{"a": 1}], object))
     with pytest.raises(PredictionsError, match="not a predictions file"):

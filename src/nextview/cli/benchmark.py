@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -13,6 +14,7 @@ def benchmark(
     out: Path = Path("benchmark"),
     policies: tuple[str, ...] = (),
     thresholds: tuple[float, ...] = (0.85, 0.9, 0.95, 0.97, 0.99),
+    split: Literal["train", "test"] | None = None,
     runs: int = 10,
     max_views: int = 5,
     reference: str = "random",
@@ -27,6 +29,7 @@ def benchmark(
         out: folder for the results; earlier results there are replaced.
         policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
         thresholds: of the belief.
+        split: take only the objects of this one; needed where the predictions hold several.
         runs: random first views of each object.
         max_views: looks at most.
         reference: the policy that the others are compared with.
@@ -58,6 +61,10 @@ def benchmark(
     for threshold in thresholds:
         Stopping(threshold, max_views)  # says what is wrong with it
     table = Predictions.load(predictions)
+    if split:
+        table = table.of_split(split)
+    elif len(set(table.splits)) > 1:
+        raise ValueError(f"{predictions}: holds training and test objects; choose with --split which are compared")
     unknown = [name for name in valley_classes or () if name not in table.classes]
     if unknown:
         raise ValueError(f"{predictions}: knows no class {unknown[0]!r}; there are {', '.join(table.classes)}")
@@ -75,6 +82,7 @@ def benchmark(
             "models": table.models,
             "policies": names,
             "failures": grid.failures,
+            "split": split,
             "reference": reference,
             "thresholds": grid.thresholds,
             "runs": runs,

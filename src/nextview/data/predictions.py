@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,21 @@ class Predictions:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def of_split(self, split: str) -> Predictions:
+        """The objects of one split.
+
+        Raises:
+            PredictionsError: there are none.
+        """
+        kept = self.splits == split
+        if not kept.any():
+            there = ", ".join(repr(str(name)) for name in np.unique(self.splits))
+            raise PredictionsError(f"these predictions hold no objects of the split {split!r}, only of {there}")
+        arrays = {name: getattr(self, name)[kept] for name in ("logits", "depth_entropy", "labels", "splits")}
+        names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
+        maps = {name: values[kept] for name, values in self.maps.items()}
+        return replace(self, **arrays, names=names, maps=maps, conflicting=self.conflicting[kept])
 
     def save(self, path: Path) -> None:
         """Write one .npz file, aside and then renamed, so that it is whole or not there."""
