@@ -1,3 +1,6 @@
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -159,16 +162,30 @@ def test_the_same_mesh_under_two_labels_is_marked_across_splits(shop):
     }  # fmt: skip
 
 
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from nextview.data.predict import predict
+from nextview.models.card import read_card
+
+if __name__ == "__main__":
+    shop, out = map(Path, sys.argv[1:])
+    maps = {"lem": read_card(shop / "tiny-lem.json")}
+    for done, _ in predict(shop / "views.zarr", out, read_card(shop / "tiny.json"), maps, workers=1):
+        if done == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
 def test_a_killed_run_goes_on_where_it_was(shop):
     recogniser, maps = cards(shop)
     out = shop / "again.npz"
-    steps = predict(shop / "views.zarr", out, recogniser, maps, workers=1)
-    while next(steps)[0] < 2:
-        pass
-    steps.close()
+    (shop / "killed.py").write_text(KILLED)
+    killed = subprocess.run([sys.executable, shop / "killed.py", shop, out], check=False)
+    assert killed.returncode == -signal.SIGKILL
     assert not out.exists()
     steps = predict(shop / "views.zarr", out, recogniser, maps, workers=1)
-    assert next(steps)[0] >= 2
+    assert next(steps) == (2, 6)
     list(steps)
     assert not out.with_name("again.npz.part").exists()
     list(predict(shop / "views.zarr", shop / "whole.npz", recogniser, maps, workers=1))
