@@ -5,17 +5,47 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
 
 console = Console(stderr=True)
 
 
-def track(done: Iterable[int], total: int, what: str) -> None:
-    """Exhaust an iterable that yields how much is done so far, and show it."""
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
-    )  # fmt: skip
+def track(done: Iterable[int], total: int, what: str, before: int = 0, views: int = 0) -> None:
+    """Exhaust an iterable that yields how much is done so far, and show it.
+
+    Args:
+        done: counts, growing.
+        total: the last count.
+        what: what is being done.
+        before: how much an earlier run had done.
+        views: if given, the speed is shown too, in objects of so many views.
+    """
+    columns = [TextColumn("{task.description}"), BarColumn(20), MofNCompleteColumn()]
+    columns += [TimeElapsedColumn(), TimeRemainingColumn(), *([Speed(views)] if views else [])]
     with Progress(*columns, console=console) as progress:
-        task = progress.add_task(what, total=total)
+        task = progress.add_task(what, total=total, completed=before)
         for n in done:
             progress.update(task, completed=n)
+
+
+class Speed(ProgressColumn):
+    """Objects and views a second."""
+
+    def __init__(self, views: int) -> None:
+        super().__init__()
+        self.views = views
+
+    def render(self, task: Task) -> Text:
+        """As text; empty until there is a speed to speak of."""
+        speed = task.finished_speed or task.speed
+        return Text(f"{speed:.1f} objects/s, {speed * self.views:.0f} views/s" if speed else "", no_wrap=True)

@@ -20,6 +20,7 @@ def render(
     turn: bool = False,
     seed: int = 0,
     workers: int | None = None,
+    scheduler: str | None = None,
 ) -> None:
     """Render a dataset folder (CLASS/train|test/MESH or CLASS/MESH) into a view store. Resumes where it was.
 
@@ -34,6 +35,7 @@ def render(
         turn: turn each mesh about the vertical by a random angle.
         seed: decides the stretch and the turn of each mesh.
         workers: processes; one for each core by default.
+        scheduler: address of a dask.distributed scheduler to use instead, as tcp://HOST:8786.
     """
     from dataclasses import replace
 
@@ -41,21 +43,26 @@ def render(
     from nextview.data.folders import list_dataset
     from nextview.data.render import Deform
     from nextview.data.render import render as render_dataset
+    from nextview.data.store import ViewStore
     from nextview.viewsphere import ViewSphere
 
     views = ViewSphere.named(sphere)
     if azimuths:
         views = replace(views, azimuths=azimuths)
     total = sum(split in (None, entry.split) for entry in list_dataset(dataset))
-    failures: list[str] = []
+    before = int(ViewStore.open(store).done.sum()) if store.exists() else 0
+    jobs = render_dataset(dataset, store, views, size, seed, Deform(stretch, turn), split, workers, scheduler)
+    track((before + n for n, _ in enumerate(jobs, 1)), total, f"rendering {store.name}", before, len(views))
 
-    def done():  # noqa: ANN202
-        jobs = render_dataset(dataset, store, views, size, seed, Deform(stretch, turn), split, workers)
-        for n, (_, reason) in enumerate(jobs, 1):
-            if reason:
-                failures.append(reason)
-            yield n
-
-    track(done(), total, f"rendering {store.name}")
-    for reason in failures:
-        console.print(f"left out: {reason}", style="yellow")
+    made = ViewStore.open(store)
+    for reason in made.failures.values():
+        console.print(f"left out: {reason}", style="yellow", highlight=False)
+    labels = [made.classes[label] for label in made.labels]
+    twins = made.twins
+    if twins:
+        console.print(f"{sum(map(len, twins)) - len(twins)} meshes are byte-identical copies of another one")
+    for group in twins:
+        if len({labels[i] for i in group}) > 1:
+            same = " = ".join(f"{made.names[i]} ({labels[i]})" for i in group)
+            console.print(f"one mesh, several labels: {same}", style="yellow", highlight=False)
+    console.print(f"{store}: {int(made.done.sum())} of {total} objects, {len(views)} views each")

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import os
+import hashlib
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
+from functools import lru_cache, partial
 from pathlib import Path
+from uuid import uuid4
 
 import numpy as np
 
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.folders import DatasetError, Entry, list_dataset
-from nextview.data.store import DEPTH_UNIT, DONE, FAILED, PENDING, POINT_UNIT, ViewStore
+from nextview.data.lock import only_one
+from nextview.data.pool import each
+from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, ViewStore
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.mesh import Mesh, MeshError, load_mesh, make_mesh
 from nextview.viewsphere import ViewSphere
@@ -32,6 +36,7 @@ class Deform:
     turn: bool = False
 
     def __call__(self, mesh: Mesh, rng: np.random.Generator) -> Mesh:
+        """The new object, normalised again."""
         reach = np.log1p(self.stretch)
         factors = np.exp(rng.uniform(-reach, reach, 3))
         angle = rng.uniform(0, 2 * np.pi) if self.turn else 0.0
@@ -62,8 +67,11 @@ def render(
     deform: Deform | None = None,
     split: str | None = None,
     workers: int | None = None,
+    scheduler: str | None = None,
 ) -> Iterator[tuple[str, str | None]]:
-    """Render every mesh that the store does not hold yet.
+    """Render every mesh that the store does not hold yet; one that failed before is tried again.
+
+    The run may end at any moment, even by a kill or a full disk; the next one goes on with what is missing.
 
     Args:
         dataset: folder of meshes.
@@ -74,60 +82,95 @@ def render(
         deform: how to make a new object of each mesh; not at all by default.
         split: only this split of the dataset.
         workers: processes; one for each core by default.
+        scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
 
     Yields:
         (name, None) for each object done, (name, reason) for one that cannot be rendered.
 
     Raises:
-        DatasetError: the dataset is unusable, or the store was begun from another one or with other settings.
+        DatasetError: the dataset is unusable, the store was begun from another one or with other settings, another run
+            is writing it, or it cannot be written.
     """
-    entries = [e for e in list_dataset(dataset) if split in (None, e.split)]
+    entries = [e for e in list_dataset(dataset.absolute()) if split in (None, e.split)]
     deform = deform or Deform()
-    recipe = {"seed": seed, "stretch": deform.stretch, "turn": deform.turn}
-    if path.exists():
-        store = ViewStore.open(path)
-        wanted = {
-            "names": [e.name for e in entries],
-            "size": size,
-            "elevations": list(sphere.elevations),
-            "azimuths": sphere.azimuths,
-            **recipe,
-        }
-        for key, value in wanted.items():
-            if store.group.attrs.get(key) != value:
-                raise DatasetError(f"{path}: was begun with other {key}; give another store or the same settings")
-    else:
-        store = ViewStore.create(path, entries, sphere, size, recipe)
-    todo = [int(i) for i in np.flatnonzero(store.group["status"][:] == PENDING)]
-    # Largest files first, so that no worker is left with a long one at the end.
-    todo.sort(key=lambda i: -entries[i].path.stat().st_size)
-    workers = workers or os.cpu_count() or 1
-    with ProcessPoolExecutor(workers, get_context("spawn"), _open_store, (path,)) as pool:
-        jobs = [pool.submit(_render_entry, i, entries[i], sphere, size, seed, deform) for i in todo]
-        for job in as_completed(jobs):
-            yield job.result()
+    with only_one(path), writing(path):
+        store = _begin(path.absolute(), entries, sphere, size, seed, deform)
+        todo = [int(i) for i in np.flatnonzero(~store.done)]
+        # Largest files first, so that no worker is left with a long one at the end.
+        todo.sort(key=lambda i: -entries[i].path.stat().st_size)
+        task = partial(_render_entry, store.path, uuid4().hex, sphere, size, seed, deform)
+        for (i, entry), reason in each(task, [(i, entries[i]) for i in todo], workers, scheduler):
+            if reason is not None:
+                # Only this process writes reasons; the status comes last, as for an object that is done.
+                store.group.attrs["failures"] = store.failures | {entry.name: f"{reason}"}
+                store.group["status"][i] = FAILED
+            elif entry.name in store.failures:
+                store.group.attrs["failures"] = {n: r for n, r in store.failures.items() if n != entry.name}
+            yield entry.name, None if reason is None else f"{reason}"
 
 
-_store: ViewStore
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Say what happens to a store when it cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DatasetError(f"{path}: cannot be written ({reason}); what is done is kept, run again to go on") from None
 
 
-def _open_store(path: Path) -> None:
-    global _store
-    _store = ViewStore.open(path)
+def _begin(path: Path, entries: list[Entry], sphere: ViewSphere, size: int, seed: int, deform: Deform) -> ViewStore:
+    """The store as an earlier run left it, if that had the same meshes and settings, or a new one."""
+    with ThreadPoolExecutor() as pool:
+        hashes = list(pool.map(_file_hash, [e.path for e in entries]))
+    recipe = {"seed": seed, "stretch": deform.stretch, "turn": deform.turn, "sha256": hashes}
+    if not path.exists():
+        return ViewStore.create(path, entries, sphere, size, recipe)
+    store = ViewStore.open(path)
+    wanted = {
+        "names": [e.name for e in entries],
+        "size": size,
+        "elevations": list(sphere.elevations),
+        "azimuths": sphere.azimuths,
+        "distance": sphere.distance,
+        **recipe,
+    }
+    for key, value in wanted.items():
+        if store.group.attrs.get(key, value) != value:
+            raise DatasetError(f"{path}: was begun with other {key}; give another store or the same settings")
+    for leftover in path.rglob("*.partial"):  # what was being written when a run was killed
+        leftover.unlink()
+    return store
+
+
+def _file_hash(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return f"unreadable {path.name}"  # its rendering will say why
+
+
+@lru_cache(maxsize=1)
+def _open(path: Path, run: str) -> ViewStore:
+    """The store, opened once for each process and run."""
+    return ViewStore.open(path)
 
 
 def _render_entry(
-    i: int, entry: Entry, sphere: ViewSphere, size: int, seed: int, deform: Deform
-) -> tuple[str, str | None]:
+    path: Path, run: str, sphere: ViewSphere, size: int, seed: int, deform: Deform, item: tuple[int, Entry]
+) -> str | None:
+    """Render one object into the store; the reason if its mesh cannot be used."""
+    i, entry = item
+    store = _open(path, run)
     try:
         mesh = load_mesh(entry.path)
         if deform != Deform():
             mesh = deform(mesh, np.random.default_rng([seed, *entry.name.encode()]))
         arrays = render_object(mesh, sphere, size)
     except MeshError as error:
-        _store.group["status"][i] = FAILED
-        return entry.name, str(error)
+        return str(error)
     for name, values in arrays.items():
-        _store.group[name][i] = values
-    _store.group["status"][i] = DONE  # last, so that an object counts only when it is whole
-    return entry.name, None
+        store.group[name][i] = values
+    store.group["status"][i] = DONE  # last, so that an object counts only when it is whole
+    return None

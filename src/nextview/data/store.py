@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec
+from zarr.codecs import BloscCodec, Crc32cCodec
 
 from nextview.data.folders import DatasetError, Entry
 from nextview.observation import POINTS, pinhole
@@ -27,8 +28,10 @@ class ViewStore:
     """Views of N objects from the V views of a sphere.
 
     Arrays of the group, sharded by object (axis 0): ``image`` (N, V, S, S) uint8; ``depth`` (N, V, S, S) uint16 in
-    DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object frame; ``measures/depth_entropy`` (N, V)
-    float32, bits; ``status`` (N,) uint8. Names, labels, splits and what was rendered how are attributes.
+    DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object frame; ``measures/depth_entropy``
+    (N, V) float32, bits, and other measures alike; ``status`` (N,) uint8. Names, labels, splits, the SHA-256 of the
+    mesh files, what was rendered how, and why meshes were left out are attributes. Chunks carry a checksum, so that a
+    damaged one is noticed when it is read.
     """
 
     path: Path
@@ -36,20 +39,12 @@ class ViewStore:
 
     @classmethod
     def create(cls, path: Path, entries: list[Entry], sphere: ViewSphere, size: int, recipe: dict) -> ViewStore:
-        """Make an empty store; ``recipe`` is kept in the attributes as it is (JSON values)."""
-        group = zarr.open_group(path, mode="w-")
-        n, v = len(entries), len(sphere)
-        codec = BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle")
-
-        def array(name: str, shape: tuple[int, ...], dtype: str) -> None:
-            group.create_array(name, shape=(n, *shape), chunks=(1, *shape), dtype=dtype, compressors=codec)
-
-        array("image", (v, size, size), "uint8")
-        array("depth", (v, size, size), "uint16")
-        array("points", (v, POINTS, 3), "int16")
-        array("measures/depth_entropy", (v,), "float32")
-        array("status", (), "uint8")
-        group.attrs.update(
+        """Make an empty store, whole or not at all; ``recipe`` is kept in the attributes as it is (JSON values)."""
+        part = path.with_name(path.name + ".part")
+        shutil.rmtree(part, ignore_errors=True)
+        store = cls(part, zarr.open_group(part, mode="w-"))
+        v = len(sphere)
+        store.group.attrs.update(
             {
                 "format": FORMAT,
                 "names": [e.name for e in entries],
@@ -59,10 +54,28 @@ class ViewStore:
                 "azimuths": sphere.azimuths,
                 "distance": sphere.distance,
                 "size": size,
+                "failures": {},
                 **recipe,
             }
         )
-        return cls(path, group)
+        store.add("image", (v, size, size), "uint8")
+        store.add("depth", (v, size, size), "uint16")
+        store.add("points", (v, POINTS, 3), "int16")
+        store.add("measures/depth_entropy", (v,), "float32")
+        store.add("status", (), "uint8")
+        part.rename(path)
+        return cls.open(path)
+
+    def add(self, name: str, shape: tuple[int, ...], dtype: str, fill: float = 0) -> None:
+        """Add an array of one ``shape`` for each object."""
+        self.group.create_array(
+            name,
+            shape=(len(self), *shape),
+            chunks=(1, *shape),
+            dtype=dtype,
+            fill_value=fill,
+            compressors=(BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle"), Crc32cCodec()),
+        )
 
     @classmethod
     def open(cls, path: str | Path) -> ViewStore:
@@ -84,35 +97,53 @@ class ViewStore:
 
     @property
     def names(self) -> list[str]:
+        """Of the objects, unique, N of them."""
         return self.group.attrs["names"]
 
     @property
     def classes(self) -> list[str]:
+        """Names of the classes, sorted."""
         return sorted(set(self.group.attrs["labels"]))
 
     @property
     def labels(self) -> NDArray[np.int64]:
         """Class of each object as an index into ``classes``, (N,) int64."""
-        return np.array([self.classes.index(label) for label in self.group.attrs["labels"]])
+        row = {name: i for i, name in enumerate(self.classes)}
+        return np.array([row[label] for label in self.group.attrs["labels"]])
 
     @property
     def splits(self) -> NDArray[np.str_]:
-        """"train", "test" or "" for each object, (N,)."""
+        """ "train", "test" or "" for each object, (N,)."""
         return np.array(self.group.attrs["splits"])
 
     @property
     def sphere(self) -> ViewSphere:
+        """The viewpoints."""
         a = self.group.attrs
         return ViewSphere(tuple(a["elevations"]), a["azimuths"], a["distance"])
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
+        """Pinhole matrix of all views, (3, 3) float64, pixels."""
         return pinhole(self.group.attrs["size"], self.sphere.distance)
 
     @property
     def done(self) -> NDArray[np.bool_]:
         """Objects that are rendered, (N,)."""
         return self.group["status"][:] == DONE
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why objects were left out, by name."""
+        return self.group.attrs.get("failures", {})
+
+    @property
+    def twins(self) -> list[list[int]]:
+        """Groups of objects whose mesh files hold the same bytes; none are known in a store made without hashes."""
+        groups: dict[str, list[int]] = {}
+        for i, digest in enumerate(self.group.attrs.get("sha256", ())):
+            groups.setdefault(digest, []).append(i)
+        return [group for group in groups.values() if len(group) > 1]
 
     def image(self, i: int) -> NDArray[np.uint8]:
         """All views of object i, (V, S, S) uint8."""

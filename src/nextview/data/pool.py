@@ -1,0 +1,111 @@
+"""Run one function on many items: on this machine's cores, or on a cluster through dask.distributed."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from typing import TypeVar
+
+from nextview.data.folders import DatasetError
+
+PATIENCE = "10s"
+"""How long a scheduler may take to answer."""
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class WorkerDied(Exception):
+    """The process that worked on an item was killed, or crashed, again when it worked on that item alone."""
+
+
+def each(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Iterator[tuple[Item, Result | WorkerDied]]:
+    """Call ``function(item)`` for every item, side by side; yields (item, result) as they come, in any order.
+
+    The function and the items must be picklable. A process that dies costs no more than the item it was working on, and
+    that only if it dies again when it works on nothing else. What the function raises ends the run.
+
+    Args:
+        function: what to call.
+        items: hashable, begun in this order.
+        workers: processes; one for each core by default.
+        scheduler: address of a dask.distributed scheduler, to use its workers instead of this machine's cores.
+
+    Raises:
+        DatasetError: the scheduler cannot be reached, or dask.distributed is not installed.
+    """
+    if scheduler is not None:
+        yield from _on_cluster(function, items, scheduler)
+        return
+    workers = workers or os.cpu_count() or 1
+    waiting = list(items)
+    while waiting:
+        finished = set()
+        try:
+            for item, result in _in_pool(function, waiting, workers):
+                finished.add(item)
+                yield item, result
+        except BrokenProcessPool:
+            waiting = [item for item in waiting if item not in finished]
+            # Items are begun in order, so the first that are not finished were being worked on. Try each alone.
+            suspects, waiting = waiting[:workers], waiting[workers:]
+            for item in suspects:
+                try:
+                    yield from _in_pool(function, [item], 1)
+                except BrokenProcessPool:
+                    yield item, WorkerDied("the process that worked on it died, twice")
+        else:
+            return
+
+
+def _in_pool(function: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[tuple[Item, Result]]:
+    pool = ProcessPoolExecutor(min(workers, len(items)), multiprocessing.get_context("spawn"), _end_with_parent)
+    try:
+        jobs = {pool.submit(function, item): item for item in items}
+        for job in as_completed(jobs):
+            yield jobs[job], job.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """A worker whose parent was killed would wait for work forever."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _on_cluster(
+    function: Callable[[Item], Result], items: Sequence[Item], scheduler: str
+) -> Iterator[tuple[Item, Result | WorkerDied]]:
+    try:
+        from distributed import Client, KilledWorker, as_completed
+    except ImportError as error:
+        raise DatasetError(f"a scheduler needs {error.name}: pip install 'nextview[cluster]'") from None
+    try:
+        client = Client(scheduler, timeout=PATIENCE)
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{scheduler}: no dask scheduler answers there ({error})") from None
+    with client:
+        jobs = dict(zip(client.map(function, items, pure=False), items, strict=True))
+        for job in as_completed(jobs):
+            try:
+                yield jobs[job], job.result()
+            except KilledWorker:
+                yield jobs[job], WorkerDied("the workers that worked on it died")

@@ -1,0 +1,261 @@
+"""The store survives what happens to long jobs, done for real: kills, full disks, broken meshes, second runs."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from nextview.data.folders import DatasetError, list_dataset
+from nextview.data.lock import only_one
+from nextview.data.pool import WorkerDied, each
+from nextview.data.render import Deform, render
+from nextview.data.store import ViewStore
+from nextview.viewsphere import ViewSphere
+
+SPHERE = ViewSphere.named("12")
+SIZE = 64
+SCRIPT = """
+import sys
+from pathlib import Path
+from nextview.data.render import render
+from nextview.viewsphere import ViewSphere
+for name, reason in render(Path(sys.argv[1]), Path(sys.argv[2]), ViewSphere.named("12"), 64, workers=2):
+    print(name, flush=True)
+"""
+
+
+def make_dataset(folder: Path, count: int = 24) -> Path:
+    rng = np.random.default_rng(0)
+    for i in range(count):
+        mesh = trimesh.creation.icosphere(3) if i % 2 else trimesh.creation.box()
+        mesh.apply_scale(rng.uniform(0.5, 2, 3))
+        path = folder / ("ball" if i % 2 else "box") / ("train" if i % 3 else "test") / f"thing_{i:02d}.off"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mesh.export(path)
+    return folder
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    group = ViewStore.open(path).group
+    return {
+        name: group[name][:]
+        for name in ("image", "depth", "points", "status", *(f"measures/{m}" for m in group["measures"]))
+    }
+
+
+def assert_same(a: Path, b: Path) -> None:
+    first, second = arrays(a), arrays(b)
+    assert first.keys() == second.keys()
+    for name, values in first.items():
+        np.testing.assert_array_equal(values, second[name], err_msg=name)
+    assert not list(b.rglob("*.partial"))
+    assert not b.with_name(b.name + ".part").exists()
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    return make_dataset(tmp_path_factory.mktemp("meshes"))
+
+
+@pytest.fixture(scope="module")
+def whole(dataset, tmp_path_factory) -> Path:
+    """A store made without interruption, by one process."""
+    path = tmp_path_factory.mktemp("whole") / "views.zarr"
+    assert [reason for _, reason in render(dataset, path, SPHERE, SIZE, workers=1)] == [None] * 24
+    return path
+
+
+def start(dataset: Path, path: Path) -> subprocess.Popen:
+    return subprocess.Popen([sys.executable, "-c", SCRIPT, dataset, path], stdout=subprocess.PIPE, text=True)
+
+
+def workers_of(parent: int) -> list[int]:
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    return [int(c) for c in children if b"resource_tracker" not in Path(f"/proc/{c}/cmdline").read_bytes()]
+
+
+def alive(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+
+
+@linux
+def test_kill_of_the_parent_loses_nothing_and_leaves_no_orphans(dataset, whole, tmp_path):
+    path = tmp_path / "views.zarr"
+    run = start(dataset, path)
+    for _ in range(3):
+        run.stdout.readline()
+    workers = workers_of(run.pid)
+    assert len(workers) == 2
+    os.kill(run.pid, signal.SIGKILL)
+    run.wait()
+    run.stdout.close()
+    deadline = time.monotonic() + 5
+    while any(alive(w) for w in workers):
+        assert time.monotonic() < deadline, "workers outlive their parent"
+        time.sleep(0.02)
+    done = int(ViewStore.open(path).done.sum())
+    assert 3 <= done < 24
+    # As if the kill had come in the middle of a write: zarr writes aside under such a name.
+    (path / "image" / "c" / "0.00.partial").write_bytes(b"half")
+    assert len(list(render(dataset, path, SPHERE, SIZE, workers=1))) == 24 - done
+    assert_same(whole, path)
+
+
+@linux
+def test_kill_of_a_worker_does_not_end_the_run(dataset, whole, tmp_path):
+    path = tmp_path / "views.zarr"
+    run = start(dataset, path)
+    run.stdout.readline()
+    os.kill(workers_of(run.pid)[0], signal.SIGKILL)
+    out, _ = run.communicate(timeout=60)
+    assert run.returncode == 0
+    assert len(out.split()) == 23
+    assert_same(whole, path)
+    assert ViewStore.open(path).failures == {}
+
+
+@linux
+def test_a_full_disk_says_so_and_the_next_run_goes_on(dataset, whole, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", disk]).returncode:
+        pytest.skip("only root can mount a small disk")
+    try:
+        path = disk / "views.zarr"
+        with pytest.raises(DatasetError, match="No space left on device"):
+            list(render(dataset, path, SPHERE, SIZE, workers=1))
+        done = int(ViewStore.open(path).done.sum())
+        assert 0 < done < 24
+        subprocess.run(["mount", "-o", "remount,size=100m", disk], check=True)
+        assert len(list(render(dataset, path, SPHERE, SIZE, workers=1))) == 24 - done
+        assert_same(whole, path)
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+@linux
+def test_a_disk_full_from_the_start_leaves_no_store(dataset, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", disk]).returncode:
+        pytest.skip("only root can mount a small disk")
+    try:
+        with pytest.raises(DatasetError, match="cannot be written"):
+            list(render(dataset, disk / "views.zarr", SPHERE, SIZE, workers=1))
+        assert not (disk / "views.zarr").exists()
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+def test_two_runs_on_one_store_refuse_each_other(dataset, whole):
+    with only_one(whole), pytest.raises(DatasetError, match="another run"):
+        list(render(dataset, whole, SPHERE, SIZE, workers=1))
+    assert list(render(dataset, whole, SPHERE, SIZE, workers=1)) == []  # and it has nothing left to do
+
+
+def test_other_settings_or_meshes_are_refused(dataset, whole, tmp_path):
+    for settings in ({"size": 32}, {"seed": 1}, {"deform": Deform(0.1)}, {"split": "train"}):
+        with pytest.raises(DatasetError, match="begun with other"):
+            list(render(dataset, whole, SPHERE, **{"size": SIZE, **settings}))
+    changed = make_dataset(tmp_path / "changed")
+    with (changed / "box/test/thing_00.off").open("a") as file:
+        file.write("\n")
+    with pytest.raises(DatasetError, match="begun with other sha256"):
+        list(render(changed, whole, SPHERE, SIZE))
+
+
+def test_broken_meshes_are_recorded_and_tried_again(tmp_path):
+    meshes = make_dataset(tmp_path / "meshes", 3)
+    broken = meshes / "box/train/thing_02.off"
+    good = broken.read_bytes()
+    broken.write_bytes(good[: len(good) // 2])
+    (meshes / "box/train/thing_03.off").write_text("OFF\n1 1 0\n0 0 0\n3 0 0 0\n")
+    path = tmp_path / "views.zarr"
+    reasons = dict(render(meshes, path, SPHERE, SIZE, workers=1))
+    store = ViewStore.open(path)
+    assert store.failures == {name: reason for name, reason in reasons.items() if reason}
+    assert "cut short" in store.failures["thing_02"]
+    assert "no extent" in store.failures["thing_03"]
+    assert store.done.tolist() == [name not in store.failures for name in store.names]
+    assert next(iter(render(meshes, path, SPHERE, SIZE, workers=1)))[1]  # a later run says it again
+
+
+def test_identical_meshes_are_known_by_their_bytes(tmp_path):
+    meshes = make_dataset(tmp_path / "meshes", 4)
+    (meshes / "box/train/twin.off").write_bytes((meshes / "ball/train/thing_01.off").read_bytes())
+    list(render(meshes, tmp_path / "views.zarr", SPHERE, SIZE, workers=1))
+    store = ViewStore.open(tmp_path / "views.zarr")
+    assert [{store.names[i] for i in group} for group in store.twins] == [{"thing_01", "twin"}]
+
+
+def test_a_box_is_stored_as_it_is_seen(tmp_path):
+    """The nearest face of a box, straight ahead: its depth, its points and its silhouette are known."""
+    half = np.array([0.3, 0.5, 0.7])
+    path = tmp_path / "meshes/box/box.off"
+    path.parent.mkdir(parents=True)
+    trimesh.creation.box(2 * half * 12.5).export(path)  # in any unit
+    list(render(tmp_path / "meshes", tmp_path / "views.zarr", ViewSphere.named("40"), 224, workers=1))
+    store = ViewStore.open(tmp_path / "views.zarr")
+    half /= np.linalg.norm(half)
+    image, depth, points = store.image(0), store.depth(0), store.points(0)
+    for view, axis in [(0, 0), (2, 1), (4, 0), (6, 1)]:  # looking along -x, -y, +x, +y
+        assert depth[view, 112, 112] == pytest.approx(3 - half[axis], abs=1e-4)
+        side = 1.0 if view < 4 else -1.0
+        np.testing.assert_allclose(points[view][:, axis], side * half[axis], atol=2e-4)
+        width, height = 2 * half[1 - axis], 2 * half[2]
+        pixels = width * height * (store.intrinsics[0, 0] / (3 - half[axis])) ** 2
+        assert np.count_nonzero(depth[view]) == pytest.approx(pixels, rel=0.03)
+    np.testing.assert_array_equal(image > 0, depth > 0)
+    assert (np.abs(points) <= half + 2e-4).all()
+
+
+def test_plain_class_folders_and_repeated_names(tmp_path):
+    for label in ("cup", "jar"):
+        (tmp_path / label).mkdir()
+        (tmp_path / label / "1.off").write_text("OFF\n")
+    (tmp_path / "README.txt").write_text("not a mesh")
+    assert [(e.name, e.label, e.split) for e in list_dataset(tmp_path)] == [("cup_1", "cup", ""), ("jar_1", "jar", "")]
+    with pytest.raises(DatasetError, match="no such folder"):
+        list_dataset(tmp_path / "nowhere")
+
+
+def die_on_three(item: int) -> int:
+    if item == 3:
+        os._exit(9)
+    return item * item
+
+
+def test_an_item_that_kills_its_process_is_the_only_one_lost():
+    results = dict(each(die_on_three, range(8), workers=2))
+    assert isinstance(results.pop(3), WorkerDied)
+    assert results == {i: i * i for i in range(8) if i != 3}
+
+
+def test_a_dask_cluster_renders_the_same(dataset, whole, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    path = tmp_path / "views.zarr"
+    with distributed.LocalCluster(
+        n_workers=2, processes=True, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        names = [name for name, _ in render(dataset, path, SPHERE, SIZE, scheduler=cluster.scheduler_address)]
+    assert sorted(names) == sorted(ViewStore.open(path).names)
+    assert_same(whole, path)
+
+
+def test_no_scheduler_there(dataset, tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("nextview.data.pool.PATIENCE", "0.5s")
+    with pytest.raises(DatasetError, match="no dask scheduler"):
+        list(render(dataset, tmp_path / "views.zarr", SPHERE, SIZE, scheduler="tcp://127.0.0.1:9"))
