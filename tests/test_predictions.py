@@ -12,7 +12,7 @@ from tiny_models import make_map_network, make_recogniser
 from nextview.data.folders import DatasetError
 from nextview.data.predict import predict
 from nextview.data.predictions import Predictions, PredictionsError
-from nextview.data.render import render
+from nextview.data.render import Deform, render
 from nextview.data.store import ViewStore
 from nextview.models.card import read_card
 from nextview.models.networks import MapNetwork, Recogniser
@@ -192,11 +192,16 @@ def test_a_killed_run_goes_on_where_it_was(shop):
     np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(shop / "whole.npz").logits)
 
 
-def test_predictions_of_other_models_are_not_overwritten(shop):
+def test_predictions_of_other_models_or_views_are_not_overwritten(shop):
     recogniser, maps = cards(shop)
-    list(predict(shop / "views.zarr", shop / "kept.npz", recogniser, {}, workers=1))
+    out = shop / "kept.npz"
+    list(predict(shop / "views.zarr", out, recogniser, {}, workers=1))
     with pytest.raises(PredictionsError, match="other objects or models"):
-        list(predict(shop / "views.zarr", shop / "kept.npz", recogniser, maps, workers=1))
+        list(predict(shop / "views.zarr", out, recogniser, maps, workers=1))
+    list(render(shop / "meshes", shop / "turned.zarr", ViewSphere.named("40"), 32, deform=Deform(turn=True), workers=1))
+    with pytest.raises(PredictionsError, match="other objects or models"):
+        list(predict(shop / "turned.zarr", out, recogniser, {}, workers=1))
+    assert list(predict(shop / "views.zarr", out, recogniser, {}, workers=1)) == [(6, 6)]  # done already
 
 
 def test_a_class_that_the_recogniser_does_not_know_is_named(shop, tmp_path):

@@ -17,6 +17,7 @@ def predict(
     maps: tuple[str, ...] = ("lem",),
     batch: int = 8,
     workers: int | None = None,
+    scheduler: str | None = None,
 ) -> None:
     """Run the recogniser and the map networks over every view of a store, once. Resumes where it was.
 
@@ -28,6 +29,7 @@ def predict(
         maps: maps to predict with the bundled networks, or NAME=CARD for others.
         batch: views a call of the networks.
         workers: processes; one for each core by default.
+        scheduler: address of a dask.distributed scheduler, to use its workers instead.
     """
     from nextview.cli.progress import track
     from nextview.data import predict as job
@@ -42,6 +44,6 @@ def predict(
         if not card and name not in MAPS:
             raise ModelError(f"no bundled network predicts the map {name!r}; there are {', '.join(MAPS)}")
         cards[name] = find_card(card or MAPS[name])
-    steps = job.predict(store, out, find_card(recogniser or RECOGNISER), cards, split, batch, workers)
+    steps = job.predict(store, out, find_card(recogniser or RECOGNISER), cards, split, batch, workers, scheduler)
     _, total = next(steps)
     track((done for done, _ in steps), total, f"predicting {store.name}")

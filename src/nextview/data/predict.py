@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
 import shutil
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nextview.data.folders import DatasetError
+from nextview.data.pool import WorkerDied, each
 from nextview.data.predictions import Predictions, PredictionsError
 from nextview.data.store import ViewStore
 from nextview.models.card import Card
@@ -41,6 +41,7 @@ def predict(
     split: str | None = None,
     batch: int = 8,
     workers: int | None = None,
+    scheduler: str | None = None,
 ) -> Iterator[tuple[int, int]]:
     """Write the predictions of a store's rendered objects.
 
@@ -54,13 +55,14 @@ def predict(
         split: only this split.
         batch: views a call of the networks.
         workers: processes; one for each core by default.
+        scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
 
     Yields:
         Objects done so far, and how many there are.
 
     Raises:
         DatasetError: the store holds no such objects, or a class that the recogniser does not know.
-        PredictionsError: ``out`` is there and comes from another store or from other models.
+        PredictionsError: ``out`` is there and comes from another store or other models, or an object kills its process.
     """
     store = ViewStore.open(path)
     chosen = np.flatnonzero(store.done & (True if split is None else store.splits == split))
@@ -72,37 +74,40 @@ def predict(
         raise DatasetError(f"{path}: recogniser {recogniser.name} does not know the class {unknown[0]!r}")
     names = tuple(store.names[i] for i in chosen)
     models = {kind: (card.name, card.sha256) for kind, card in {"recogniser": recogniser, **maps}.items()}
+    entropy = store.measure()[chosen]  # differs where the views do
     if out.exists():
         there = Predictions.load(out)
-        if (there.names, there.models) != (names, models):
+        if (there.names, there.models) != (names, models) or not np.array_equal(there.depth_entropy, entropy):
             raise PredictionsError(f"{out}: was made from other objects or models; give another name or remove it")
         yield len(names), len(names)
         return
 
+    recipe = {"names": names, "models": models, "views": hashlib.sha256(entropy.tobytes()).hexdigest()}
     n, v, rings = len(chosen), len(store.sphere), store.sphere.rings
     shapes = {"logits": (n, v, len(classes)), **{f"map_{name}": (n, v, rings, 3) for name in maps}}
-    arrays = _begin(out.with_name(out.name + ".part"), {"names": names, "models": models}, shapes)
+    arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
     # Logits are written last: an object counts as done when none of its logits is the NaN that the file began with.
     todo = np.flatnonzero(np.isnan(arrays["logits"]).any((1, 2)))
     total = n - len(todo)
     yield total, n
-    with ProcessPoolExecutor(
-        workers or os.cpu_count(), get_context("spawn"), _open, (path, recogniser, maps, batch)
-    ) as pool:
-        try:
-            jobs = {pool.submit(_predict_object, int(chosen[row])): row for row in todo}
-            for job in as_completed(jobs):
-                for name, values in job.result().items():
-                    arrays[name][jobs[job]] = values
-                total += 1
-                yield total, n
-        finally:
-            pool.shutdown(cancel_futures=True)
+    paths = (
+        recogniser.path.with_suffix(".json").absolute(),
+        tuple((kind, card.path.with_suffix(".json").absolute()) for kind, card in maps.items()),
+    )
+    say = partial(_predict_object, path.absolute(), *paths, batch)
+    row = {int(i): at for at, i in enumerate(chosen)}
+    for i, found in each(say, [int(i) for i in chosen[todo]], workers, scheduler):
+        if isinstance(found, WorkerDied):
+            raise PredictionsError(f"{path}: object {store.names[i]} cannot be predicted: {found}")
+        for name, values in found.items():
+            arrays[name][row[i]] = values
+        total += 1
+        yield total, n
 
     Predictions(
         np.array(arrays["logits"]),
         {name: np.array(arrays[f"map_{name}"]) for name in maps},
-        store.measure()[chosen],
+        entropy,
         names,
         np.array([classes.index(store.classes[label]) for label in store.labels[chosen]]),
         classes,
@@ -131,29 +136,26 @@ def _begin(part: Path, recipe: dict, shapes: dict[str, tuple[int, ...]]) -> dict
     return arrays
 
 
-_store: ViewStore
-_recogniser: Recogniser
-_maps: dict[str, MapNetwork]
-_batch: int
-
-
-def _open(path: Path, recogniser: Card, maps: dict[str, Card], batch: int) -> None:
+@lru_cache(maxsize=1)
+def _open(
+    path: Path, recogniser: Path, maps: tuple[tuple[str, Path], ...]
+) -> tuple[ViewStore, Recogniser, dict[str, MapNetwork]]:
     """Each process has its own store and networks, and one thread: objects are what runs side by side."""
-    global _store, _recogniser, _maps, _batch
-    _store, _batch = ViewStore.open(path), batch
-    _recogniser = Recogniser(recogniser.path.with_suffix(".json"), threads=1)
-    _maps = {name: MapNetwork(card.path.with_suffix(".json"), threads=1) for name, card in maps.items()}
+    networks = {name: MapNetwork(card, threads=1) for name, card in maps}
+    return ViewStore.open(path), Recogniser(recogniser, threads=1), networks
 
 
-def _predict_object(i: int) -> dict[str, NDArray[np.float32]]:
+def _predict_object(
+    path: Path, recogniser: Path, maps: tuple[tuple[str, Path], ...], batch: int, i: int
+) -> dict[str, NDArray[np.float32]]:
     """Maps and logits of all views of one object, by the names of their files; the logits last."""
-    poses, intrinsics = _store.sphere.poses, _store.intrinsics
-    depth, points = _store.depth(i), _store.points(i)
+    store, names_it, networks = _open(path, recogniser, maps)
+    poses, intrinsics = store.sphere.poses, store.intrinsics
+    depth, clouds = store.depth(i), cloud_input(store.points(i), store.sphere.poses)
     # One view at a time stays in the processor's cache.
     inputs = np.concatenate(
-        [geometry_input(depth[v : v + 1], poses[v : v + 1], intrinsics, _recogniser.size) for v in range(len(poses))]
+        [geometry_input(depth[v : v + 1], poses[v : v + 1], intrinsics, names_it.size) for v in range(len(poses))]
     )
-    clouds = cloud_input(points, poses)
-    parts = [slice(start, start + _batch) for start in range(0, len(poses), _batch)]
-    found = {f"map_{name}": np.concatenate([net.from_clouds(clouds[p]) for p in parts]) for name, net in _maps.items()}
-    return {**found, "logits": np.concatenate([_recogniser.from_inputs(inputs[p])[0] for p in parts])}
+    parts = [slice(start, start + batch) for start in range(0, len(poses), batch)]
+    found = {f"map_{k}": np.concatenate([net.from_clouds(clouds[p]) for p in parts]) for k, net in networks.items()}
+    return {**found, "logits": np.concatenate([names_it.from_inputs(inputs[p])[0] for p in parts])}
