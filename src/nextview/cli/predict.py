@@ -33,6 +33,7 @@ def predict(
     """
     from nextview.cli.progress import track
     from nextview.data import predict as job
+    from nextview.data.store import ViewStore
     from nextview.models.card import ModelError, find_card
     from nextview.models.networks import MAPS, RECOGNISER
 
@@ -45,5 +46,5 @@ def predict(
             raise ModelError(f"no bundled network predicts the map {name!r}; there are {', '.join(MAPS)}")
         cards[name] = find_card(card or MAPS[name])
     steps = job.predict(store, out, find_card(recogniser or RECOGNISER), cards, split, batch, workers, scheduler)
-    _, total = next(steps)
-    track((done for done, _ in steps), total, f"predicting {store.name}")
+    before, total = next(steps)
+    track((done for done, _ in steps), total, f"predicting {store.name}", before, len(ViewStore.open(store).sphere))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.data.folders import DatasetError
+from nextview.data.lock import only_one
 from nextview.data.pool import WorkerDied, each
 from nextview.data.predictions import Predictions, PredictionsError
 from nextview.data.store import ViewStore
@@ -61,7 +62,8 @@ def predict(
         Objects done so far, and how many there are.
 
     Raises:
-        DatasetError: the store holds no such objects, or a class that the recogniser does not know.
+        DatasetError: the store holds no such objects, or a class that the recogniser does not know, or another run is
+            writing ``out``.
         PredictionsError: ``out`` is there and comes from another store or other models, or an object kills its process.
     """
     store = ViewStore.open(path)
@@ -83,41 +85,42 @@ def predict(
         return
 
     recipe = {"names": names, "models": models, "views": hashlib.sha256(entropy.tobytes()).hexdigest()}
-    n, v, rings = len(chosen), len(store.sphere), store.sphere.rings
-    shapes = {"logits": (n, v, len(classes)), **{f"map_{name}": (n, v, rings, 3) for name in maps}}
-    arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
-    # Logits are written last: an object counts as done when none of its logits is the NaN that the file began with.
-    todo = np.flatnonzero(np.isnan(arrays["logits"]).any((1, 2)))
-    total = n - len(todo)
-    yield total, n
-    paths = (
-        recogniser.path.with_suffix(".json").absolute(),
-        tuple((kind, card.path.with_suffix(".json").absolute()) for kind, card in maps.items()),
-    )
-    say = partial(_predict_object, path.absolute(), *paths, batch)
-    row = {int(i): at for at, i in enumerate(chosen)}
-    for i, found in each(say, [int(i) for i in chosen[todo]], workers, scheduler):
-        if isinstance(found, WorkerDied):
-            raise PredictionsError(f"{path}: object {store.names[i]} cannot be predicted: {found}")
-        for name, values in found.items():
-            arrays[name][row[i]] = values
-        total += 1
+    with only_one(out):
+        n, v, rings = len(chosen), len(store.sphere), store.sphere.rings
+        shapes = {"logits": (n, v, len(classes)), **{f"map_{name}": (n, v, rings, 3) for name in maps}}
+        arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
+        # Logits are written last: an object counts as done when none of its logits is the NaN that the file began with.
+        todo = np.flatnonzero(np.isnan(arrays["logits"]).any((1, 2)))
+        total = n - len(todo)
         yield total, n
+        paths = (
+            recogniser.path.with_suffix(".json").absolute(),
+            tuple((kind, card.path.with_suffix(".json").absolute()) for kind, card in maps.items()),
+        )
+        say = partial(_predict_object, path.absolute(), *paths, batch)
+        row = {int(i): at for at, i in enumerate(chosen)}
+        for i, found in each(say, [int(i) for i in chosen[todo]], workers, scheduler):
+            if isinstance(found, WorkerDied):
+                raise PredictionsError(f"{path}: object {store.names[i]} cannot be predicted: {found}")
+            for name, values in found.items():
+                arrays[name][row[i]] = values
+            total += 1
+            yield total, n
 
-    Predictions(
-        np.array(arrays["logits"]),
-        {name: np.array(arrays[f"map_{name}"]) for name in maps},
-        entropy,
-        names,
-        np.array([classes.index(store.classes[label]) for label in store.labels[chosen]]),
-        classes,
-        store.splits[chosen],
-        conflicting_objects(store)[chosen],
-        store.sphere,
-        models,
-        {name: tuple(card.facts.get("valley_classes", ())) for name, card in maps.items()},
-    ).save(out)
-    shutil.rmtree(out.with_name(out.name + ".part"))
+        Predictions(
+            np.array(arrays["logits"]),
+            {name: np.array(arrays[f"map_{name}"]) for name in maps},
+            entropy,
+            names,
+            np.array([classes.index(store.classes[label]) for label in store.labels[chosen]]),
+            classes,
+            store.splits[chosen],
+            conflicting_objects(store)[chosen],
+            store.sphere,
+            models,
+            {name: tuple(card.facts.get("valley_classes", ())) for name, card in maps.items()},
+        ).save(out)
+        shutil.rmtree(out.with_name(out.name + ".part"))
 
 
 def _begin(part: Path, recipe: dict, shapes: dict[str, tuple[int, ...]]) -> dict[str, np.memmap]:
