@@ -161,8 +161,8 @@ def test_a_disk_full_from_the_start_leaves_no_store(dataset, tmp_path):
 
 def test_two_runs_on_one_store_refuse_each_other(dataset, whole):
     with only_one(whole), pytest.raises(DatasetError, match="another run"):
-        list(render(dataset, whole, SPHERE, SIZE, workers=1))
-    assert list(render(dataset, whole, SPHERE, SIZE, workers=1)) == []  # and it has nothing left to do
+        list(render(dataset, whole, SPHERE, SIZE, workers=0))
+    assert list(render(dataset, whole, SPHERE, SIZE, workers=0)) == []  # and it has nothing left to do
 
 
 def test_other_settings_or_meshes_are_refused(dataset, whole, tmp_path):
@@ -183,19 +183,19 @@ def test_broken_meshes_are_recorded_and_tried_again(tmp_path):
     broken.write_bytes(good[: len(good) // 2])
     (meshes / "box/train/thing_03.off").write_text("OFF\n1 1 0\n0 0 0\n3 0 0 0\n")
     path = tmp_path / "views.zarr"
-    reasons = dict(render(meshes, path, SPHERE, SIZE, workers=1))
+    reasons = dict(render(meshes, path, SPHERE, SIZE, workers=0))
     store = ViewStore.open(path)
     assert store.failures == {name: reason for name, reason in reasons.items() if reason}
     assert "cut short" in store.failures["thing_02"]
     assert "no extent" in store.failures["thing_03"]
     assert store.done.tolist() == [name not in store.failures for name in store.names]
-    assert next(iter(render(meshes, path, SPHERE, SIZE, workers=1)))[1]  # a later run says it again
+    assert next(iter(render(meshes, path, SPHERE, SIZE, workers=0)))[1]  # a later run says it again
 
 
 def test_identical_meshes_are_known_by_their_bytes(tmp_path):
     meshes = make_dataset(tmp_path / "meshes", 4)
     (meshes / "box/train/twin.off").write_bytes((meshes / "ball/train/thing_01.off").read_bytes())
-    list(render(meshes, tmp_path / "views.zarr", SPHERE, SIZE, workers=1))
+    list(render(meshes, tmp_path / "views.zarr", SPHERE, SIZE, workers=0))
     store = ViewStore.open(tmp_path / "views.zarr")
     assert [{store.names[i] for i in group} for group in store.twins] == [{"thing_01", "twin"}]
 
@@ -206,7 +206,7 @@ def test_a_box_is_stored_as_it_is_seen(tmp_path):
     path = tmp_path / "meshes/box/box.off"
     path.parent.mkdir(parents=True)
     trimesh.creation.box(2 * half * 12.5).export(path)  # in any unit
-    list(render(tmp_path / "meshes", tmp_path / "views.zarr", ViewSphere.named("40"), 224, workers=1))
+    list(render(tmp_path / "meshes", tmp_path / "views.zarr", ViewSphere.named("40"), 224, workers=0))
     store = ViewStore.open(tmp_path / "views.zarr")
     half /= np.linalg.norm(half)
     image, depth, points = store.image(0), store.depth(0), store.points(0)

@@ -38,7 +38,7 @@ def each(
     Args:
         function: what to call.
         items: hashable, begun in this order.
-        workers: processes; one for each core by default.
+        workers: processes; one for each core by default; 0 to work in this one.
         scheduler: address of a dask.distributed scheduler, to use its workers instead of this machine's cores.
 
     Raises:
@@ -46,6 +46,9 @@ def each(
     """
     if scheduler is not None:
         yield from _on_cluster(function, items, scheduler)
+        return
+    if workers == 0:
+        yield from ((item, function(item)) for item in items)
         return
     workers = workers or os.cpu_count() or 1
     waiting = list(items)
