@@ -43,7 +43,7 @@ def fit(
         precision="bf16-mixed",
         accelerator="auto",
         logger=CSVLogger(out, "log", ""),
-        callbacks=[ModelCheckpoint(out, "best", save_last=True, save_top_k=0), EpochSeed()],
+        callbacks=[ModelCheckpoint(out, "epoch", save_last=True), EpochSeed()],
         enable_model_summary=False,
         reload_dataloaders_every_n_epochs=1,
     )

@@ -25,7 +25,7 @@ class RecogniserRecipe:
 
     depth: int = 18
     size: int = 112
-    epochs: int = 14
+    epochs: int = 12
     views: int = 8
     batch: int = 64
     rate: float = 2e-3
@@ -51,7 +51,7 @@ class LemRecipe:
         seed: decides everything random.
     """
 
-    epochs: int = 8
+    epochs: int = 6
     views: int = 8
     points: int = 256
     batch: int = 16

@@ -1,0 +1,231 @@
+"""``nextview export``: from a training run to an ONNX model with its card."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tyro
+
+Positional = tyro.conf.Positional
+
+
+def export_recogniser(
+    run: Positional[Path],
+    store: Positional[Path],
+    out: Positional[Path],
+    /,
+    name: str = "resnet18-modelnet10",
+    note: str = "",
+) -> None:
+    """Export a trained recogniser: ONNX, calibrated on validation views, with a card of scores on validation and test.
+
+    Args:
+        run: folder made by nextview train recogniser.
+        store: the store that it was trained on.
+        out: folder for NAME.onnx and NAME.json.
+        name: what to call the model.
+        note: what else the card should say.
+    """
+    import json
+
+    import numpy as np
+    import torch
+
+    from nextview.cli.progress import console
+    from nextview.data.split import split_training, test_objects
+    from nextview.data.store import ViewStore
+    from nextview.models.card import ModelError
+    from nextview.models.geometry_input import CHANNELS
+    from nextview.models.networks import Recogniser
+    from nextview.training.export import CalibratedRecogniser, export_onnx, fit_temperature
+    from nextview.training.inputs import load_inputs
+    from nextview.training.networks import ResNet
+    from nextview.training.recipes import RecogniserRecipe
+    from nextview.training.scores import recogniser_scores
+
+    recipe = RecogniserRecipe(**json.loads((run / "recipe.json").read_text()))
+    views = ViewStore.open(store)
+    inputs = load_inputs(store, recipe.size)
+    training, validation = split_training(views, recipe.validation, recipe.seed)
+    network = ResNet(recipe.depth, len(views.classes), len(CHANNELS))
+    network.load_state_dict(torch.load(run / "network.pt", weights_only=True))
+    network.eval()
+
+    out.mkdir(parents=True, exist_ok=True)
+    weights, card = out / f"{name}.onnx", out / f"{name}.json"
+    facts = {
+        "name": name,
+        "kind": "recogniser",
+        "network": f"ResNet-{recipe.depth}",
+        "input": "4 channels from a depth image and its pose: facing, up, height, nearness; uint8, 0 = background",
+        "input_size": recipe.size,
+        "classes": views.classes,
+        "temperature": 1.0,
+    }
+    example = torch.from_numpy(np.array(inputs[validation[0], :2]))
+    export_onnx(CalibratedRecogniser(network, 1.0), example, "input", ["logits", "features"], weights)
+    _write_card(card, weights, facts)
+    raw = _all_logits(Recogniser(card), inputs, validation, "validation views")
+    labels = views.labels
+    temperature = fit_temperature(raw.reshape(-1, raw.shape[2]), np.repeat(labels[validation], raw.shape[1]))
+
+    shipped = CalibratedRecogniser(network, temperature).eval()
+    export_onnx(shipped, example, "input", ["logits", "features"], weights)
+    _write_card(card, weights, facts)
+    recogniser = Recogniser(card)
+    sample = np.array(inputs[validation[:: max(1, len(validation) // 8)][:8], 5])
+    with torch.no_grad():
+        difference = float(np.abs(shipped(torch.from_numpy(sample))[0].numpy() - recogniser.from_inputs(sample)[0]).max())
+    console.print(f"largest difference between torch and ONNX logits on real views: {difference:.2g}")
+    if not difference < 0.1:
+        raise ModelError(f"{weights}: its logits differ from the network's by up to {difference:.2g}")
+    test = test_objects(views)
+    tested = _all_logits(recogniser, inputs, test, "test views")
+    facts |= {
+        "temperature": round(temperature, 4),
+        "training": {
+            "data": f"{len(training)} objects of the training split of {len(views.classes)} classes, {len(views.sphere)} views each",
+            "recipe": json.loads((run / "recipe.json").read_text()),
+        },
+        "scores": {
+            f"validation ({len(validation)} objects of the training split)": recogniser_scores(raw, labels[validation]),
+            f"test ({len(test)} objects)": recogniser_scores(tested, labels[test]),
+        },
+        "largest_difference_to_torch": round(difference, 4),
+        "note": note,
+    }
+    _write_card(card, weights, facts)
+
+
+def export_lem(
+    run: Positional[Path],
+    store: Positional[Path],
+    out: Positional[Path],
+    /,
+    recogniser: str = "resnet18-modelnet10",
+    name: str = "lem-modelnet10",
+    note: str = "",
+) -> None:
+    """Export a trained LEM: ONNX, with a card of scores and the classes that prefer the valley, chosen on validation.
+
+    Args:
+        run: folder made by nextview train lem.
+        store: the store that it was trained on.
+        out: folder for NAME.onnx and NAME.json.
+        recogniser: the model, or its card, whose beliefs decide which classes prefer the valley.
+        name: what to call the model.
+        note: what else the card should say.
+    """
+    import json
+
+    import numpy as np
+    import torch
+
+    from nextview.cli.progress import console
+    from nextview.data.split import split_training, test_objects
+    from nextview.data.store import POINT_UNIT, ViewStore
+    from nextview.measures.depth_entropy import normalise_per_object
+    from nextview.models.card import ModelError
+    from nextview.models.cloud_input import cloud_input
+    from nextview.models.networks import MapNetwork, Recogniser
+    from nextview.training.export import MapOnly, export_onnx
+    from nextview.training.inputs import load_inputs
+    from nextview.training.networks import PointNet
+    from nextview.training.recipes import LemRecipe
+    from nextview.training.scores import map_scores
+    from nextview.training.valleys import valley_gains
+
+    recipe = LemRecipe(**json.loads((run / "recipe.json").read_text()))
+    views = ViewStore.open(store)
+    sphere = views.sphere
+    training, validation = split_training(views, recipe.validation, recipe.seed)
+    test = test_objects(views)
+    network = PointNet(sphere.rings)
+    network.load_state_dict(torch.load(run / "network.pt", weights_only=True))
+    shipped = MapOnly(network).eval()
+
+    out.mkdir(parents=True, exist_ok=True)
+    weights, card = out / f"{name}.onnx", out / f"{name}.json"
+    points = np.stack([views.points(int(i)) for i in validation[:2]])[:, 3]
+    clouds = cloud_input(points, sphere.poses[[3, 3]])
+    export_onnx(shipped, torch.from_numpy(clouds), "cloud", ["map"], weights)
+    facts = {
+        "name": name,
+        "kind": "lem",
+        "network": "PointNet with both transforms",
+        "input": "1,024 visible points, upright, camera at azimuth zero, scaled to [0, 1] by their own extent",
+        "output": f"depth-entropy, 0 .. 1 over the object's views, of {sphere.rings} rings x azimuth -1, 0, +1",
+    }
+    _write_card(card, weights, facts)
+    predictor = MapNetwork(card)
+    with torch.no_grad():
+        difference = float(np.abs(shipped(torch.from_numpy(clouds)).numpy() - predictor.from_clouds(clouds)).max())
+    console.print(f"largest difference between torch and ONNX maps on real views: {difference:.2g}")
+    if not difference < 0.02:
+        raise ModelError(f"{weights}: its maps differ from the network's by up to {difference:.2g}")
+
+    true = normalise_per_object(views.measure())[:, sphere.windows]
+    stored = views.all_points()
+
+    def predict(objects: np.ndarray, what: str) -> np.ndarray:
+        def one(i: int) -> np.ndarray:
+            return predictor.from_clouds(cloud_input(stored[i] * np.float32(POINT_UNIT), sphere.poses))
+
+        return _tracked(one, objects, what)
+
+    valid_maps, test_maps = predict(validation, "validation maps"), predict(test, "test maps")
+    judge = Recogniser(recogniser)
+    logits = _all_logits(judge, load_inputs(store, judge.size), validation, "validation views")
+    gains = valley_gains(sphere, logits, valid_maps, views.labels[validation])
+    shape = (-1, sphere.rings, 3)
+    facts |= {
+        "training": {
+            "data": f"{len(training)} objects of the training split, {len(sphere)} views each",
+            "recipe": json.loads((run / "recipe.json").read_text()),
+        },
+        "scores": {
+            f"validation ({len(validation)} objects of the training split)": map_scores(
+                valid_maps.reshape(shape), true[validation].reshape(shape)
+            ),
+            f"test ({len(test)} objects)": map_scores(test_maps.reshape(shape), true[test].reshape(shape)),
+        },
+        "valley_gain_on_validation": {views.classes[c]: round(gain, 4) for c, gain in gains.items()},
+        "valley_classes": [views.classes[c] for c, gain in gains.items() if gain > 0],
+        "largest_difference_to_torch": round(difference, 4),
+        "note": note,
+    }
+    _write_card(card, weights, facts)
+
+
+def _write_card(card: Path, weights: Path, facts: dict) -> None:
+    import json
+
+    from nextview.models.card import file_hash
+
+    part = card.with_suffix(".part")
+    part.write_text(json.dumps(facts | {"sha256": file_hash(weights)}, indent=1) + "\n")
+    part.rename(card)
+
+
+def _tracked(one, objects, what: str):  # noqa: ANN001, ANN202
+    """Stack what ``one`` gives for each object, behind a progress bar."""
+    import numpy as np
+
+    from nextview.cli.progress import track
+
+    found = []
+
+    def done():  # noqa: ANN202
+        for i in objects:
+            found.append(one(i))
+            yield len(found)
+
+    track(done(), len(objects), what)
+    return np.stack(found)
+
+
+def _all_logits(recogniser, inputs, objects, what: str):  # noqa: ANN001, ANN202
+    """Logits (objects, V, classes) of all views."""
+    import numpy as np
+
+    return _tracked(lambda i: recogniser.from_inputs(np.ascontiguousarray(inputs[i]))[0], objects, what)

@@ -1,0 +1,105 @@
+"""From a trained network to an ONNX file that gives the same answers, with half-precision weights."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+from torch import Tensor, nn
+
+OPSET = 18
+
+
+class CalibratedRecogniser(nn.Module):
+    """The recogniser as it ships: raw input bytes in, logits over a temperature and pooled features out."""
+
+    def __init__(self, network: nn.Module, temperature: float) -> None:
+        super().__init__()
+        self.network, self.temperature = network, temperature
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        logits, features = self.network(x.float() / 255)
+        return logits / self.temperature, features
+
+
+class MapOnly(nn.Module):
+    """A map network without the transforms that only training needs."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, cloud: Tensor) -> Tensor:
+        return self.network(cloud)[0]
+
+
+def export_onnx(network: nn.Module, example: Tensor, inputs: str, outputs: list[str], path: Path) -> None:
+    """Write a network as ONNX, batch size free, weights in half precision and arithmetic in single.
+
+    Args:
+        network: in evaluation mode.
+        example: an input, (B, ...), B at least 2.
+        inputs: name of the input.
+        outputs: names of the outputs.
+        path: the file, written aside and renamed.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            network.eval(),
+            (example,),
+            dynamo=True,
+            input_names=[inputs],
+            output_names=outputs,
+            dynamic_shapes=({0: torch.export.Dim("batch")},),
+            opset_version=OPSET,
+            verbose=False,
+        )
+    model = halve_weights(program.model_proto)
+    onnx.checker.check_model(model, full_check=True)
+    part = path.with_suffix(".part")
+    onnx.save(model, part)
+    part.rename(path)
+
+
+def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Store large float32 weights as float16 and cast them back where they are used: half the file, same arithmetic."""
+    casts = []
+    for weight in model.graph.initializer:
+        if weight.data_type != TensorProto.FLOAT or np.prod(weight.dims) < 1024:
+            continue
+        name = weight.name
+        half = numpy_helper.from_array(numpy_helper.to_array(weight).astype(np.float16), name + "_half")
+        weight.CopyFrom(half)
+        casts.append(helper.make_node("Cast", [half.name], [name], to=TensorProto.FLOAT))
+    nodes = [*casts, *model.graph.node]
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    return model
+
+
+def fit_temperature(logits: NDArray[np.floating], labels: NDArray[np.int64]) -> float:
+    """The temperature that gives single views the best likelihood, every class weighted evenly.
+
+    Args:
+        logits: of single views, (M, classes).
+        labels: their classes, (M,).
+
+    Returns:
+        What to divide the logits by (Guo et al., "On calibration of modern neural networks", ICML 2017).
+    """
+    from scipy.optimize import minimize_scalar
+    from scipy.special import log_softmax
+
+    weight = (1 / np.bincount(labels, minlength=logits.shape[1]).clip(1))[labels]
+
+    def loss(log_temperature: float) -> float:
+        scaled = log_softmax(logits / np.exp(log_temperature), axis=1)
+        return -float((weight * scaled[np.arange(len(labels)), labels]).sum() / weight.sum())
+
+    return float(np.exp(minimize_scalar(loss, bounds=(-3, 3), method="bounded").x))
