@@ -9,7 +9,7 @@ from skimage.measure import perimeter_crofton
 from nextview.data.folders import DatasetError
 from nextview.data.measure import measure
 from nextview.data.render import render
-from nextview.data.store import ViewStore
+from nextview.data.store import DEPTH_UNIT, ViewStore
 from nextview.measures.depth_spread import BIN, depth_distribution, max_depth
 from nextview.measures.registry import MEASURES
 from nextview.measures.silhouette import silhouette_area, silhouette_length
@@ -84,7 +84,8 @@ def test_measures_are_kept_in_the_store_and_not_made_twice(views):
     store = ViewStore.open(views)
     row = store.names.index("ball")
     for name, function in MEASURES.items():
-        np.testing.assert_allclose(store.measure(name)[row], [function(d) for d in store.depth(row)], rtol=1e-3)
+        depth = store.group["depth"][row] * DEPTH_UNIT
+        np.testing.assert_allclose(store.measure(name)[row], [function(d) for d in depth], rtol=1e-6)
         np.testing.assert_allclose(store.measure(name)[row], function(ball(96)), rtol=0.05)  # alike from all sides
     np.testing.assert_array_equal(store.measure(), before)
     assert np.isnan(store.measure("max_depth")[store.names.index("broken")]).all()
