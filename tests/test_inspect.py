@@ -1,0 +1,71 @@
+"""What the pictures of a store say is what the store holds."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from nextview.cli.inspect import inspect
+from nextview.data.folders import DatasetError
+from nextview.data.measure import measure
+from nextview.data.render import render
+from nextview.data.store import ViewStore
+from nextview.report.store_figures import disk_use, object_figure, store_figure, summary
+from nextview.viewsphere import ViewSphere
+
+SPHERE = ViewSphere.named("40")
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("shop")
+    for i in range(5):
+        label = "box" if i < 3 else "ball"
+        path = folder / "meshes" / label / ("train" if i % 2 else "test") / f"thing_{i}.off"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        (trimesh.creation.box([1, 2, 3 + i]) if i < 3 else trimesh.creation.icosphere(2)).export(path)
+    (folder / "meshes/box/train/broken.off").write_text("OFF\n")
+    list(render(folder / "meshes", folder / "views.zarr", SPHERE, 32, workers=0))
+    return folder / "views.zarr"
+
+
+def test_summary_counts(views):
+    facts = summary(ViewStore.open(views))
+    assert facts["objects"] == "6 in 2 classes"
+    assert (facts["rendered"], facts["left out"], facts["not rendered yet"]) == ("5", "1", "0")
+    assert facts["views"].startswith("200 ")
+    assert facts["byte-identical copies"] == "1  (0 with several labels)"  # the two balls
+    assert sum(disk_use(ViewStore.open(views)).values()) == sum(
+        p.stat().st_size for p in views.rglob("*") if p.is_file()
+    )
+
+
+def test_bars_are_as_long_as_the_classes(views):
+    bars = store_figure(ViewStore.open(views)).subfigs[0].axes[0].containers
+    counts = {bar.get_label(): [patch.get_width() for patch in bar] for bar in bars}
+    assert counts == {"train": [1, 1], "test": [1, 2], "not rendered": [0, 1]}  # ball, box
+
+
+def test_an_object_is_drawn_with_the_horizon_lowest(views):
+    list(measure(views, workers=0))
+    store = ViewStore.open(views)
+    row = store.names.index("thing_0")
+    top, bottom = object_figure(store, row).subfigs
+    mosaic = top.axes[0].images[0].get_array()
+    np.testing.assert_array_equal(mosaic[-32:, 32:64], store.image(row)[1])  # ring 0, azimuth 1
+    np.testing.assert_array_equal(mosaic[:32, -32:], store.image(row)[39])
+    np.testing.assert_array_equal(bottom.axes[0].images[0].get_array().ravel(), store.measure()[row])
+    assert len([axes for axes in bottom.axes if axes.get_title()]) == len(list(store.group["measures"]))
+
+
+def test_the_command_draws_or_says_why_not(views, tmp_path):
+    inspect(views, tmp_path / "store.png")
+    inspect(views, tmp_path / "thing.svg", object="thing_3")
+    assert (tmp_path / "store.png").read_bytes().startswith(b"\x89PNG")
+    assert b"<svg" in (tmp_path / "thing.svg").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["store.png", "thing.svg"]
+    with pytest.raises(DatasetError, match="has no object 'thin'; there are thing_"):
+        inspect(views, tmp_path / "x.png", object="thin")
+    with pytest.raises(DatasetError, match="broken is not rendered"):
+        inspect(views, tmp_path / "x.png", object="broken")
+    with pytest.raises(DatasetError, match=r"\.png, \.pdf or \.svg"):
+        inspect(views, tmp_path / "x.txt")
