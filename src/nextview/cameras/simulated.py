@@ -51,14 +51,18 @@ class SimulatedCamera:
         rays = self._rays[bound].reshape(-1, 3) @ rotation.T
         if len(rays):
             hits = self._scene.run(np.broadcast_to(origin, rays.shape).copy(), rays, output=1)
-            seen = hits["primID"] >= 0
-            normals = hits["Ng"]
-            cosine = np.abs(np.einsum("ij,ij->i", normals, rays))
-            cosine /= np.sqrt(np.einsum("ij,ij->i", normals, normals)) * self._ray_length[bound].ravel() + 1e-30
-            shade = np.where(seen, 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5, 0).astype(np.uint8)
-            shape = depth[bound].shape
-            image[bound] = shade.reshape(shape)
-            depth[bound] = np.where(seen, hits["tfar"], 0).reshape(shape)
+            seen = np.flatnonzero(hits["primID"] >= 0)
+            normals, towards = np.take(hits["Ng"], seen, 0), np.take(rays, seen, 0)
+            cosine = np.abs(np.einsum("ij,ij->i", normals, towards))
+            lengths = np.sqrt(np.einsum("ij,ij->i", normals, normals)) * np.take(self._ray_length[bound], seen)
+            cosine /= lengths + 1e-30
+            window = depth[bound].shape
+            shade = np.zeros(len(rays), np.uint8)
+            shade[seen] = 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5
+            distance = np.zeros(len(rays), np.float32)
+            distance[seen] = np.take(hits["tfar"], seen)
+            image[bound] = shade.reshape(window)
+            depth[bound] = distance.reshape(window)
         points = visible_points(depth, pose, self.intrinsics, self.seed)
         return Observation(image, depth, points, pose, self.intrinsics)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
+import zarr
 
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.folders import DatasetError, Entry, list_dataset
@@ -170,7 +171,9 @@ def _render_entry(
         arrays = render_object(mesh, sphere, size)
     except MeshError as error:
         return str(error)
-    for name, values in arrays.items():
-        store.group[name][i] = values
-    store.group["status"][i] = DONE  # last, so that an object counts only when it is whole
+    # Finding out whether a chunk is worth writing costs more than writing it.
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        for name, values in arrays.items():
+            store.group[name][i] = values
+        store.group["status"][i] = DONE  # last, so that an object counts only when it is whole
     return None

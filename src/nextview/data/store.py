@@ -74,7 +74,7 @@ class ViewStore:
             chunks=(1, *shape),
             dtype=dtype,
             fill_value=fill,
-            compressors=(BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle"), Crc32cCodec()),
+            compressors=(BloscCodec(cname="zstd", clevel=2, shuffle="shuffle"), Crc32cCodec()),
         )
 
     @classmethod
