@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,6 +76,8 @@ def make_mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], name: 
         raise MeshError(f"{name}: the mesh has no extent, all its vertices are in one place")
     vertices /= reach
     radius = np.sqrt((vertices**2).sum(1).max())
+    if reach > np.finfo(float).max / radius:
+        raise MeshError(f"{name}: the mesh is too large, its radius is not a finite number")
     return Mesh(vertices / radius, faces.astype(np.int32), centre, float(radius * reach), name)
 
 
@@ -122,13 +125,46 @@ def _read_with_trimesh(data: bytes, suffix: str) -> tuple[NDArray[np.float64], N
 
     import trimesh  # a third of a second to import, and OFF does not need it
 
-    if suffix == ".stl" and len(data) > 84 and not data.lstrip()[:5].lower() == b"solid":
-        facets = int.from_bytes(data[80:84], "little")
-        if len(data) < 84 + 50 * facets:
-            raise ValueError(f"the file is cut short, {facets} faces announced, {(len(data) - 84) // 50} found")
+    damage = _DAMAGE.get(suffix, lambda data: None)(data)
+    if damage:
+        raise ValueError(damage)
     loaded = trimesh.load(io.BytesIO(data), file_type=suffix[1:], process=False)
     if isinstance(loaded, trimesh.Scene):
         loaded = loaded.to_mesh()
+    vertices = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
     if not isinstance(loaded, trimesh.Trimesh):
-        return np.asarray(loaded.vertices, float), np.zeros((0, 3), np.int64)  # a point cloud: no faces
-    return np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces, np.int64)
+        return vertices, np.zeros((0, 3), np.int64)  # a point cloud: no faces
+    return vertices, np.asarray(loaded.faces, np.int64)
+
+
+def _damage_stl(data: bytes) -> str | None:
+    facets, room = int.from_bytes(data[80:84], "little"), (len(data) - 84) // 50
+    if data.lstrip()[:5].lower() == b"solid":  # text, or one of the many binary files that begin with this word
+        whole = re.search(rb"endsolid", data, re.I) or facets == room
+        return None if whole else "the file is cut short, endsolid is missing"
+    if len(data) < 84:
+        return "the file is cut short in its header"
+    return f"the file is cut short, {facets} faces announced, {room} found" if facets > room else None
+
+
+def _damage_ply(data: bytes) -> str | None:
+    header, _, body = data.partition(b"end_header")
+    lines = [line.split() for line in body.splitlines() if line.strip()]
+    if b"format ascii" not in header or not lines:
+        return None  # trimesh checks the length of binary files
+    announced = sum(int(count) for count in re.findall(rb"(?m)^element\s+\S+\s+(\d+)", header))
+    if len(lines) < announced:
+        return f"the file is cut short, {announced} lines announced, {len(lines)} found"
+    faces_last = re.search(rb"element\s+face\s+\d+\s+property\s+list.*\s*$", header)
+    return "the file is cut short in its last line" if faces_last and int(lines[-1][0]) >= len(lines[-1]) else None
+
+
+def _damage_obj(data: bytes) -> str | None:
+    last = data.rsplit(b"\n", 1)[-1].split()
+    if last[:1] in ([b"v"], [b"f"]) and len(last) < 4:
+        return "the file is cut short in its last line"
+    return "a face refers to vertex 0, the first is 1" if re.search(rb"(?m)^f\b.*[ \t]0(?=[/\s]|$)", data) else None
+
+
+_DAMAGE = {".stl": _damage_stl, ".ply": _damage_ply, ".obj": _damage_obj}
+"""What trimesh lets pass: for some formats, a function of the file's bytes that says what is wrong with them."""

@@ -1,7 +1,7 @@
 """Read OFF, ModelNet's format, strictly: a truncated file is refused, which general readers let pass.
 
-ModelNet's own files break the standard in known ways (the counts on the first line, as in ``OFF490926 662722 0``); those,
-comments, blank lines, CRLF, polygons and colour columns are all read.
+ModelNet's own files break the standard in known ways (the counts on the first line, as in ``OFF490926 662722 0``);
+those, comments, blank lines, CRLF, polygons and colour columns are all read.
 """
 
 from __future__ import annotations
@@ -48,12 +48,14 @@ def _read_plain(body: bytes, vertex_count: int, face_count: int) -> tuple[NDArra
     if len(numbers) != 3 * vertex_count + 4 * face_count:
         return None
     faces = numbers[3 * vertex_count :].reshape(-1, 4)
-    if not (faces[:, 0] == 3).all() or not (faces == np.floor(faces)).all():
+    with np.errstate(invalid="ignore"):
+        indices = faces.astype(np.int64)
+    if not (indices[:, 0] == 3).all() or not (indices == faces).all():
         return None
     # The count of numbers can come out right by accident where colours stand; the lines then cannot.
     if sum(1 for line in body.splitlines() if line.strip()) != vertex_count + face_count:
         return None
-    return numbers[: 3 * vertex_count].reshape(-1, 3), faces[:, 1:].astype(np.int64)
+    return numbers[: 3 * vertex_count].reshape(-1, 3), indices[:, 1:]
 
 
 def _read_lines(body: bytes, vertex_count: int, face_count: int) -> tuple[NDArray, NDArray]:
