@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from typing import Any
 
 import tyro
 
 from nextview.cli.benchmark import benchmark
+from nextview.cli.check import check
+from nextview.cli.correspond import correspond
 from nextview.cli.demo import demo
+from nextview.cli.download import download
 from nextview.cli.export import export_lem, export_recogniser
+from nextview.cli.inspect import inspect
+from nextview.cli.measure import measure
 from nextview.cli.models import models
 from nextview.cli.predict import predict
 from nextview.cli.recognise import recognise
@@ -16,16 +23,59 @@ from nextview.cli.render import render
 from nextview.cli.report import report
 from nextview.cli.train import train_lem, train_recogniser
 
-COMMANDS = {
+COMMANDS: dict[str, Any] = {
     "recognise": recognise,
     "demo": demo,
     "models": models,
+    "download": download,
     "render": render,
-    "train recogniser": train_recogniser,
-    "train lem": train_lem,
-    "export recogniser": export_recogniser,
-    "export lem": export_lem,
+    "check": check,
+    "measure": measure,
+    "correspond": correspond,
+    "inspect": inspect,
+    "train": {"recogniser": train_recogniser, "lem": train_lem},
+    "export": {"recogniser": export_recogniser, "lem": export_lem},
     "predict": predict,
     "benchmark": benchmark,
     "report": report,
 }
+GROUPS = {"train": "Train a network on a view store.", "export": "Turn a training run into an ONNX model with a card."}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run a command. A user's mistake ends in one sentence on standard error and exit status 2."""
+    commands = COMMANDS
+    prog, arguments = "nextview", sys.argv[1:] if arguments is None else arguments
+    description = "Active 3D object recognition: what it is, and where to look next."
+    if arguments and isinstance(commands.get(arguments[0]), dict):  # a group, such as nextview train
+        prog, description = f"{prog} {arguments[0]}", GROUPS[arguments[0]]
+        commands, arguments = commands[arguments[0]], arguments[1:]
+    else:
+        commands = {name: _group(name) if isinstance(c, dict) else c for name, c in commands.items()}
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            commands,
+            prog=prog,
+            description=description,
+            args=arguments,
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+        )
+    except ValueError as error:
+        print(f"nextview: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _group(name: str) -> Callable[[], None]:
+    """Stands for a group in the list of commands; the group itself is taken apart before."""
+
+    def group() -> None:
+        raise AssertionError(name)
+
+    group.__doc__ = GROUPS[name]
+    return group
+
+
+if __name__ == "__main__":
+    main()

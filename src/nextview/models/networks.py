@@ -110,6 +110,11 @@ class Models:
     def classes(self) -> tuple[str, ...]:
         return self.recogniser.classes
 
+    def valley_classes(self, map_name: str) -> tuple[int, ...]:
+        """Classes (indices) for which a map's valley is the better view, as its card says; none without that map."""
+        network = self.maps.get(map_name)
+        return () if network is None else tuple(self.classes.index(c) for c in network.valley_classes)
+
     def evidence(self, observations: Sequence[Observation]) -> Evidence:
         """What the models say of looks from one camera."""
         logits, features = self.recogniser(observations)

@@ -1,0 +1,27 @@
+"""``nextview demo``: recognise a bundled sample object."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+
+def demo(
+    shape: Literal["chair", "table", "monitor"] = "chair", start: int = 3, figure: Path = Path("nextview_demo.png")
+) -> None:
+    """Recognise a sample object that ships with nextview, and draw the episode.
+
+    Args:
+        shape: which one.
+        start: first view, 0 to 39.
+        figure: where to write the picture.
+    """
+    from nextview.cli.timing import Stopwatch
+
+    watch = Stopwatch()
+    from nextview.cli.progress import console
+    from nextview.cli.recognise import show
+    from nextview.data.samples import sample_mesh
+
+    show(lambda: sample_mesh(shape), f"the sample {shape}", watch, start=start, figure=figure)
+    console.print(f"The picture is in {figure}; now try your own: nextview recognise MESH --figure out.png")

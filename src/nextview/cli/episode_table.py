@@ -1,0 +1,87 @@
+"""An episode as a table, and as JSON."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from nextview.recognition import Stopping
+from nextview.session import Look, Recognition
+from nextview.viewsphere import ViewSphere
+
+
+def _angles(sphere: ViewSphere, view: int) -> str:
+    elevation, azimuth = sphere.angles(view)
+    return f"{view:>2} ({elevation:.0f}°, {azimuth:.0f}°)"
+
+
+def _peak(sphere: ViewSphere, look: Look) -> tuple[int, float] | None:
+    """View and value of the highest cell of the look's predicted map."""
+    for predicted in look.maps.values():
+        cell = int(predicted.argmax())
+        return int(sphere.window(look.view).flat[cell]), float(predicted.flat[cell])
+    return None
+
+
+def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: Stopping) -> None:
+    """Print each look and the answer."""
+    table = Table(title=f"Looking at {name}", caption="views: number (elevation, azimuth); travel: grid cells")
+    for column in ("step", "view", "this image says", "belief (top 3)", "map's peak", "next view", "travel"):
+        table.add_column(column, justify="right" if column in ("step", "travel") else "left")
+    for step, look in enumerate(result.looks, 1):
+        top = np.argsort(-look.belief)[:3]
+        own = int(look.guess.argmax())
+        peak = _peak(sphere, look)
+        table.add_row(
+            str(step),
+            _angles(sphere, look.view),
+            f"{result.classes[own]} {look.guess[own]:.2f}",
+            ", ".join(f"{result.classes[c]} {look.belief[c]:.3f}" for c in top),
+            "-" if peak is None else f"{_angles(sphere, peak[0])} {peak[1]:.2f}",
+            "stop" if look.next_view is None else _angles(sphere, look.next_view),
+            f"{look.travel:.2f}",
+        )
+    console = Console()
+    console.print(table)
+    reason = f"threshold {stopping.threshold} reached" if result.confident else "no views left"
+    console.print(
+        f"It is a [bold]{result.answer}[/bold], belief {result.confidence:.3f}, after {len(result.looks)} "
+        f"look{'s' * (len(result.looks) > 1)} and {result.travel:.2f} cells of travel ({reason})."
+    )
+
+
+def as_json(result: Recognition, sphere: ViewSphere) -> str:
+    """Everything the table shows, and the whole beliefs and maps, as one JSON object."""
+
+    def rounded(values: np.ndarray) -> list:
+        return np.round(np.asarray(values, float), 6).tolist()
+
+    looks = []
+    for look in result.looks:
+        peak = _peak(sphere, look)
+        looks.append(
+            {
+                "view": look.view,
+                "elevation": sphere.angles(look.view)[0],
+                "azimuth": sphere.angles(look.view)[1],
+                "image_says": dict(zip(result.classes, rounded(look.guess), strict=True)),
+                "belief": dict(zip(result.classes, rounded(look.belief), strict=True)),
+                "maps": {name: rounded(values) for name, values in look.maps.items()},
+                "map_peak": None if peak is None else peak[0],
+                "next_view": look.next_view,
+                "travel_cells": round(look.travel, 6),
+                "travel_radians": round(look.arc, 6),
+            }
+        )
+    return json.dumps(
+        {
+            "answer": result.answer,
+            "confidence": round(result.confidence, 6),
+            "threshold_reached": result.confident,
+            "looks": looks,
+        },
+        indent=1,
+    )

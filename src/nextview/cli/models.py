@@ -1,0 +1,30 @@
+"""``nextview models``: what ships with the package."""
+
+from __future__ import annotations
+
+import tyro
+
+
+def models(name: tyro.conf.Positional[str | None] = None, /) -> None:
+    """List the bundled models, or print the whole card of one.
+
+    Args:
+        name: the model whose card to print.
+    """
+    import json
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from nextview.models.card import bundled_cards, file_hash, find_card
+
+    if name:
+        print(json.dumps(find_card(name).facts, indent=1))
+        return
+    table = Table("model", "kind", "network", "MB", "scores on test", "file")
+    for card in bundled_cards().values():
+        tested = [f"{k}: {v}" for split, s in card.facts["scores"].items() if "test" in split for k, v in s.items()]
+        intact = "intact" if file_hash(card.path) == card.sha256 else "DAMAGED"
+        size = f"{card.path.stat().st_size / 1e6:.1f}"
+        table.add_row(card.name, card.kind, card.facts["network"], size, "\n".join(tested), intact)
+    Console().print(table)

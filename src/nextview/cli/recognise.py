@@ -1,0 +1,108 @@
+"""``nextview recognise``: look at one mesh until it is clear what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from nextview.cli.timing import Stopwatch
+    from nextview.mesh import Mesh
+
+PolicyName = Literal["lem", "lem-peak", "random", "random-all", "furthest", "unidirectional"]
+
+
+def recognise(
+    mesh: tyro.conf.Positional[Path],
+    /,
+    policy: PolicyName = "lem",
+    threshold: float = 0.97,
+    max_views: int = 5,
+    start: int | None = None,
+    up: Literal["y", "z"] | None = None,
+    seed: int = 0,
+    figure: Path | None = None,
+    json: bool = False,
+    timing: bool = False,
+) -> None:
+    """Recognise the object in a mesh file by next best views, and show where it looked and why.
+
+    Args:
+        mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
+        policy: how the next view is chosen.
+        threshold: stop when the belief in one class reaches this.
+        max_views: stop after so many views.
+        start: first view, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
+        up: the file's up axis; z if not given, but y for GLB.
+        seed: decides the first view and whatever the policy draws.
+        figure: write a picture of the episode to this file (PNG, PDF or SVG).
+        json: print JSON instead of a table.
+        timing: also print where the time went, from the start of the process.
+    """
+    from nextview.cli.timing import Stopwatch
+
+    watch = Stopwatch()
+    from nextview.mesh import load_mesh
+
+    def load() -> Mesh:
+        return load_mesh(mesh, up)
+
+    show(load, mesh.name, watch, policy, threshold, max_views, start, seed, figure, json, timing)
+
+
+def show(
+    load: Callable[[], Mesh],
+    name: str,
+    watch: Stopwatch,
+    policy: PolicyName = "lem",
+    threshold: float = 0.97,
+    max_views: int = 5,
+    start: int | None = None,
+    seed: int = 0,
+    figure: Path | None = None,
+    json: bool = False,
+    timing: bool = False,
+) -> None:
+    """Recognise what ``load`` returns and print the episode; the rest as for ``recognise``."""
+    import numpy as np
+
+    from nextview.cameras.simulated import SimulatedCamera
+    from nextview.models.networks import load_models
+    from nextview.policies.registry import make_policy
+    from nextview.recognition import Stopping
+    from nextview.session import Session
+    from nextview.viewsphere import ViewSphere
+
+    stopping = Stopping(threshold, max_views)
+    sphere = ViewSphere.named("40")
+    rng = np.random.default_rng(seed)
+    drawn = int(rng.integers(len(sphere)))
+    watch.lap("importing")
+    camera = SimulatedCamera(load())
+    watch.lap("building the scene")
+    models = load_models(("lem",) if policy.startswith("lem") else ())
+    chosen = make_policy(policy, sphere, models.valley_classes("lem"))
+    session = Session(models, chosen, sphere, drawn if start is None else start, stopping, rng)
+    watch.lap("loading the models")
+    while not session.done:
+        seen = camera.observe(session.pose)
+        watch.lap("looking")
+        session.tell(seen)
+        watch.lap("thinking")
+    result = session.result
+
+    from nextview.cli.episode_table import as_json, print_episode
+
+    if json:
+        print(as_json(result, sphere))
+    else:
+        print_episode(result, sphere, name, stopping)
+    if timing:
+        watch.show()
+    if figure:
+        from nextview.report.episode_figure import save_episode
+
+        save_episode(result, sphere, figure, name)

@@ -1,0 +1,128 @@
+"""A picture of one episode: what was seen, what the map promised, what was believed, and the path on the sphere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from nextview.session import Look, Recognition
+from nextview.viewsphere import ViewSphere
+
+INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
+
+
+def save_episode(result: Recognition, sphere: ViewSphere, path: Path, title: str) -> None:
+    """Draw an episode into a PNG, PDF or SVG file.
+
+    Raises:
+        ValueError: the file cannot be written, or its suffix is not a picture's.
+    """
+    figure = draw_episode(result, sphere, title)
+    try:
+        figure.savefig(path, dpi=110, facecolor="white")
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: the figure cannot be written ({error})") from None
+
+
+def draw_episode(result: Recognition, sphere: ViewSphere, title: str) -> Figure:
+    """One column for each look (image, predicted map with the choice marked, belief), and the sphere beside them."""
+    looks = result.looks
+    figure = Figure(figsize=(2.5 * len(looks) + 5.2, 8.2), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=[2.5 * len(looks), 5.2])
+    axes = left.subplots(3, len(looks), squeeze=False, gridspec_kw={"height_ratios": [1, 0.95, 1.15]})
+    shown = np.argsort(-np.max([look.belief for look in looks], axis=0))[:5]
+    for k, look in enumerate(looks):
+        _draw_image(axes[0, k], look, sphere, k + 1)
+        _draw_map(axes[1, k], look, sphere, first=k == 0)
+        _draw_belief(axes[2, k], look, result.classes, shown, first=k == 0)
+    _draw_path(right.add_subplot(projection="3d"), looks, sphere)
+    figure.suptitle(
+        f"{title}: {result.answer}, belief {result.confidence:.3f}, {len(looks)} look{'s' * (len(looks) > 1)}, "
+        f"{result.travel:.2f} cells of travel",
+        color=INK,
+        fontsize=14,
+    )
+    return figure
+
+
+def _draw_image(axis: Axes, look: Look, sphere: ViewSphere, step: int) -> None:
+    elevation, azimuth = sphere.angles(look.view)
+    axis.imshow(look.observation.image, cmap="gray", vmin=0, vmax=255)
+    axis.set_title(f"look {step}: view {look.view}\n{elevation:.0f}° up, {azimuth:.0f}° round", color=INK, fontsize=10)
+    axis.axis("off")
+
+
+def _draw_map(axis: Axes, look: Look, sphere: ViewSphere, first: bool) -> None:
+    if not look.maps:
+        axis.axis("off")
+        return
+    name, predicted = next(iter(look.maps.items()))
+    axis.imshow(predicted, cmap="viridis", vmin=0, vmax=1, origin="lower", aspect="auto")
+    window = sphere.window(look.view)
+    for ring, column in np.ndindex(window.shape):
+        value = predicted[ring, column]
+        axis.text(column, ring, f"{value:.2f}", ha="center", va="center", fontsize=8, color="white" if value < 0.7 else INK)
+    for view, colour, label in ((look.view, "white", "here"), (look.next_view, ACCENT, "next")):
+        for ring, column in np.argwhere(window == view)[:1] if view is not None else ():
+            box = (column - 0.46, ring - 0.46), 0.92, 0.92
+            axis.add_patch(_rectangle(*box, colour))
+            axis.text(column, ring - 0.33, label, ha="center", va="center", fontsize=7, color=colour, weight="bold")
+    axis.set_xticks(range(3), ["-1", "0", "+1"], fontsize=8)
+    axis.set_yticks(range(sphere.rings), [f"{e:.0f}°" for e in sphere.elevations] if first else [], fontsize=8)
+    axis.set_title(f"predicted {name.upper()}" + ("" if look.next_view is not None else " (not needed)"), fontsize=9)
+    if first:
+        axis.set_ylabel("elevation")
+    axis.set_xlabel("azimuth step", fontsize=8)
+
+
+def _rectangle(corner: tuple[float, float], width: float, height: float, colour: str):  # noqa: ANN202
+    from matplotlib.patches import Rectangle
+
+    return Rectangle(corner, width, height, fill=False, edgecolor=colour, linewidth=2.2)
+
+
+def _draw_belief(axis: Axes, look: Look, classes: tuple[str, ...], shown: np.ndarray, first: bool) -> None:
+    rows = np.arange(len(shown))[::-1]
+    axis.barh(rows + 0.18, look.belief[shown], 0.36, color=ACCENT, label="belief after this look")
+    axis.barh(rows - 0.18, look.guess[shown], 0.36, color=FAINT, label="this image alone")
+    axis.set_xlim(0, 1)
+    axis.set_yticks(rows, [classes[c].replace("_", " ") for c in shown] if first else [])
+    axis.spines[["top", "right"]].set_visible(False)
+    best = int(look.belief.argmax())
+    axis.set_title(f"{classes[best].replace('_', ' ')} {look.belief[best]:.3f}", fontsize=10, color=ACCENT)
+    if first:
+        axis.legend(fontsize=7, loc="lower right", frameon=False)
+
+
+def _draw_path(axis: Axes, looks: tuple[Look, ...], sphere: ViewSphere) -> None:
+    d = sphere.directions
+    axis.scatter(*d.T, s=14, color=FAINT, depthshade=False)
+    for elevation in np.radians(sphere.elevations):
+        a = np.linspace(0, 2 * np.pi, 91)
+        ring = np.cos(elevation) * np.cos(a), np.cos(elevation) * np.sin(a), np.full_like(a, np.sin(elevation))
+        axis.plot(*ring, color=FAINT, linewidth=0.6)
+    cloud = np.concatenate([look.observation.points[::8] for look in looks])
+    axis.scatter(*cloud.T, s=1, color=INK, alpha=0.35, depthshade=False)
+    views = [look.view for look in looks]
+    for a, b in zip(views, views[1:], strict=False):
+        arc = _great_circle(d[a], d[b])
+        axis.plot(*arc.T, color=ACCENT, linewidth=2)
+    axis.scatter(*d[views].T, s=46, color=ACCENT, depthshade=False)
+    for step, view in enumerate(views, 1):
+        axis.text(*(d[view] * 1.16), str(step), color=ACCENT, fontsize=12, weight="bold", ha="center")
+    # Look from the side where the path is, a little from above.
+    middle = d[views].sum(0)
+    axis.view_init(elev=24, azim=float(np.degrees(np.arctan2(middle[1], middle[0]))) - 25)
+    axis.set_box_aspect((1, 1, 0.75), zoom=1.35)
+    axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-0.5, 1))
+    axis.set_axis_off()
+    axis.set_title("where it looked from, and the points it saw", fontsize=10, color=INK)
+
+
+def _great_circle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Points on the arc from one unit vector to another, (24, 3)."""
+    line = a + np.linspace(0, 1, 24)[:, None] * (b - a)
+    return line / np.linalg.norm(line, axis=1, keepdims=True)
