@@ -42,7 +42,7 @@ def _read_plain(body: bytes, vertex_count: int, face_count: int) -> tuple[NDArra
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)
         try:
-            numbers = np.fromstring(body, sep=" ")  # type: ignore[call-overload]
+            numbers = np.fromstring(body, sep=" ")
         except (DeprecationWarning, ValueError):
             return None
     if len(numbers) != 3 * vertex_count + 4 * face_count:

@@ -66,6 +66,8 @@ class ViewSphere:
             raise ValueError("a view sphere needs at least one ring of at least three viewpoints")
         if not all(-90 <= e <= 90 for e in self.elevations):
             raise ValueError(f"elevations must lie between -90 and 90 degrees, not {self.elevations}")
+        if not 0 < self.distance < np.inf:
+            raise ValueError(f"the distance must be a positive number of object radii, not {self.distance}")
 
     @classmethod
     def named(cls, name: str) -> ViewSphere:
@@ -79,6 +81,7 @@ class ViewSphere:
 
     @property
     def rings(self) -> int:
+        """How many rings."""
         return len(self.elevations)
 
     @cached_property
