@@ -1,0 +1,313 @@
+"""Policies against scikit-image, brute force and what their names promise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from scipy.ndimage import maximum_filter
+from scipy.stats import chisquare
+from skimage.feature import peak_local_max
+
+from nextview.policies.base import EpisodeState, Evidence, best_in_window
+from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
+from nextview.policies.maps import MapPeak, local_peaks, peaks_first
+from nextview.policies.oracle import OracleGain, OracleValley
+from nextview.policies.registry import POLICIES, make_policy
+from nextview.viewsphere import ViewSphere
+
+SPHERE = ViewSphere.named("40")
+RING = ViewSphere.named("12")
+spheres = st.sampled_from([SPHERE, RING, ViewSphere((0.0, 45.0), 3)])
+maps = npst.arrays(
+    np.float64,
+    st.tuples(st.just(1), st.integers(1, 6), st.integers(1, 5)),
+    elements=st.sampled_from([-1.0, 0.0, 0.25, 0.5, 0.75, 1.0]),
+)
+
+
+def state_of(sphere, current, visited=None, belief=None, **local_maps) -> EpisodeState:
+    """Episodes that stand at ``current``, having visited that and what is told."""
+    current = np.atleast_1d(current)
+    seen = np.zeros((len(current), len(sphere)), bool)
+    seen[np.arange(len(current)), current] = True
+    for row, views in enumerate(visited or []):
+        seen[row, list(views)] = True
+    belief = np.full((len(current), 2), 0.5) if belief is None else np.asarray(belief)
+    evidence = Evidence(np.zeros((len(current), 2)), {k: np.asarray(m, float) for k, m in local_maps.items()})
+    return EpisodeState(current, seen, belief, evidence, int(seen.sum(1).max()), np.arange(len(current)))
+
+
+def random_state(sphere, rng, episodes=50) -> EpisodeState:
+    """Episodes under way, with maps whose values often tie."""
+    state = state_of(sphere, rng.integers(len(sphere), size=episodes), belief=rng.dirichlet([1, 1], episodes))
+    state.visited[:] |= rng.random(state.visited.shape) < rng.random((episodes, 1))
+    cells = rng.integers(0, 4, (episodes, sphere.rings, 3)) / 4.0
+    return replace(state, evidence=Evidence(np.zeros((episodes, 2)), {"lem": cells, "lcm": cells}))
+
+
+# Peaks
+
+
+@given(st.integers(0, 2**32), st.integers(2, 7), st.integers(3, 7))
+def test_local_peaks_are_those_of_scikit_image(seed, rows, columns):
+    cells = np.random.default_rng(seed).random((rows, columns))
+    expected = peak_local_max(cells, min_distance=1, threshold_abs=-1, exclude_border=False)
+    found = np.argwhere(local_peaks(cells[None])[0])
+    # Of two diagonal or straight neighbours scikit-image keeps one; without ties no two peaks are neighbours.
+    assert sorted(map(tuple, found)) == sorted(map(tuple, expected))
+
+
+@given(maps)
+def test_local_peaks_with_ties_are_those_of_a_maximum_filter(cells):
+    expected = cells[0] == maximum_filter(cells[0], size=3, mode="constant", cval=-np.inf)
+    np.testing.assert_array_equal(local_peaks(cells)[0], expected)
+
+
+@given(maps)
+def test_peaks_come_first_and_each_group_by_value(cells):
+    scores, peaks, cells = peaks_first(cells)[0], local_peaks(cells)[0], cells[0]
+    if not peaks.all():
+        assert scores[peaks].min() > scores[~peaks].max()
+    for group in (peaks, ~peaks):
+        order = np.argsort(scores[group], kind="stable")
+        assert (np.diff(cells[group][order]) >= 0).all()
+
+
+# What every policy promises
+
+
+def policies(sphere, rng):
+    yield from (make_policy(name, sphere, (1,)) for name in POLICIES)
+    labels, objects = rng.integers(0, 2, 50), np.arange(50)
+    yield OracleValley(sphere, labels, (1,))
+    logits = rng.normal(size=(50, len(sphere), 2))
+    yield OracleGain(sphere, logits, labels, objects)
+    yield OracleGain(sphere, logits, labels, objects, anywhere=True)
+
+
+@settings(deadline=None, max_examples=30)
+@given(spheres, st.integers(0, 2**32))
+def test_no_policy_goes_back_while_a_view_is_left(sphere, seed):
+    rng = np.random.default_rng(seed)
+    state = random_state(sphere, rng)
+    for policy in policies(sphere, rng):
+        chosen = policy.next_views(state, rng)
+        assert chosen.shape == (50,)
+        assert np.issubdtype(chosen.dtype, np.integer)
+        assert ((chosen >= 0) & (chosen < len(sphere))).all()
+        again = state.visited[np.arange(50), chosen]
+        assert not (again & ~state.visited.all(1)).any(), policy
+
+
+@settings(deadline=None, max_examples=10)
+@given(spheres, st.integers(0, 2**32))
+def test_every_policy_can_see_the_whole_sphere(sphere, seed):
+    rng = np.random.default_rng(seed)
+    for policy in policies(sphere, rng):
+        state = random_state(sphere, rng)
+        state.visited[:] = False
+        for _ in range(len(sphere) - 1):
+            state.visited[np.arange(50), state.current] = True
+            state = replace(state, current=policy.next_views(state, rng))
+        state.visited[np.arange(50), state.current] = True
+        assert state.visited.all(), policy
+
+
+@settings(deadline=None, max_examples=20)
+@given(spheres, st.integers(0, 2**32))
+def test_no_row_depends_on_another(sphere, seed):
+    rng = np.random.default_rng(seed)
+    state = random_state(sphere, rng)
+    for policy in policies(sphere, rng):
+        if isinstance(policy, (Random, RandomAll, Furthest)):
+            continue  # they draw
+        together = policy.next_views(state, rng)
+        for row in range(0, 50, 7):
+            alone = EpisodeState(
+                state.current[[row]],
+                state.visited[[row]],
+                state.belief[[row]],
+                Evidence(np.zeros((1, 2)), {k: m[[row]] for k, m in state.evidence.maps.items()}),
+                state.step,
+                state.episodes[[row]],
+            )
+            assert policy.next_views(alone, rng)[0] == together[row]
+
+
+# The best in the window
+
+
+def test_best_in_window_takes_the_highest_that_is_free():
+    scores = np.arange(15.0).reshape(1, 5, 3)
+    state = state_of(SPHERE, 0)
+    assert best_in_window(SPHERE, state, scores) == 33  # top ring, one azimuth on
+    state.visited[0, [33, 32]] = True
+    assert best_in_window(SPHERE, state, scores) == 39  # top ring, one azimuth back: wraps round
+    assert best_in_window(SPHERE, state, -scores) == 7  # bottom ring, one azimuth back
+
+
+def test_a_whole_window_visited_goes_to_the_nearest_free_view():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        current = int(rng.integers(40))
+        state = state_of(SPHERE, current, [SPHERE.window(current).ravel()])
+        state.visited[0, rng.integers(0, 40, 15)] = True
+        chosen = int(best_in_window(SPHERE, state, rng.random((1, 5, 3)))[0])
+        free = np.flatnonzero(~state.visited[0])
+        assert chosen in free
+        assert SPHERE.travel[current, chosen] == SPHERE.travel[current, free].min()
+
+
+def test_nothing_left_stays_in_the_window():
+    state = state_of(RING, [3, 4], [range(12), []])
+    scores = np.array([[[0.1, 0.2, 0.9]], [[0.1, 0.2, 0.9]]])
+    assert best_in_window(RING, state, scores).tolist() == [4, 5]
+
+
+# Baselines
+
+
+@pytest.mark.parametrize("policy", [Random(SPHERE), RandomAll(SPHERE)], ids=["window", "all"])
+def test_random_is_uniform_over_what_is_free(policy):
+    visited = [11, 3, 28, 36, 0, 25]
+    state = state_of(SPHERE, np.full(20_000, 11), [visited] * 20_000)
+    chosen = policy.next_views(state, np.random.default_rng(0))
+    candidates = SPHERE.window(11).ravel() if isinstance(policy, Random) else np.arange(40)
+    free = np.setdiff1d(candidates, visited)
+    drawn = np.bincount(chosen, minlength=40)
+    assert drawn[free].sum() == 20_000
+    assert chisquare(drawn[free]).pvalue > 1e-3
+
+
+def test_random_draws_from_the_generator_handed_in():
+    state = state_of(SPHERE, np.zeros(200, int))
+    for policy in (Random(SPHERE), RandomAll(SPHERE), Furthest(SPHERE)):
+        a, b, c = (policy.next_views(state, np.random.default_rng(seed)) for seed in (1, 1, 2))
+        np.testing.assert_array_equal(a, b)
+        assert (a != c).any()
+
+
+@given(st.integers(0, 2**32))
+def test_furthest_is_the_furthest_free_view_of_the_window(seed):
+    rng = np.random.default_rng(seed)
+    state = random_state(SPHERE, rng)
+    chosen = Furthest(SPHERE).next_views(state, rng)
+    for row, view in enumerate(state.current):
+        free = [v for v in SPHERE.window(view).ravel() if not state.visited[row, v]]
+        if free:
+            assert chosen[row] in free
+            assert SPHERE.travel[view, chosen[row]] == max(SPHERE.travel[view, v] for v in free)
+
+
+def test_furthest_breaks_ties_with_equal_chance():
+    chosen = Furthest(SPHERE).next_views(state_of(SPHERE, np.zeros(4000, int)), np.random.default_rng(0))
+    views, counts = np.unique(chosen, return_counts=True)
+    assert views.tolist() == [33, 39]  # both corners of the top ring
+    assert chisquare(counts).pvalue > 1e-3
+
+
+@given(spheres, st.data())
+def test_unidirectional_walks_the_ring(sphere, data):
+    start = data.draw(st.integers(0, len(sphere) - 1))
+    state, walked = state_of(sphere, start), [start]
+    for _ in range(sphere.azimuths - 1):
+        state = replace(state, current=Unidirectional(sphere).next_views(state, np.random.default_rng(0)))
+        state.visited[0, state.current] = True
+        walked.append(int(state.current[0]))
+    ring, first = divmod(start, sphere.azimuths)
+    assert walked == [ring * sphere.azimuths + (first + k) % sphere.azimuths for k in range(sphere.azimuths)]
+    if sphere.rings > 1:  # round: on to the ring next to it
+        following = int(Unidirectional(sphere).next_views(state, np.random.default_rng(0))[0])
+        assert sphere.ring[following] != ring
+
+
+def test_unidirectional_passes_over_what_was_visited():
+    state = state_of(SPHERE, [14, 14], [[15, 8], [15, 8, 9, 10, 11, 12]])
+    assert Unidirectional(SPHERE).next_views(state, np.random.default_rng(0)).tolist() == [9, 13]
+
+
+# Maps
+
+HILLS = [[0.1, 0.9, 0.1], [0.2, 0.3, 0.2], [0.4, 0.2, 0.1], [0.5, 0.3, 0.2], [0.8, 0.6, 0.7]]
+"""Around view 11: peaks at the top left (0.8), the bottom middle (0.9) and the top right (0.7)."""
+
+
+def test_map_peak_goes_from_peak_to_peak_then_to_the_highest_rest():
+    policy, state = MapPeak(SPHERE), state_of(SPHERE, 11, lem=[HILLS])
+    taken = []
+    for _ in range(4):
+        chosen = policy.next_views(state, np.random.default_rng(0))
+        state.visited[0, chosen] = True
+        taken.append(int(chosen[0]))
+    # 3 is below, 34 and 36 are at the sides of the top ring; no peak left, the highest rest is 35 between them (0.6).
+    assert taken == [3, 34, 36, 35]
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32))
+def test_map_peak_is_the_highest_free_peak_of_scikit_image(seed):
+    rng = np.random.default_rng(seed)
+    state = random_state(SPHERE, rng, 20)
+    cells = rng.random((20, 5, 3))
+    state = replace(state, evidence=Evidence(np.zeros((20, 2)), {"lem": cells}))
+    chosen = MapPeak(SPHERE).next_views(state, rng)
+    for row, window in enumerate(SPHERE.windows[state.current]):
+        free = ~state.visited[row, window]
+        peaks = peak_local_max(cells[row], min_distance=1, threshold_abs=-1, exclude_border=False)
+        peaks = [tuple(p) for p in peaks if free[tuple(p)]] or [tuple(p) for p in np.argwhere(free)]
+        if peaks:
+            assert chosen[row] == window[max(peaks, key=lambda p: cells[row][p])]
+
+
+def test_a_valley_is_chosen_by_the_believed_class():
+    state = state_of(SPHERE, [11, 11], belief=[[0.9, 0.1], [0.2, 0.8]], lem=[HILLS, HILLS])
+    policy = MapPeak(SPHERE, valley_classes=(1,))
+    peak, valley = policy.next_views(state, np.random.default_rng(0))
+    assert peak == 3
+    assert HILLS[SPHERE.ring[valley]][[2, 3, 4].index(SPHERE.azimuth_index[valley])] == 0.1
+    both = MapPeak(SPHERE, valley_classes=(0, 1)).next_views(state, np.random.default_rng(0))
+    assert both.tolist() == [valley, valley]
+    assert MapPeak(SPHERE).next_views(state, np.random.default_rng(0)).tolist() == [3, 3]
+
+
+@given(st.integers(0, 2**32))
+def test_a_valley_is_a_peak_of_the_negated_map(seed):
+    rng = np.random.default_rng(seed)
+    state = random_state(SPHERE, rng)
+    turned = replace(state, evidence=Evidence(np.zeros((50, 2)), {"lem": -state.evidence.maps["lem"]}))
+    valleys = MapPeak(SPHERE, valley_classes=(0, 1)).next_views(state, rng)
+    np.testing.assert_array_equal(valleys, MapPeak(SPHERE).next_views(turned, rng))
+
+
+def test_a_map_of_another_name():
+    policy = MapPeak(SPHERE, "lcm")
+    assert policy.needs == ("lcm",)
+    assert policy.next_views(state_of(SPHERE, 11, lcm=[HILLS], lem=[-np.array(HILLS)]), np.random.default_rng(0)) == 3
+
+
+def test_the_oracle_valley_goes_by_the_true_class():
+    state = state_of(SPHERE, [11, 11], belief=[[0.9, 0.1], [0.9, 0.1]], lem=[HILLS, HILLS])
+    chosen = OracleValley(SPHERE, np.array([0, 1]), (1,)).next_views(state, np.random.default_rng(0))
+    assert chosen[0] == 3
+    assert HILLS[SPHERE.ring[chosen[1]]][[2, 3, 4].index(SPHERE.azimuth_index[chosen[1]])] == 0.1
+
+
+# By name
+
+
+def test_policies_by_name():
+    for name in POLICIES:
+        assert hasattr(make_policy(name, SPHERE), "next_views")
+    assert make_policy("lem", SPHERE, [1, 3]) == MapPeak(SPHERE, "lem", (1, 3))
+    assert make_policy("lem-peak", SPHERE, [1, 3]) == MapPeak(SPHERE, "lem")
+    with pytest.raises(ValueError, match=r"no policy is called 'best'.*random"):
+        make_policy("best", SPHERE)
+
+
+@pytest.mark.parametrize("name", ["nowhere:Policy", "nextview.policies.maps:Nothing", "builtins:len", ":", "math:sqrt"])
+def test_a_policy_of_ones_own_that_cannot_be_made(name):
+    with pytest.raises(ValueError, match=r"^policy "):
+        make_policy(name, SPHERE)
