@@ -112,7 +112,7 @@ def open3d_raycasting(files: list[str]) -> tuple[float, int]:
 
 
 def open3d_window(files: list[str]) -> tuple[float, int]:
-    """The thesis's way: a window, a captured image and depth, and 1,024 points of the depth's cloud."""
+    """The thesis's way: a window; an image, a depth image and a cloud of 1,024 points as loose files."""
     import open3d as o3d
 
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
@@ -121,26 +121,32 @@ def open3d_window(files: list[str]) -> tuple[float, int]:
     camera = o3d.camera.PinholeCameraParameters()
     camera.intrinsic = o3d.camera.PinholeCameraIntrinsic(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2 - 0.5, SIZE / 2 - 0.5)
     seconds = 0.0
-    for file in files:
-        vertices, faces = read(file)
-        mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
-        began = time.perf_counter()
-        mesh.compute_vertex_normals()
-        window.clear_geometries()
-        window.add_geometry(mesh)
-        for pose in poses():
-            camera.extrinsic = np.linalg.inv(pose)
-            window.get_view_control().convert_from_pinhole_camera_parameters(camera, allow_arbitrary=True)
-            window.poll_events()
-            window.update_renderer()
-            np.asarray(window.capture_screen_float_buffer(False))
-            depth = np.asarray(window.capture_depth_float_buffer(False))
-            cloud = o3d.geometry.PointCloud.create_from_depth_image(
-                o3d.geometry.Image(depth), camera.intrinsic, camera.extrinsic, depth_scale=1.0
-            )
-            if len(cloud.points) > 1024:
-                cloud.random_down_sample(1024 / len(cloud.points))
-        seconds += time.perf_counter() - began
+    with tempfile.TemporaryDirectory() as folder:
+        for number, file in enumerate(files):
+            vertices, faces = read(file)
+            began = time.perf_counter()
+            mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
+            mesh.compute_vertex_normals()
+            window.clear_geometries()
+            window.add_geometry(mesh)
+            for view, pose in enumerate(poses()):
+                camera.extrinsic = np.linalg.inv(pose)
+                window.get_view_control().convert_from_pinhole_camera_parameters(camera, allow_arbitrary=True)
+                window.poll_events()
+                window.update_renderer()
+                image = np.asarray(window.capture_screen_float_buffer(True))
+                depth = np.asarray(window.capture_depth_float_buffer(True))
+                assert image.any(), "the window shows nothing"
+                cloud = o3d.geometry.PointCloud.create_from_depth_image(
+                    o3d.geometry.Image(depth), camera.intrinsic, camera.extrinsic, depth_scale=1.0
+                )
+                if len(cloud.points) > 1024:
+                    cloud = cloud.random_down_sample(1024 / len(cloud.points))
+                name = f"{folder}/{number}_{view}"
+                o3d.io.write_image(f"{name}.png", o3d.geometry.Image((255 * image).astype(np.uint8)))
+                o3d.io.write_image(f"{name}_depth.png", o3d.geometry.Image((1e4 * depth).astype(np.uint16)))
+                o3d.io.write_point_cloud(f"{name}.ply", cloud)
+            seconds += time.perf_counter() - began
     window.destroy_window()
     return seconds, 0
 

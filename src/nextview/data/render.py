@@ -153,9 +153,12 @@ def _file_hash(path: Path) -> str:
 
 
 @lru_cache(maxsize=1)
-def _open(path: Path, run: str) -> ViewStore:
-    """The store, opened once for each process and run."""
-    return ViewStore.open(path)
+def _arrays(path: Path, run: str) -> dict[str, zarr.Array]:
+    """The store's arrays, opened once for each process and run."""
+    # Finding out whether a chunk is worth writing costs more than writing it.
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        group = ViewStore.open(path).group
+        return {name: group[name] for name in ("image", "depth", "points", "measures/depth_entropy", "status")}
 
 
 def _render_entry(
@@ -163,17 +166,17 @@ def _render_entry(
 ) -> str | None:
     """Render one object into the store; the reason if its mesh cannot be used."""
     i, entry = item
-    store = _open(path, run)
+    arrays = _arrays(path, run)
     try:
         mesh = load_mesh(entry.path)
         if deform != Deform():
             mesh = deform(mesh, np.random.default_rng([seed, *entry.name.encode()]))
-        arrays = render_object(mesh, sphere, size)
+        rendered = render_object(mesh, sphere, size)
     except MeshError as error:
         return str(error)
-    # Finding out whether a chunk is worth writing costs more than writing it.
-    with zarr.config.set({"array.write_empty_chunks": True}):
-        for name, values in arrays.items():
-            store.group[name][i] = values
-        store.group["status"][i] = DONE  # last, so that an object counts only when it is whole
+    except MemoryError:
+        return f"{entry.path}: too large for this machine's memory"
+    for name, values in rendered.items():
+        arrays[name][i] = values
+    arrays["status"][i] = DONE  # last, so that an object counts only when it is whole
     return None
