@@ -1,0 +1,237 @@
+"""Episodes against a plain loop over one object, and policies that misbehave."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import softmax
+
+from nextview.episode import Episodes, PolicyError, run_episodes, select
+from nextview.policies.base import EpisodeState, Evidence
+from nextview.policies.baselines import Random, Unidirectional
+from nextview.policies.maps import MapPeak
+from nextview.recognition import Stopping
+from nextview.viewsphere import ViewSphere
+
+SPHERE = ViewSphere.named("40")
+CLASSES = 4
+
+
+@dataclass(frozen=True)
+class Table:
+    """What the models would say of every view of some objects; episode e looks at object e."""
+
+    logits: np.ndarray
+    lem: np.ndarray
+
+    @classmethod
+    def random(cls, objects: int, sphere: ViewSphere = SPHERE, seed: int = 0) -> "Table":
+        rng = np.random.default_rng(seed)
+        logits = rng.normal(size=(objects, len(sphere), CLASSES)) * 1.5
+        logits[np.arange(objects), :, rng.integers(0, CLASSES, objects)] += 1
+        return cls(logits, rng.random((objects, len(sphere), sphere.rings, 3)))
+
+    def observe(self, episodes: np.ndarray, views: np.ndarray) -> Evidence:
+        return Evidence(self.logits[episodes, views], {"lem": self.lem[episodes, views]}, self.lem[episodes, views, 0])
+
+
+def walk(table: Table, policy, episode: int, start: int, stopping: Stopping, sphere: ViewSphere = SPHERE):
+    """One episode as one would write it for one object: views, beliefs."""
+    views, beliefs = [start], []
+    while True:
+        beliefs.append(softmax(table.logits[episode, views].sum(0)))
+        if beliefs[-1].max() >= stopping.threshold or len(views) in (stopping.max_views, len(sphere)):
+            return views, beliefs
+        visited = np.zeros((1, len(sphere)), bool)
+        visited[0, views] = True
+        here = np.array([views[-1]])
+        evidence = table.observe(np.array([episode]), here)
+        state = EpisodeState(here, visited, beliefs[-1][None], evidence, len(views), np.array([episode]))
+        views.append(int(policy.next_views(state, np.random.default_rng(0))[0]))
+
+
+def run(table, policy, starts, stopping, sphere=SPHERE, seed=0) -> Episodes:
+    return run_episodes(table.observe, sphere, policy, starts, stopping, np.random.default_rng(seed))
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    st.integers(0, 1000),
+    st.sampled_from([0.0, 0.5, 0.8, 0.97, 1.0]),
+    st.integers(1, 7),
+    st.sampled_from([Unidirectional(SPHERE), MapPeak(SPHERE), MapPeak(SPHERE, valley_classes=(0, 2))]),
+)
+def test_many_episodes_at_once_are_each_episode_alone(seed, threshold, max_views, policy):
+    table, stopping = Table.random(20, seed=seed), Stopping(threshold, max_views)
+    starts = np.random.default_rng(seed).integers(0, 40, 20)
+    episodes = run(table, policy, starts, stopping)
+    end = episodes.outcome
+    for e, start in enumerate(starts):
+        views, beliefs = walk(table, policy, e, int(start), stopping)
+        assert end.views[e, : len(views)].tolist() == views
+        assert (end.views[e, len(views) :] == -1).all()
+        assert end.looks[e] == len(views)
+        assert end.answer[e] == beliefs[-1].argmax()
+        assert end.confidence[e] == pytest.approx(beliefs[-1].max(), abs=1e-12)
+        assert end.confident[e] == (beliefs[-1].max() >= threshold)
+        legs = list(pairwise(views))
+        assert end.travel[e] == pytest.approx(sum(SPHERE.travel[leg] for leg in legs), abs=1e-12)
+        assert end.arc[e] == pytest.approx(sum(SPHERE.arc[leg] for leg in legs), abs=1e-12)
+
+
+def test_the_steps_tell_the_same_story_as_the_outcome():
+    table, policy, starts = Table.random(30), MapPeak(SPHERE), np.arange(30)
+    episodes = run(table, policy, starts, Stopping(0.9, 5))
+    assert episodes.steps[0].episodes.tolist() == list(range(30))
+    for k, step in enumerate(episodes.steps):
+        np.testing.assert_array_equal(episodes.outcome.views[step.episodes, k], step.views)
+        np.testing.assert_array_equal(step.evidence.logits, table.logits[step.episodes, step.views])
+        np.testing.assert_array_equal(step.stopped, step.next_views == -1)
+        if k + 1 < len(episodes.steps):
+            following = episodes.steps[k + 1]
+            np.testing.assert_array_equal(following.episodes, step.episodes[~step.stopped])
+            np.testing.assert_array_equal(following.views, step.next_views[~step.stopped])
+    assert episodes.steps[-1].stopped.all()
+
+
+def test_no_view_twice_and_every_view_where_nothing_is_certain():
+    table = Table(np.zeros((5, 40, CLASSES)), Table.random(5).lem)
+    end = run(table, Random(SPHERE), np.arange(5), Stopping(0.99, 1000)).outcome
+    np.testing.assert_array_equal(np.sort(end.views, axis=1), np.tile(np.arange(40), (5, 1)))
+    assert not end.confident.any()
+
+
+def test_a_threshold_of_zero_takes_one_look():
+    end = run(Table.random(10), MapPeak(SPHERE), np.arange(10), Stopping(0.0, 5)).outcome
+    assert (end.looks == 1).all()
+    assert end.confident.all()
+    assert (end.travel == 0).all()
+    assert (end.arc == 0).all()
+
+
+def test_one_look_allowed_asks_no_policy():
+    end = run(Table.random(10), Broken("raises"), np.arange(10), Stopping(1.0, 1)).outcome
+    assert (end.looks == 1).all()
+
+
+def test_confidence_counts_at_the_threshold_itself():
+    logits = np.zeros((1, 40, 2))
+    end = run(Table(logits, Table.random(1).lem), MapPeak(SPHERE), np.array([0]), Stopping(0.5, 5)).outcome
+    assert end.looks == 1
+    assert end.confident
+
+
+def test_the_same_seed_gives_the_same_episodes():
+    runs = [run(Table.random(40), Random(SPHERE), np.arange(40), Stopping(), seed=s).outcome.views for s in (1, 1, 2)]
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert runs[0].shape != runs[2].shape or (runs[0] != runs[2]).any()
+
+
+def test_another_sphere():
+    ring = ViewSphere.named("12")
+    table, stopping = Table.random(12, ring), Stopping(0.99, 12)
+    end = run(table, Unidirectional(ring), np.arange(12), stopping, ring).outcome
+    for e in range(12):
+        assert end.views[e, : end.looks[e]].tolist() == [(e + k) % 12 for k in range(end.looks[e])]
+    np.testing.assert_allclose(end.travel, end.looks - 1)
+
+
+def test_select_keeps_rows_of_everything():
+    evidence = Table.random(6).observe(np.arange(6), np.arange(6))
+    keep = np.array([True, False, True, True, False, False])
+    kept = select(evidence, keep)
+    np.testing.assert_array_equal(kept.logits, evidence.logits[[0, 2, 3]])
+    np.testing.assert_array_equal(kept.maps["lem"], evidence.maps["lem"][[0, 2, 3]])
+    assert kept.features is not None
+    assert len(kept.features) == 3
+    assert select(Evidence(evidence.logits), keep).features is None
+
+
+# Refusing
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A policy with a fault, in episode 7 only where it can be told apart."""
+
+    fault: str
+    needs: tuple[str, ...] = ()
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator):
+        good = Unidirectional(SPHERE).next_views(state, rng)
+        seven = state.episodes == 7
+        if self.fault == "raises" and seven.any():
+            raise KeyError("no such map")
+        return {
+            "raises": good,
+            "stays": np.where(seven, state.current, good),
+            "too high": np.where(seven, 40, good),
+            "negative": np.where(seven, -1, good),
+            "too few": good[1:],
+            "too many": np.append(good, 0),
+            "fractions": good + 0.5,
+            "truths": good > 3,
+            "a column": good[:, None],
+            "nothing": None,
+            "words": ["left"] * len(good),
+        }[self.fault]
+
+
+@pytest.mark.parametrize(
+    ("fault", "part", "episode"),
+    [
+        ("raises", "raised KeyError: 'no such map'", 7),
+        ("stays", "which was visited before", 7),
+        ("too high", "chose view 40, which is not on the sphere", 7),
+        ("negative", "chose view -1, which is not on the sphere", 7),
+        ("too few", "has to return 20 integers", None),
+        ("too many", "has to return 20 integers", None),
+        ("fractions", "has to return 20 integers", None),
+        ("truths", "has to return 20 integers", None),
+        ("a column", "has to return 20 integers", None),
+        ("nothing", "has to return 20 integers", None),
+        ("words", "has to return 20 integers", None),
+    ],
+)
+def test_a_policy_that_misbehaves_is_named(fault, part, episode):
+    with pytest.raises(PolicyError, match=f"^policy Broken .*{part}") as refusal:
+        run(Table.random(20), Broken(fault), np.arange(20), Stopping(1.0, 5))
+    assert refusal.value.episode == episode
+
+
+def test_a_map_that_is_missing_or_of_another_sphere():
+    table = Table.random(3)
+    with pytest.raises(PolicyError, match="policy MapPeak raised KeyError: 'lcm'"):
+        run(table, MapPeak(SPHERE, "lcm"), np.arange(3), Stopping(1.0))
+    ring = ViewSphere.named("12")
+    with pytest.raises(PolicyError, match="policy MapPeak raised ValueError"):
+        run(table, MapPeak(ring), np.arange(3), Stopping(1.0), ring)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_logit_that_is_not_finite_is_refused(bad):
+    table = Table.random(5)
+    table.logits[3, :, 1] = bad
+    with pytest.raises(ValueError, match="a logit that is not a finite number"):
+        run(table, MapPeak(SPHERE), np.arange(5), Stopping())
+
+
+@pytest.mark.parametrize("start", [-1, 40])
+def test_a_start_off_the_sphere(start):
+    with pytest.raises(ValueError, match="0 to 39"):
+        run(Table.random(2), MapPeak(SPHERE), np.array([0, start]), Stopping())
+
+
+def test_no_outcome_before_the_end():
+    table = Table.random(2)
+    episodes = Episodes(SPHERE, MapPeak(SPHERE), np.array([0, 1]), Stopping(1.0, 2), np.random.default_rng(0))
+    with pytest.raises(ValueError, match="still running"):
+        _ = episodes.outcome
+    episodes.tell(table.observe(episodes.running, episodes.current))
+    with pytest.raises(ValueError, match="still running"):
+        _ = episodes.outcome
+    episodes.tell(table.observe(episodes.running, episodes.current))
+    assert (episodes.outcome.looks == 2).all()
