@@ -8,6 +8,7 @@ import trimesh
 
 from nextview.data.check import check
 from nextview.data.folders import DatasetError
+from nextview.data.measure import measure
 from nextview.data.render import render
 from nextview.data.store import ViewStore
 from nextview.viewsphere import ViewSphere
@@ -37,6 +38,16 @@ def chunk(views: Path, name: str, i: int) -> Path:
 
 def test_a_sound_store_is_found_sound(views):
     assert sorted(check(views, workers=0)) == [("a", None), ("b", None), ("c", None)]
+
+
+def test_other_measures_are_checked_where_they_are_made(views):
+    next(steps := measure(views, ["max_depth"], workers=0))
+    next(steps)
+    steps.close()
+    assert {problem for _, problem in check(views, workers=0)} == {None}
+    list(measure(views, ["max_depth"], workers=0))
+    ViewStore.open(views).group["measures/max_depth"][1, 3] = 0.1
+    assert dict(check(views, workers=0))["b"] == "max_depth is not that of the depth"
 
 
 @pytest.mark.parametrize("name", ["image", "depth", "points", "measures/depth_entropy"])

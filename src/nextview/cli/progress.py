@@ -30,7 +30,7 @@ def track(done: Iterable[int], total: int, what: str, before: int = 0, views: in
         before: how much an earlier run had done.
         views: if given, the speed is shown too, in objects of so many views.
     """
-    columns = [TextColumn("{task.description}"), BarColumn(20), MofNCompleteColumn()]
+    columns = [TextColumn("{task.description}"), BarColumn(12), MofNCompleteColumn()]
     columns += [TimeElapsedColumn(), TimeRemainingColumn(), *([Speed(views)] if views else [])]
     with Progress(*columns, console=console) as progress:
         task = progress.add_task(what, total=total, completed=before)

@@ -14,7 +14,7 @@ from nextview.data.folders import DatasetError
 from nextview.data.lock import only_one
 from nextview.data.pool import each
 from nextview.data.store import DEPTH_UNIT, PENDING, POINT_UNIT, ViewStore
-from nextview.measures.depth_entropy import depth_entropy
+from nextview.measures.registry import MEASURES
 
 
 def check(
@@ -22,8 +22,8 @@ def check(
 ) -> Iterator[tuple[str, str | None]]:
     """Read every rendered object and hold its arrays against each other.
 
-    Image and depth must show the same silhouette, points must lie where the depth says, and the depth-entropy must be
-    that of the depth. Chunks written with a checksum must have it.
+    Image and depth must show the same silhouette, points must lie where the depth says, and measures must be those of
+    the depth. Chunks written with a checksum must have it.
 
     Args:
         path: the store.
@@ -52,7 +52,8 @@ def check(
 def _check_object(path: Path, i: int) -> str | None:
     store = ViewStore.open(path)
     arrays = {}
-    for name in ("image", "depth", "points", "measures/depth_entropy"):
+    measures = [name for name in MEASURES if name in store.group["measures"]]
+    for name in ("image", "depth", "points", *(f"measures/{name}" for name in measures)):
         try:
             arrays[name] = store.group[name][i]
         except Exception as error:  # a damaged chunk raises whatever its codec makes of it
@@ -60,9 +61,11 @@ def _check_object(path: Path, i: int) -> str | None:
     image, depth = arrays["image"], arrays["depth"]
     if ((image > 0) != (depth > 0)).any():
         return "image and depth do not show the same silhouette"
-    entropy = np.array([depth_entropy(d * DEPTH_UNIT) for d in depth], np.float32)
-    if not np.allclose(entropy, arrays["measures/depth_entropy"], rtol=1e-6, atol=0):
-        return "depth_entropy is not that of the depth"
+    for name in measures:
+        stored = arrays[f"measures/{name}"]
+        true = np.array([MEASURES[name](d * DEPTH_UNIT) for d in depth], np.float32)
+        if not (np.isnan(stored).all() or np.allclose(true, stored, rtol=1e-6, atol=0)):
+            return f"{name} is not that of the depth"
     expected = [
         visible_points(d * np.float32(DEPTH_UNIT), pose, store.intrinsics)
         for d, pose in zip(depth, store.sphere.poses, strict=True)
