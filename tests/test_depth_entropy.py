@@ -1,0 +1,78 @@
+"""Depth-entropy against closed forms and scikit-image."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from scipy.stats import entropy
+from skimage.measure import shannon_entropy
+
+from nextview.measures.depth_entropy import QUANTUM, depth_entropy, normalise_per_object
+
+
+def test_closed_forms():
+    assert depth_entropy(np.zeros((8, 8))) == 0
+    assert depth_entropy(np.full((8, 8), 2.5)) == 0
+    half = np.zeros((10, 10), np.float32)
+    half[5:] = 2.5
+    assert depth_entropy(half) == pytest.approx(1)  # background counts as a value
+    quarter = np.zeros((10, 10))
+    quarter[:5, :5] = 3.0
+    assert depth_entropy(quarter) == pytest.approx(0.25 * 2 + 0.75 * np.log2(4 / 3))
+
+
+@given(st.integers(1, 64), st.integers(1, 8))
+def test_k_values_equally_often_are_log2_k_bits(k, times):
+    depth = np.repeat(2 + np.arange(k) * 2 * QUANTUM, times).reshape(k, times)
+    assert depth_entropy(depth) == pytest.approx(np.log2(k), abs=1e-12)
+    assert depth_entropy(depth.astype(np.float32)) == pytest.approx(np.log2(k), abs=1e-12)
+
+
+def test_a_slanted_plane_of_uniform_depth():
+    # Depths spread evenly over 0.512 radii fill 512 quanta: 9 bits.
+    depth = (2 + (np.arange(512 * 64) + 0.5) / 64 * QUANTUM - QUANTUM / 2).reshape(128, 256)
+    assert depth_entropy(depth) == pytest.approx(9, abs=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_scikit_image_agrees_on_the_quantised_image(dtype):
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        depth = rng.uniform(2, 4, (60, 60)).round(rng.choice([1, 2, 3, 9])).astype(dtype)
+        depth[rng.random(depth.shape) < rng.random()] = 0
+        levels = np.floor(depth.astype(np.float64) / QUANTUM + 0.5)
+        assert depth_entropy(depth) == pytest.approx(shannon_entropy(levels, base=2), abs=1e-9)
+
+
+@given(npst.arrays(np.float64, (6, 7), elements=st.integers(0, 20).map(lambda k: k * QUANTUM)))
+def test_it_is_an_entropy(depth):
+    bits = depth_entropy(depth)
+    counts = np.unique(np.rint(depth / QUANTUM), return_counts=True)[1]
+    assert bits == pytest.approx(entropy(counts, base=2), abs=1e-12)
+    assert 0 <= bits <= np.log2(depth.size) + 1e-12
+    assert depth_entropy(depth[::-1].T) == pytest.approx(bits, abs=1e-12)
+
+
+def test_differences_below_the_quantum_do_not_count():
+    rng = np.random.default_rng(1)
+    depth = 2.5 + rng.uniform(-0.4, 0.4, (50, 50)) * QUANTUM
+    assert depth_entropy(depth) == 0
+    assert depth_entropy(np.where(np.arange(50) % 2, depth, depth + QUANTUM)) == pytest.approx(1)
+
+
+@given(npst.arrays(np.float64, (3, 9), elements=st.floats(-100, 100, allow_subnormal=False)))
+def test_normalising_keeps_order_and_ends_at_zero_and_one(values):
+    scaled = normalise_per_object(values)
+    assert scaled.dtype == np.float32
+    for row, out in zip(values, scaled, strict=True):
+        if np.ptp(row) == 0:
+            assert (out == 0).all()
+            continue
+        assert (out.min(), out.max()) == (0, 1)
+        np.testing.assert_allclose(out, np.interp(row, [row.min(), row.max()], [0, 1]), atol=1e-6)
+
+
+def test_each_object_is_normalised_by_itself():
+    values = np.array([[1.0, 2.0, 3.0], [10.0, 40.0, 20.0], [5.0, 5.0, 5.0]])
+    np.testing.assert_allclose(normalise_per_object(values), [[0, 0.5, 1], [0, 1, 1 / 3], [0, 0, 0]], rtol=1e-6)
