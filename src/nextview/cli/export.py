@@ -15,6 +15,7 @@ def export_recogniser(
     out: Positional[Path],
     /,
     name: str = "resnet18-modelnet10",
+    commands: tuple[str, ...] = (),
     note: str = "",
 ) -> None:
     """Export a trained recogniser: ONNX, calibrated on validation views, with a card of scores on validation and test.
@@ -24,6 +25,7 @@ def export_recogniser(
         store: the store that it was trained on.
         out: folder for NAME.onnx and NAME.json.
         name: what to call the model.
+        commands: the commands that made the run, for the card.
         note: what else the card should say.
     """
     import json
@@ -86,6 +88,7 @@ def export_recogniser(
         "training": {
             "data": f"{len(training)} objects of the training split of {len(views.classes)} classes, {len(views.sphere)} views each",
             "recipe": json.loads((run / "recipe.json").read_text()),
+            "commands": list(commands),
         },
         "scores": {
             f"validation ({len(validation)} objects of the training split)": recogniser_scores(raw, labels[validation]),
@@ -104,6 +107,7 @@ def export_lem(
     /,
     recogniser: str = "resnet18-modelnet10",
     name: str = "lem-modelnet10",
+    commands: tuple[str, ...] = (),
     note: str = "",
 ) -> None:
     """Export a trained LEM: ONNX, with a card of scores and the classes that prefer the valley, chosen on validation.
@@ -114,6 +118,7 @@ def export_lem(
         out: folder for NAME.onnx and NAME.json.
         recogniser: the model, or its card, whose beliefs decide which classes prefer the valley.
         name: what to call the model.
+        commands: the commands that made the run, for the card.
         note: what else the card should say.
     """
     import json
@@ -182,6 +187,7 @@ def export_lem(
         "training": {
             "data": f"{len(training)} objects of the training split, {len(sphere)} views each",
             "recipe": json.loads((run / "recipe.json").read_text()),
+            "commands": list(commands),
         },
         "scores": {
             f"validation ({len(validation)} objects of the training split)": map_scores(

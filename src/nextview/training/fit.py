@@ -37,6 +37,8 @@ def fit(
     module: L.LightningModule, training: IterableDataset, validation: IterableDataset, epochs: int, out: Path
 ) -> L.LightningModule:
     """Train a module to its last epoch; checkpoints and logs go to ``out``, from which a second call resumes."""
+    # Numbers too small for the normal format are slow on CPUs and mean nothing here.
+    torch.set_flush_denormal(True)
     last = out / "last.ckpt"
     trainer = L.Trainer(
         max_epochs=epochs,

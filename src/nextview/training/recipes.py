@@ -51,8 +51,8 @@ class LemRecipe:
         seed: decides everything random.
     """
 
-    epochs: int = 6
-    views: int = 8
+    epochs: int = 5
+    views: int = 6
     points: int = 256
     batch: int = 16
     rate: float = 1e-3

@@ -1,0 +1,148 @@
+"""The command line as a user meets it, with the bundled models."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from nextview import SimulatedCamera, Stopping, ViewSphere, load_mesh, load_models, make_policy, recognise
+from nextview.cli.main import main
+from nextview.data.samples import SAMPLES, sample_mesh
+from nextview.models.card import BUNDLED, ModelError, bundled_cards
+from nextview.models.networks import RECOGNISER, MapNetwork, Recogniser
+from tests.test_readme import write_off
+
+DATA = os.environ.get("NEXTVIEW_DATA")
+
+
+@pytest.fixture(scope="module")
+def chair(tmp_path_factory):
+    path = tmp_path_factory.mktemp("mesh") / "chair.off"
+    write_off(path, sample_mesh("chair"))
+    return path
+
+
+def test_json_holds_the_whole_episode(chair, capsys):
+    main(["recognise", str(chair), "--json", "--start", "3", "--threshold", "1", "--max-views", "4"])
+    episode = json.loads(capsys.readouterr().out)
+    looks = episode["looks"]
+    assert [look["view"] for look in looks][0] == 3
+    assert len(looks) == len({look["view"] for look in looks}) == 4
+    assert [look["next_view"] for look in looks] == [look["view"] for look in looks[1:]] + [None]
+    for look in looks:
+        assert sum(look["belief"].values()) == pytest.approx(1, abs=1e-4)
+    assert looks[0]["belief"] == looks[0]["image_says"]
+    sphere = ViewSphere.named("40")
+    legs = [sphere.travel[a["view"], b["view"]] for a, b in zip(looks, looks[1:], strict=False)]
+    assert looks[-1]["travel_cells"] == pytest.approx(sum(legs), abs=1e-5)
+
+
+def test_same_seed_same_episode(chair, capsys):
+    for policy in ("random", "lem"):
+        runs = []
+        for _ in range(2):
+            main(["recognise", str(chair), "--policy", policy, "--threshold", "1", "--seed", "7", "--json"])
+            runs.append(capsys.readouterr().out)
+        assert runs[0] == runs[1]
+
+
+def test_table_figure_and_timing(chair, tmp_path, capsys):
+    figure = tmp_path / "out.png"
+    main(["recognise", str(chair), "--figure", str(figure), "--timing", "--start", "5"])
+    printed = capsys.readouterr()
+    assert "chair" in printed.out
+    for part in ("importing", "loading the models", "building the scene", "looking", "thinking"):
+        assert part in printed.err
+    picture = imread(figure)
+    assert picture.shape[0] > 400
+    assert picture[..., :3].std() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["missing.off"], "no such file"),
+        (["chair.off", "--start", "40"], "0 to 39"),
+        (["chair.off", "--threshold", "1.5"], "between 0 and 1"),
+        (["chair.off", "--max-views", "0"], "at least one view"),
+        (["chair.off", "--figure", "no/such/folder/out.png"], "cannot be written"),
+    ],
+)
+def test_mistakes_end_in_one_sentence(chair, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(chair.parent)
+    with pytest.raises(SystemExit) as stop:
+        main(["recognise", *arguments])
+    assert stop.value.code == 2
+    message = capsys.readouterr().err.strip()
+    assert words in message
+    assert len(message.splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_samples_are_recognised_from_most_views(name):
+    models, sphere = load_models(), ViewSphere.named("40")
+    camera = SimulatedCamera(sample_mesh(name))
+    policy = make_policy("lem", sphere, models.valley_classes("lem"))
+    answers = [recognise(camera, models, policy, sphere, start).answer for start in range(0, 40, 3)]
+    assert np.mean([answer == name for answer in answers]) > 0.75
+
+
+def test_bundled_models_are_what_their_cards_say():
+    cards = bundled_cards()
+    assert {card.kind for card in cards.values()} >= {"recogniser", "lem"}
+    assert {path.suffix for path in BUNDLED.iterdir()} <= {".onnx", ".json"}
+    assert sum(card.path.stat().st_size for card in cards.values()) < 60e6
+    for card in cards.values():
+        assert {"data", "recipe", "commands"} <= set(card.facts["training"])
+        assert len(card.facts["scores"]) == 2
+
+
+def copy_model(folder, change):
+    for suffix in (".onnx", ".json"):
+        source = (BUNDLED / RECOGNISER).with_suffix(suffix)
+        (folder / source.name).write_bytes(change(source.read_bytes()) if suffix == ".onnx" else source.read_bytes())
+    return folder / f"{RECOGNISER}.json"
+
+
+@pytest.mark.parametrize("change", [lambda b: b[: len(b) // 2], lambda b: b"\x80\x04" + b, lambda b: b""])
+def test_damaged_weights_are_refused(tmp_path, change):
+    with pytest.raises(ModelError, match="SHA-256"):
+        Recogniser(copy_model(tmp_path, change))
+
+
+def test_wrong_models_are_refused(tmp_path):
+    with pytest.raises(ModelError, match="not a recogniser"):
+        Recogniser("lem-modelnet10")
+    with pytest.raises(ModelError, match="not a map network"):
+        MapNetwork(RECOGNISER)
+    with pytest.raises(ModelError, match="no bundled model"):
+        Recogniser("resnet999")
+    (tmp_path / "foreign.json").write_text("[1, 2]")
+    with pytest.raises(ModelError, match="not a model card"):
+        Recogniser(tmp_path / "foreign.json")
+
+
+def test_inference_never_imports_torch(chair):
+    code = (
+        "import sys; from nextview.cli.main import main; "
+        f"main(['recognise', {str(chair)!r}, '--json']); assert 'torch' not in sys.modules"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+@pytest.mark.skipif(not DATA, reason="NEXTVIEW_DATA names no folder with ModelNet10")
+def test_real_meshes_are_mostly_recognised():
+    models, sphere = load_models(), ViewSphere.named("40")
+    policy = make_policy("lem", sphere, models.valley_classes("lem"))
+    meshes = sorted(Path(DATA, "ModelNet10").glob("*/test/*.off"))[::3][:10]
+    right = [
+        recognise(SimulatedCamera(load_mesh(path)), models, policy, sphere, 8, Stopping()).answer == path.parts[-3]
+        for path in meshes
+    ]
+    assert len(right) >= 5
+    assert np.mean(right) >= 0.6  # the published single-view recogniser is right on 0.87
