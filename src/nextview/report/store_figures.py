@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nextview.data.store import ViewStore
@@ -34,14 +35,17 @@ def object_figure(store: ViewStore, i: int) -> Figure:
     names = [name for name in sorted(store.group["measures"]) if np.isfinite(store.measure(name)[i]).all()]
     names.sort(key=lambda name: name != "depth_entropy")  # the thesis's first
     wide = sphere.azimuths / sphere.rings
-    figure = Figure(figsize=(14, 14 / 2 / wide + 2.6 + (0.6 if wide > 3 else 0)), layout="constrained")
+    rows, columns = (2, 1) if wide > 3 else (1, 2)
+    views_height = rows * (14 / columns / wide + 0.6)
+    maps_height = 2.2 if sphere.rings > 1 else 1.3
+    figure = Figure(figsize=(14, views_height + maps_height), layout="constrained")
     label = store.classes[store.labels[i]]
     figure.suptitle(
         f"{store.names[i]}  ·  {label}{f', {store.splits[i]} split' if store.splits[i] else ''}", fontsize=14
     )
-    top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=[14 / 2 / wide, 2.2]))
+    top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=[views_height, maps_height]))
 
-    left, right = top.subplots(1, 2)
+    left, right = top.subplots(rows, columns)
     step = max(1, -(-store.image(i).shape[-1] // CELL))
     left.imshow(_mosaic(store.image(i)[:, ::step, ::step], sphere), cmap="gray", vmin=0, vmax=255)
     left.set_title("shaded image")
@@ -122,6 +126,7 @@ def correspondence_figure(maps: NDArray[np.floating], sphere: ViewSphere, title:
 def summary(store: ViewStore) -> dict[str, str]:
     """What a store holds, in words."""
     sizes = disk_use(store)
+    size = sum(sizes.values())
     labels, done, views = store.labels, store.done, len(store.sphere)
     rendered = int(done.sum())
     copies = sum(map(len, store.twins)) - len(store.twins)
@@ -134,7 +139,7 @@ def summary(store: ViewStore) -> dict[str, str]:
         "not rendered yet": f"{len(store) - rendered - len(store.failures):,}",
         "views": f"{rendered * views:,}  ({views} of {side} x {side} each)",
         "byte-identical copies": f"{copies:,}  ({conflicting} with several labels)",
-        "size on disk": f"{sum(sizes.values()) / 1e9:.2f} GB",
+        "size on disk": f"{size / 1e9:.2f} GB" if size > 1e9 else f"{size / 1e6:.1f} MB",
     }
     if rendered:
         facts["per view"] = "  ".join(
@@ -170,7 +175,8 @@ def _class_bars(axes: Axes, store: ViewStore) -> None:
     for row, count in enumerate(start):
         axes.text(count, row, f" {int(count):,}", va="center", fontsize=9)
     axes.set_yticks(rows, store.classes)
-    axes.invert_yaxis()
+    axes.set_ylim(max(len(rows), 6) - 0.5, -0.5)  # a few classes get bars no thicker than those of many
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlim(0, start.max() * 1.1)
     axes.set_xlabel("objects")
     axes.spines[["top", "right"]].set_visible(False)
