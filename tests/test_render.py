@@ -221,6 +221,40 @@ def test_a_box_is_stored_as_it_is_seen(tmp_path):
     assert (np.abs(points) <= half + 2e-4).all()
 
 
+def test_every_face_of_a_cube_is_where_its_view_looks(tmp_path):
+    """A cube with a knob of another length on each side: which one points at the camera, which way is right and up."""
+    knobs = {(1, 0, 0): 0.1, (0, 1, 0): 0.2, (-1, 0, 0): 0.3, (0, -1, 0): 0.4}
+    parts = [trimesh.creation.box([1, 1, 1])]
+    for direction, length in knobs.items():
+        d = np.array(direction)
+        parts.append(trimesh.creation.box(np.where(d != 0, length, 0.2)))
+        parts[-1].apply_translation(d * (0.5 + length / 2))
+    parts.append(trimesh.creation.box([0.2, 0.2, 0.5], trimesh.transformations.translation_matrix([0, 0, 0.75])))
+    shape = trimesh.util.concatenate(parts)
+    (tmp_path / "meshes/cube").mkdir(parents=True)
+    shape.export(tmp_path / "meshes/cube/cube.off")
+    list(render(tmp_path / "meshes", tmp_path / "views.zarr", ViewSphere.named("40"), 224, workers=0))
+    depth = ViewStore.open(tmp_path / "views.zarr").depth(0)
+    centre = shape.bounds.mean(0)
+    radius = np.linalg.norm(shape.vertices - centre, axis=1).max()
+    for view, direction in zip((0, 2, 4, 6), knobs, strict=True):
+        d = np.array(direction)
+        focal = 112 * np.sqrt(8)
+        eye = 3 * d * radius + centre  # in the file's frame
+        face = d * (0.5 + knobs[direction])  # middle of the knob that points at the camera
+        right = np.array([-d[1], d[0], 0])  # the camera's, for one that stands at d and looks at the origin
+        ahead = (face - eye) @ -d
+        column = 112 + focal * ((face - eye) @ right) / ahead
+        row = 112 - focal * (face - eye)[2] / ahead
+        assert depth[view, int(row), int(column)] == pytest.approx(ahead / radius, abs=1e-3)
+        seen = np.argwhere(depth[view] > 0)
+        spike = np.array([0, 0, 1.0]) - eye  # the only thing on top: its middle is the highest that is seen
+        assert seen[:, 0].min() == pytest.approx(112 - focal * spike[2] / (spike @ -d - 0.1), abs=1.5)
+        beside = knobs[tuple(int(x) for x in right)]  # the knob on the right of the picture
+        edge = right * (0.5 + beside) - eye
+        assert seen[:, 1].max() + 1 == pytest.approx(112 + focal * (edge @ right) / (edge @ -d - 0.1), abs=1.5)
+
+
 def test_plain_class_folders_and_repeated_names(tmp_path):
     for label in ("cup", "jar"):
         (tmp_path / label).mkdir()
