@@ -1,8 +1,8 @@
-"""Recognise every mesh of a test split live (camera, networks, policy) with each policy, from the same random first views.
+"""Recognise every mesh of a test split live (camera, networks, policy), with each policy, from the same first views.
 
     python benchmarks/recognise_test_split.py DATASET/ModelNet10 [--runs 1] [--limit N]
 
-Prints accuracy over objects and over classes with a 95 % bootstrap interval over objects, looks and travel of each policy.
+Prints for each policy: accuracy over objects (95 % bootstrap interval over objects) and over classes, looks, travel.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
 """The command line as a user meets it, with the bundled models."""
 
+import itertools
 import json
 import os
 import subprocess
@@ -9,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from tests.test_readme import write_off
 
 from nextview import SimulatedCamera, Stopping, ViewSphere, load_mesh, load_models, make_policy, recognise
 from nextview.cli.main import main
 from nextview.data.samples import SAMPLES, sample_mesh
 from nextview.models.card import BUNDLED, ModelError, bundled_cards
 from nextview.models.networks import RECOGNISER, MapNetwork, Recogniser
-from tests.test_readme import write_off
 
 DATA = os.environ.get("NEXTVIEW_DATA")
 
@@ -31,14 +32,14 @@ def test_json_holds_the_whole_episode(chair, capsys):
     main(["recognise", str(chair), "--json", "--start", "3", "--threshold", "1", "--max-views", "4"])
     episode = json.loads(capsys.readouterr().out)
     looks = episode["looks"]
-    assert [look["view"] for look in looks][0] == 3
+    assert next(look["view"] for look in looks) == 3
     assert len(looks) == len({look["view"] for look in looks}) == 4
     assert [look["next_view"] for look in looks] == [look["view"] for look in looks[1:]] + [None]
     for look in looks:
         assert sum(look["belief"].values()) == pytest.approx(1, abs=1e-4)
     assert looks[0]["belief"] == looks[0]["image_says"]
     sphere = ViewSphere.named("40")
-    legs = [sphere.travel[a["view"], b["view"]] for a, b in zip(looks, looks[1:], strict=False)]
+    legs = [sphere.travel[a["view"], b["view"]] for a, b in itertools.pairwise(looks)]
     assert looks[-1]["travel_cells"] == pytest.approx(sum(legs), abs=1e-5)
 
 

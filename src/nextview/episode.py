@@ -1,4 +1,4 @@
-"""The loop: observe, believe, stop or choose, move. One implementation for one robot and for a hundred thousand replays."""
+"""The loop: observe, believe, stop or choose, move. One for a robot and for a hundred thousand replays."""
 
 from __future__ import annotations
 

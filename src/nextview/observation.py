@@ -19,9 +19,10 @@ class Observation:
     Attributes:
         image: grey image, (H, W) uint8, 0 where there is no object.
         depth: distance along the optical axis, (H, W) float32, object radii, 0 where there is no object.
-        points: points on the visible surface, (1024, 3) float32, object frame, object radii; all zero if nothing is visible.
+        points: on the visible surface, (1024, 3) float32, object frame, object radii; all zero if nothing is visible.
         pose: camera-to-world, (4, 4) float64, OpenCV axes (x right, y down, z forward).
-        intrinsics: pinhole matrix, (3, 3) float64, pixels; the centre of pixel (row, column) is at (column + 0.5, row + 0.5).
+        intrinsics: pinhole matrix, (3, 3) float64, pixels; pixel (row, column) has its centre at
+            (column + 0.5, row + 0.5).
     """
 
     image: NDArray[np.uint8]
@@ -48,6 +49,11 @@ def pinhole(size: int, distance: float) -> NDArray[np.float64]:
 
     Returns:
         (3, 3) float64.
+
+    Raises:
+        ValueError: the camera stands inside the sphere.
     """
+    if not distance > 1:
+        raise ValueError(f"the camera has to stand more than one object radius from the centre, not {distance}")
     focal = size / 2 * np.sqrt(distance**2 - 1)  # size/2 over the tangent of the half angle asin(1/distance)
     return np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])

@@ -56,14 +56,17 @@ class Recognition:
 
     @property
     def answer(self) -> str:
+        """The class believed most."""
         return self.classes[int(self.looks[-1].belief.argmax())]
 
     @property
     def confidence(self) -> float:
+        """The belief in the answer."""
         return float(self.looks[-1].belief.max())
 
     @property
     def travel(self) -> float:
+        """Of the whole episode, in grid cells."""
         return self.looks[-1].travel
 
 
@@ -101,6 +104,7 @@ class Session:
 
     @property
     def done(self) -> bool:
+        """Whether the episode has ended."""
         return len(self._episodes.running) == 0
 
     @property

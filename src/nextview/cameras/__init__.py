@@ -1,0 +1,1 @@
+"""Cameras: what can look at an object from a pose."""

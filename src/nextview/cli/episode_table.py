@@ -15,7 +15,7 @@ from nextview.viewsphere import ViewSphere
 
 def _angles(sphere: ViewSphere, view: int) -> str:
     elevation, azimuth = sphere.angles(view)
-    return f"{view:>2} ({elevation:.0f}°, {azimuth:.0f}°)"
+    return f"{view}\n{elevation:.0f}°, {azimuth:.0f}°"
 
 
 def _peak(sphere: ViewSphere, look: Look) -> tuple[int, float] | None:
@@ -28,9 +28,11 @@ def _peak(sphere: ViewSphere, look: Look) -> tuple[int, float] | None:
 
 def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: Stopping) -> None:
     """Print each look and the answer."""
-    table = Table(title=f"Looking at {name}", caption="views: number (elevation, azimuth); travel: grid cells")
-    for column in ("step", "view", "this image says", "belief (top 3)", "map's peak", "next view", "travel"):
-        table.add_column(column, justify="right" if column in ("step", "travel") else "left")
+    table = Table(
+        show_lines=True, title=f"Looking at {name}", caption="view: number, elevation, azimuth; travel: grid cells"
+    )
+    for column in ("step", "view", "image says", "belief, top 3", "map's peak", "next view", "travel"):
+        table.add_column(column, justify="right" if column in ("step", "travel") else "left", no_wrap=True)
     for step, look in enumerate(result.looks, 1):
         top = np.argsort(-look.belief)[:3]
         own = int(look.guess.argmax())
@@ -38,9 +40,9 @@ def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: 
         table.add_row(
             str(step),
             _angles(sphere, look.view),
-            f"{result.classes[own]} {look.guess[own]:.2f}",
-            ", ".join(f"{result.classes[c]} {look.belief[c]:.3f}" for c in top),
-            "-" if peak is None else f"{_angles(sphere, peak[0])} {peak[1]:.2f}",
+            f"{result.classes[own]}\n{look.guess[own]:.3f}",
+            "\n".join(f"{result.classes[c]} {look.belief[c]:.3f}" for c in top),
+            "-" if peak is None else f"{_angles(sphere, peak[0])}\n{peak[1]:.2f}",
             "stop" if look.next_view is None else _angles(sphere, look.next_view),
             f"{look.travel:.2f}",
         )

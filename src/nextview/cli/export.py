@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-Positional = tyro.conf.Positional
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from nextview.models.networks import Recogniser
 
 
 def export_recogniser(
-    run: Positional[Path],
-    store: Positional[Path],
-    out: Positional[Path],
+    run: tyro.conf.Positional[Path],
+    store: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
     /,
     name: str = "resnet18-modelnet10",
     commands: tuple[str, ...] = (),
@@ -55,7 +60,7 @@ def export_recogniser(
 
     out.mkdir(parents=True, exist_ok=True)
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
-    facts = {
+    facts: dict[str, Any] = {
         "name": name,
         "kind": "recogniser",
         "network": f"ResNet-{recipe.depth}",
@@ -77,7 +82,9 @@ def export_recogniser(
     recogniser = Recogniser(card)
     sample = np.array(inputs[validation[:: max(1, len(validation) // 8)][:8], 5])
     with torch.no_grad():
-        difference = float(np.abs(shipped(torch.from_numpy(sample))[0].numpy() - recogniser.from_inputs(sample)[0]).max())
+        difference = float(
+            np.abs(shipped(torch.from_numpy(sample))[0].numpy() - recogniser.from_inputs(sample)[0]).max()
+        )
     console.print(f"largest difference between torch and ONNX logits on real views: {difference:.2g}")
     if not difference < 0.1:
         raise ModelError(f"{weights}: its logits differ from the network's by up to {difference:.2g}")
@@ -86,7 +93,7 @@ def export_recogniser(
     facts |= {
         "temperature": round(temperature, 4),
         "training": {
-            "data": f"{len(training)} objects of the training split of {len(views.classes)} classes, {len(views.sphere)} views each",
+            "data": f"{len(training)} objects of the training split, {len(views.sphere)} views each",
             "recipe": json.loads((run / "recipe.json").read_text()),
             "commands": list(commands),
         },
@@ -101,9 +108,9 @@ def export_recogniser(
 
 
 def export_lem(
-    run: Positional[Path],
-    store: Positional[Path],
-    out: Positional[Path],
+    run: tyro.conf.Positional[Path],
+    store: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
     /,
     recogniser: str = "resnet18-modelnet10",
     name: str = "lem-modelnet10",
@@ -154,7 +161,7 @@ def export_lem(
     points = np.stack([views.points(int(i)) for i in validation[:2]])[:, 3]
     clouds = cloud_input(points, sphere.poses[[3, 3]])
     export_onnx(shipped, torch.from_numpy(clouds), "cloud", ["map"], weights)
-    facts = {
+    facts: dict[str, Any] = {
         "name": name,
         "kind": "lem",
         "network": "PointNet with both transforms",
@@ -172,8 +179,8 @@ def export_lem(
     true = normalise_per_object(views.measure())[:, sphere.windows]
     stored = views.all_points()
 
-    def predict(objects: np.ndarray, what: str) -> np.ndarray:
-        def one(i: int) -> np.ndarray:
+    def predict(objects: NDArray, what: str) -> NDArray:
+        def one(i: int) -> NDArray:
             return predictor.from_clouds(cloud_input(stored[i] * np.float32(POINT_UNIT), sphere.poses))
 
         return _tracked(one, objects, what)
@@ -203,7 +210,7 @@ def export_lem(
     _write_card(card, weights, facts)
 
 
-def _write_card(card: Path, weights: Path, facts: dict) -> None:
+def _write_card(card: Path, weights: Path, facts: dict[str, Any]) -> None:
     import json
 
     from nextview.models.card import file_hash
@@ -213,24 +220,24 @@ def _write_card(card: Path, weights: Path, facts: dict) -> None:
     part.rename(card)
 
 
-def _tracked(one, objects, what: str):  # noqa: ANN001, ANN202
+def _tracked(one: Callable[[int], NDArray], objects: NDArray, what: str) -> NDArray:
     """Stack what ``one`` gives for each object, behind a progress bar."""
     import numpy as np
 
     from nextview.cli.progress import track
 
-    found = []
+    found: list[NDArray] = []
 
-    def done():  # noqa: ANN202
+    def done() -> Iterator[int]:
         for i in objects:
-            found.append(one(i))
+            found.append(one(int(i)))
             yield len(found)
 
     track(done(), len(objects), what)
     return np.stack(found)
 
 
-def _all_logits(recogniser, inputs, objects, what: str):  # noqa: ANN001, ANN202
+def _all_logits(recogniser: Recogniser, inputs: NDArray, objects: NDArray, what: str) -> NDArray:
     """Logits (objects, V, classes) of all views."""
     import numpy as np
 

@@ -10,14 +10,12 @@ import tyro
 
 from nextview.training.recipes import LemRecipe, RecogniserRecipe
 
-Positional = tyro.conf.Positional
-
 
 def train_recogniser(
-    store: Positional[Path],
-    out: Positional[Path],
+    store: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
     deformed: Path | None = None,
-    recipe: tyro.conf.OmitArgPrefixes[RecogniserRecipe] = RecogniserRecipe(),  # noqa: B008
+    recipe: tyro.conf.OmitArgPrefixes[RecogniserRecipe] = RecogniserRecipe(),
 ) -> None:
     """Train the recogniser on a store's training split. Resumes if OUT holds a run that was cut off.
 
@@ -54,9 +52,9 @@ def train_recogniser(
 
 
 def train_lem(
-    store: Positional[Path],
-    out: Positional[Path],
-    recipe: tyro.conf.OmitArgPrefixes[LemRecipe] = LemRecipe(),  # noqa: B008
+    store: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    recipe: tyro.conf.OmitArgPrefixes[LemRecipe] = LemRecipe(),
 ) -> None:
     """Train the LEM on a store's training split. Resumes if OUT holds a run that was cut off.
 

@@ -1,0 +1,1 @@
+"""Datasets, view stores and predictions."""

@@ -1,0 +1,1 @@
+"""View-quality measures by name."""

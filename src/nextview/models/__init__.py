@@ -1,0 +1,1 @@
+"""Inference with ONNX Runtime: the bundled models, their cards and inputs."""

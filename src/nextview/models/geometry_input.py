@@ -15,9 +15,9 @@ def geometry_input(
 
     facing: cosine between the surface normal and the ray to the camera, 0 .. 1 (what a headlight would show).
     up: vertical part of the normal, -1 .. 1. height: above the object's centre, -1 .. 1 radii. nearness: towards the
-    camera from the object's centre, -1 .. 1 radii. Each becomes 1 .. 255; 0 is background. Normals come from differences
-    between neighbouring pixels of the full image, on whichever side the depth changes less; the image is then thinned by
-    taking every k-th pixel.
+    camera from the object's centre, -1 .. 1 radii. Each becomes 1 .. 255; 0 is background. Normals come from
+    differences between neighbouring pixels of the full image, on whichever side the depth changes less; the image is
+    then thinned to every k-th pixel.
 
     Args:
         depth: (B, H, W), object radii, 0 = no object; H and W are multiples of ``size``.
@@ -31,7 +31,7 @@ def geometry_input(
     Raises:
         ValueError: the image is not a square multiple of ``size``.
     """
-    b, h, w = depth.shape
+    _b, h, w = depth.shape
     if h != w or h % size:
         raise ValueError(f"a depth image of {h}x{w} cannot be thinned to {size}x{size}: use a multiple of {size}")
     k = h // size

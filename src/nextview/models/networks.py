@@ -108,6 +108,7 @@ class Models:
 
     @property
     def classes(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of the logits."""
         return self.recogniser.classes
 
     def valley_classes(self, map_name: str) -> tuple[int, ...]:

@@ -63,7 +63,7 @@ class Policy(Protocol):
 def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]) -> NDArray[np.int64]:
     """The unvisited view of the local window with the highest score.
 
-    Where the whole window is visited, the unvisited view with the shortest travel; where all views are, the window's best.
+    Where the whole window is visited, the unvisited view with the shortest travel; where all are, the window's best.
 
     Args:
         sphere: the viewpoints.

@@ -49,6 +49,7 @@ class MapPeak:
 
     @property
     def needs(self) -> tuple[str, ...]:
+        """The map that is climbed."""
         return (self.map_name,)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:

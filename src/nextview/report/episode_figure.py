@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from mpl_toolkits.mplot3d import Axes3D
 
 from nextview.session import Look, Recognition
 from nextview.viewsphere import ViewSphere
@@ -30,14 +33,16 @@ def save_episode(result: Recognition, sphere: ViewSphere, path: Path, title: str
 def draw_episode(result: Recognition, sphere: ViewSphere, title: str) -> Figure:
     """One column for each look (image, predicted map with the choice marked, belief), and the sphere beside them."""
     looks = result.looks
-    figure = Figure(figsize=(2.5 * len(looks) + 5.2, 8.2), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=[2.5 * len(looks), 5.2])
-    axes = left.subplots(3, len(looks), squeeze=False, gridspec_kw={"height_ratios": [1, 0.95, 1.15]})
+    heights = [2.7, 2.6, 2.9] if looks[0].maps else [2.7, 2.9]
+    figure = Figure(figsize=(2.5 * len(looks) + 5.2, sum(heights)), layout="constrained")
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.5 * len(looks), 5.2])[0]
+    axes = left.subplots(len(heights), len(looks), squeeze=False, gridspec_kw={"height_ratios": heights})
     shown = np.argsort(-np.max([look.belief for look in looks], axis=0))[:5]
     for k, look in enumerate(looks):
         _draw_image(axes[0, k], look, sphere, k + 1)
-        _draw_map(axes[1, k], look, sphere, first=k == 0)
-        _draw_belief(axes[2, k], look, result.classes, shown, first=k == 0)
+        if look.maps:
+            _draw_map(axes[1, k], look, sphere, first=k == 0)
+        _draw_belief(axes[-1, k], look, result.classes, shown, first=k == 0)
     _draw_path(right.add_subplot(projection="3d"), looks, sphere)
     figure.suptitle(
         f"{title}: {result.answer}, belief {result.confidence:.3f}, {len(looks)} look{'s' * (len(looks) > 1)}, "
@@ -56,19 +61,18 @@ def _draw_image(axis: Axes, look: Look, sphere: ViewSphere, step: int) -> None:
 
 
 def _draw_map(axis: Axes, look: Look, sphere: ViewSphere, first: bool) -> None:
-    if not look.maps:
-        axis.axis("off")
-        return
     name, predicted = next(iter(look.maps.items()))
     axis.imshow(predicted, cmap="viridis", vmin=0, vmax=1, origin="lower", aspect="auto")
     window = sphere.window(look.view)
     for ring, column in np.ndindex(window.shape):
         value = predicted[ring, column]
-        axis.text(column, ring, f"{value:.2f}", ha="center", va="center", fontsize=8, color="white" if value < 0.7 else INK)
+        axis.text(
+            column, ring, f"{value:.2f}", ha="center", va="center", fontsize=8, color="white" if value < 0.7 else INK
+        )
     for view, colour, label in ((look.view, "white", "here"), (look.next_view, ACCENT, "next")):
         for ring, column in np.argwhere(window == view)[:1] if view is not None else ():
-            box = (column - 0.46, ring - 0.46), 0.92, 0.92
-            axis.add_patch(_rectangle(*box, colour))
+            corner = (column - 0.46, ring - 0.46)
+            axis.add_patch(Rectangle(corner, 0.92, 0.92, fill=False, edgecolor=colour, linewidth=2.2))
             axis.text(column, ring - 0.33, label, ha="center", va="center", fontsize=7, color=colour, weight="bold")
     axis.set_xticks(range(3), ["-1", "0", "+1"], fontsize=8)
     axis.set_yticks(range(sphere.rings), [f"{e:.0f}°" for e in sphere.elevations] if first else [], fontsize=8)
@@ -76,12 +80,6 @@ def _draw_map(axis: Axes, look: Look, sphere: ViewSphere, first: bool) -> None:
     if first:
         axis.set_ylabel("elevation")
     axis.set_xlabel("azimuth step", fontsize=8)
-
-
-def _rectangle(corner: tuple[float, float], width: float, height: float, colour: str):  # noqa: ANN202
-    from matplotlib.patches import Rectangle
-
-    return Rectangle(corner, width, height, fill=False, edgecolor=colour, linewidth=2.2)
 
 
 def _draw_belief(axis: Axes, look: Look, classes: tuple[str, ...], shown: np.ndarray, first: bool) -> None:
@@ -97,18 +95,18 @@ def _draw_belief(axis: Axes, look: Look, classes: tuple[str, ...], shown: np.nda
         axis.legend(fontsize=7, loc="lower right", frameon=False)
 
 
-def _draw_path(axis: Axes, looks: tuple[Look, ...], sphere: ViewSphere) -> None:
+def _draw_path(axis: Axes3D, looks: tuple[Look, ...], sphere: ViewSphere) -> None:
     d = sphere.directions
     axis.scatter(*d.T, s=14, color=FAINT, depthshade=False)
     for elevation in np.radians(sphere.elevations):
-        a = np.linspace(0, 2 * np.pi, 91)
-        ring = np.cos(elevation) * np.cos(a), np.cos(elevation) * np.sin(a), np.full_like(a, np.sin(elevation))
+        around = np.linspace(0, 2 * np.pi, 91)
+        ring = np.cos(elevation) * np.cos(around), np.cos(elevation) * np.sin(around), 0 * around + np.sin(elevation)
         axis.plot(*ring, color=FAINT, linewidth=0.6)
-    cloud = np.concatenate([look.observation.points[::8] for look in looks])
+    cloud = np.concatenate([look.observation.points[::3] for look in looks])
     axis.scatter(*cloud.T, s=1, color=INK, alpha=0.35, depthshade=False)
     views = [look.view for look in looks]
-    for a, b in zip(views, views[1:], strict=False):
-        arc = _great_circle(d[a], d[b])
+    for a, b in itertools.pairwise(d[views]):
+        arc = _great_circle(a, b)
         axis.plot(*arc.T, color=ACCENT, linewidth=2)
     axis.scatter(*d[views].T, s=46, color=ACCENT, depthshade=False)
     for step, view in enumerate(views, 1):

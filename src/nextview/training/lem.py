@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import numpy as np
@@ -79,7 +80,7 @@ class LemModule(L.LightningModule):
         predicted = self.net(batch[0])[0].float()
         self.log("validation_mse", F.mse_loss(predicted, batch[1]), prog_bar=True, batch_size=len(predicted))
 
-    def configure_optimizers(self):  # noqa: ANN201  (Lightning's own union of types)
+    def configure_optimizers(self) -> dict[str, Any]:
         optimizer = torch.optim.Adam(self.parameters(), lr=self.recipe.rate)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, self.recipe.rate, self.steps, pct_start=0.2)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import numpy as np
@@ -109,7 +110,7 @@ class RecogniserModule(L.LightningModule):
         self.hits.zero_()
         self.seen.zero_()
 
-    def configure_optimizers(self):  # noqa: ANN201  (Lightning's own union of types)
+    def configure_optimizers(self) -> dict[str, Any]:
         decayed = [p for p in self.net.parameters() if p.ndim > 1]
         plain = [p for p in self.net.parameters() if p.ndim <= 1]
         optimizer = torch.optim.AdamW(

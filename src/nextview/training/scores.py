@@ -35,8 +35,8 @@ def map_scores(predicted: NDArray[np.floating], true: NDArray[np.floating]) -> d
         true: the same shape.
 
     Returns:
-        Mean squared error; the share of maps whose predicted highest cell lies at distance d = 0, d <= 1, d < 2 cells from the
-        true one; the mean regret: true highest value minus the true value at the predicted highest cell.
+        Mean squared error; the share of maps whose predicted highest cell lies at distance d = 0, d <= 1, d < 2 cells
+        from the true one; the mean regret: true highest value minus the true value at the predicted highest cell.
     """
     m, _, columns = true.shape
     p, t = predicted.reshape(m, -1), true.reshape(m, -1)
