@@ -140,7 +140,7 @@ def _read_with_trimesh(data: bytes, suffix: str) -> tuple[NDArray[np.float64], N
 def _damage_stl(data: bytes) -> str | None:
     facets, room = int.from_bytes(data[80:84], "little"), (len(data) - 84) // 50
     if data.lstrip()[:5].lower() == b"solid":  # text, or one of the many binary files that begin with this word
-        whole = re.search(rb"endsolid", data, re.I) or facets == room
+        whole = b"endsolid" in data.lower() or facets == room
         return None if whole else "the file is cut short, endsolid is missing"
     if len(data) < 84:
         return "the file is cut short in its header"
@@ -149,14 +149,15 @@ def _damage_stl(data: bytes) -> str | None:
 
 def _damage_ply(data: bytes) -> str | None:
     header, _, body = data.partition(b"end_header")
-    lines = [line.split() for line in body.splitlines() if line.strip()]
-    if b"format ascii" not in header or not lines:
+    if b"format ascii" not in header:
         return None  # trimesh checks the length of binary files
+    lines = [line for line in body.splitlines() if line.strip()]
     announced = sum(int(count) for count in re.findall(rb"(?m)^element\s+\S+\s+(\d+)", header))
     if len(lines) < announced:
         return f"the file is cut short, {announced} lines announced, {len(lines)} found"
     faces_last = re.search(rb"element\s+face\s+\d+\s+property\s+list.*\s*$", header)
-    return "the file is cut short in its last line" if faces_last and int(lines[-1][0]) >= len(lines[-1]) else None
+    last = lines[-1].split() if lines and faces_last else [b"0"]
+    return "the file is cut short in its last line" if int(last[0]) >= len(last) else None
 
 
 def _damage_obj(data: bytes) -> str | None:
