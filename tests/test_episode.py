@@ -235,3 +235,28 @@ def test_no_outcome_before_the_end():
         _ = episodes.outcome
     episodes.tell(table.observe(episodes.running, episodes.current))
     assert (episodes.outcome.looks == 2).all()
+
+
+def test_a_look_that_fails_is_not_taken_in():
+    class Moody:
+        needs = ()
+        fail = True
+
+        def next_views(self, state, rng):
+            if self.fail:
+                raise RuntimeError("not now")
+            return (state.current + 1) % 40
+
+    policy, sphere = Moody(), ViewSphere.named("40")
+    episodes = Episodes(sphere, policy, np.array([3]), Stopping(1.0, 3), np.random.default_rng(0))
+    look = Evidence(np.array([[1.0, 0.0]]))
+    with pytest.raises(PolicyError, match="not now"):
+        episodes.tell(look)
+    with pytest.raises(ValueError, match="finite"):
+        episodes.tell(Evidence(np.array([[np.nan, 0.0]])))
+    with pytest.raises(ValueError, match="2 looks for 1"):
+        episodes.tell(Evidence(np.zeros((2, 2))))
+    policy.fail = False
+    step = episodes.tell(look)
+    assert step.belief[0, 0] == pytest.approx(1 / (1 + np.exp(-1)))
+    assert step.next_views.tolist() == [4]

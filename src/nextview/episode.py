@@ -91,16 +91,25 @@ class Episodes:
             raise ValueError(f"a first view has to be one of the {len(sphere)} views, 0 to {len(sphere) - 1}")
         self.steps: list[Step] = []
         self._visited = np.zeros((len(starts), len(sphere)), bool)
-        self._total: NDArray[np.float64] | None = None
+        self._total: NDArray[np.float64] = np.zeros((len(starts), 0))
 
     def tell(self, evidence: Evidence) -> Step:
-        """Take in the evidence of one look in every running episode; stop or choose its next view."""
-        if self._total is None:
-            self._total = np.zeros((len(self.current), evidence.logits.shape[1]))
+        """Take in the evidence of one look in every running episode; stop or choose its next view.
+
+        Where this raises, nothing is taken in: the same look can be told again.
+
+        Raises:
+            ValueError: the evidence is of another number of episodes, or a logit is not finite.
+            PolicyError: the policy failed or chose something that is not a next view.
+        """
         now, views = self.running, self.current[self.running]
-        self._visited[now, views] = True
-        self._total[now] += evidence.logits
-        belief = fuse(self._total[now, None])
+        if len(evidence.logits) != len(now):
+            raise ValueError(f"evidence of {len(evidence.logits)} looks for {len(now)} running episodes")
+        before = self._total[now] if self.steps else 0.0
+        total = before + np.asarray(evidence.logits, np.float64)
+        belief = fuse(total[:, None])
+        visited = self._visited[now]
+        visited[np.arange(len(now)), views] = True
         looks = len(self.steps) + 1
         stopped = belief.max(1) >= self.stopping.threshold
         if looks >= min(self.stopping.max_views, len(self.sphere)):
@@ -109,11 +118,13 @@ class Episodes:
         next_views = np.full(len(now), -1)
         if going.any():
             left = now[going]
-            state = EpisodeState(views[going], self._visited[left], belief[going], select(evidence, going), looks, left)
-            chosen = self._choose(state)
-            next_views[going] = chosen
-            self.current[left] = chosen
+            state = EpisodeState(views[going], visited[going], belief[going], select(evidence, going), looks, left)
+            next_views[going] = self._choose(state)
         step = Step(now, views, evidence, belief, stopped, next_views)
+        if not self.steps:
+            self._total = np.zeros((len(self.current), total.shape[1]))
+        self._total[now], self._visited[now] = total, visited
+        self.current[now[going]] = next_views[going]
         self.steps.append(step)
         self.running = now[going]
         return step
@@ -162,7 +173,7 @@ class Episodes:
         Raises:
             ValueError: some are still running.
         """
-        if len(self.running) or not self.steps:
+        if len(self.running):
             raise ValueError("the episodes are still running")
         b = len(self.current)
         views = np.full((b, len(self.steps)), -1)

@@ -20,9 +20,10 @@ def fuse(logits: NDArray[np.floating]) -> NDArray[np.float64]:
     Raises:
         ValueError: a logit is not finite.
     """
-    total = np.asarray(logits, np.float64).sum(-2)
-    if not np.isfinite(total).all():
+    logits = np.asarray(logits, np.float64)
+    if not np.isfinite(logits).all():
         raise ValueError("the recogniser gave a logit that is not a finite number")
+    total = logits.sum(-2)
     total = np.exp(total - total.max(-1, keepdims=True))
     return total / total.sum(-1, keepdims=True)
 

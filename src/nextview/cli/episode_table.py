@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -29,9 +30,13 @@ def _peak(sphere: ViewSphere, look: Look) -> tuple[int, float] | None:
 def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: Stopping) -> None:
     """Print each look and the answer."""
     table = Table(
-        show_lines=True, title=f"Looking at {name}", caption="view: number, elevation, azimuth; travel: grid cells"
+        box=box.SIMPLE,
+        show_lines=True,
+        pad_edge=False,
+        title=f"Looking at {name}",
+        caption="view: number, elevation, azimuth; travel: grid cells",
     )
-    for column in ("step", "view", "image says", "belief, top 3", "map's peak", "next view", "travel"):
+    for column in ("step", "view", "image says", "belief, top 3", "map's peak", "next", "travel"):
         table.add_column(column, justify="right" if column in ("step", "travel") else "left", no_wrap=True)
     for step, look in enumerate(result.looks, 1):
         top = np.argsort(-look.belief)[:3]

@@ -55,5 +55,9 @@ class MapPeak:
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
+        if maps.shape[1:] != (self.sphere.rings, 3):
+            raise ValueError(
+                f"the map {self.map_name!r} is {maps.shape[1:]}, but the sphere has {self.sphere.rings} rings"
+            )
         valley = np.isin(state.belief.argmax(1), self.valley_classes)
         return best_in_window(self.sphere, state, peaks_first(np.where(valley[:, None, None], -maps, maps)))
