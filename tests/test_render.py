@@ -21,12 +21,17 @@ from nextview.viewsphere import ViewSphere
 SPHERE = ViewSphere.named("12")
 SIZE = 64
 SCRIPT = """
-import sys
+import multiprocessing, os, signal, sys
 from pathlib import Path
 from nextview.data.render import render
 from nextview.viewsphere import ViewSphere
-for name, reason in render(Path(sys.argv[1]), Path(sys.argv[2]), ViewSphere.named("12"), 64, workers=2):
-    print(name, flush=True)
+dataset, path, victim = sys.argv[1:]
+for n, _ in enumerate(render(Path(dataset), Path(path), ViewSphere.named("12"), 64, workers=2), 1):
+    if n == 3:
+        workers = [child.pid for child in multiprocessing.active_children()]
+        print(*workers, flush=True)
+        os.kill(os.getpid() if victim == "parent" else workers[0], signal.SIGKILL)
+print(n)
 """
 
 
@@ -71,13 +76,12 @@ def whole(dataset, tmp_path_factory) -> Path:
     return path
 
 
-def start(dataset: Path, path: Path) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, "-c", SCRIPT, dataset, path], stdout=subprocess.PIPE, text=True)
-
-
-def workers_of(parent: int) -> list[int]:
-    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
-    return [int(c) for c in children if b"resource_tracker" not in Path(f"/proc/{c}/cmdline").read_bytes()]
+def render_and_kill(dataset: Path, path: Path, victim: str) -> tuple[int, list[int]]:
+    """Exit status, and the numbers that the script prints."""
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, dataset, path, victim], stdout=subprocess.PIPE, text=True, timeout=120
+    )
+    return done.returncode, [int(word) for word in done.stdout.split()]
 
 
 def alive(process: int) -> bool:
@@ -93,15 +97,10 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @linux
 def test_kill_of_the_parent_loses_nothing_and_leaves_no_orphans(dataset, whole, tmp_path):
     path = tmp_path / "views.zarr"
-    run = start(dataset, path)
-    for _ in range(3):
-        run.stdout.readline()
-    workers = workers_of(run.pid)
+    status, workers = render_and_kill(dataset, path, "parent")
+    assert status == -signal.SIGKILL
     assert len(workers) == 2
-    os.kill(run.pid, signal.SIGKILL)
-    run.wait()
-    run.stdout.close()
-    deadline = time.monotonic() + 5
+    deadline = time.monotonic() + 30
     while any(alive(w) for w in workers):
         assert time.monotonic() < deadline, "workers outlive their parent"
         time.sleep(0.02)
@@ -116,12 +115,9 @@ def test_kill_of_the_parent_loses_nothing_and_leaves_no_orphans(dataset, whole, 
 @linux
 def test_kill_of_a_worker_does_not_end_the_run(dataset, whole, tmp_path):
     path = tmp_path / "views.zarr"
-    run = start(dataset, path)
-    run.stdout.readline()
-    os.kill(workers_of(run.pid)[0], signal.SIGKILL)
-    out, _ = run.communicate(timeout=60)
-    assert run.returncode == 0
-    assert len(out.split()) == 23
+    status, printed = render_and_kill(dataset, path, "worker")
+    assert status == 0
+    assert printed[-1] == 24
     assert_same(whole, path)
     assert ViewStore.open(path).failures == {}
 
