@@ -1,6 +1,8 @@
 import json
+import runpy
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -181,6 +183,21 @@ def test_settings_tell_how_to_run_it_again(folder):
     assert settings["seed"] == 0
     assert settings["models"]["recogniser"] == ["r", "0" * 64]
     assert settings["valley_classes"] == ["box"]
+
+
+def test_the_page_of_the_reproduction_says_what_the_tables_say(folder):
+    page = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "reproduction.py"))["page"]
+    text = page(folder / "p.npz", samples=200)
+    benchmark(folder / "p.npz", out=folder / "full", samples=200)
+    summary = pd.read_csv(folder / "full" / "summary.csv").set_index(["policy", "threshold", "measure"])["value"]
+    tests = pd.read_csv(folder / "full" / "tests.csv").set_index(["policy", "threshold", "measure"])
+    for name in ("lem", "oracle-gain"):
+        row = next(line for line in text.split("## Every policy")[1].splitlines() if line.startswith(f"| {name} |"))
+        for cell, measure in zip(row.split("|")[2:], ["accuracy", "clean_accuracy", "looks"], strict=False):
+            assert float(cell.split()[0]) == pytest.approx(summary[name, 0.97, measure], abs=0.0051)
+        test = tests.loc[(name, 0.97, "accuracy")]
+        assert f"{100 * test.difference:+.1f} ({100 * test.low:+.1f} to {100 * test.high:+.1f}" in text
+    assert "LCM from a predicted map; no such network" in text
 
 
 @pytest.mark.parametrize(("policy", "column"), [("oracle-valley", "LEM10"), ("furthest", "furthest")])
