@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import warnings
 from pathlib import Path
 
 import lightning as L
@@ -40,6 +42,7 @@ def fit(
     # Numbers too small for the normal format are slow on CPUs and mean nothing here.
     torch.set_flush_denormal(True)
     last = out / "last.ckpt"
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     trainer = L.Trainer(
         max_epochs=epochs,
         precision="bf16-mixed",
@@ -48,6 +51,12 @@ def fit(
         callbacks=[ModelCheckpoint(out, "epoch", save_last=True), EpochSeed()],
         enable_model_summary=False,
         reload_dataloaders_every_n_epochs=1,
+        log_every_n_steps=1,
     )
-    trainer.fit(module, datamodule=Batches(training, validation), ckpt_path=str(last) if last.exists() else None)
+    with warnings.catch_warnings():
+        # All of them describe what is meant here: a run that resumes, and data sets that make their own batches.
+        warnings.filterwarnings("ignore", module="lightning")
+        warnings.filterwarnings("ignore", message=".*LeafSpec")
+        resume = str(last) if last.exists() else None
+        trainer.fit(module, datamodule=Batches(training, validation), ckpt_path=resume)
     return module

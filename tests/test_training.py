@@ -1,0 +1,178 @@
+"""Networks, scores and the way from a folder of meshes to a model that recognises, in small."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy.special import softmax
+from tests.test_readme import write_off
+
+from nextview.cli.main import main
+from nextview.data import split
+from nextview.data.samples import SAMPLES, boxes_mesh
+from nextview.data.store import ViewStore
+from nextview.models.networks import MapNetwork, Recogniser
+from nextview.viewsphere import ViewSphere
+
+torch = pytest.importorskip("torch")
+
+from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
+from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
+from nextview.training.scores import map_scores, recogniser_scores  # noqa: E402
+from nextview.training.valleys import valley_gains  # noqa: E402
+
+BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
+
+
+@pytest.mark.parametrize(("depth", "published"), [(18, 11_689_512), (34, 21_797_672)])
+def test_resnet_is_torchvisions(depth, published):
+    network = ResNet(depth, 1000, 3)
+    assert sum(p.numel() for p in network.parameters()) == published
+    norms = ["bn1"]
+    convolutions = ["conv1"]
+    for stage, blocks in enumerate(BLOCKS[depth], 1):
+        for block in range(blocks):
+            at = f"layer{stage}.{block}."
+            convolutions += [at + "conv1", at + "conv2"]
+            norms += [at + "bn1", at + "bn2"]
+            if stage > 1 and block == 0:
+                convolutions.append(at + "downsample.0")
+                norms.append(at + "downsample.1")
+    parts = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
+    names = {f"{c}.weight" for c in convolutions} | {f"{n}.{p}" for n in norms for p in parts}
+    assert set(network.state_dict()) == names | {"fc.weight", "fc.bias"}
+
+
+def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
+    torch.manual_seed(0)
+    network = PointNet(5).eval()
+    cloud = torch.rand(3, 200, 3)
+    predicted, a, b = network(cloud)
+    assert predicted.shape == (3, 5, 3)
+    assert torch.allclose(a, torch.eye(3).expand(3, 3, 3))
+    assert torch.allclose(b, torch.eye(64).expand(3, 64, 64))
+    assert torch.allclose(network(cloud[:, torch.randperm(200)])[0], predicted, atol=1e-5)
+
+
+def test_orthogonality_of_rotations_and_scalings():
+    rotation = torch.linalg.qr(torch.randn(4, 3, 3)).Q
+    assert orthogonality(rotation) < 1e-5
+    assert orthogonality(2 * torch.eye(64).expand(2, 64, 64)).item() == pytest.approx(3 * math.sqrt(64))
+
+
+def test_temperature_is_recovered():
+    rng = np.random.default_rng(0)
+    logits = 3 * rng.normal(size=(20_000, 4))
+    labels = (softmax(logits, 1).cumsum(1) > rng.random((20_000, 1))).argmax(1)
+    for temperature in (0.5, 1.0, 2.5):
+        assert fit_temperature(temperature * logits, labels) == pytest.approx(temperature, rel=0.05)
+
+
+def test_export_keeps_the_answers(tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    torch.manual_seed(0)
+    network = ResNet(18, 5, 4).eval()
+    x = torch.rand(2, 4, 64, 64)
+    export_onnx(network, x, "input", ["logits", "features"], tmp_path / "net.onnx")
+    assert [p.name for p in tmp_path.iterdir()] == ["net.onnx"]
+    session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
+    more = torch.rand(3, 4, 64, 64)  # another batch size than the example's
+    with torch.no_grad():
+        expected = network(more)
+    for ours, theirs in zip(session.run(None, {"input": more.numpy()}), expected, strict=True):
+        assert np.abs(ours - theirs.numpy()).max() < 0.01 * theirs.abs().max()
+    full = sum(p.numel() for p in network.parameters()) * 4
+    assert (tmp_path / "net.onnx").stat().st_size < 0.6 * full
+
+
+def test_scores_by_hand():
+    logits = np.zeros((2, 2, 2))
+    logits[0, 0, 0], logits[0, 1, 1] = 5, 1  # object 0 (class 0): one view right, and it outweighs the other
+    logits[1, :, 1] = 1  # object 1 (class 1): both right
+    scores = recogniser_scores(logits, np.array([0, 1]))
+    assert scores["single_view"] == {"instance": 0.75, "class": 0.75}
+    assert scores["all_views_fused"] == {"instance": 1.0, "class": 1.0}
+    true = np.zeros((3, 5, 3))
+    true[:, 2, 1] = 1
+    true[2, 4, 1] = 0.25
+    predicted = np.zeros((3, 5, 3))
+    predicted[0, 2, 1] = predicted[1, 2, 0] = predicted[2, 4, 1] = 1  # at distance 0, 1 and 2
+    scores = map_scores(predicted, true)
+    assert scores["d0"] == pytest.approx(1 / 3, abs=1e-4)
+    assert scores["d_le_1"] == scores["d_lt_2"] == pytest.approx(2 / 3, abs=1e-4)
+    assert scores["regret"] == pytest.approx((0 + 1 + 0.75) / 3, abs=1e-4)
+
+
+def test_valley_classes_are_those_that_gain_by_the_valley():
+    sphere = ViewSphere.named("40")
+    logits = np.zeros((2, 40, 2))
+    high = sphere.ring == 4
+    logits[0, ~high, 0], logits[1, high, 1] = 3, 3  # class 0 is clear from below, class 1 from above
+    maps = np.broadcast_to((sphere.ring / 4)[sphere.windows], (2, 40, 5, 3))  # the map rises with the ring
+    gains = valley_gains(sphere, logits, maps, np.array([0, 1]))
+    assert gains[0] > 0.1
+    assert gains[1] < -0.1
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Twenty boxy objects of two classes, rendered, and both networks trained on them for a moment."""
+    root = tmp_path_factory.mktemp("train")
+    rng = np.random.default_rng(0)
+    for label in ("monitor", "table"):
+        for k in range(10):
+            scale = rng.uniform(0.8, 1.25, 3)
+            boxes = [tuple(tuple(np.multiply(corner, scale)) for corner in box) for box in SAMPLES[label]()]
+            folder = root / "meshes" / label / ("test" if k > 7 else "train")
+            folder.mkdir(parents=True, exist_ok=True)
+            write_off(folder / f"{label}_{k}.off", boxes_mesh(boxes, label))
+    twin = root / "meshes/table/train/table_0.off"
+    (root / "meshes/monitor/train/monitor_twin.off").write_bytes(twin.read_bytes())
+    store, runs, models = root / "views.zarr", root / "runs", root / "models"
+    small = ["--epochs", "2", "--views", "4", "--batch", "8", "--validation", "0.25"]
+    main(["render", str(root / "meshes"), str(store), "--workers", "1"])
+    main(["train", "recogniser", str(store), str(runs / "recogniser"), *small])
+    main(["export", "recogniser", str(runs / "recogniser"), str(store), str(models), "--name", "tiny"])
+    main(["train", "lem", str(store), str(runs / "lem"), *small])
+    card = str(models / "tiny.json")
+    main(["export", "lem", str(runs / "lem"), str(store), str(models), "--name", "tiny-lem", "--recogniser", card])
+    return root
+
+
+def test_split_keeps_twins_together_and_test_objects_out(trained):
+    store = ViewStore.open(trained / "views.zarr")
+    for seed in range(6):
+        training, validation = split.split_training(store, 0.25, seed)
+        assert not set(training) & set(validation)
+        assert set(training) | set(validation) | set(split.test_objects(store)) == set(range(len(store)))
+        assert (store.splits[[*training, *validation]] == "train").all()
+        twins = [store.names.index(name) for name in ("table_0", "monitor_twin")]
+        assert np.isin(twins, validation).sum() in (0, 2)
+        assert set(store.labels[validation]) == {0, 1}
+
+
+def test_trained_models_have_cards_and_run(trained):
+    card = json.loads((trained / "models/tiny.json").read_text())
+    assert card["classes"] == ["monitor", "table"]
+    assert {part.split()[0] for part in card["scores"]} == {"validation", "test"}
+    recogniser = Recogniser(trained / "models/tiny.json")
+    logits, features = recogniser.from_inputs(np.zeros((3, 4, 112, 112), np.uint8))
+    assert logits.shape == (3, 2)
+    assert features.shape == (3, 512)
+    assert MapNetwork(trained / "models/tiny-lem.json").from_clouds(np.zeros((2, 1024, 3), np.float32)).shape == (
+        2,
+        5,
+        3,
+    )
+
+
+def test_a_finished_run_is_not_trained_again(trained):
+    run = trained / "runs/lem"
+    log = (run / "log/metrics.csv").read_text()
+    before = torch.load(run / "network.pt", weights_only=True)
+    arguments = ["--epochs", "2", "--views", "4", "--batch", "8", "--validation", "0.25"]
+    main(["train", "lem", str(trained / "views.zarr"), str(run), *arguments])
+    after = torch.load(run / "network.pt", weights_only=True)
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert "1," in log
