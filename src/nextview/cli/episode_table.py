@@ -33,6 +33,7 @@ def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: 
         box=box.SIMPLE,
         show_lines=True,
         pad_edge=False,
+        padding=(0, 1, 0, 0),
         title=f"Looking at {name}",
         caption="view: number, elevation, azimuth; travel: grid cells",
     )

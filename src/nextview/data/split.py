@@ -9,9 +9,7 @@ from nextview.data.folders import DatasetError
 from nextview.data.store import ViewStore
 
 
-def split_training(
-    store: ViewStore, share: float = 0.1, seed: int = 0
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Divide the rendered objects of the training split.
 
     Meshes that are byte-identical look identical, so equal depth-entropy from all views marks them; they stay on one
