@@ -183,6 +183,12 @@ def test_a_sphere_without_size(distance):
         ViewSphere((0.0,), 8, distance)
 
 
+@pytest.mark.parametrize("name", ["ring", "azimuth_index", "poses", "directions", "windows", "travel", "arc"])
+def test_nobody_can_move_the_shared_viewpoints(name):
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(ViewSphere.named("40"), name)[0] *= 2
+
+
 def test_an_unknown_layout():
     with pytest.raises(ValueError, match=r"'41'.*40, 12"):
         ViewSphere.named("41")

@@ -43,9 +43,16 @@ def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = D
     return pose
 
 
+def _fixed(array: NDArray) -> NDArray:
+    array.flags.writeable = False
+    return array
+
+
 @dataclass(frozen=True)
 class ViewSphere:
     """Viewpoints on rings around an object; ``len(sphere)`` of them.
+
+    Its arrays are read-only: the named layouts are shared, and a change in place would move everybody's viewpoints.
 
     Attributes:
         elevations: elevation of each ring, degrees, ring 0 first.
@@ -87,12 +94,12 @@ class ViewSphere:
     @cached_property
     def ring(self) -> Index:
         """Ring of each view, shape (V,), int64."""
-        return np.repeat(np.arange(self.rings), self.azimuths)
+        return _fixed(np.repeat(np.arange(self.rings), self.azimuths))
 
     @cached_property
     def azimuth_index(self) -> Index:
         """Position of each view on its ring, shape (V,), int64."""
-        return np.tile(np.arange(self.azimuths), self.rings)
+        return _fixed(np.tile(np.arange(self.azimuths), self.rings))
 
     def angles(self, view: int) -> tuple[float, float]:
         """(elevation, azimuth) of a view, degrees."""
@@ -101,20 +108,19 @@ class ViewSphere:
     @cached_property
     def poses(self) -> Float:
         """Camera-to-world pose of each view, shape (V, 4, 4), float64, OpenCV camera axes."""
-        return look_at_origin(
-            np.radians(self.elevations)[self.ring], 2 * np.pi * self.azimuth_index / self.azimuths, self.distance
-        )
+        elevation, azimuth = np.radians(self.elevations)[self.ring], 2 * np.pi * self.azimuth_index / self.azimuths
+        return _fixed(look_at_origin(elevation, azimuth, self.distance))
 
     @cached_property
     def directions(self) -> Float:
         """Unit vector from the origin towards each view, shape (V, 3), float64."""
-        return self.poses[:, :3, 3] / self.distance
+        return _fixed(self.poses[:, :3, 3] / self.distance)
 
     @cached_property
     def windows(self) -> Index:
         """Neighbours of each view: all rings x azimuth -1, 0, +1 with wrap-around, shape (V, rings, 3), int64."""
         columns = (self.azimuth_index[:, None] + np.array([-1, 0, 1])) % self.azimuths
-        return np.arange(self.rings)[None, :, None] * self.azimuths + columns[:, None, :]
+        return _fixed(np.arange(self.rings)[None, :, None] * self.azimuths + columns[:, None, :])
 
     def window(self, view: int) -> Index:
         """View indices around one view, shape (rings, 3), int64; the view itself is in the middle column."""
@@ -125,14 +131,14 @@ class ViewSphere:
         """Distance between views in grid cells (Euclidean over ring and azimuth, table 9), shape (V, V), float64."""
         rings = self.ring[:, None] - self.ring[None, :]
         steps = np.abs(self.azimuth_index[:, None] - self.azimuth_index[None, :])
-        return np.hypot(rings, np.minimum(steps, self.azimuths - steps))
+        return _fixed(np.hypot(rings, np.minimum(steps, self.azimuths - steps)))
 
     @cached_property
     def arc(self) -> Float:
         """Great-circle angle between views, radians, shape (V, V), float64."""
         # arctan2 keeps its precision for equal and for opposite directions, where arccos loses half the digits.
         a, b = self.directions[:, None], self.directions[None, :]
-        return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1))
+        return _fixed(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
 
 
 LAYOUTS = {
