@@ -94,6 +94,12 @@ def test_pinhole_puts_the_tangent_ray_on_the_border(distance, size):
     np.testing.assert_allclose(intrinsics @ tangent, [size, size / 2, 1], rtol=1e-9)
 
 
+@pytest.mark.parametrize("distance", [1.0, 0.5, -3.0, np.nan])
+def test_no_image_holds_a_ball_that_the_camera_is_inside_of(distance):
+    with pytest.raises(ValueError, match="more than one object radius"):
+        pinhole(224, distance)
+
+
 def test_a_ball_is_lit_by_a_headlight():
     look = SimulatedCamera(BALL, 224).observe(SPHERE.poses[9])
     d = rays(224, look.intrinsics)
