@@ -184,6 +184,49 @@ def test_the_up_axis_can_be_told(tmp_path):
         load_mesh(path, "x")
 
 
+@pytest.mark.parametrize(
+    "faces",
+    [
+        "f 1 2 3\nf 1 3 4\nf 4 3 5\nf 1 4 5\nf 2 1 5\nf 3 2 5\n",
+        "f 1 2 3 4\nf 4 3 5\nf 1 4 5\nf 2 1 5\nf 3 2 5\n",
+        "f 1 2 3 # part 0\nf 1 3 4 # 0\nf 4 3 5\nf 1 4 5\nf 2 1 5\nf 3 2 5\n",
+        "f 1/1/1 2/1/1 3/1/1 4/1/1\ng sides\nf 4//1 3//1 5//1\nf 1/1 4/1 5/1\ns off\nf 2 1 5\nusemtl a\nf 3 2 5",
+        "f 1 2 \\\n 3 4\nf -2 3 5\nf 1 4 -1\nf 2 -5 5\nf 3 2 5\n",
+    ],
+    ids=["triangles", "polygon", "comments", "texture, normals and groups", "continued and relative"],
+)
+@pytest.mark.parametrize(
+    "change", [str, lambda text: text.replace("\n", "\r\n"), lambda text: text.replace(" ", "\t ")]
+)
+def test_obj_as_it_is_found_in_the_wild(tmp_path, faces, change):
+    apex = "v 1 1 -3 0.5 0.5 0.5 # with a colour\nvt 0 0\nvn 0 0 1\n"
+    text = "mtllib none.mtl\n\n" + "".join("v {} {} {}\n".format(*v) for v in SQUARE) + apex + faces
+    mesh = load_mesh(write(tmp_path, "pyramid.obj", change(text)))
+    closed = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert len(mesh.faces) == 6
+    assert closed.is_watertight
+    assert closed.volume * mesh.radius**3 == pytest.approx(4 * 3 / 3)
+
+
+def test_relative_indices_of_an_obj_count_from_where_they_stand(tmp_path):
+    # The format's own example: every face takes the four vertices just before it.
+    squares = [np.add(SQUARE, (0, 0, height)) for height in (0, 1, 5)]
+    text = "".join("".join("v {} {} {}\n".format(*v) for v in square) + "f -4 -3 -2 -1\n" for square in squares)
+    mesh = load_mesh(write(tmp_path, "squares.obj", text))
+    found = (mesh.vertices * mesh.radius + mesh.centre)[mesh.faces]
+    assert np.ptp(found[..., 2], axis=1).max() < 1e-9
+    assert np.round(found[:, 0, 2], 9).tolist() == [0, 0, 1, 1, 5, 5]
+
+
+def test_obj_is_read_as_trimesh_reads_it(tmp_path):
+    shape = trimesh.creation.icosphere(subdivisions=2).export(file_type="obj")
+    path = write(tmp_path, "ball.obj", shape)
+    other = trimesh.load(path, process=False)
+    mesh = load_mesh(path)
+    np.testing.assert_array_equal(mesh.faces, other.faces)
+    np.testing.assert_allclose(mesh.vertices * mesh.radius + mesh.centre, other.vertices, atol=1e-12)
+
+
 # Normalising
 
 
@@ -221,6 +264,22 @@ def test_vertices_that_no_face_uses_do_not_count():
 
 # Refusing
 
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "part"),
+    [
+        (SQUARE, [[0, 1, 2, 3]] * 3, r"faces have the shape \(3, 4\)"),  # twelve numbers, but no four triangles
+        (np.ones((3, 2)), [[0, 1, 2]], r"vertices have the shape \(3, 2\)"),
+        (SQUARE, [0, 1, 2], r"faces have the shape \(3,\)"),
+        (SQUARE, [], "no faces"),
+        ([], [[0, 1, 2]], "no vertices"),
+    ],
+)
+def test_arrays_that_are_no_triangle_mesh(vertices, faces, part):
+    with pytest.raises(MeshError, match=f"^thing: .*{part}"):
+        make_mesh(vertices, faces, "thing")
+
+
 GOOD = "0 0 0\n1 0 0\n0 1 0"
 
 
@@ -234,6 +293,7 @@ def broken_files() -> dict[str, tuple[str, bytes | str, str]]:
         "no vertices": ("a.off", "OFF\n0 0 0\n", "no vertices"),
         "edges only": ("a.off", off(GOOD, "2 0 1"), "no faces"),
         "index too high": ("a.off", off(GOOD, "3 0 1 3"), "vertex 3, but there are only 3"),
+        "index absurd": ("a.off", off(GOOD, "3 0 1 " + "9" * 30), "refers to vertex 9+, but there are only 3"),
         "index below zero": ("a.off", off(GOOD, "3 0 1 -1"), "vertex -1"),
         "index not a number": ("a.off", off(GOOD, "3 0 1 inf"), "inf"),
         "index with a fraction": ("a.off", off(GOOD, "3 0 1 1.5"), "1.5"),
@@ -255,12 +315,25 @@ def broken_files() -> dict[str, tuple[str, bytes | str, str]]:
         "huge face count": ("a.off", "OFF\n1 999999999999 0\n1 2 3\n", "cut short"),
         "absurd count": ("a.off", "OFF\n" + "9" * 6000 + " 1 0\n", "not a readable OFF mesh"),
         "huge face": ("a.off", off(GOOD, "999999999999 0 1 2"), "3 of 999999999999 corners"),
-        "OBJ index too high": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "out of bounds"),
-        "OBJ index too low": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -4 2 3\n", "out of bounds"),
+        "OBJ index too high": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "vertex 4, but there are only 3"),
+        "OBJ index absurd": (
+            "a.obj",
+            "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 " + "9" * 30,
+            "vertex 9+, but there are only 3",
+        ),
+        "OBJ index too low": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -4 2 3\n", "vertex -4, but only 3 come before"),
+        "OBJ index of no vertex yet": (
+            "a.obj",
+            "f -1 1 2\nv 0 0 0\nv 1 0 0\nv 0 1 0\n",
+            "vertex -1, but only 0 come before",
+        ),
         "OBJ index zero": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "vertex 0, the first is 1"),
         "OBJ NaN": ("a.obj", "v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN or infinite"),
         "OBJ no faces": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
         "OBJ cut in a face": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2", "cut short"),
+        "OBJ damaged inside": ("a.obj", "v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "vertex 2 has 2 of 3 coordinates"),
+        "OBJ vertex not a number": ("a.obj", "v 0 0 zero\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "zero"),
+        "OBJ index not a number": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 two 3\n", "two"),
         "OBJ cut in a vertex": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1", "cut short"),
         "PLY index too high": ("a.ply", text_ply.replace(b"3 1 3 0", b"3 1 33 0"), "vertex 33"),
         "PLY index below zero": ("a.ply", text_ply.replace(b"3 1 3 0", b"3 1 -3 0"), "vertex -3"),
@@ -272,6 +345,7 @@ def broken_files() -> dict[str, tuple[str, bytes | str, str]]:
         "STL cut": ("a.stl", binary["stl"][:400], "cut short, 12 faces announced, 6 found"),
         "STL named solid, cut": ("a.stl", b"solid" + binary["stl"][5:400], "cut short"),
         "STL text cut": ("a.stl", binary["stl_ascii"][:-30], "cut short"),
+        "STL text cut in its second solid": ("a.stl", 2 * binary["stl_ascii"][:-30] + "\n", "cut short"),
         "STL NaN": ("a.stl", binary["stl"][:96] + struct.pack("<f", np.nan) + binary["stl"][100:], "NaN or infinite"),
     }
     for kind in ("ply", "glb"):

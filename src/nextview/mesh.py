@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.obj import read_obj
 from nextview.off import read_off
 
 FORMATS = (".off", ".obj", ".ply", ".stl", ".glb")
@@ -49,14 +50,14 @@ def make_mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], name: 
         The mesh in the object frame, without the vertices that no face uses.
 
     Raises:
-        MeshError: no faces, an index out of range, a position that is not finite, or no extent.
+        MeshError: no faces, not triangles, an index out of range, a position that is not finite, or no extent.
     """
-    vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
-    faces = np.asarray(faces).reshape(-1, 3)
-    if len(vertices) == 0:
-        raise MeshError(f"{name}: the mesh has no vertices")
-    if len(faces) == 0:
-        raise MeshError(f"{name}: the mesh has no faces")
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
+    for array, what in ((vertices, "vertices"), (faces, "faces")):
+        if len(array) == 0:
+            raise MeshError(f"{name}: the mesh has no {what}")
+        if array.shape != (len(array), 3):
+            raise MeshError(f"{name}: {what} have the shape {array.shape}, not (n, 3)")
     if faces.min() < 0 or faces.max() >= len(vertices):
         worst = int(faces.min() if faces.min() < 0 else faces.max())
         raise MeshError(f"{name}: a face refers to vertex {worst}, but there are only {len(vertices)} vertices")
@@ -111,7 +112,7 @@ def load_mesh(path: str | Path, up: str | None = None) -> Mesh:
     if not data.strip():
         raise MeshError(f"{path}: the file is empty")
     try:
-        vertices, faces = read_off(data) if suffix == ".off" else _read_with_trimesh(data, suffix)
+        vertices, faces = _READERS[suffix](data) if suffix in _READERS else _read_with_trimesh(data, suffix)
     except Exception as error:  # parsers raise whatever a broken file makes them raise
         reason = str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
         raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({reason})") from None
@@ -123,7 +124,7 @@ def load_mesh(path: str | Path, up: str | None = None) -> Mesh:
 def _read_with_trimesh(data: bytes, suffix: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     import io
 
-    import trimesh  # a third of a second to import, and OFF does not need it
+    import trimesh  # a third of a second to import, and OFF and OBJ do not need it
 
     damage = _DAMAGE.get(suffix, lambda data: None)(data)
     if damage:
@@ -138,12 +139,12 @@ def _read_with_trimesh(data: bytes, suffix: str) -> tuple[NDArray[np.float64], N
 
 
 def _damage_stl(data: bytes) -> str | None:
-    facets, room = int.from_bytes(data[80:84], "little"), (len(data) - 84) // 50
-    if data.lstrip()[:5].lower() == b"solid":  # text, or one of the many binary files that begin with this word
-        whole = b"endsolid" in data.lower() or facets == room
-        return None if whole else "the file is cut short, endsolid is missing"
+    if b"\0" not in data:  # text: a binary file holds zeros, though it may begin with "solid" too
+        unended = re.search(rb"[\r\n]\s*facet\b", data.lower().rpartition(b"endsolid")[2])
+        return "the file is cut short, endsolid is missing" if unended else None
     if len(data) < 84:
         return "the file is cut short in its header"
+    facets, room = int.from_bytes(data[80:84], "little"), (len(data) - 84) // 50
     return f"the file is cut short, {facets} faces announced, {room} found" if facets > room else None
 
 
@@ -160,12 +161,6 @@ def _damage_ply(data: bytes) -> str | None:
     return "the file is cut short in its last line" if int(last[0]) >= len(last) else None
 
 
-def _damage_obj(data: bytes) -> str | None:
-    last = data.rsplit(b"\n", 1)[-1].split()
-    if last[:1] in ([b"v"], [b"f"]) and len(last) < 4:
-        return "the file is cut short in its last line"
-    return "a face refers to vertex 0, the first is 1" if re.search(rb"(?m)^f\b.*[ \t]0(?=[/\s]|$)", data) else None
-
-
-_DAMAGE = {".stl": _damage_stl, ".ply": _damage_ply, ".obj": _damage_obj}
+_READERS = {".off": read_off, ".obj": read_obj}
+_DAMAGE = {".stl": _damage_stl, ".ply": _damage_ply}
 """What trimesh lets pass: for some formats, a function of the file's bytes that says what is wrong with them."""

@@ -79,5 +79,7 @@ def _read_lines(body: bytes, vertex_count: int, face_count: int) -> tuple[NDArra
         if corners < 0 or len(columns) < 1 + corners:
             raise ValueError(f"face {i} has {len(columns) - 1} of {corners} corners")
         polygon = [int(c) for c in columns[1 : 1 + corners]]
+        if max(polygon, default=0) >= vertex_count:
+            raise ValueError(f"face {i} refers to vertex {max(polygon)}, but there are only {vertex_count} vertices")
         triangles += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, corners - 1)]
     return vertices, np.array(triangles, np.int64).reshape(-1, 3)
