@@ -58,5 +58,8 @@ def fit(
         warnings.filterwarnings("ignore", module="lightning")
         warnings.filterwarnings("ignore", message=".*LeafSpec")
         resume = str(last) if last.exists() else None
-        trainer.fit(module, datamodule=Batches(training, validation), ckpt_path=resume)
+        try:
+            trainer.fit(module, datamodule=Batches(training, validation), ckpt_path=resume)
+        finally:
+            torch.set_flush_denormal(False)  # it holds for the whole process
     return module
