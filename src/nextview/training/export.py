@@ -60,11 +60,20 @@ def export_onnx(network: nn.Module, example: Tensor, inputs: str, outputs: list[
             opset_version=OPSET,
             verbose=False,
         )
-    model = halve_weights(program.model_proto)
+    model = strip_traces(halve_weights(program.model_proto))
     onnx.checker.check_model(model, full_check=True)
     part = path.with_suffix(".part")
     onnx.save(model, part)
     part.rename(path)
+
+
+def strip_traces(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Take out what the exporter notes down of the machine: source lines and stack traces."""
+    graph = model.graph
+    for part in (model, graph, *graph.node, *graph.value_info, *graph.input, *graph.output, *graph.initializer):
+        del part.metadata_props[:]
+        part.doc_string = ""
+    return model
 
 
 def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
