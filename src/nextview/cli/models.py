@@ -22,13 +22,12 @@ def models(name: tyro.conf.Positional[str | None] = None, /) -> None:
         print(json.dumps(find_card(name).facts, indent=1))
         return
     table = Table("model", "kind", "network", "MB", "scores on test", "file")
-    for column in table.columns[::4]:
-        column.no_wrap = True
+    table.columns[0].no_wrap = True
     for card in bundled_cards().values():
         tested = []
         for split, scores in card.facts["scores"].items():
             for score, value in scores.items() if split.startswith("test") else ():
-                value = f"{value['instance']} (class mean {value['class']})" if isinstance(value, dict) else value
+                value = f"{value['instance']}\n  class mean {value['class']}" if isinstance(value, dict) else value
                 tested.append(f"{score.replace('_', ' ')} {value}")
         intact = "intact" if file_hash(card.path) == card.sha256 else "DAMAGED"
         size = f"{card.path.stat().st_size / 1e6:.1f}"
