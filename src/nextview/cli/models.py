@@ -21,7 +21,7 @@ def models(name: tyro.conf.Positional[str | None] = None, /) -> None:
     if name:
         print(json.dumps(find_card(name).facts, indent=1))
         return
-    table = Table("model", "kind", "network", "MB", "scores on test", "file")
+    table = Table("model", "kind", "MB", "scores on test", "file")
     table.columns[0].no_wrap = True
     for card in bundled_cards().values():
         tested = []
@@ -31,5 +31,5 @@ def models(name: tyro.conf.Positional[str | None] = None, /) -> None:
                 tested.append(f"{score.replace('_', ' ')} {value}")
         intact = "intact" if file_hash(card.path) == card.sha256 else "DAMAGED"
         size = f"{card.path.stat().st_size / 1e6:.1f}"
-        table.add_row(card.name, card.kind, card.facts["network"], size, "\n".join(tested), intact)
+        table.add_row(card.name, card.kind, size, "\n".join(tested), intact)
     Console().print(table)
