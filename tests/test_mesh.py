@@ -304,6 +304,7 @@ def broken_files() -> dict[str, tuple[str, bytes | str, str]]:
         "overflow": ("a.off", off("0 0 1e999\n1 0 0\n0 1 0", "3 0 1 2"), "1 vertices are NaN or infinite"),
         "too large": ("a.off", off("-1.7e308 -1.7e308 0\n1.7e308 0 0\n0 1.7e308 0", "3 0 1 2"), "too large"),
         "one place": ("a.off", off("5 5 5\n5 5 5\n5 5 5", "3 0 1 2"), "no extent"),
+        "rounding apart": ("a.off", off("1e6 1 0\n1e6 1.0000001 0\n1000000.0000001 1 0", "3 0 1 2"), "no extent"),
         "no counts": ("a.off", "OFF\nhello\n", "counts"),
         "binary OFF": ("a.off", b"OFF BINARY\n\0\0\0\3\0\0\0\1", "counts"),
         "another format": ("a.off", "solid x\nendsolid x\n", "does not begin with OFF"),
@@ -311,6 +312,12 @@ def broken_files() -> dict[str, tuple[str, bytes | str, str]]:
         "unknown suffix": ("a.xyz", "0 0 0\n", "not a mesh format"),
         "OFF cut in its faces": ("a.off", PYRAMID[: PYRAMID.index("3 3 0")], "cut short.*6 faces.*5 found"),
         "OFF cut in its vertices": ("a.off", PYRAMID[: PYRAMID.index("2 2 0")], "cut short.*5 vertices.*2 and 0 found"),
+        # Three coloured vertices, no face: 21 numbers, as many as three vertices and three triangles have.
+        "OFF cut where the numbers come out even": (
+            "a.off",
+            "COFF\n3 3 0\n3 0 0 1 0 0 0\n1 0 3 0 1 2 3\n0 1 2 3 0 1 2\n",
+            "cut short, 3 vertices and 3 faces announced, 3 and 0 found",
+        ),
         "huge vertex count": ("a.off", "OFF\n999999999999 5 0\n1 2 3\n", "cut short"),
         "huge face count": ("a.off", "OFF\n1 999999999999 0\n1 2 3\n", "cut short"),
         "absurd count": ("a.off", "OFF\n" + "9" * 6000 + " 1 0\n", "not a readable OFF mesh"),

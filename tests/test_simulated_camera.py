@@ -132,6 +132,18 @@ def test_any_pose_sees_what_casting_every_ray_sees(position, quaternion):
     same_but_at_edges(camera.observe(pose).depth, cast_all(CHAIR, pose, 64, camera.intrinsics))
 
 
+def test_a_wall_that_runs_past_the_camera_is_seen_to_the_border():
+    # It begins a little to the left, ahead, and ends behind: where its ends project says nothing of where it is seen.
+    corners = np.array([[-0.1, -0.05, 1], [-0.1, 0.05, 1], [0.3, 0.05, -1], [0.3, -0.05, -1]])
+    wall = make_mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    pose = np.eye(4)
+    pose[:3, 3] = -wall.centre / wall.radius
+    camera = SimulatedCamera(wall, 64)
+    depth = camera.observe(pose).depth
+    assert depth[32, -1] > 0
+    same_but_at_edges(depth, cast_all(wall, pose, 64, camera.intrinsics))
+
+
 def middle(seen: np.ndarray) -> tuple[float, float]:
     """Mean (row, column) of the pixels, from the middle of the image, in image sides."""
     return tuple(np.mean(np.nonzero(seen), axis=1) / len(seen) - 0.5)
