@@ -421,6 +421,17 @@ SOUND = {kind: as_bytes(wedge().export(file_type=kind)) for kind in ("obj", "stl
 SOUND["ply"] = wedge().export(file_type="ply", encoding="ascii")
 
 
+@pytest.mark.parametrize("kind", ["off", "stl", "stl_ascii", "ply", "ply ascii", "glb"])
+def test_a_file_cut_anywhere_is_refused(tmp_path, kind):
+    kind, *ascii_ = kind.split()
+    content = as_bytes(wedge().export(file_type=kind, **({"encoding": "ascii"} if ascii_ else {}))).rstrip(b"\n")
+    path = tmp_path / f"cut.{kind.removesuffix('_ascii')}"
+    for length in range(1, len(content), 5):
+        path.write_bytes(content[:length])
+        with pytest.raises(MeshError):
+            load_mesh(path)
+
+
 @settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(["obj", "ply", "stl", "glb"]), st.data())
 def test_one_damaged_byte_never_gives_another_error(tmp_path, kind, data):
