@@ -75,7 +75,7 @@ def test_export_keeps_the_answers(tmp_path):
     torch.manual_seed(0)
     network = ResNet(18, 5, 4).eval()
     x = torch.rand(2, 4, 64, 64)
-    export_onnx(network, x, "input", ["logits", "features"], tmp_path / "net.onnx")
+    export_onnx(network, x.numpy(), "input", ["logits", "features"], tmp_path / "net.onnx")
     assert [p.name for p in tmp_path.iterdir()] == ["net.onnx"]
     session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
     more = torch.rand(3, 4, 64, 64)  # another batch size than the example's

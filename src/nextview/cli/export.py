@@ -36,7 +36,6 @@ def export_recogniser(
     import json
 
     import numpy as np
-    import torch
 
     from nextview.cli.progress import console
     from nextview.data.split import split_training, test_objects
@@ -44,7 +43,7 @@ def export_recogniser(
     from nextview.models.card import ModelError
     from nextview.models.geometry_input import CHANNELS
     from nextview.models.networks import Recogniser
-    from nextview.training.export import CalibratedRecogniser, export_onnx, fit_temperature
+    from nextview.training.export import CalibratedRecogniser, answer, export_onnx, fit_temperature, load_weights
     from nextview.training.inputs import load_inputs
     from nextview.training.networks import ResNet
     from nextview.training.recipes import RecogniserRecipe
@@ -55,7 +54,7 @@ def export_recogniser(
     inputs = load_inputs(store, recipe.size)
     training, validation = split_training(views, recipe.validation, recipe.seed)
     network = ResNet(recipe.depth, len(views.classes), len(CHANNELS))
-    network.load_state_dict(torch.load(run / "network.pt", weights_only=True))
+    load_weights(network, run)
     network.eval()
 
     out.mkdir(parents=True, exist_ok=True)
@@ -69,7 +68,7 @@ def export_recogniser(
         "classes": views.classes,
         "temperature": 1.0,
     }
-    example = torch.from_numpy(np.array(inputs[validation[0], :2]))
+    example = np.array(inputs[validation[0], :2])
     export_onnx(CalibratedRecogniser(network, 1.0), example, "input", ["logits", "features"], weights)
     _write_card(card, weights, facts)
     raw = _all_logits(Recogniser(card), inputs, validation, "validation views")
@@ -81,10 +80,7 @@ def export_recogniser(
     _write_card(card, weights, facts)
     recogniser = Recogniser(card)
     sample = np.array(inputs[validation[:: max(1, len(validation) // 8)][:8], 5])
-    with torch.no_grad():
-        difference = float(
-            np.abs(shipped(torch.from_numpy(sample))[0].numpy() - recogniser.from_inputs(sample)[0]).max()
-        )
+    difference = float(np.abs(answer(shipped, sample) - recogniser.from_inputs(sample)[0]).max())
     console.print(f"largest difference between torch and ONNX logits on real views: {difference:.2g}")
     if not difference < 0.1:
         raise ModelError(f"{weights}: its logits differ from the network's by up to {difference:.2g}")
@@ -131,7 +127,6 @@ def export_lem(
     import json
 
     import numpy as np
-    import torch
 
     from nextview.cli.progress import console
     from nextview.data.split import split_training, test_objects
@@ -140,7 +135,7 @@ def export_lem(
     from nextview.models.card import ModelError
     from nextview.models.cloud_input import cloud_input
     from nextview.models.networks import MapNetwork, Recogniser
-    from nextview.training.export import MapOnly, export_onnx
+    from nextview.training.export import MapOnly, answer, export_onnx, load_weights
     from nextview.training.inputs import load_inputs
     from nextview.training.networks import PointNet
     from nextview.training.recipes import LemRecipe
@@ -153,14 +148,14 @@ def export_lem(
     training, validation = split_training(views, recipe.validation, recipe.seed)
     test = test_objects(views)
     network = PointNet(sphere.rings)
-    network.load_state_dict(torch.load(run / "network.pt", weights_only=True))
+    load_weights(network, run)
     shipped = MapOnly(network).eval()
 
     out.mkdir(parents=True, exist_ok=True)
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
     points = np.stack([views.points(int(i)) for i in validation[:2]])[:, 3]
     clouds = cloud_input(points, sphere.poses[[3, 3]])
-    export_onnx(shipped, torch.from_numpy(clouds), "cloud", ["map"], weights)
+    export_onnx(shipped, clouds, "cloud", ["map"], weights)
     facts: dict[str, Any] = {
         "name": name,
         "kind": "lem",
@@ -170,8 +165,7 @@ def export_lem(
     }
     _write_card(card, weights, facts)
     predictor = MapNetwork(card)
-    with torch.no_grad():
-        difference = float(np.abs(shipped(torch.from_numpy(clouds)).numpy() - predictor.from_clouds(clouds)).max())
+    difference = float(np.abs(answer(shipped, clouds) - predictor.from_clouds(clouds)).max())
     console.print(f"largest difference between torch and ONNX maps on real views: {difference:.2g}")
     if not difference < 0.02:
         raise ModelError(f"{weights}: its maps differ from the network's by up to {difference:.2g}")

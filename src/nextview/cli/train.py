@@ -26,12 +26,12 @@ def train_recogniser(
         recipe: how to train.
     """
     import numpy as np
-    import torch
 
     from nextview.cli.progress import track
     from nextview.data.split import split_training
     from nextview.data.store import ViewStore
     from nextview.training import recogniser
+    from nextview.training.export import save_weights
     from nextview.training.inputs import load_inputs, prepare_inputs
 
     views = ViewStore.open(store)
@@ -48,7 +48,7 @@ def train_recogniser(
     out.mkdir(parents=True, exist_ok=True)
     (out / "recipe.json").write_text(json.dumps(asdict(recipe), indent=1) + "\n")
     network = recogniser.train(sources, views.labels, training, validation, recipe, out)
-    torch.save(network.state_dict(), out / "network.pt")
+    save_weights(network, out)
 
 
 def train_lem(
@@ -63,12 +63,12 @@ def train_lem(
         out: folder for checkpoints, logs and network.pt.
         recipe: how to train.
     """
-    import torch
 
     from nextview.data.split import split_training
     from nextview.data.store import ViewStore
     from nextview.measures.depth_entropy import normalise_per_object
     from nextview.training import lem
+    from nextview.training.export import save_weights
 
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation, recipe.seed)
@@ -76,4 +76,4 @@ def train_lem(
     out.mkdir(parents=True, exist_ok=True)
     (out / "recipe.json").write_text(json.dumps(asdict(recipe), indent=1) + "\n")
     network = lem.train(views.all_points(), maps, views.sphere.poses, training, validation, recipe, out)
-    torch.save(network.state_dict(), out / "network.pt")
+    save_weights(network, out)

@@ -38,7 +38,25 @@ class MapOnly(nn.Module):
         return self.network(cloud)[0]
 
 
-def export_onnx(network: nn.Module, example: Tensor, inputs: str, outputs: list[str], path: Path) -> None:
+def save_weights(network: nn.Module, run: Path) -> None:
+    """Keep a trained network's parameters in its run's folder, as network.pt."""
+    torch.save(network.state_dict(), run / "network.pt")
+
+
+def load_weights(network: nn.Module, run: Path) -> nn.Module:
+    """Give a network the parameters of a run; the network, in evaluation mode. Nothing in the file is executed."""
+    network.load_state_dict(torch.load(run / "network.pt", weights_only=True))
+    return network.eval()
+
+
+def answer(network: nn.Module, inputs: NDArray) -> NDArray[np.float32]:
+    """What a network, in torch, says of inputs (B, ...): its first output where it has several."""
+    with torch.no_grad():
+        outputs = network.eval()(torch.from_numpy(inputs))
+    return (outputs[0] if isinstance(outputs, tuple) else outputs).numpy()
+
+
+def export_onnx(network: nn.Module, example: NDArray, inputs: str, outputs: list[str], path: Path) -> None:
     """Write a network as ONNX, batch size free, weights in half precision and arithmetic in single.
 
     Args:
@@ -52,7 +70,7 @@ def export_onnx(network: nn.Module, example: Tensor, inputs: str, outputs: list[
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
             network.eval(),
-            (example,),
+            (torch.from_numpy(example),),
             dynamo=True,
             input_names=[inputs],
             output_names=outputs,
