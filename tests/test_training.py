@@ -18,9 +18,9 @@ from nextview.viewsphere import ViewSphere
 
 torch = pytest.importorskip("torch")
 
+from nextview.benchmark.scores import map_scores, recogniser_scores  # noqa: E402
 from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
-from nextview.training.scores import map_scores, recogniser_scores  # noqa: E402
 from nextview.training.valleys import valley_gains  # noqa: E402
 
 BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}

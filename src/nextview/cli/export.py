@@ -37,6 +37,7 @@ def export_recogniser(
 
     import numpy as np
 
+    from nextview.benchmark.scores import recogniser_scores
     from nextview.cli.progress import console
     from nextview.data.split import split_training, test_objects
     from nextview.data.store import ViewStore
@@ -47,7 +48,6 @@ def export_recogniser(
     from nextview.training.inputs import load_inputs
     from nextview.training.networks import ResNet
     from nextview.training.recipes import RecogniserRecipe
-    from nextview.training.scores import recogniser_scores
 
     recipe = RecogniserRecipe(**json.loads((run / "recipe.json").read_text()))
     views = ViewStore.open(store)
@@ -128,6 +128,7 @@ def export_lem(
 
     import numpy as np
 
+    from nextview.benchmark.scores import map_scores
     from nextview.cli.progress import console
     from nextview.data.split import split_training, test_objects
     from nextview.data.store import POINT_UNIT, ViewStore
@@ -139,7 +140,6 @@ def export_lem(
     from nextview.training.inputs import load_inputs
     from nextview.training.networks import PointNet
     from nextview.training.recipes import LemRecipe
-    from nextview.training.scores import map_scores
     from nextview.training.valleys import valley_gains
 
     recipe = LemRecipe(**json.loads((run / "recipe.json").read_text()))
