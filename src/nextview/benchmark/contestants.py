@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import log_softmax
 
 from nextview.data.predictions import Predictions
+from nextview.measures.confidence_map import confidence_maps
 from nextview.measures.depth_entropy import normalise_per_object
 from nextview.policies.base import Policy
 from nextview.policies.fixed import orbit, ranked
@@ -128,11 +129,9 @@ def true_lem(p: Predictions) -> NDArray[np.float32]:
     return normalise_per_object(p.depth_entropy)[:, p.sphere.windows]
 
 
-def true_lcm(p: Predictions) -> NDArray[np.float64]:
-    """Local windows of the recogniser's confidence, 0 where it is wrong (section 4.2.2), (N, V, R, 3)."""
-    sure = np.exp(log_softmax(p.logits.astype(np.float64), axis=2)).max(2)
-    right = p.logits.argmax(2) == p.labels[:, None]
-    return np.where(right, sure, 0)[:, p.sphere.windows]
+def true_lcm(p: Predictions) -> NDArray[np.float32]:
+    """Local windows of the recogniser's confidence, 0 where it is wrong (section 4.1.3), (N, V, R, 3)."""
+    return confidence_maps(p.logits, p.labels)[:, p.sphere.windows]
 
 
 TRUE_MAPS: dict[str, Callable[[Predictions], NDArray]] = {"true-lem": true_lem, "true-lcm": true_lcm}
