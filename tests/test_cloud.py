@@ -73,6 +73,15 @@ def test_every_visible_pixel_has_the_same_chance():
     assert chisquare(drawn.ravel()).pvalue > 1e-3
 
 
+@pytest.mark.parametrize("nothing", [np.nan, np.inf, -np.inf, -1.0, 65535.0])
+def test_no_point_is_drawn_where_a_sensor_measured_nothing(nothing):
+    depth, intrinsics = random_depth(64, 64, 0.4), pinhole(64, 3.0)
+    sensed = np.where(depth > 0, depth, np.float32(nothing))
+    np.testing.assert_array_equal(
+        visible_points(sensed, POSES[5], intrinsics), visible_points(depth, POSES[5], intrinsics)
+    )
+
+
 def test_the_draw_depends_on_the_seed_and_the_visible_pixels_alone():
     depth, intrinsics = random_depth(64, 64, 0.6), pinhole(64, 3.0)
     first = visible_points(depth, POSES[3], intrinsics, 1)

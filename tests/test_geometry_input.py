@@ -5,8 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nextview.cameras.simulated import SimulatedCamera
+from nextview.data.samples import sample_mesh
 from nextview.models.geometry_input import CHANNELS, geometry_input
-from nextview.observation import pinhole
+from nextview.observation import POINTS, Observation, pinhole
 from nextview.viewsphere import ViewSphere, look_at_origin
 
 SIZE = 224
@@ -17,31 +19,35 @@ STEP = 1 / 127
 """One grey level, in the channels' own scale."""
 
 
-def rays(size: int = SIZE) -> np.ndarray:
+def rays(intrinsics: np.ndarray = INTRINSICS) -> np.ndarray:
     """Directions with z = 1 through the centres of the pixels, camera frame."""
-    row, column = np.mgrid[:size, :size] + 0.5
-    return np.stack([column, row, np.ones_like(row)], -1) @ np.linalg.inv(pinhole(size, DISTANCE)).T
+    row, column = np.mgrid[:SIZE, :SIZE] + 0.5
+    return np.stack([column, row, np.ones_like(row)], -1) @ np.linalg.inv(intrinsics).T
 
 
-def channels_of(depth: np.ndarray, pose: np.ndarray, size: int = SIZE) -> dict[str, np.ndarray]:
+def channels_of(
+    depth: np.ndarray, pose: np.ndarray, size: int = SIZE, intrinsics: np.ndarray = INTRINSICS
+) -> dict[str, np.ndarray]:
     """The channels in their own scale; NaN where there is background."""
-    coded = geometry_input(depth[None].astype(np.float32), pose[None], INTRINSICS, size)[0]
+    coded = geometry_input(depth[None].astype(np.float32), pose[None], intrinsics, size)[0]
     values = np.where(coded > 0, (coded.astype(float) - 1) / 127 - 1, np.nan)
     named = dict(zip(CHANNELS, values, strict=True))
     named["facing"] = (named["facing"] + 1) / 2
     return named
 
 
-def plane_depth(pose: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def plane_depth(
+    pose: np.ndarray, point: np.ndarray, normal: np.ndarray, intrinsics: np.ndarray = INTRINSICS
+) -> np.ndarray:
     """Depth of the plane through a point, world frame, wherever it lies in front of the camera."""
-    directions = rays() @ pose[:3, :3].T
+    directions = rays(intrinsics) @ pose[:3, :3].T
     depth = (point - pose[:3, 3]) @ normal / (directions @ normal)
     return np.where((depth > 0) & (depth < 50), depth, 0)
 
 
-def expected_channels(depth, pose, normal):
+def expected_channels(depth, pose, normal, intrinsics=INTRINSICS):
     """Closed forms where the surface and its unit normals, towards the camera, are known in the world frame."""
-    directions = rays() @ pose[:3, :3].T
+    directions = rays(intrinsics) @ pose[:3, :3].T
     positions = pose[:3, 3] + depth[..., None] * directions
     towards = -directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     return {
@@ -90,6 +96,80 @@ def test_a_plane_at_any_slant(elevation, azimuth, tilt, turn, offset):
             inside &= expected["facing"] > 0.3  # perspective bends depth between neighbours on steep planes
         limit = 0.5 * STEP + (1e-4 if name in ("height", "nearness") else 0.02)
         np.testing.assert_allclose(found[name][inside], expected[name][inside], atol=limit, err_msg=name)
+
+
+@pytest.mark.parametrize(("tilt", "turn"), [(0.0, 0.7), (0.7, 0.0), (-0.5, 0.6)])
+@pytest.mark.parametrize("squeeze", [0.5, 0.8, 1.25, 2.0])
+def test_a_camera_whose_pixels_are_not_square(tilt, turn, squeeze):
+    intrinsics = INTRINSICS.copy()
+    intrinsics[1] = [0, squeeze * INTRINSICS[0, 0], 100.0]
+    pose = look_at_origin(0.4, 1.0)
+    slant = np.array([np.sin(tilt), np.sin(turn) * np.cos(tilt), -np.cos(turn) * np.cos(tilt)])
+    normal = pose[:3, :3] @ slant
+    depth = plane_depth(pose, np.zeros(3), normal, intrinsics)
+    expected = expected_channels(depth, pose, normal, intrinsics)
+    found = channels_of(depth, pose, intrinsics=intrinsics)
+    for name in CHANNELS:
+        inside = (depth > 0) & (np.abs(expected[name]) <= 1)
+        if name in ("facing", "up"):
+            inside &= expected["facing"] > 0.3
+        assert inside.mean() > 0.3
+        limit = 0.5 * STEP + (1e-4 if name in ("height", "nearness") else 0.02)
+        np.testing.assert_allclose(found[name][inside], expected[name][inside], atol=limit, err_msg=name)
+
+
+def as_the_bundled_models_were_trained(depth, poses, focal, centre):
+    """The formula of the bundled models' training, for square pixels: what they are given must not change by a bit."""
+    rotation, origin = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
+
+    def slope(axis):
+        back = np.where(np.roll(depth, 1, axis) > 0, depth - np.roll(depth, 1, axis), np.inf)
+        forth = np.where(np.roll(depth, -1, axis) > 0, np.roll(depth, -1, axis) - depth, np.inf)
+        least = np.where(np.abs(back) < np.abs(forth), back, forth)
+        return np.where(np.isfinite(least), least, 0).astype(np.float32)
+
+    focal = np.float32(focal)
+    across, down = slope(2), slope(1)
+    x = ((np.arange(depth.shape[2]) + 0.5 - centre) / focal).astype(np.float32)[None, None, :]
+    y = x.reshape(1, -1, 1)
+    through = depth / focal + x * across + y * down
+    length = np.sqrt(across**2 + down**2 + through**2) + 1e-12
+    a, b, c = (rotation[:, 2, i, None, None] for i in range(3))
+    facing = depth / focal / (length * np.sqrt(x**2 + y**2 + 1))
+    up = (a * across + b * down + c * -through) / length
+    height = a * (x * depth) + b * (y * depth) + c * depth + origin[:, 2, None, None]
+    nearness = np.linalg.norm(origin, axis=1)[:, None, None] - depth
+    channels = np.stack([2 * facing - 1, up, height, nearness], 1)
+    return np.where(depth[:, None] > 0, 1 + 127 * (np.clip(channels, -1, 1) + 1) + 0.5, 0).astype(np.uint8)
+
+
+@pytest.mark.parametrize("name", ["chair", "monitor"])
+def test_a_render_is_coded_as_the_bundled_models_know_it(name):
+    poses = POSES[::3]
+    camera = SimulatedCamera(sample_mesh(name), SIZE)
+    depth = np.stack([camera.observe(pose).depth for pose in poses])
+    depth[:, [0, -1]] = depth[:, :, [0, -1]] = 0  # the formula above wraps around the border
+    found = geometry_input(depth, poses, INTRINSICS, SIZE)
+    assert (found > 0).mean() > 0.05
+    np.testing.assert_array_equal(found, as_the_bundled_models_were_trained(depth, poses, INTRINSICS[0, 0], SIZE / 2))
+
+
+NOTHING = [np.nan, np.inf, -np.inf, -0.001, -3.0, 65535.0, 3e38]
+"""What depth cameras give where they measured nothing."""
+
+
+@pytest.mark.parametrize("nothing", NOTHING)
+def test_what_a_sensor_gives_for_nothing_is_background(nothing):
+    clean = plane_depth(POSES[13], np.zeros(3), -POSES[13][:3, 2]).astype(np.float32)
+    clean[np.random.default_rng(0).random(clean.shape) < 0.2] = 0
+    sensed = np.where(clean > 0, clean, np.float32(nothing))
+    expected = geometry_input(clean[None], POSES[[13]], INTRINSICS, 112)
+    np.testing.assert_array_equal(geometry_input(sensed[None], POSES[[13]], INTRINSICS, 112), expected)
+    image, points = np.zeros(clean.shape, np.uint8), np.zeros((POINTS, 3), np.float32)
+    look = Observation(image, sensed, points, POSES[13], INTRINSICS)
+    np.testing.assert_array_equal(look.depth, clean)
+    assert look.depth.dtype == np.float32
+    assert Observation(image, clean, points, POSES[13], INTRINSICS).depth is clean  # nothing is copied
 
 
 def test_a_floor_a_wall_and_a_ceiling():

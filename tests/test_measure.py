@@ -68,6 +68,16 @@ def test_an_empty_view_measures_nothing(name):
     assert MEASURES[name](np.zeros((20, 20))) == 0
 
 
+@pytest.mark.parametrize("name", MEASURES)
+@pytest.mark.parametrize("nothing", [np.nan, np.inf, -np.inf, -2.0, 65535.0])
+def test_what_a_sensor_gives_for_nothing_is_no_object(name, nothing):
+    depth = ball(64)
+    sensed = np.where(depth > 0, depth, nothing)
+    assert MEASURES[name](sensed) == MEASURES[name](depth)
+    assert MEASURES[name](np.full((8, 8), nothing)) == 0
+    assert np.isnan(sensed).any() == np.isnan(nothing)  # what was handed in is left alone
+
+
 @pytest.fixture
 def views(tmp_path):
     for name, mesh in {"ball": trimesh.creation.icosphere(4), "box": trimesh.creation.box([1, 2, 3])}.items():

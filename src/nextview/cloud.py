@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.observation import POINTS
+from nextview.observation import POINTS, object_depth
 
 
 @lru_cache(maxsize=8)
@@ -36,7 +36,7 @@ def visible_points(
     Returns:
         (1024, 3) float32, object frame; all zero if nothing is visible.
     """
-    flat = depth.ravel()
+    flat = object_depth(depth).ravel()
     order = pixel_order(flat.size, seed)
     for first in (4 * POINTS, 16 * POINTS, flat.size):  # most often the beginning of the order holds enough
         visible = np.flatnonzero(flat[order[:first]])

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 POINTS = 1024
 """Points in the partial cloud of one look (thesis, section 4.1.2)."""
+FARTHEST = 50.0
+"""Depth at which nothing counts as an object any more, object radii: depth cameras have large numbers for "nothing"."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +20,8 @@ class Observation:
 
     Attributes:
         image: grey image, (H, W) uint8, 0 where there is no object.
-        depth: distance along the optical axis, (H, W) float32, object radii, 0 where there is no object.
+        depth: distance along the optical axis, (H, W) float32, object radii, 0 where there is no object. What a sensor
+            gives for nothing else (see ``object_depth``) becomes 0 here.
         points: on the visible surface, (1024, 3) float32, object frame, object radii; all zero if nothing is visible.
         pose: camera-to-world, (4, 4) float64, OpenCV axes (x right, y down, z forward).
         intrinsics: pinhole matrix, (3, 3) float64, pixels; pixel (row, column) has its centre at
@@ -31,6 +34,9 @@ class Observation:
     pose: NDArray[np.float64]
     intrinsics: NDArray[np.float64]
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "depth", object_depth(self.depth))
+
 
 class Camera(Protocol):
     """Anything that can look at the object from a given pose."""
@@ -38,6 +44,20 @@ class Camera(Protocol):
     def observe(self, pose: NDArray[np.float64]) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""
         ...
+
+
+def object_depth(depth: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Depth as all of nextview understands it: 0 where a sensor gives NaN, infinity, a negative or a huge number.
+
+    Args:
+        depth: any shape, object radii.
+
+    Returns:
+        The same array if it holds nothing of the kind, else a mended copy.
+    """
+    if depth.min() >= 0 and depth.max() < FARTHEST:  # not so if there is a NaN
+        return depth
+    return np.where((depth > 0) & (depth < FARTHEST), depth, 0)
 
 
 def pinhole(size: int, distance: float) -> NDArray[np.float64]:

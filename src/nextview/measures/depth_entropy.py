@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import entr
 
+from nextview.observation import object_depth
+
 QUANTUM = 1e-3
 """Depth values closer than this count as equal, object radii."""
 
@@ -19,7 +21,7 @@ def depth_entropy(depth: NDArray[np.floating]) -> float:
     Returns:
         0 for an image of one value, at most log2 of the number of pixels.
     """
-    values = np.rint(np.asarray(depth, np.float64).ravel() / QUANTUM).astype(np.int64)
+    values = np.rint(object_depth(np.asarray(depth, np.float64)).ravel() / QUANTUM).astype(np.int64)
     counts = np.bincount(values)
     return float(entr(counts[counts > 0] / values.size).sum() / np.log(2))
 

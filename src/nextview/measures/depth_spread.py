@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.observation import object_depth
+
 BIN = 0.01
 """Width of the depth histogram's bins, object radii: a hundred across the object's radius."""
 
@@ -20,6 +22,7 @@ def depth_distribution(depth: NDArray[np.floating]) -> float:
     Returns:
         0 where all is at one depth or nothing is seen, less than 1.
     """
+    depth = object_depth(depth)
     bins = (depth[depth > 0] / BIN).astype(np.int64)
     share = np.bincount(bins) / max(len(bins), 1)
     return float(1 - (share**2).sum()) if len(bins) else 0.0
@@ -34,5 +37,6 @@ def max_depth(depth: NDArray[np.floating]) -> float:
     Returns:
         Object radii; 0 where nothing is seen.
     """
+    depth = object_depth(depth)
     seen = depth[depth > 0]
     return float(np.ptp(seen)) if len(seen) else 0.0

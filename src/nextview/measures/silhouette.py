@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.observation import object_depth
+
 
 def silhouette_area(depth: NDArray[np.floating]) -> float:
     """Share of the image that shows the object ("view area").
@@ -15,7 +17,7 @@ def silhouette_area(depth: NDArray[np.floating]) -> float:
     Returns:
         Between 0 and 1; the sphere around the object fills pi/4 of the image.
     """
-    return np.count_nonzero(depth) / depth.size
+    return np.count_nonzero(object_depth(depth)) / depth.size
 
 
 def silhouette_length(depth: NDArray[np.floating]) -> float:
@@ -31,7 +33,7 @@ def silhouette_length(depth: NDArray[np.floating]) -> float:
     Returns:
         0 where nothing is seen.
     """
-    seen = np.pad(depth > 0, 1)
+    seen = np.pad(object_depth(depth) > 0, 1)
     straight = (seen[1:] != seen[:-1]).sum() + (seen[:, 1:] != seen[:, :-1]).sum()
     diagonal = (seen[1:, 1:] != seen[:-1, :-1]).sum() + (seen[1:, :-1] != seen[:-1, 1:]).sum()
     # Lines along the diagonals are 1/sqrt(2) pixels apart; the four directions share pi.

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.observation import object_depth
+
 CHANNELS = ("facing", "up", "height", "nearness")
 
 
@@ -36,13 +38,14 @@ def geometry_input(
         raise ValueError(f"a depth image of {h}x{w} cannot be thinned to {size}x{size}: use a multiple of {size}")
     k = h // size
     rotation, origin = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
-    padded = np.pad(depth.astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
+    padded = np.pad(object_depth(depth).astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
     z = padded[:, 1:-1:k, 1:-1:k]
     along_column = _slope(padded[:, 1:-1:k, :-2:k], z, padded[:, 1:-1:k, 2::k])
     along_row = _slope(padded[:, :-2:k, 1:-1:k], z, padded[:, 2::k, 1:-1:k])
-    focal = np.float32(intrinsics[0, 0])
+    focal, focal_y = intrinsics[0, 0].astype(np.float32), intrinsics[1, 1].astype(np.float32)
+    along_row *= focal_y / focal  # a step down the image as long as one across it
     x = ((np.arange(0, w, k) + 0.5 - intrinsics[0, 2]) / focal).astype(np.float32)[None, None, :]
-    y = ((np.arange(0, h, k) + 0.5 - intrinsics[1, 2]) / focal).astype(np.float32)[None, :, None]
+    y = ((np.arange(0, h, k) + 0.5 - intrinsics[1, 2]) / focal_y).astype(np.float32)[None, :, None]
     # The surface is P = (x z, y z, z); the cross product of its derivatives, scaled, points to the camera:
     through = z / focal + x * along_column + y * along_row
     length = np.sqrt(along_column**2 + along_row**2 + through**2) + 1e-12
