@@ -30,10 +30,23 @@ TRAVEL = {10: "table9_travel_per_class_modelnet10", 40: "table11_travel_per_clas
 
 
 @cache
-def read_table(name: str) -> dict[str, dict[str, float]]:
-    """A table that ships with the package: rows by their first column, then numbers by the name of the column."""
+def read_rows(name: str) -> list[dict[str, str]]:
+    """A table that ships with the package, as it is written: a row by the names of its columns."""
     with (files("nextview.benchmark") / "published" / f"{name}.csv").open(encoding="utf-8") as file:
-        return {row.pop(next(iter(row))): {k: float(v) for k, v in row.items()} for row in csv.DictReader(file)}
+        return list(csv.DictReader(file))
+
+
+@cache
+def read_table(name: str) -> dict[str, dict[str, float]]:
+    """The same with rows by their first column, then numbers by the name of the column."""
+    rows = [list(row.items()) for row in read_rows(name)]
+    return {first: {column: float(value) for column, value in rest} for (_, first), *rest in rows}
+
+
+def published_classes(classes: tuple[str, ...]) -> int | None:
+    """10 or 40 for the classes of ModelNet10 or ModelNet40, in any order; None for others."""
+    n = len(classes)
+    return n if n in ACCURACY and set(classes) == set(read_table(ACCURACY[n])) else None
 
 
 def published_threshold(policy: str) -> float | None:
@@ -53,8 +66,8 @@ def published(
         classes: of the data: only those of ModelNet10 and 40 were published.
         label: the class, for one of the tables by class.
     """
-    n = len(classes)
-    if n not in ACCURACY or set(classes) != set(read_table(ACCURACY[n])):
+    n = published_classes(classes)
+    if n is None:
         return None
     over_classes, kind = measure.startswith("class_"), measure.removeprefix("class_")
     if policy in FIVE_VIEWS and kind == "accuracy":
@@ -73,3 +86,41 @@ def published(
         return None
     row = "instance_accuracy" if kind == "accuracy" else "instance_travel"
     return read_table("table5_nbv_modelnet10")[row][COLUMNS[policy]]
+
+
+def published_recognisers(classes: tuple[str, ...], views: int) -> list[tuple[str, int, float]]:
+    """Network, batch size and accuracy from one of so many views, over objects, of table 6; the best first."""
+    n = published_classes(classes)
+    rows = [
+        (row["model"], int(row["batch_size"]), float(row["accuracy"]))
+        for row in read_rows("table6_resnet")
+        if (int(row["classes"]), int(row["views"])) == (n, views)
+    ]
+    return sorted(rows, key=lambda row: -row[2])
+
+
+def published_map(name: str, measure: str, classes: tuple[str, ...], label: str | None = None) -> float | None:
+    """The published score of a map network that was trained on these classes and tested on them (tables 4 and 7).
+
+    Table 4's peaks are the means over table 7's classes and its loss the mean over objects, which the text does not say.
+
+    Args:
+        name: of the map, "lem" or "lcm".
+        measure: "mse" (the published loss, which has 1e-4 of a regulariser in it), "d0", "d_le_1" or "d_lt_2", over
+            objects or, with "class_" before it, over classes.
+        classes: of the data.
+        label: the class, for table 7.
+    """
+    n = published_classes(classes)
+    over_classes, kind = measure.startswith("class_"), measure.removeprefix("class_")
+    column = {"mse": "loss"}.get(kind, kind)
+    if n is None or column not in ("loss", "d0", "d_le_1", "d_lt_2"):
+        return None
+    if label is None and over_classes == (kind != "mse"):
+        for row in read_rows("table4_map_prediction"):
+            if (row["model"].lower(), int(row["classes_train"]), int(row["classes_test"])) == (name, n, n):
+                return float(row[column])
+    if (name, n) == ("lem", 10) and (label is not None or over_classes):
+        rows = read_table("table7_lem_per_class_modelnet10")
+        return rows[label][column] if label is not None else float(np.mean([row[column] for row in rows.values()]))
+    return None
