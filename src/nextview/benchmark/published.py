@@ -102,7 +102,7 @@ def published_recognisers(classes: tuple[str, ...], views: int) -> list[tuple[st
 def published_map(name: str, measure: str, classes: tuple[str, ...], label: str | None = None) -> float | None:
     """The published score of a map network that was trained on these classes and tested on them (tables 4 and 7).
 
-    Table 4's peaks are the means over table 7's classes and its loss the mean over objects, which the text does not say.
+    Table 4's peaks are means over table 7's classes, and its loss is the mean over objects; the text does not say so.
 
     Args:
         name: of the map, "lem" or "lcm".

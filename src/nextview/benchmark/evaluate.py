@@ -1,0 +1,236 @@
+"""How good the models under the policies are: every view of every object judged, no policy asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from nextview.benchmark import statistics as st
+from nextview.benchmark.contestants import true_lcm, true_lem
+from nextview.benchmark.published import published_map, published_recognisers
+from nextview.benchmark.scores import map_errors
+from nextview.data.predictions import Predictions
+
+Float = NDArray[np.float64]
+
+TRUTHS: dict[str, Callable[[Predictions], NDArray]] = {"lem": true_lem, "lcm": true_lcm}
+"""Maps whose truth the predictions tell."""
+
+
+class EvaluationError(ValueError):
+    """Predictions in which there is nothing to judge; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The results, each a long table; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``.
+
+    Attributes:
+        accuracy: looks (1, or V: the logits of all views summed), label (empty: all classes), measure, objects, value,
+            low, high, published. The measures: ``accuracy``; ``clean_accuracy``, without the objects whose very mesh
+            also has another label; with ``class_`` before it the mean over classes.
+        fusion: looks, accuracy, low, high, class_accuracy, calibration_error: that many random views fused.
+        confusion: looks, label, answer, answers: how many; a view is an answer, or a whole object.
+        reliability: looks, bin, confidence, accuracy, answers.
+        maps: map, by, label, measure, value, low, high, published; the measures are those of ``scores.map_errors``.
+            ``by`` is the network or a yardstick made from the true maps of these very objects, which flatters it:
+            their mean, the same for every view; or their mean for the object's true class at the view.
+        left_out: for each map that is not judged, or not of all objects, why.
+    """
+
+    accuracy: pd.DataFrame
+    fusion: pd.DataFrame
+    confusion: pd.DataFrame
+    reliability: pd.DataFrame
+    maps: pd.DataFrame
+    left_out: dict[str, str]
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """The tables by name."""
+        found = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: table for name, table in found.items() if isinstance(table, pd.DataFrame)}
+
+
+def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluation:
+    """Judge the recogniser and the map networks behind some predictions.
+
+    Args:
+        p: what they said.
+        samples: of the bootstrap.
+        rng: draws them, and the orders in which views are fused.
+
+    Raises:
+        EvaluationError: the recogniser knows one class only.
+    """
+    if len(p.classes) < 2:
+        raise EvaluationError(f"the recogniser knows one class only, {p.classes[0]}: there is nothing to tell apart")
+    if samples < 1:
+        raise EvaluationError(f"at least one sample of the bootstrap is needed, not {samples}")
+    weights = st.resample(len(p), samples, rng)
+    fused = fused_views(p.logits, p.labels, rng)
+    judged = {1: p.logits, len(p.sphere): p.logits.astype(np.float64).sum(1, keepdims=True)}
+    maps, left_out = _maps(p, weights)
+    return Evaluation(
+        _accuracy(p, judged, weights), _fusion(p, *fused, weights), _confusion(p, judged), _reliability(p, judged),
+        maps, left_out,
+    )  # fmt: skip
+
+
+def fused_views(
+    logits: NDArray[np.floating], labels: NDArray[np.int64], rng: np.random.Generator
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations.
+
+    Every view comes first once, second once, and so on: with one view this is the single-view accuracy exactly.
+
+    Args:
+        logits: (N, V, classes).
+        labels: (N,).
+        rng: draws one order for each object.
+
+    Returns:
+        Whether the answer is right, and its confidence, each (V looks, N, V rotations).
+    """
+    n, v, _ = logits.shape
+    order = rng.permuted(np.tile(np.arange(v), (n, 1)), axis=1)
+    shuffled = np.take_along_axis(logits.astype(np.float64), order[:, :, None], axis=1)
+    right, confidence = np.empty((v, n, v), bool), np.empty((v, n, v), np.float32)
+    for turn in range(v):
+        total = np.roll(shuffled, -turn, axis=1).cumsum(1)
+        right[:, :, turn] = (total.argmax(2) == labels[:, None]).T
+        confidence[:, :, turn] = _confidence(total).T
+    return right, confidence
+
+
+def _confidence(logits: NDArray[np.floating]) -> Float:
+    """The peak of the softmax over the last axis."""
+    logits = np.asarray(logits, np.float64)
+    return 1 / np.exp(logits - logits.max(-1, keepdims=True)).sum(-1)
+
+
+def _means(
+    top: Float, bottom: Float, labels: NDArray[np.int64], classes: tuple[str, ...], weights: Float | None
+) -> Iterator[tuple[str, str, Float, Float, Float]]:
+    """Ratios of sums over objects (N, M): over all of them, as the mean over classes ("class_"), and in each class.
+
+    Yields:
+        Label (empty: all), what stands before the measure, and values with the ends of their intervals, each (M,).
+    """
+    everything = np.ones(len(labels), bool)
+    groups = [("", "", everything), ("", "class_", everything)]
+    groups += [(classes[index], "", labels == index) for index in np.unique(labels)]
+    for label, over, here in groups:
+
+        def mean(w: Float, over: str = over, here: NDArray[np.bool_] = here) -> Float:
+            if over:
+                return st.class_mean(top, bottom, labels, w)
+            return st.ratio(top[here], bottom[here], w[:, here])
+
+        value = mean(np.ones((1, len(labels))))[0]
+        low, high = (np.full_like(value, np.nan),) * 2 if weights is None else st.interval(mean(weights))
+        yield label, over, value, low, high
+
+
+def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.DataFrame:
+    clean = np.where(p.conflicting, 0.0, 1.0)
+    bottom = np.stack([np.ones(len(p)), clean], 1)
+    best = published_recognisers(p.classes, len(p.sphere))
+    rows = []
+    for looks, logits in judged.items():
+        right = (logits.argmax(2) == p.labels[:, None]).mean(1)
+        for label, over, value, low, high in _means(right[:, None] * bottom, bottom, p.labels, p.classes, weights):
+            here = p.labels == p.classes.index(label) if label else slice(None)
+            for i, (measure, objects) in enumerate(
+                zip(("accuracy", "clean_accuracy"), bottom[here].sum(0), strict=True)
+            ):
+                beside = best[0][2] if best and (looks, label, over, i) == (1, "", "", 0) else np.nan
+                rows.append((looks, label, over + measure, int(objects), value[i], low[i], high[i], beside))
+    return pd.DataFrame(rows, columns=["looks", "label", "measure", "objects", "value", "low", "high", "published"])
+
+
+def _fusion(p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.float32], weights: Float) -> pd.DataFrame:
+    top = right.mean(2).T
+    one = np.ones_like(top)
+    low, high = st.interval(st.ratio(top, one, weights))
+    return pd.DataFrame(
+        {
+            "looks": np.arange(1, len(right) + 1),
+            "accuracy": top.mean(0),
+            "low": low,
+            "high": high,
+            "class_accuracy": st.class_mean(top, one, p.labels, np.ones((1, len(p))))[0],
+            "calibration_error": [
+                st.calibration_error(sure.ravel(), answer.ravel())
+                for sure, answer in zip(confidence, right, strict=True)
+            ],
+        }
+    )
+
+
+def _confusion(p: Predictions, judged: dict[int, NDArray]) -> pd.DataFrame:
+    rows = []
+    for looks, logits in judged.items():
+        counts = np.zeros((len(p.classes), len(p.classes)), np.int64)
+        np.add.at(counts, (p.labels[:, None], logits.argmax(2)), 1)
+        rows += [(looks, p.classes[i], p.classes[j], int(count)) for (i, j), count in np.ndenumerate(counts)]
+    return pd.DataFrame(rows, columns=["looks", "label", "answer", "answers"])
+
+
+def _reliability(p: Predictions, judged: dict[int, NDArray]) -> pd.DataFrame:
+    rows = []
+    for looks, logits in judged.items():
+        right = logits.argmax(2) == p.labels[:, None]
+        sure, accuracy, count = st.reliability(_confidence(logits).ravel(), right.ravel())
+        rows += [(looks, i, sure[i], accuracy[i], count[i]) for i in np.flatnonzero(count)]
+    return pd.DataFrame(rows, columns=["looks", "bin", "confidence", "accuracy", "answers"])
+
+
+def judged_objects(p: Predictions, name: str) -> NDArray[np.int64]:
+    """The objects whose true map can be told: for the LCM those that are right from any view (section 4.1.3)."""
+    right = p.logits.argmax(2) == p.labels[:, None]
+    return np.flatnonzero(right.any(1)) if name == "lcm" else np.arange(len(p))
+
+
+def yardsticks(true: NDArray[np.floating], labels: NDArray[np.int64]) -> dict[str, NDArray[np.floating]]:
+    """Maps to be measured against: the mean map, and the mean map of the class at the view, each as ``true`` is.
+
+    Args:
+        true: (N, V, rings, 3).
+        labels: true class of each object, (N,).
+    """
+    classes, row = np.unique(labels, return_inverse=True)
+    of_class = np.stack([true[labels == index].mean(0) for index in classes])
+    return {"mean map": np.broadcast_to(true.mean((0, 1)), true.shape), "mean map of the class": of_class[row]}
+
+
+def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]:
+    rows: list[tuple] = []
+    left_out = {} if p.maps else {"maps": "these predictions hold none"}
+    for name, predicted in p.maps.items():
+        if name not in TRUTHS:
+            left_out[name] = f"what is true of this map is not known; known are {', '.join(TRUTHS)}"
+            continue
+        kept = judged_objects(p, name)
+        if len(kept) == 0:
+            left_out[name] = "no object is recognised from any view"
+            continue
+        if len(kept) < len(p):
+            left_out[name] = f"without the objects that are recognised from no view: {len(p) - len(kept)} of {len(p)}"
+        true, labels = TRUTHS[name](p)[kept], p.labels[kept]
+        for by, maps in {"network": predicted[kept], **yardsticks(true, labels)}.items():
+            window = true.shape[2:]
+            errors = map_errors(maps.reshape(-1, *window), true.reshape(-1, *window))
+            top = np.stack([values.reshape(len(kept), -1).mean(1) for values in errors.values()], 1)
+            drawn = weights[:, kept] if by == "network" else None
+            for label, over, value, low, high in _means(top, np.ones_like(top), labels, p.classes, drawn):
+                for i, measure in enumerate(errors):
+                    beside = None
+                    if by == "network":
+                        beside = published_map(name, over + measure, p.classes, label or None)
+                    rows.append((name, by, label, over + measure, value[i], low[i], high[i], beside))
+    columns = ["map", "by", "label", "measure", "value", "low", "high", "published"]
+    return pd.DataFrame(rows, columns=columns).astype({"published": "float64"}), left_out
