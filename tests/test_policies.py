@@ -16,6 +16,7 @@ from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectio
 from nextview.policies.maps import MapPeak, local_peaks, peaks_first
 from nextview.policies.oracle import OracleGain, OracleValley
 from nextview.policies.registry import POLICIES, make_policy
+from nextview.policies.spread import Spread
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("40")
@@ -122,7 +123,7 @@ def test_no_row_depends_on_another(sphere, seed):
     rng = np.random.default_rng(seed)
     state = random_state(sphere, rng)
     for policy in policies(sphere, rng):
-        if isinstance(policy, (Random, RandomAll, Furthest)):
+        if isinstance(policy, (Random, RandomAll, Furthest, Spread)):
             continue  # they draw
         together = policy.next_views(state, rng)
         for row in range(0, 50, 7):
@@ -184,7 +185,7 @@ def test_random_is_uniform_over_what_is_free(policy):
 
 def test_random_draws_from_the_generator_handed_in():
     state = state_of(SPHERE, np.zeros(200, int))
-    for policy in (Random(SPHERE), RandomAll(SPHERE), Furthest(SPHERE)):
+    for policy in (Random(SPHERE), RandomAll(SPHERE), Furthest(SPHERE), Spread(SPHERE, anywhere=False)):
         a, b, c = (policy.next_views(state, np.random.default_rng(seed)) for seed in (1, 1, 2))
         np.testing.assert_array_equal(a, b)
         assert (a != c).any()
@@ -227,6 +228,30 @@ def test_unidirectional_walks_the_ring(sphere, data):
 def test_unidirectional_passes_over_what_was_visited():
     state = state_of(SPHERE, [14, 14], [[15, 8], [15, 8, 9, 10, 11, 12]])
     assert Unidirectional(SPHERE).next_views(state, np.random.default_rng(0)).tolist() == [9, 13]
+
+
+@settings(deadline=None, max_examples=20)
+@given(spheres, st.booleans(), st.integers(0, 2**32))
+def test_spread_is_the_free_view_farthest_from_all_visited(sphere, anywhere, seed):
+    rng = np.random.default_rng(seed)
+    state = random_state(sphere, rng)
+    chosen = Spread(sphere, anywhere).next_views(state, rng)
+    for row, view in enumerate(state.current):
+        reachable = range(len(sphere)) if anywhere else sphere.window(view).ravel()
+        seen = sphere.directions[state.visited[row]]
+        apart = {v: np.arccos(np.clip(seen @ sphere.directions[v], -1, 1)).min() for v in reachable}
+        free = {v: arc for v, arc in apart.items() if not state.visited[row, v]}
+        if free:
+            assert free[chosen[row]] >= max(free.values()) - 1e-5
+
+
+def test_spread_breaks_ties_with_equal_chance():
+    # Opposite views of one ring: those between them are a quarter turn away from either.
+    state = state_of(ViewSphere((0.0,), 4), np.zeros(4000, int), [[2]] * 4000)
+    chosen = Spread(ViewSphere((0.0,), 4)).next_views(state, np.random.default_rng(0))
+    views, counts = np.unique(chosen, return_counts=True)
+    assert views.tolist() == [1, 3]
+    assert chisquare(counts).pvalue > 1e-3
 
 
 # Maps

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from nextview.cli.timing import Stopwatch
     from nextview.mesh import Mesh
 
-PolicyName = Literal["lem", "lem-peak", "random", "random-all", "furthest", "unidirectional"]
+PolicyName = Literal["lem", "lem-peak", "random", "random-all", "furthest", "unidirectional", "spread", "spread-local"]
 
 
 def recognise(

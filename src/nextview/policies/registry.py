@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
 from nextview.policies.maps import MapPeak
+from nextview.policies.spread import Spread
 from nextview.viewsphere import ViewSphere
 
 POLICIES: dict[str, Callable[[ViewSphere, tuple[int, ...]], Policy]] = {
@@ -15,6 +16,8 @@ POLICIES: dict[str, Callable[[ViewSphere, tuple[int, ...]], Policy]] = {
     "random-all": lambda sphere, valleys: RandomAll(sphere),
     "furthest": lambda sphere, valleys: Furthest(sphere),
     "unidirectional": lambda sphere, valleys: Unidirectional(sphere),
+    "spread": lambda sphere, valleys: Spread(sphere),
+    "spread-local": lambda sphere, valleys: Spread(sphere, anywhere=False),
     "lem": lambda sphere, valleys: MapPeak(sphere, "lem", valleys),
     "lem-peak": lambda sphere, valleys: MapPeak(sphere, "lem"),
     "lcm": lambda sphere, valleys: MapPeak(sphere, "lcm", valleys),
