@@ -1,21 +1,19 @@
-"""The figures of a benchmark, from its tables: narrow ones, so that they can be read on a phone."""
+"""The figures of a benchmark, from its tables."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import StringIO
 
-import matplotlib
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from nextview.benchmark.contestants import ORACLES
 from nextview.benchmark.results import Results
+from nextview.report.diagrams import confusion_matrix, draw_reliability, reliability_figure
+from nextview.report.style import INK, legend, new_figure
 
-INK, FAINT = "#1f2933", "#d5dbe1"
 COLOURS = {
     "random": "#8a949e",
     "random-all": "#4a5560",
@@ -35,34 +33,6 @@ COLOURS = {
 }
 OWN = ("#b5179e", "#7b2d00", "#3a7d00", "#7209b7")
 """For the policies of others."""
-STYLE = {
-    "font.family": "sans-serif",
-    "font.sans-serif": ["Helvetica Neue", "Arial", "Liberation Sans", "DejaVu Sans"],
-    "font.size": 9.5,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": "#8a949e",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": FAINT,
-    "grid.linewidth": 0.6,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "lines.linewidth": 1.7,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "nextview",
-}
-
-
-def to_svg(figure: Figure) -> str:
-    """A figure as SVG text, the same every time."""
-    text = StringIO()
-    with matplotlib.rc_context(STYLE):
-        figure.savefig(text, format="svg", bbox_inches="tight", pad_inches=0.05, metadata={"Date": None})
-    return text.getvalue()
 
 
 def is_oracle(policy: str) -> bool:
@@ -86,7 +56,7 @@ def look_of(policy: str, results: Results) -> dict:
 
 def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure:
     """Accuracy against threshold, with 95 % intervals (figures 15 and 18)."""
-    figure, axes = _figure(4.6, 3.5)
+    figure, axes = new_figure(4.6, 3.5)
     table = results.tables.summary.query("measure == @measure and threshold == threshold")
     ticks = sorted(table["threshold"].unique())
     for k, name in enumerate(names := [n for n in compared(results) if n in set(table["policy"])]):
@@ -99,13 +69,13 @@ def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure
     axes.set_xlabel("confidence threshold")
     axes.set_ylabel("class accuracy" if measure == "class_accuracy" else "accuracy")
     axes.yaxis.set_major_formatter(PercentFormatter(1))
-    _legend(axes)
+    legend(axes)
     return figure
 
 
 def budget_curve(results: Results, budget: str) -> Figure:
     """Accuracy against mean looks or mean travel, over all thresholds; in the legend the mean height of the curve."""
-    figure, axes = _figure(4.6, 3.5)
+    figure, axes = new_figure(4.6, 3.5)
     areas = results.tables.areas.query("budget == @budget").set_index("policy")["value"]
     for name in compared(results):
         rows = results.tables.sweep[results.tables.sweep["policy"] == name]
@@ -116,7 +86,7 @@ def budget_curve(results: Results, budget: str) -> Figure:
     axes.set_xlabel(labels[budget])
     axes.set_ylabel("accuracy")
     axes.yaxis.set_major_formatter(PercentFormatter(1))
-    _legend(axes, "policy  mean height")
+    legend(axes, "policy  mean height")
     return figure
 
 
@@ -126,7 +96,7 @@ def differences(results: Results, threshold: float, measure: str) -> Figure:
     unit = 100 if measure.endswith("accuracy") else 1
     difference, low, high = (unit * rows[column].to_numpy(float) for column in ("difference", "low", "high"))
     clear = rows["p_holm"].to_numpy(float) < 0.05
-    figure, axes = _figure(4.6, 0.6 + 0.24 * max(3, len(rows)))
+    figure, axes = new_figure(4.6, 0.6 + 0.24 * max(3, len(rows)))
     for y, policy in enumerate(rows["policy"]):
         colour = look_of(policy, results)["color"]
         axes.hlines(y, low[y], high[y], color=colour, linewidth=1.6)
@@ -146,19 +116,13 @@ def reliability_diagram(results: Results, policies: Sequence[str], threshold: fl
 
     Bins of fewer than 20 episodes are left out.
     """
-    figure, axes = _figure(4.6, 3.9)
-    axes.plot([0, 1], [0, 1], color=INK, linewidth=0.9)
+    figure, axes = reliability_figure("when it stopped")
     error = results.tables.summary.query("measure == 'calibration_error' and threshold == @threshold")
     errors = error.set_index("policy")["value"]
     for name in policies:
         rows = results.tables.reliability.query("policy == @name and threshold == @threshold and episodes >= 20")
-        look = look_of(name, results)
-        size = 8 + 220 * rows["episodes"] / rows["episodes"].sum()
-        axes.plot(rows["confidence"], rows["accuracy"], linewidth=1.1, **look, label=f"{name}  {errors[name]:.3f}")
-        axes.scatter(rows["confidence"], rows["accuracy"], s=size, color=look["color"], alpha=0.55, linewidths=0)
-    axes.set(xlim=(0, 1.03), ylim=(0, 1.03), xlabel="confidence when it stopped", ylabel="share that was right")
-    axes.set_aspect("equal")
-    _legend(axes, "policy  calibration error")
+        draw_reliability(axes, rows, rows["episodes"], f"{name}  {errors[name]:.3f}", **look_of(name, results))
+    legend(axes, "policy  calibration error")
     return figure
 
 
@@ -167,22 +131,7 @@ def confusion(episodes: pd.DataFrame, classes: Sequence[str], title: str) -> Fig
     counts = np.zeros((len(classes), len(classes)))
     label, answer = (pd.Categorical(episodes[c], categories=list(classes)).codes for c in ("label", "answer"))
     np.add.at(counts, (label, answer), 1)
-    share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
-    n = len(classes)
-    figure, axes = _figure(4.6, 4.4)
-    axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
-    for i, j in np.argwhere(share >= 0.01) if n <= 15 else ():
-        colour = "white" if share[i, j] > 0.55 else INK
-        axes.text(j, i, f"{100 * share[i, j]:.0f}", ha="center", va="center", fontsize=8, color=colour)
-    names = [name.replace("_", " ") for name in classes]
-    size = 8.5 if n <= 15 else 5
-    axes.set_xticks(np.arange(n), names, rotation=50, ha="right", rotation_mode="anchor", fontsize=size)
-    axes.set_yticks(np.arange(n), names, fontsize=size)
-    axes.set(xlabel="answer", ylabel="true class")
-    axes.set_title(title, fontsize=10, loc="left")
-    axes.grid(visible=False)
-    axes.tick_params(length=0)
-    return figure
+    return confusion_matrix(counts, classes, title)
 
 
 def class_differences(results: Results, threshold: float) -> Figure:
@@ -192,7 +141,7 @@ def class_differences(results: Results, threshold: float) -> Figure:
     table = table.pivot(index="label", columns="policy", values="value")
     names = [name for name in compared(results) if name in table and name not in (reference, "oracle-gain")]
     values = np.round(100 * (table[names].to_numpy() - table[[reference]].to_numpy()).T, 1) + 0.0  # no minus zero
-    figure, axes = _figure(4.9, 0.9 + 0.3 * len(names))
+    figure, axes = new_figure(4.9, 0.9 + 0.3 * len(names))
     reach = max(1.0, float(np.abs(values).max()))
     axes.imshow(values, cmap="RdBu", vmin=-reach, vmax=reach, aspect="auto")
     if values.shape[1] <= 15:
@@ -205,14 +154,3 @@ def class_differences(results: Results, threshold: float) -> Figure:
     axes.grid(visible=False)
     axes.tick_params(length=0)
     return figure
-
-
-def _figure(width: float, height: float) -> tuple[Figure, Axes]:
-    with matplotlib.rc_context(STYLE):
-        figure = Figure((width, height))
-        return figure, figure.add_subplot()
-
-
-def _legend(axes: Axes, title: str | None = None) -> None:
-    with matplotlib.rc_context(STYLE):
-        axes.legend(loc="upper center", bbox_to_anchor=(0.45, -0.17), ncols=2, title=title, title_fontsize=8.5)

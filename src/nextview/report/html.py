@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import base64
 import json
-import os
 from collections.abc import Sequence
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from nextview.benchmark.results import Results
 from nextview.report import curves, tables
+from nextview.report.elements import asset, card, description, document, numbers, picture, side_by_side, write
 from nextview.report.trajectories import Pictures, gains, trajectories, worst_failures
 
 
@@ -25,7 +22,7 @@ def headline_threshold(results: Results) -> float:
 
 def headline_policy(results: Results, threshold: float) -> str:
     """The most accurate policy that a robot could follow, other than the reference; the reference if it is alone."""
-    found = tables.numbers(results.tables.summary, "policy", "threshold", "measure")
+    found = numbers(results.tables.summary, "policy", "threshold", "measure")
     reference = results.settings["reference"]
     names = [n for n in results.tables.sweep["policy"].unique() if not curves.is_oracle(n) and n != reference]
     return max(names, key=lambda n: found[n, threshold, "accuracy"].value, default=reference)
@@ -44,9 +41,7 @@ def write_report(results: Results, path: Path, pictures: Pictures) -> None:
     """
     if results.tables.sweep.empty:
         raise ValueError(f"{results.folder}: holds fixed views only; a report needs a policy that chooses")
-    part = path.with_name(path.name + ".part")
-    part.write_text(page(results, pictures), encoding="utf-8")
-    os.replace(part, path)
+    write(page(results, pictures), path)
 
 
 def page(results: Results, pictures: Pictures) -> str:
@@ -64,31 +59,15 @@ def page(results: Results, pictures: Pictures) -> str:
         ("episodes", "Step through an episode", _viewer(results, best, at, failures.values.tolist(), pictures)),
         ("made", "How this was made", _made(results, pictures)),
     ]
-    sections = [section for section in sections if section[2]]
-    links = "".join(f'<a href="#{name}">{title}</a>' for name, title, _ in sections)
-    body = "".join(f'<section id="{name}"><h2>{title}</h2>{content}</section>' for name, title, content in sections)
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Next best view: {escape(best)} against {escape(reference)}</title>"
-        f"<style>{_asset('report.css')}</style></head><body><main>"
-        f"{_headline(results, best, at)}<nav>{links}</nav>{body}"
-        f"</main><script>{_asset('viewer.js')}</script></body></html>\n"
-    )
-
-
-def _asset(name: str) -> str:
-    return (files("nextview.report") / "page" / name).read_text(encoding="utf-8")
+    title = f"Next best view: {best} against {reference}"
+    return document(title, _headline(results, best, at), sections, asset("viewer.js"))
 
 
 def _headline(results: Results, best: str, at: float) -> str:
     p, settings = results.predictions, results.settings
-    found = tables.numbers(results.tables.summary, "policy", "threshold", "measure")
+    found = numbers(results.tables.summary, "policy", "threshold", "measure")
     reference = settings["reference"]
     first = results.tables.sweep.query("policy == @reference or policy == @best").iloc[0]
-
-    def card(title: str, number: str, small: str) -> str:
-        return f'<div class="card"><span>{title}</span><b>{number}</b><span>{small}</span></div>'
 
     def of(policy: str) -> str:
         n = found[policy, at, "accuracy"]
@@ -130,21 +109,9 @@ def _verdict(results: Results, best: str, at: float) -> str:
     )
 
 
-def _figure(figure: Figure, alt: str, caption: str) -> str:
-    data = base64.b64encode(curves.to_svg(figure).encode()).decode()
-    return (
-        f'<figure><img src="data:image/svg+xml;base64,{data}" alt="{escape(alt)}">'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
-
-
-def _figures(*figures: str, small: bool = False) -> str:
-    return f'<div class="figures{" small" if small else ""}">{"".join(figures)}</div>'
-
-
 def _spoken(results: Results, policies: Sequence[str], at: float, measure: str) -> str:
     """The numbers of a figure in words, for those who cannot see it."""
-    found = tables.numbers(results.tables.summary, "policy", "threshold", "measure")
+    found = numbers(results.tables.summary, "policy", "threshold", "measure")
     said = (f"{name} {found[name, at, measure].value:.3f}" for name in policies if (name, at, measure) in found)
     return f"At threshold {at:g}: " + ", ".join(said) + "."
 
@@ -160,9 +127,9 @@ def _results(results: Results, at: float) -> str:
     failures = "".join(f"<p>Left out: {escape(sentence)}</p>" for sentence in results.settings["failures"].values())
     shown = ""
     if len(results.tables.tests):
-        shown = _figures(
+        shown = side_by_side(
             *(
-                _figure(
+                picture(
                     curves.differences(results, at, measure),
                     f"Difference of each policy to the reference in {what}, with intervals. "
                     + _spoken(results, list(results.tables.sweep["policy"].unique()), at, measure),
@@ -183,7 +150,7 @@ def _curves(results: Results, at: float) -> str:
         "height.</p>"
     )
     figures = [
-        _figure(
+        picture(
             curves.threshold_curve(results, measure),
             f"{what} against threshold. " + _spoken(results, names, at, measure),
             f"{what} against threshold, as figures 15 and 18.",
@@ -193,24 +160,24 @@ def _curves(results: Results, at: float) -> str:
     for budget, what in (("looks", "looks"), ("travel_all", "travel")):
         if results.tables.sweep[budget].max() > results.tables.sweep[budget].min():
             figures.append(
-                _figure(
+                picture(
                     curves.budget_curve(results, budget),
                     f"Accuracy against mean {what}. " + _spoken(results, names, at, budget),
                     f"Accuracy against mean {what}; oracles broken.",
                 )
             )
-    return text + _figures(*figures)
+    return text + side_by_side(*figures)
 
 
 def _calibration(results: Results, best: str, at: float) -> str:
     ran = set(results.tables.sweep["policy"])
     policies = [n for n in dict.fromkeys((results.settings["reference"], best, "oracle-gain")) if n in ran]
-    figure = _figure(
+    figure = picture(
         curves.reliability_diagram(results, policies, at),
         "Share of right answers against confidence. " + _spoken(results, policies, at, "calibration_error"),
         f"Reliability at threshold {at:g}: on the diagonal, 90&nbsp;% sure is right nine times in ten.",
     )
-    return tables.calibration(results, curves.compared(results)) + _figures(figure)
+    return tables.calibration(results, curves.compared(results)) + side_by_side(figure)
 
 
 def _classes(results: Results, best: str, at: float) -> str:
@@ -219,18 +186,18 @@ def _classes(results: Results, best: str, at: float) -> str:
         if name in ran:
             figure = curves.confusion(results.episodes(name, at), results.predictions.classes, name)
             figures.append(
-                _figure(figure, f"Confusion matrix of {name} at threshold {at:g}.", "Percent of each true class.")
+                picture(figure, f"Confusion matrix of {name} at threshold {at:g}.", "Percent of each true class.")
             )
     difference = ""
     if results.settings["reference"] in ran and len(set(curves.compared(results)) - {"oracle-gain"}) > 1:
         reference = escape(results.settings["reference"])
-        difference = _figure(
+        difference = picture(
             curves.class_differences(results, at),
             "Accuracy of each class against the reference, in percentage points; the table below has the numbers.",
             f"Accuracy by class against {reference} at threshold {at:g}, percentage points.",
         )
     return (
-        _figures(*figures, difference)
+        side_by_side(*figures, difference)
         + tables.per_class(results, "accuracy", at)
         + tables.per_class(results, "travel_moved", at)
     )
@@ -304,4 +271,4 @@ def _made(results: Results, pictures: Pictures) -> str:
     }  # fmt: skip
     if pictures.store is not None:
         facts["pictures"] = pictures.store.path.name
-    return "<dl>" + "".join(f"<dt>{escape(k)}</dt><dd>{escape(str(v))}</dd>" for k, v in facts.items()) + "</dl>"
+    return description(facts)

@@ -2,60 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from html import escape
-from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from nextview.benchmark.published import COLUMNS, published_threshold
 from nextview.benchmark.results import Results
 from nextview.report.curves import is_oracle
+from nextview.report.elements import NONE, cell, numbers, table
 
-NONE = "&ndash;"
 KNOWING = ("best", "worst", "high", "low")
 """How the names of fixed views begin that are chosen by a truth no robot has."""
-
-
-class Number(NamedTuple):
-    """A number with its interval and the published one; NaN where there is none."""
-
-    value: float
-    low: float = np.nan
-    high: float = np.nan
-    published: float = np.nan
-
-
-def numbers(frame: pd.DataFrame, *keys: str) -> dict[tuple, Number]:
-    """A long table as a mapping; a threshold that is NaN becomes None."""
-    names = [[None if key != key else key for key in row] for row in frame[list(keys)].to_numpy(object).tolist()]
-    values = frame[list(Number._fields)].to_numpy(float).tolist()
-    return {tuple(name): Number(*value) for name, value in zip(names, values, strict=True)}
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str) -> str:
-    """A table of ready-made cells; the first of each row is its heading. Wide ones scroll by themselves."""
-    top = "".join(f'<th scope="col">{cell}</th>' for cell in head)
-    body = "".join(
-        f'<tr><th scope="row">{row[0]}</th>' + "".join(f"<td>{cell}</td>" for cell in row[1:]) + "</tr>" for row in rows
-    )
-    return (
-        f'<p class="soft">{caption}</p><div class="wide" tabindex="0"><table aria-label="{caption}">'
-        f"<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>"
-    )
-
-
-def cell(number: Number | None, digits: int = 3) -> str:
-    """A number, its interval below it, and the published one below that."""
-    if number is None or np.isnan(number.value):
-        return NONE
-    text = f"{number.value:.{digits}f}"
-    if number.high > number.low:
-        text += f"<small>{number.low:.{digits}f} &ndash; {number.high:.{digits}f}</small>"
-    if np.isfinite(number.published):
-        text += f'<small class="published">published {number.published:.{digits}f}</small>'
-    return text
 
 
 def p_value(p: float) -> str:

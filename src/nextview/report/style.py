@@ -1,0 +1,59 @@
+"""How all figures of the reports look: narrow, so that they can be read on a phone."""
+
+from __future__ import annotations
+
+from io import StringIO
+from pathlib import Path
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+INK, FAINT = "#1f2933", "#d5dbe1"
+STYLE = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["Helvetica Neue", "Arial", "Liberation Sans", "DejaVu Sans"],
+    "font.size": 9.5,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": "#8a949e",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.6,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.7,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "nextview",
+}
+
+
+def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
+    """An empty figure with one pair of axes, inches."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure((width, height))
+        return figure, figure.add_subplot()
+
+
+def legend(axes: Axes, title: str | None = None) -> None:
+    """A legend in two columns below the axes."""
+    with matplotlib.rc_context(STYLE):
+        axes.legend(loc="upper center", bbox_to_anchor=(0.45, -0.17), ncols=2, title=title, title_fontsize=8.5)
+
+
+def to_svg(figure: Figure) -> str:
+    """A figure as SVG text, the same every time."""
+    text = StringIO()
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(text, format="svg", bbox_inches="tight", pad_inches=0.05, metadata={"Date": None})
+    return text.getvalue()
+
+
+def to_png(figure: Figure, path: Path) -> None:
+    """A figure as a PNG file."""
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(path, dpi=160, facecolor="white", bbox_inches="tight", pad_inches=0.1)
