@@ -38,7 +38,7 @@ def visible_points(
     """
     flat = object_depth(depth).ravel()
     order = pixel_order(flat.size, seed)
-    for first in (4 * POINTS, 16 * POINTS, flat.size):  # most often the beginning of the order holds enough
+    for first in (4 * POINTS, 8 * POINTS, 16 * POINTS, flat.size):  # most often the beginning of the order holds enough
         visible = np.flatnonzero(flat[order[:first]])
         if len(visible) >= POINTS:
             break

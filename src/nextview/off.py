@@ -34,28 +34,29 @@ def read_off(data: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def _read_plain(body: bytes, vertex_count: int, face_count: int) -> tuple[NDArray, NDArray] | None:
-    """The usual case at full speed: three numbers a vertex, triangles only. None if the file is anything else."""
-    if b"\n3" not in body and face_count:
+    """The usual case at full speed: three numbers a line, then triangles alone. None if the file is anything else."""
+    body = body.strip()
+    ends = np.flatnonzero(np.frombuffer(body, np.uint8) == ord("\n"))
+    if min(vertex_count, face_count) == 0 or len(ends) != vertex_count + face_count - 1:
+        return None
+    if re.search(rb"\n[ \t\r]*\n", body):  # a blank line may hide that another one holds too much
         return None
     import warnings
 
+    middle = int(ends[vertex_count - 1])
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)
         try:
-            numbers = np.fromstring(body, sep=" ")
+            vertices = np.fromstring(body[:middle], sep=" ")
+            faces = np.fromstring(body[middle:], np.int64, sep=" ")
         except (DeprecationWarning, ValueError):
             return None
-    if len(numbers) != 3 * vertex_count + 4 * face_count:
+    if len(vertices) != 3 * vertex_count or len(faces) != 4 * face_count or (faces[::4] != 3).any():
         return None
-    faces = numbers[3 * vertex_count :].reshape(-1, 4)
-    with np.errstate(invalid="ignore"):
-        indices = faces.astype(np.int64)
-    if not (indices[:, 0] == 3).all() or not (indices == faces).all():
-        return None
-    # The count of numbers can come out right by accident where colours stand; the lines then cannot.
-    if sum(1 for line in body.splitlines() if line.strip()) != vertex_count + face_count:
-        return None
-    return numbers[: 3 * vertex_count].reshape(-1, 3), indices[:, 1:]
+    indices = faces.reshape(-1, 4)[:, 1:]
+    if indices.max() >= vertex_count:
+        return None  # an index beyond 64 bits has been cut; the other way gives it as it is
+    return vertices.reshape(-1, 3), indices
 
 
 def _read_lines(body: bytes, vertex_count: int, face_count: int) -> tuple[NDArray, NDArray]:

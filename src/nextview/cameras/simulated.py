@@ -16,6 +16,11 @@ AMBIENT = 0.15
 """Brightness of a surface seen edge-on, so that it stays apart from the black background."""
 
 
+def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Of rows of three; einsum takes three times as long."""
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+
+
 class SimulatedCamera:
     """Looks at one mesh from any pose.
 
@@ -33,9 +38,10 @@ class SimulatedCamera:
         self.size = size
         self.seed = seed
         self.intrinsics = pinhole(size, distance)
-        self._vertices = mesh.vertices.astype(np.float32)
+        vertices = mesh.vertices.astype(np.float32)
+        self._corners = np.ascontiguousarray(vertices.T)
         self._scene = EmbreeScene()
-        TriangleMesh(self._scene, self._vertices, np.ascontiguousarray(mesh.faces, dtype=np.int32))
+        TriangleMesh(self._scene, vertices, np.ascontiguousarray(mesh.faces, dtype=np.int32))
         centres = (np.arange(size, dtype=np.float32) + 0.5 - size / 2) / self.intrinsics[0, 0].astype(np.float32)
         self._rays = np.empty((size, size, 3), np.float32)  # z = 1, so that Embree's distance is the depth
         self._rays[..., 0], self._rays[..., 1], self._rays[..., 2] = centres[None, :], centres[:, None], 1.0
@@ -48,27 +54,23 @@ class SimulatedCamera:
         depth = np.zeros((self.size, self.size), np.float32)
         # Only pixels inside the object's projected bound can hit anything: cast no others.
         bound = self._bound(rotation, origin)
-        rays = self._rays[bound].reshape(-1, 3) @ rotation.T
-        if len(rays):
-            hits = self._scene.run(np.broadcast_to(origin, rays.shape).copy(), rays, output=1)
-            seen = np.flatnonzero(hits["primID"] >= 0)
-            normals, towards = np.take(hits["Ng"], seen, 0), np.take(rays, seen, 0)
-            cosine = np.abs(np.einsum("ij,ij->i", normals, towards))
-            lengths = np.sqrt(np.einsum("ij,ij->i", normals, normals)) * np.take(self._ray_length[bound], seen)
-            cosine /= lengths + 1e-30
-            window = depth[bound].shape
-            shade = np.zeros(len(rays), np.uint8)
-            shade[seen] = 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5
-            distance = np.zeros(len(rays), np.float32)
-            distance[seen] = np.take(hits["tfar"], seen)
-            image[bound] = shade.reshape(window)
-            depth[bound] = distance.reshape(window)
+        height, width = depth[bound].shape
+        if height and width:
+            rays = self._rays[bound].reshape(-1, 3) @ np.ascontiguousarray(rotation.T)
+            origins = np.tile(np.tile(origin, width), height).reshape(-1, 3)  # row by row: ten times as fast
+            hits = self._scene.run(origins, rays, output=1)
+            hit, normals = hits["primID"] >= 0, hits["Ng"]
+            cosine = np.abs(_dot(normals, rays))
+            cosine /= np.sqrt(_dot(normals, normals)) * self._ray_length[bound].ravel() + 1e-30
+            shade = np.where(hit, 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5, 0)
+            image[bound] = shade.reshape(height, width)
+            depth[bound] = np.where(hit, hits["tfar"], 0).reshape(height, width)
         points = visible_points(depth, pose, self.intrinsics, self.seed)
         return Observation(image, depth, points, pose, self.intrinsics)
 
     def _bound(self, rotation: NDArray[np.float32], origin: NDArray[np.float32]) -> tuple[slice, slice]:
         """Rows and columns that hold the projection of every vertex; the whole image if one is behind the camera."""
-        x, y, z = ((self._vertices - origin) @ rotation).T
+        x, y, z = rotation.T @ self._corners - (rotation.T @ origin)[:, None]
         if z.min() <= 1e-6:
             return slice(0, self.size), slice(0, self.size)
         focal, centre = self.intrinsics[0, 0], self.size / 2

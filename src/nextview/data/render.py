@@ -21,6 +21,7 @@ from nextview.data.pool import each
 from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, ViewStore
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.mesh import Mesh, MeshError, load_mesh, make_mesh
+from nextview.observation import POINTS
 from nextview.viewsphere import ViewSphere
 
 
@@ -49,12 +50,17 @@ class Deform:
 def render_object(mesh: Mesh, sphere: ViewSphere, size: int) -> dict[str, np.ndarray]:
     """All views of one mesh as the store keeps them: image, depth, points and depth-entropy."""
     camera = SimulatedCamera(mesh, size, sphere.distance)
-    looks = [camera.observe(pose) for pose in sphere.poses]
-    depth = np.stack([np.rint(look.depth / DEPTH_UNIT).astype(np.uint16) for look in looks])
+    image = np.empty((len(sphere), size, size), np.uint8)
+    depth = np.empty((len(sphere), size, size), np.uint16)
+    points = np.empty((len(sphere), POINTS, 3), np.float32)
+    for view, pose in enumerate(sphere.poses):
+        look = camera.observe(pose)
+        image[view], points[view] = look.image, look.points
+        depth[view] = np.rint(look.depth / DEPTH_UNIT)
     return {
-        "image": np.stack([look.image for look in looks]),
+        "image": image,
         "depth": depth,
-        "points": np.stack([np.rint(look.points / POINT_UNIT).clip(-32767, 32767).astype(np.int16) for look in looks]),
+        "points": np.rint(points / POINT_UNIT).clip(-32767, 32767).astype(np.int16),
         "measures/depth_entropy": np.array([depth_entropy(d * DEPTH_UNIT) for d in depth], np.float32),
     }
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import entr
 
 from nextview.observation import object_depth
 
@@ -21,9 +20,12 @@ def depth_entropy(depth: NDArray[np.floating]) -> float:
     Returns:
         0 for an image of one value, at most log2 of the number of pixels.
     """
-    values = np.rint(object_depth(np.asarray(depth, np.float64)).ravel() / QUANTUM).astype(np.int64)
-    counts = np.bincount(values)
-    return float(entr(counts[counts > 0] / values.size).sum() / np.log(2))
+    depth = object_depth(np.asarray(depth, np.float64))
+    seen = depth[depth > 0]
+    counts = np.bincount(np.rint(seen / QUANTUM).astype(np.int64), minlength=1)
+    counts[0] += depth.size - seen.size
+    share = counts[counts > 0] / depth.size
+    return float((share * np.log2(1 / share)).sum())
 
 
 def normalise_per_object(values: NDArray[np.floating]) -> NDArray[np.float32]:
