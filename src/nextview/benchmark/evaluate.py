@@ -20,6 +20,9 @@ Float = NDArray[np.float64]
 TRUTHS: dict[str, Callable[[Predictions], NDArray]] = {"lem": true_lem, "lcm": true_lcm}
 """Maps whose truth the predictions tell."""
 
+RELIABILITY_LOOKS = (1, 2, 5)
+"""Looks after which confidence is compared with accuracy, beside all of them."""
+
 
 class EvaluationError(ValueError):
     """Predictions in which there is nothing to judge; the message is one sentence."""
@@ -35,7 +38,7 @@ class Evaluation:
             also has another label; with ``class_`` before it the mean over classes.
         fusion: looks, accuracy, low, high, class_accuracy, calibration_error: that many random views fused.
         confusion: looks, label, answer, answers: how many; a view is an answer, or a whole object.
-        reliability: looks, bin, confidence, accuracy, answers.
+        reliability: looks, bin, confidence, accuracy, answers: after one look and a few more, in random order.
         maps: map, by, label, measure, value, low, high, published; the measures are those of ``scores.map_errors``.
             ``by`` is the network or a yardstick made from the true maps of these very objects, which flatters it:
             their mean, the same for every view; or their mean for the object's true class at the view.
@@ -71,13 +74,17 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
     if samples < 1:
         raise EvaluationError(f"at least one sample of the bootstrap is needed, not {samples}")
     weights = st.resample(len(p), samples, rng)
-    fused = fused_views(p.logits, p.labels, rng)
+    right, confidence = fused_views(p.logits, p.labels, rng)
     judged = {1: p.logits, len(p.sphere): p.logits.astype(np.float64).sum(1, keepdims=True)}
     maps, left_out = _maps(p, weights)
     return Evaluation(
-        _accuracy(p, judged, weights), _fusion(p, *fused, weights), _confusion(p, judged), _reliability(p, judged),
-        maps, left_out,
-    )  # fmt: skip
+        _accuracy(p, judged, weights),
+        _fusion(p, right, confidence, weights),
+        _confusion(p, judged),
+        _reliability(right, confidence),
+        maps,
+        left_out,
+    )
 
 
 def fused_views(
@@ -102,14 +109,8 @@ def fused_views(
     for turn in range(v):
         total = np.roll(shuffled, -turn, axis=1).cumsum(1)
         right[:, :, turn] = (total.argmax(2) == labels[:, None]).T
-        confidence[:, :, turn] = _confidence(total).T
+        confidence[:, :, turn] = (1 / np.exp(total - total.max(2, keepdims=True)).sum(2)).T  # the softmax's peak
     return right, confidence
-
-
-def _confidence(logits: NDArray[np.floating]) -> Float:
-    """The peak of the softmax over the last axis."""
-    logits = np.asarray(logits, np.float64)
-    return 1 / np.exp(logits - logits.max(-1, keepdims=True)).sum(-1)
 
 
 def _means(
@@ -180,12 +181,14 @@ def _confusion(p: Predictions, judged: dict[int, NDArray]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["looks", "label", "answer", "answers"])
 
 
-def _reliability(p: Predictions, judged: dict[int, NDArray]) -> pd.DataFrame:
-    rows = []
-    for looks, logits in judged.items():
-        right = logits.argmax(2) == p.labels[:, None]
-        sure, accuracy, count = st.reliability(_confidence(logits).ravel(), right.ravel())
-        rows += [(looks, i, sure[i], accuracy[i], count[i]) for i in np.flatnonzero(count)]
+def _reliability(right: NDArray[np.bool_], confidence: NDArray[np.float32]) -> pd.DataFrame:
+    rows, v = [], len(right)
+    for looks in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
+        turns = slice(None) if looks < v else slice(1)  # all views are the same in every order
+        sure, share, count = st.reliability(
+            confidence[looks - 1, :, turns].ravel().astype(np.float64), right[looks - 1, :, turns].ravel()
+        )
+        rows += [(looks, i, sure[i], share[i], count[i]) for i in np.flatnonzero(count)]
     return pd.DataFrame(rows, columns=["looks", "bin", "confidence", "accuracy", "answers"])
 
 

@@ -66,4 +66,4 @@ def draw_reliability(axes: Axes, rows: pd.DataFrame, answers: pd.Series, label: 
     """
     axes.plot(rows["confidence"], rows["accuracy"], linewidth=1.1, color=color, label=label, **line)
     size = 8 + 220 * answers / answers.sum()
-    axes.scatter(rows["confidence"], rows["accuracy"], s=size, color=color, alpha=0.55, linewidths=0)
+    axes.scatter(rows["confidence"], rows["accuracy"], s=size, color=color, alpha=0.55, linewidths=0, clip_on=False)
