@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,22 +55,29 @@ def save(folder: Path, grid: Grid, tables: Tables, settings: dict[str, Any]) -> 
         ResultsError: the folder is there and holds something else.
     """
     check_target(folder)
+    with written_whole(folder) as part:
+        _write_episodes(part / "episodes.parquet", grid)
+        for name, table in tables.named().items():
+            table.to_csv(part / f"{name}.csv", index=False)
+        grid.trials.predictions.save(part / "predictions.npz")
+        (part / "benchmark.json").write_text(json.dumps(settings, indent=1) + "\n")
+
+
+def check_target(folder: Path, mark: str = "benchmark.json", what: str = "benchmark") -> None:
+    """Refuse to replace anything but earlier results, which are known by a file among them."""
+    if folder.exists() and not (folder / mark).exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ResultsError(f"{folder}: is there and holds no {what} results; give another folder")
+
+
+@contextmanager
+def written_whole(folder: Path) -> Iterator[Path]:
+    """A new folder to write into, which takes the place of ``folder`` when all is written."""
     part = folder.with_name(folder.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
-    _write_episodes(part / "episodes.parquet", grid)
-    for name, table in tables.named().items():
-        table.to_csv(part / f"{name}.csv", index=False)
-    grid.trials.predictions.save(part / "predictions.npz")
-    (part / "benchmark.json").write_text(json.dumps(settings, indent=1) + "\n")
+    yield part
     shutil.rmtree(folder, ignore_errors=True)
     part.rename(folder)
-
-
-def check_target(folder: Path) -> None:
-    """Refuse to replace anything but earlier results."""
-    if folder.exists() and not (folder / "benchmark.json").exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ResultsError(f"{folder}: is there and holds no benchmark results; give another folder")
 
 
 def load(folder: Path) -> Results:
