@@ -13,7 +13,7 @@ from nextview.episode import Episodes, PolicyError, run_episodes, select
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.baselines import Random, Unidirectional
 from nextview.policies.maps import MapPeak
-from nextview.recognition import Stopping
+from nextview.recognition import PLAIN_SUM, Calibration, Stopping
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("40")
@@ -38,11 +38,11 @@ class Table:
         return Evidence(self.logits[episodes, views], {"lem": self.lem[episodes, views]}, self.lem[episodes, views, 0])
 
 
-def walk(table: Table, policy, episode: int, start: int, stopping: Stopping, sphere: ViewSphere = SPHERE):
+def walk(table: Table, policy, episode: int, start: int, stopping: Stopping, calibration, sphere=SPHERE):
     """One episode as one would write it for one object: views, beliefs."""
     views, beliefs = [start], []
     while True:
-        beliefs.append(softmax(table.logits[episode, views].sum(0)))
+        beliefs.append(softmax(table.logits[episode, views].sum(0) / calibration.temperature(len(views))))
         if beliefs[-1].max() >= stopping.threshold or len(views) in (stopping.max_views, len(sphere)):
             return views, beliefs
         visited = np.zeros((1, len(sphere)), bool)
@@ -53,8 +53,8 @@ def walk(table: Table, policy, episode: int, start: int, stopping: Stopping, sph
         views.append(int(policy.next_views(state, np.random.default_rng(0))[0]))
 
 
-def run(table, policy, starts, stopping, sphere=SPHERE, seed=0) -> Episodes:
-    return run_episodes(table.observe, sphere, policy, starts, stopping, np.random.default_rng(seed))
+def run(table, policy, starts, stopping, sphere=SPHERE, seed=0, calibration=PLAIN_SUM) -> Episodes:
+    return run_episodes(table.observe, sphere, policy, starts, stopping, np.random.default_rng(seed), calibration)
 
 
 @settings(deadline=None, max_examples=25)
@@ -63,14 +63,15 @@ def run(table, policy, starts, stopping, sphere=SPHERE, seed=0) -> Episodes:
     st.sampled_from([0.0, 0.5, 0.8, 0.97, 1.0]),
     st.integers(1, 7),
     st.sampled_from([Unidirectional(SPHERE), MapPeak(SPHERE), MapPeak(SPHERE, valley_classes=(0, 2))]),
+    st.sampled_from([PLAIN_SUM, Calibration(0.7, 0.4)]),
 )
-def test_many_episodes_at_once_are_each_episode_alone(seed, threshold, max_views, policy):
+def test_many_episodes_at_once_are_each_episode_alone(seed, threshold, max_views, policy, calibration):
     table, stopping = Table.random(20, seed=seed), Stopping(threshold, max_views)
     starts = np.random.default_rng(seed).integers(0, 40, 20)
-    episodes = run(table, policy, starts, stopping)
+    episodes = run(table, policy, starts, stopping, calibration=calibration)
     end = episodes.outcome
     for e, start in enumerate(starts):
-        views, beliefs = walk(table, policy, e, int(start), stopping)
+        views, beliefs = walk(table, policy, e, int(start), stopping, calibration)
         assert end.views[e, : len(views)].tolist() == views
         assert (end.views[e, len(views) :] == -1).all()
         assert end.looks[e] == len(views)

@@ -17,6 +17,7 @@ from nextview.data.store import ViewStore
 from nextview.models.card import read_card
 from nextview.models.networks import MapNetwork, Recogniser
 from nextview.observation import Observation
+from nextview.recognition import Calibration, RiskBounds
 from nextview.viewsphere import ViewSphere
 
 CLASSES = ["ball", "box", "pillar"]
@@ -65,14 +66,14 @@ def cards(shop: Path) -> tuple:
 
 
 def test_what_is_saved_is_what_is_loaded(tmp_path):
-    saved = some_predictions()
+    saved = replace(some_predictions(), calibration=Calibration(0.8, 0.3, RiskBounds((0.9,), ((0.1,),), 0.1)))
     saved.save(tmp_path / "p.npz")
     loaded = Predictions.load(tmp_path / "p.npz")
     for name in ("logits", "depth_entropy", "labels", "splits", "conflicting"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(saved, name))
         assert getattr(loaded, name).dtype == getattr(saved, name).dtype
     np.testing.assert_array_equal(loaded.maps["lem"], saved.maps["lem"])
-    for name in ("names", "classes", "sphere", "models", "valley_classes"):
+    for name in ("names", "classes", "sphere", "models", "valley_classes", "calibration"):
         assert getattr(loaded, name) == getattr(saved, name)
     assert [p.name for p in tmp_path.iterdir()] == ["p.npz"]
 
@@ -214,3 +215,22 @@ def test_a_split_without_objects_is_named(shop, tmp_path):
     recogniser, maps = cards(shop)
     with pytest.raises(DatasetError, match="'validation'"):
         list(predict(shop / "views.zarr", tmp_path / "p.npz", recogniser, maps, "validation"))
+
+
+def test_predictions_made_before_there_were_calibrations_are_read(tmp_path):
+    some_predictions().save(tmp_path / "p.npz")
+    with np.load(tmp_path / "p.npz") as file:
+        kept = {name: file[name] for name in file.files if name != "calibration"}
+    np.savez(tmp_path / "p.npz", **kept)
+    assert Predictions.load(tmp_path / "p.npz").calibration == Calibration()
+
+
+def test_a_card_that_was_calibrated_since_brings_predictions_up_to_date(shop):
+    (recogniser, maps), out = cards(shop), shop / "calibrated.npz"
+    list(predict(shop / "views.zarr", out, recogniser, maps, workers=1))
+    before = Predictions.load(out)
+    later = replace(recogniser, facts={**recogniser.facts, "calibration": Calibration(0.5, 0.25).facts()})
+    assert list(predict(shop / "views.zarr", out, later, maps, workers=1)) == [(6, 6)]
+    after = Predictions.load(out)
+    assert (before.calibration, after.calibration) == (Calibration(), Calibration(0.5, 0.25))
+    np.testing.assert_array_equal(after.logits, before.logits)

@@ -1,13 +1,16 @@
 """Belief against SciPy, and the limits of a stopping rule."""
 
+import json
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from scipy.special import log_softmax, softmax
+from scipy.stats import multivariate_normal
 
-from nextview.recognition import Stopping, fuse
+from nextview.recognition import Calibration, RiskBounds, RiskError, Stopping, fuse
 
 logits = npst.arrays(
     st.sampled_from([np.float32, np.float64]),
@@ -46,6 +49,66 @@ def test_huge_logits_do_not_overflow():
 def test_a_logit_that_is_not_finite_is_refused(bad):
     with pytest.raises(ValueError, match="a logit that is not a finite number"):
         fuse(np.array([[0.0, 1.0], [bad, 0.0]]))
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.9])
+def test_calibrated_belief_is_the_posterior_of_equally_correlated_looks(correlation):
+    # Two classes, each look a Gaussian measurement around -1 or +1 whose noise is correlated between looks.
+    rng, spread = np.random.default_rng(0), 1.7
+    for looks in (1, 2, 5, 20):
+        noise = spread**2 * ((1 - correlation) * np.eye(looks) + correlation)
+        seen = rng.multivariate_normal(np.ones(looks), noise, size=6)
+        likelihood = np.stack([multivariate_normal(np.full(looks, m), noise).logpdf(seen) for m in (-1, 1)], -1)
+        of_each = np.stack([-((seen - m) ** 2) / (2 * spread**2) for m in (-1, 1)], -1)
+        belief = fuse(of_each, Calibration(1.0, correlation).temperature(looks))
+        np.testing.assert_allclose(belief, softmax(likelihood, -1), atol=1e-9)
+
+
+def test_a_calibration_survives_the_card():
+    bounds = RiskBounds((0.5, 0.9), ((0.2, 0.1), (0.3, 0.15)), 0.1)
+    for calibration in (Calibration(), Calibration(0.7, 0.25), Calibration(1.2, 0.8, bounds)):
+        assert Calibration.of_facts(json.loads(json.dumps(calibration.facts()))) == calibration
+    assert Calibration.of_facts(None) == Calibration()
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [
+        {"temperature_of_one": 0, "correlation": 0},
+        {"temperature_of_one": 1, "correlation": -0.1},
+        {"temperature_of_one": 1, "correlation": np.nan},
+        {"temperature_of_one": "warm", "correlation": 0},
+        {"correlation": 0},
+        {"temperature_of_one": 1, "correlation": 0, "risk": {"delta": 0.1}},
+        "calibrated",
+    ],
+)
+def test_a_calibration_that_makes_no_sense_is_refused(facts):
+    with pytest.raises(ValueError, match="calibration"):
+        Calibration.of_facts(facts)
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(0.01, 0.5), min_size=1, max_size=8), st.floats(0.02, 0.4))
+def test_the_threshold_of_a_risk_is_the_lowest_from_which_all_bounds_hold(row, risk):
+    thresholds = tuple(np.linspace(0.5, 0.99, len(row)))
+    bounds = RiskBounds(thresholds, (tuple(row),), 0.1)
+    held = [t for i, t in enumerate(thresholds) if all(b <= risk for b in row[i:])]
+    if held:
+        assert bounds.threshold(risk, 1) == min(held)
+    else:
+        with pytest.raises(RiskError, match="cannot promise"):
+            bounds.threshold(risk, 1)
+
+
+def test_what_was_not_calibrated_is_not_promised():
+    bounds = RiskBounds((0.9,), ((0.01,), (0.02,)), 0.1)
+    assert bounds.threshold(0.05, 2) == 0.9
+    with pytest.raises(RiskError, match="at most 2 views, not 3"):
+        bounds.threshold(0.05, 3)
+    for risk in (0.0, 1.0, np.nan):
+        with pytest.raises(RiskError, match="between 0 and 1"):
+            bounds.threshold(risk, 1)
 
 
 @pytest.mark.parametrize("threshold", [-0.01, 1.01, np.nan, np.inf])

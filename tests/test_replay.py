@@ -1,3 +1,4 @@
+import json
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from nextview.models.card import read_card
 from nextview.models.networks import MapNetwork, Models, Recogniser
 from nextview.policies.base import Evidence
 from nextview.policies.registry import make_policy
-from nextview.recognition import Stopping
+from nextview.recognition import Calibration, Stopping
 from nextview.session import recognise
 from nextview.viewsphere import ViewSphere
 
@@ -81,6 +82,8 @@ def test_the_policy_is_asked_once_for_all_episodes_of_a_look(trials, monkeypatch
 
 
 def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(trials):
+    calibration = Calibration(0.8, 0.5)
+    trials = replace(trials, predictions=replace(trials.predictions, calibration=calibration))
     p = trials.predictions
     for name, everywhere in [("oracle-gain", False), ("oracle-gain-all", True)]:
         views = replay(name, trials, 3, seed=0).views
@@ -88,7 +91,9 @@ def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(trials):
             i, seen = trials.objects[e], list(views[e, :2])
             around = range(40) if everywhere else p.sphere.windows[seen[-1]].ravel()
             belief = {
-                v: softmax(p.logits[i, [*seen, v]].astype(float).sum(0))[p.labels[i]] for v in around if v not in seen
+                v: softmax(p.logits[i, [*seen, v]].astype(float).sum(0) / calibration.temperature(3))[p.labels[i]]
+                for v in around
+                if v not in seen
             }
             assert belief[views[e, 2]] == pytest.approx(max(belief.values()), abs=1e-9)
 
@@ -270,6 +275,8 @@ def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(meshes, 
     list(render(tmp_path / "meshes", tmp_path / "views.zarr", sphere, 64, workers=1))
     classes = sorted(path.name for path in (tmp_path / "meshes").iterdir())
     recogniser = make_recogniser(tmp_path, classes, size=32)
+    calibrated = json.loads(recogniser.read_text()) | {"calibration": Calibration(0.6, 0.7).facts()}
+    recogniser.write_text(json.dumps(calibrated))
     lem = make_map_network(tmp_path, valleys=(classes[0],))
     cards = read_card(recogniser), {"lem": read_card(lem)}
     list(predict(tmp_path / "views.zarr", tmp_path / "p.npz", *cards, workers=1))
@@ -290,4 +297,5 @@ def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(meshes, 
             assert [look.view for look in live.looks] == paths.views[e, : ends.looks[e]].tolist()
             assert live.answer == classes[ends.answer[e]]
             assert live.confident == ends.confident[e]
+            assert live.confidence == pytest.approx(ends.confidence[e], abs=0.01)  # the store rounds
             assert live.travel == pytest.approx(ends.travel[e])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.policies.base import EpisodeState, Evidence, Policy
-from nextview.recognition import Stopping, fuse
+from nextview.recognition import PLAIN_SUM, Calibration, Stopping, fuse
 from nextview.viewsphere import ViewSphere
 
 
@@ -74,6 +74,7 @@ class Episodes:
         starts: first view of each episode, (B,).
         stopping: when an episode ends; a sphere with fewer views than ``max_views`` ends it too.
         rng: for policies that draw.
+        calibration: how far to trust the sum of the logits; fully by default.
     """
 
     def __init__(
@@ -83,8 +84,10 @@ class Episodes:
         starts: NDArray[np.int64],
         stopping: Stopping,
         rng: np.random.Generator,
+        calibration: Calibration = PLAIN_SUM,
     ) -> None:
         self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
+        self.calibration = calibration
         self.running = np.arange(len(starts))
         self.current = np.array(starts, np.int64)
         if ((self.current < 0) | (self.current >= len(sphere))).any():
@@ -107,10 +110,10 @@ class Episodes:
             raise ValueError(f"evidence of {len(evidence.logits)} looks for {len(now)} running episodes")
         before = self._total[now] if self.steps else 0.0
         total = before + np.asarray(evidence.logits, np.float64)
-        belief = fuse(total[:, None])
+        looks = len(self.steps) + 1
+        belief = fuse(total[:, None], self.calibration.temperature(looks))
         visited = self._visited[now]
         visited[np.arange(len(now)), views] = True
-        looks = len(self.steps) + 1
         stopped = belief.max(1) >= self.stopping.threshold
         if looks >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
@@ -209,6 +212,7 @@ def run_episodes(
     starts: NDArray[np.int64],
     stopping: Stopping,
     rng: np.random.Generator,
+    calibration: Calibration = PLAIN_SUM,
 ) -> Episodes:
     """Run episodes to their end.
 
@@ -219,8 +223,9 @@ def run_episodes(
         starts: first view of each episode, (B,).
         stopping: when an episode ends.
         rng: for policies that draw.
+        calibration: how far to trust the sum of the logits; fully by default.
     """
-    episodes = Episodes(sphere, policy, starts, stopping, rng)
+    episodes = Episodes(sphere, policy, starts, stopping, rng, calibration)
     while len(episodes.running):
         episodes.tell(observe(episodes.running, episodes.current[episodes.running]))
     return episodes

@@ -1,18 +1,21 @@
-"""What the looks add up to: belief over classes, and when to stop."""
+"""What the looks add up to: belief over classes, how far to trust it, and when to stop."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 
-def fuse(logits: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Belief after several looks: softmax of the sum of their logits (thesis, section 4.4).
+def fuse(logits: NDArray[np.floating], temperature: float = 1.0) -> NDArray[np.float64]:
+    """Belief after several looks: softmax of the sum of their logits (thesis, section 4.4), over a temperature.
 
     Args:
         logits: (..., looks, classes).
+        temperature: for so many looks, see ``Calibration``; 1 for the plain sum.
 
     Returns:
         (..., classes) float64, sums to 1.
@@ -24,8 +27,107 @@ def fuse(logits: NDArray[np.floating]) -> NDArray[np.float64]:
     if not np.isfinite(logits).all():
         raise ValueError("the recogniser gave a logit that is not a finite number")
     total = logits.sum(-2)
-    total = np.exp(total - total.max(-1, keepdims=True))
+    total = np.exp((total - total.max(-1, keepdims=True)) / temperature)
     return total / total.sum(-1, keepdims=True)
+
+
+class RiskError(ValueError):
+    """An error rate that cannot be promised; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class RiskBounds:
+    """How often those who stop at a threshold are wrong, at most, as far as validation objects can tell.
+
+    Attributes:
+        thresholds: of the belief, ascending, (T,).
+        bounds: upper confidence bound of the error among those who reached the threshold, by how many looks they had
+            at most (from 1 on) and threshold, (looks, T).
+        delta: how often such a bound may be wrong itself.
+    """
+
+    thresholds: tuple[float, ...]
+    bounds: tuple[tuple[float, ...], ...]
+    delta: float
+
+    def threshold(self, risk: float, max_views: int) -> float:
+        """The lowest threshold whose bound, and that of every higher one, is at most ``risk``.
+
+        Going down from the highest until the first fails tests each at the full ``delta`` (fixed-sequence testing;
+        Angelopoulos et al., Learn then test, 2021).
+
+        Raises:
+            RiskError: not even the highest will do, or so many looks were not calibrated.
+        """
+        if not 0 < risk < 1:
+            raise RiskError(f"the risk is an error rate between 0 and 1, not {risk}")
+        if max_views > len(self.bounds):
+            raise RiskError(f"error rates were calibrated for at most {len(self.bounds)} views, not {max_views}")
+        row = np.array(self.bounds[max_views - 1])
+        held = np.flatnonzero(np.maximum.accumulate(row[::-1]) <= risk)
+        if len(held) == 0:
+            raise RiskError(f"this recogniser cannot promise an error rate of {risk}, only {row[-1]:.3f} and more")
+        return self.thresholds[len(row) - 1 - int(held[-1])]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How far to trust a sum of logits. Looks at one object err together, so k of them are not k pieces of evidence.
+
+    The sum over k looks is divided by ``temperature * (1 + correlation * (k - 1))``: what the variance of a sum of k
+    equally correlated terms grows by, beyond k. Correlation 0 trusts the sum, 1 the mean.
+
+    Attributes:
+        temperature_of_one: temperature of a single look.
+        correlation: of the evidence of two looks, 0 .. 1.
+        risk: for stopping with a promise; None if not known.
+
+    Raises:
+        ValueError: a temperature that is not positive, or a negative correlation.
+    """
+
+    temperature_of_one: float = 1.0
+    correlation: float = 0.0
+    risk: RiskBounds | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.temperature_of_one < np.inf or not 0 <= self.correlation < np.inf:
+            raise ValueError(f"no calibration: temperature {self.temperature_of_one}, correlation {self.correlation}")
+
+    def temperature(self, looks: int) -> float:
+        """What the sum of the logits of so many looks is divided by."""
+        return self.temperature_of_one * (1 + self.correlation * (looks - 1))
+
+    @classmethod
+    def of_facts(cls, facts: Mapping[str, Any] | None) -> Calibration:
+        """From what a model's card says under "calibration"; the plain sum if it says nothing.
+
+        Raises:
+            ValueError: it makes no sense.
+        """
+        if not facts:
+            return cls()
+        try:
+            risk = facts.get("risk")
+            bounds = risk and RiskBounds(tuple(risk["thresholds"]), tuple(map(tuple, risk["bounds"])), risk["delta"])
+            return cls(facts["temperature_of_one"], facts["correlation"], bounds)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"a calibration that cannot be read ({type(error).__name__}: {error})") from None
+
+    def facts(self) -> dict[str, Any]:
+        """What ``of_facts`` reads, for JSON."""
+        facts: dict[str, Any] = {
+            "temperature_of_one": self.temperature_of_one,
+            "correlation": self.correlation,
+        }
+        if self.risk is not None:
+            r = self.risk
+            facts["risk"] = {"delta": r.delta, "thresholds": list(r.thresholds), "bounds": [*map(list, r.bounds)]}
+        return facts
+
+
+PLAIN_SUM = Calibration()
+"""Trusts the sum of the logits as it stands, as the thesis did."""
 
 
 @dataclass(frozen=True)

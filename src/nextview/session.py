@@ -100,7 +100,9 @@ class Session:
             raise ValueError(f"this policy needs the map {missing[0]!r}; load it with the models")
         self.models, self.sphere = models, sphere
         self.looks: list[Look] = []
-        self._episodes = Episodes(sphere, policy, np.array([start]), stopping, rng or np.random.default_rng(0))
+        rng = rng or np.random.default_rng(0)
+        calibration = models.recogniser.calibration
+        self._episodes = Episodes(sphere, policy, np.array([start]), stopping, rng, calibration)
 
     @property
     def done(self) -> bool:
@@ -134,7 +136,7 @@ class Session:
         look = Look(
             view,
             observation,
-            fuse(step.evidence.logits[:, None])[0],
+            fuse(step.evidence.logits[:, None], self._episodes.calibration.temperature(1))[0],
             step.belief[0],
             {name: values[0] for name, values in step.evidence.maps.items()},
             None if to < 0 else to,

@@ -14,6 +14,7 @@ from nextview.data.predictions import Predictions
 from nextview.measures.confidence_map import confidence_maps
 from nextview.measures.depth_entropy import normalise_per_object
 from nextview.policies.base import Policy
+from nextview.policies.card import PolicyCardError, bundled_policies
 from nextview.policies.fixed import orbit, ranked
 from nextview.policies.maps import MapPeak
 from nextview.policies.oracle import OracleGain, OracleValley
@@ -67,14 +68,15 @@ FIXED = {
 
 def _gain(t: Trials, anywhere: bool) -> Policy:
     p = t.predictions
-    return OracleGain(p.sphere, p.logits, p.labels, t.objects, anywhere)
+    return OracleGain(p.sphere, p.logits, p.labels, t.objects, anywhere, p.calibration)
 
 
 def default_contestants(trials: Trials) -> list[str]:
     """All that these predictions allow."""
     sphere = trials.predictions.sphere
     n, v = sphere.azimuths, len(sphere)
-    names = [name for name in [*POLICIES, *ORACLES] if not _lacking(_make(name, trials), trials)]
+    names = [*POLICIES, *(name for name in bundled_policies() if _fits(name, trials)), *ORACLES]
+    names = [name for name in names if not _lacking(_make(name, trials), trials)]
     names += [f"{kind}-{min(5, v)}" for kind in FIXED if kind != "orbit"]
     return names + [f"orbit-{k}" for k in sorted({n, v})]
 
@@ -95,10 +97,20 @@ def contestant_policy(name: str, trials: Trials) -> Policy:
 def _make(name: str, trials: Trials) -> Policy:
     if name in ORACLES:
         return ORACLES[name](trials)
-    if name in POLICIES or ":" in name:
-        return make_policy(name, trials.predictions.sphere, trials.valley_classes)
-    names = [*POLICIES, *ORACLES, *(f"{kind}-K" for kind in FIXED)]
+    if name in POLICIES or name in bundled_policies() or name.endswith(".json") or ":" in name:
+        p = trials.predictions
+        return make_policy(name, p.sphere, trials.valley_classes, p.classes)
+    names = [*POLICIES, *bundled_policies(), *ORACLES, *(f"{kind}-K" for kind in FIXED)]
     raise ValueError(f"no policy is called {name!r}; there are {', '.join(names)}")
+
+
+def _fits(name: str, trials: Trials) -> bool:
+    """Whether a bundled policy was learned for these viewpoints and classes."""
+    try:
+        _make(name, trials)
+    except PolicyCardError:
+        return False
+    return True
 
 
 def _lacking(policy: Policy, trials: Trials) -> list[str]:

@@ -18,7 +18,7 @@ from nextview.benchmark.contestants import TRUE_MAPS, Trials, contestant_policy,
 from nextview.data.predictions import Predictions
 from nextview.episode import PolicyError, run_episodes
 from nextview.policies.base import Evidence
-from nextview.recognition import Stopping
+from nextview.recognition import Stopping, fuse
 from nextview.viewsphere import ViewSphere
 
 
@@ -105,7 +105,7 @@ def replay(name: str, trials: Trials, max_views: int, seed: int) -> Paths:
         return Evidence(p.logits[rows, views], {name: values[rows, views] for name, values in maps.items()})
 
     try:
-        done = run_episodes(observe, p.sphere, policy, trials.starts, Stopping(1.0, max_views), rng)
+        done = run_episodes(observe, p.sphere, policy, trials.starts, Stopping(1.0, max_views), rng, p.calibration)
     except PolicyError as error:
         where = "" if error.episode is None else f" (object {p.names[objects[error.episode]]})"
         raise ContestantError(f"{name}: {error}{where}") from error
@@ -120,13 +120,14 @@ def replay(name: str, trials: Trials, max_views: int, seed: int) -> Paths:
 
 def _look_at(views: NDArray[np.int64], trials: Trials) -> Paths:
     """Take fixed views one after the other."""
-    total = np.zeros((len(views), len(trials.predictions.classes)))
+    p = trials.predictions
+    total = np.zeros((len(views), len(p.classes)))
     answers, confidences = np.zeros(views.shape, np.int64), np.zeros(views.shape)
     for k, now in enumerate(views.T):
-        total += trials.predictions.logits[trials.objects, now]
+        total += p.logits[trials.objects, now]
         answers[:, k] = total.argmax(1)
-        confidences[:, k] = 1 / np.exp(total - total.max(1, keepdims=True)).sum(1)  # the peak of the softmax
-    return Paths(views, answers, confidences, *_moved(trials.predictions.sphere, views), fixed=True)
+        confidences[:, k] = fuse(total[:, None], p.calibration.temperature(k + 1)).max(1)
+    return Paths(views, answers, confidences, *_moved(p.sphere, views), fixed=True)
 
 
 def _moved(sphere: ViewSphere, views: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from nextview.models.card import Card
 from nextview.models.cloud_input import cloud_input
 from nextview.models.geometry_input import geometry_input
 from nextview.models.networks import MapNetwork, Recogniser
+from nextview.recognition import Calibration
 
 
 def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
@@ -65,6 +67,8 @@ def predict(
         DatasetError: the store holds no such objects, or a class that the recogniser does not know, or another run is
             writing ``out``.
         PredictionsError: ``out`` is there and comes from another store or other models, or an object kills its process.
+            Where it comes from the same, only what the cards say beside the networks (valley classes, calibration) is
+            brought up to date.
     """
     store = ViewStore.open(path)
     chosen = np.flatnonzero(store.done & (True if split is None else store.splits == split))
@@ -76,11 +80,15 @@ def predict(
         raise DatasetError(f"{path}: recogniser {recogniser.name} does not know the class {unknown[0]!r}")
     names = tuple(store.names[i] for i in chosen)
     models = {kind: (card.name, card.sha256) for kind, card in {"recogniser": recogniser, **maps}.items()}
+    valleys = {name: tuple(card.facts.get("valley_classes", ())) for name, card in maps.items()}
+    calibration = Calibration.of_facts(recogniser.facts.get("calibration"))
     entropy = store.measure()[chosen]  # differs where the views do
     if out.exists():
         there = Predictions.load(out)
         if (there.names, there.models) != (names, models) or not np.array_equal(there.depth_entropy, entropy):
             raise PredictionsError(f"{out}: was made from other objects or models; give another name or remove it")
+        if (there.valley_classes, there.calibration) != (valleys, calibration):
+            replace(there, valley_classes=valleys, calibration=calibration).save(out)
         yield len(names), len(names)
         return
 
@@ -118,7 +126,8 @@ def predict(
             conflicting_objects(store)[chosen],
             store.sphere,
             models,
-            {name: tuple(card.facts.get("valley_classes", ())) for name, card in maps.items()},
+            valleys,
+            calibration,
         ).save(out)
         shutil.rmtree(out.with_name(out.name + ".part"))
 

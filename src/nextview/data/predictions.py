@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import zipfile
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.recognition import PLAIN_SUM, Calibration
 from nextview.viewsphere import ViewSphere
 
 FORMAT = 1
@@ -36,6 +38,7 @@ class Predictions:
         sphere: the viewpoints.
         models: name and SHA-256 of the recogniser ("recogniser") and of each map network ("lem").
         valley_classes: for each map, the classes for which its card says that the valley is the better view.
+        calibration: how far the recogniser's card says that a sum of its logits is to be trusted.
 
     Raises:
         PredictionsError: shapes that do not fit, nothing inside, or a number that is not finite.
@@ -52,6 +55,7 @@ class Predictions:
     sphere: ViewSphere
     models: dict[str, tuple[str, str]]
     valley_classes: dict[str, tuple[str, ...]]
+    calibration: Calibration = PLAIN_SUM
 
     def __post_init__(self) -> None:
         n, v, c = len(self.names), len(self.sphere), len(self.classes)
@@ -106,6 +110,7 @@ class Predictions:
             "elevations": np.array(self.sphere.elevations),
             "azimuths": self.sphere.azimuths,
             "distance": self.sphere.distance,
+            "calibration": np.array(json.dumps(self.calibration.facts())),
             "models": np.array([(kind, *model) for kind, model in self.models.items()]).reshape(-1, 3),
         }
         arrays |= {f"map/{name}": values for name, values in self.maps.items()}
@@ -147,6 +152,7 @@ class Predictions:
                 ViewSphere(tuple(f["elevations"].tolist()), int(f["azimuths"]), float(f["distance"])),
                 {kind: (name, sha) for kind, name, sha in f["models"].tolist()},
                 {name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
+                Calibration.of_facts(json.loads(str(f["calibration"])) if "calibration" in f else None),
             )
         except KeyError as error:
             raise PredictionsError(f"{path}: {error.args[0]}") from None

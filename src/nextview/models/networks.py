@@ -15,6 +15,7 @@ from nextview.models.cloud_input import cloud_input
 from nextview.models.geometry_input import geometry_input
 from nextview.observation import Observation
 from nextview.policies.base import Evidence
+from nextview.recognition import Calibration
 
 RECOGNISER = "resnet18-modelnet10"
 MAPS = {"lem": "lem-modelnet10"}
@@ -55,6 +56,10 @@ class Recogniser:
             raise ModelError(f"model {self.card.name} is a {self.card.kind}, not a recogniser")
         self.classes: tuple[str, ...] = tuple(self.card.facts["classes"])
         self.size: int = self.card.facts["input_size"]
+        try:
+            self.calibration = Calibration.of_facts(self.card.facts.get("calibration"))
+        except ValueError as error:
+            raise ModelError(f"{self.card.path.with_suffix('.json')}: {error}") from None
         self._session = open_weights(self.card, threads)
 
     def __call__(self, observations: Sequence[Observation]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from nextview.policies.base import EpisodeState, best_in_window
 from nextview.policies.maps import peaks_first
+from nextview.recognition import PLAIN_SUM, Calibration
 from nextview.viewsphere import ViewSphere
 
 
@@ -50,6 +51,7 @@ class OracleGain:
         labels: true class of each object, (N,) int64.
         objects: the object of each episode, (E,) int64.
         anywhere: choose among all unvisited views instead of the local window.
+        calibration: of the belief in the episodes.
     """
 
     sphere: ViewSphere
@@ -57,18 +59,20 @@ class OracleGain:
     labels: NDArray[np.int64]
     objects: NDArray[np.int64]
     anywhere: bool = False
+    calibration: Calibration = PLAIN_SUM
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
         b = len(state.current)
         objects = self.objects[state.episodes]
-        # Belief is the softmax of the sum so far, so its logarithm is that sum up to a constant.
-        so_far = np.log(np.maximum(state.belief, np.finfo(np.float64).tiny))[:, None]
+        # Belief is the softmax of the sum so far over its temperature: its logarithm is that sum up to a constant.
+        now, then = self.calibration.temperature(state.step), self.calibration.temperature(state.step + 1)
+        so_far = now * np.log(np.maximum(state.belief, np.finfo(np.float64).tiny))[:, None]
         views = (
             np.arange(len(self.sphere))[None] if self.anywhere else self.sphere.windows[state.current].reshape(b, -1)
         )
-        total = so_far + self.logits[objects[:, None], views]
+        total = (so_far + self.logits[objects[:, None], views]) / then
         of_truth = np.take_along_axis(total, self.labels[objects][:, None, None], 2)[..., 0]
         top = total.max(2)
         gain = of_truth - top - np.log(np.exp(total - top[..., None]).sum(2))

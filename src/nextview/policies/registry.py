@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
+from nextview.policies.card import bundled_policies, read_policy
 from nextview.policies.maps import MapPeak
 from nextview.policies.spread import Spread
 from nextview.viewsphere import ViewSphere
@@ -25,22 +27,29 @@ POLICIES: dict[str, Callable[[ViewSphere, tuple[int, ...]], Policy]] = {
 }
 
 
-def make_policy(name: str, sphere: ViewSphere, valley_classes: Sequence[int] = ()) -> Policy:
+def make_policy(
+    name: str, sphere: ViewSphere, valley_classes: Sequence[int] = (), classes: Sequence[str] | None = None
+) -> Policy:
     """A policy by name.
 
     Args:
-        name: one of POLICIES, or "module:Class" for one of your own, which is called with the sphere alone.
+        name: one of POLICIES, a learned one that is bundled, the path of a learned one's card (.json), or
+            "module:Class" for one of your own, which is called with the sphere alone.
         sphere: the viewpoints.
         valley_classes: classes (indices) whose believers go to the map's valley; only "lem" and "lcm" use it.
+        classes: names of the recogniser's classes; a learned policy for others is refused.
 
     Raises:
         ValueError: there is no such policy, or it cannot be made.
     """
+    if name in POLICIES:
+        return POLICIES[name](sphere, tuple(valley_classes))
+    learned = bundled_policies()
+    if name in learned or name.endswith(".json"):
+        return read_policy(learned.get(name, Path(name)), sphere, classes)
     if ":" in name:
         return _import_policy(name, sphere)
-    if name not in POLICIES:
-        raise ValueError(f"no policy is called {name!r}; there are {', '.join(POLICIES)}")
-    return POLICIES[name](sphere, tuple(valley_classes))
+    raise ValueError(f"no policy is called {name!r}; there are {', '.join([*POLICIES, *learned])}")
 
 
 def _import_policy(path: str, sphere: ViewSphere) -> Policy:

@@ -155,7 +155,7 @@ def _scene(
 
 def _episode(results: Results, i: int, policy: str, views: list[int]) -> dict[str, Any]:
     p = results.predictions
-    beliefs = [fuse(p.logits[i, views[:k]]) for k in range(1, len(views) + 1)]
+    beliefs = [fuse(p.logits[i, views[:k]], p.calibration.temperature(k)) for k in range(1, len(views) + 1)]
     top = [np.argsort(-belief, kind="stable")[:3] for belief in beliefs]
     travel = [0.0, *np.cumsum(p.sphere.travel[views[:-1], views[1:]])]
     return {
