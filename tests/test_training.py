@@ -11,6 +11,7 @@ from tests.test_readme import write_off
 
 from nextview.cli.main import main
 from nextview.data import split
+from nextview.data.folders import Entry
 from nextview.data.samples import SAMPLES, boxes_mesh
 from nextview.data.store import ViewStore
 from nextview.models.networks import MapNetwork, Recogniser
@@ -20,6 +21,7 @@ torch = pytest.importorskip("torch")
 
 from nextview.benchmark.scores import map_scores, recogniser_scores  # noqa: E402
 from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
+from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
 from nextview.training.valleys import valley_gains  # noqa: E402
 
@@ -179,3 +181,22 @@ def test_a_finished_run_is_not_trained_again(trained):
     after = torch.load(run / "network.pt", weights_only=True)
     assert all(torch.equal(before[name], after[name]) for name in before)
     assert "1," in log
+
+
+def test_folds_divide_every_class_evenly_and_keep_twins_together(tmp_path):
+    rng = np.random.default_rng(0)
+    labels = np.repeat(["a", "b"], [12, 8])
+    measured = rng.random((20, 5))
+    measured[15] = measured[3]  # one mesh, two labels
+    entries = [Entry(tmp_path / f"{i}.off", f"{label}_{i}", label, "train") for i, label in enumerate(labels)]
+    store = ViewStore.create(tmp_path / "s.zarr", entries, ViewSphere((0.0,), 5, 3.0), 8, {})
+    store.group["measures/depth_entropy"][:] = measured
+    objects = np.delete(np.arange(20), 7)
+    folds = hold_out(store, objects, 3, seed=1)
+    assert sorted(np.concatenate(folds)) == sorted(objects)
+    counts = np.array([np.bincount(store.labels[fold], minlength=2) for fold in folds])
+    assert np.ptp(counts, axis=0).max() <= 2  # a twin of the other class may shift one
+    assert any({3, 15} <= set(fold) for fold in folds)
+    assert any((a != b).any() for a, b in zip(folds, hold_out(store, objects, 3, 2), strict=True) if len(a) == len(b))
+    with pytest.raises(ValueError, match="cannot be divided"):
+        hold_out(store, objects, 1, seed=0)

@@ -15,6 +15,7 @@ def train_recogniser(
     store: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     deformed: Path | None = None,
+    folds: int = 0,
     recipe: tyro.conf.OmitArgPrefixes[RecogniserRecipe] = RecogniserRecipe(),
 ) -> None:
     """Train the recogniser on a store's training split. Resumes if OUT holds a run that was cut off.
@@ -23,6 +24,8 @@ def train_recogniser(
         store: view store made by nextview render.
         out: folder for checkpoints, logs and network.pt.
         deformed: a store of the same objects, stretched and turned (nextview render --stretch .25 --turn).
+        folds: train so many recognisers instead, OUT/fold0 and so on, each without its share of the training objects,
+            for evidence from networks that have not seen the object.
         recipe: how to train.
     """
     import numpy as np
@@ -32,6 +35,7 @@ def train_recogniser(
     from nextview.data.store import ViewStore
     from nextview.training import recogniser
     from nextview.training.export import save_weights
+    from nextview.training.folds import hold_out
     from nextview.training.inputs import load_inputs, prepare_inputs
 
     views = ViewStore.open(store)
@@ -45,10 +49,16 @@ def train_recogniser(
         missing = [views.names[i] for i in training if sources[-1][1][i] < 0]
         if missing:
             raise ValueError(f"{path}: lacks {len(missing)} of the training objects, {missing[0]} among them")
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "recipe.json").write_text(json.dumps(asdict(recipe), indent=1) + "\n")
-    network = recogniser.train(sources, views.labels, training, validation, recipe, out)
-    save_weights(network, out)
+    runs = {out: training[:0]}
+    if folds:
+        runs = {out / f"fold{k}": held for k, held in enumerate(hold_out(views, training, folds, recipe.seed))}
+    for run, held in runs.items():
+        run.mkdir(parents=True, exist_ok=True)
+        (run / "recipe.json").write_text(json.dumps(asdict(recipe), indent=1) + "\n")
+        (run / "held_out.json").write_text(json.dumps([views.names[i] for i in held]) + "\n")
+        seen = np.setdiff1d(training, held)
+        network = recogniser.train(sources, views.labels, seen, validation, recipe, run)
+        save_weights(network, run)
 
 
 def train_lem(

@@ -12,6 +12,8 @@ class RecogniserRecipe:
     Attributes:
         depth: ResNet-18 or -34.
         size: side of the input image, pixels.
+        small: side of the images in the first epochs, which are faster so; see ``small_epochs``.
+        small_epochs: how many epochs see small images.
         epochs: passes over the training objects.
         views: views of each object in one epoch, drawn at random.
         batch: views a step.
@@ -25,6 +27,8 @@ class RecogniserRecipe:
 
     depth: int = 18
     size: int = 112
+    small: int = 80
+    small_epochs: int = 0
     epochs: int = 12
     views: int = 8
     batch: int = 64

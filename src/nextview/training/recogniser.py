@@ -57,12 +57,13 @@ class Views(IterableDataset):
             yield torch.from_numpy(np.stack(batch)), torch.from_numpy(self.labels[objects[part]])
 
 
-def augment(x: Tensor) -> Tensor:
+def augment(x: Tensor, s: int) -> Tensor:
     """Vary inputs (B, C, S, S) in 0 .. 1: mirror, shift, scale and stretch, roll a little, hide a rectangle, add noise.
 
-    A mirrored object is of the same class, and none of the channels changes its sign under the mirror.
+    A mirrored object is of the same class, and none of the channels changes its sign under the mirror. The result is
+    (B, C, s, s).
     """
-    b, _, s, _ = x.shape
+    b, channels = x.shape[:2]
     scale = torch.empty(b, 2).uniform_(0.8, 1.25)
     scale[:, 0] *= torch.randint(0, 2, (b,)) * 2 - 1
     roll = torch.empty(b).normal_(0, 0.05)
@@ -70,7 +71,7 @@ def augment(x: Tensor) -> Tensor:
     theta[:, 0, 0], theta[:, 0, 1] = scale[:, 0] * roll.cos(), -scale[:, 0] * roll.sin()
     theta[:, 1, 0], theta[:, 1, 1] = scale[:, 1] * roll.sin(), scale[:, 1] * roll.cos()
     theta[:, :, 2] = torch.empty(b, 2).uniform_(-0.1, 0.1)
-    x = F.grid_sample(x, F.affine_grid(theta, list(x.shape), align_corners=False), align_corners=False)
+    x = F.grid_sample(x, F.affine_grid(theta, [b, channels, s, s], align_corners=False), align_corners=False)
     # A rectangle of background, in half of the images, as if something stood in front.
     side = torch.empty(b, 2).uniform_(0.1, 0.4)
     corner = torch.rand(b, 2) * (1 - side)
@@ -93,7 +94,8 @@ class RecogniserModule(L.LightningModule):
         self.seen = torch.zeros(classes)
 
     def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
-        x = augment(batch[0].float() / 255).to(memory_format=torch.channels_last)
+        size = self.recipe.small if self.current_epoch < self.recipe.small_epochs else self.recipe.size
+        x = augment(batch[0].float() / 255, size).to(memory_format=torch.channels_last)
         loss = F.cross_entropy(self.net(x)[0].float(), batch[1], label_smoothing=self.recipe.smoothing)
         self.log("loss", loss, prog_bar=True, on_step=False, on_epoch=True)
         return loss
