@@ -36,7 +36,8 @@ class Evaluation:
         accuracy: looks (1, or V: the logits of all views summed), label (empty: all classes), measure, objects, value,
             low, high, published. The measures: ``accuracy``; ``clean_accuracy``, without the objects whose very mesh
             also has another label; with ``class_`` before it the mean over classes.
-        fusion: looks, accuracy, low, high, class_accuracy, calibration_error: that many random views fused.
+        fusion: looks, accuracy, low, high, class_accuracy, confidence (its mean), calibration_error: that many random
+            views fused.
         confusion: looks, label, answer, answers: how many; a view is an answer, or a whole object.
         reliability: looks, bin, confidence, accuracy, answers: after one look and a few more, in random order.
         maps: map, by, label, measure, value, low, high, published; the measures are those of ``scores.map_errors``.
@@ -164,6 +165,7 @@ def _fusion(p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.flo
             "low": low,
             "high": high,
             "class_accuracy": st.class_mean(top, one, p.labels, np.ones((1, len(p))))[0],
+            "confidence": confidence.mean((1, 2), np.float64),
             "calibration_error": [
                 st.calibration_error(sure.ravel(), answer.ravel())
                 for sure, answer in zip(confidence, right, strict=True)

@@ -13,6 +13,7 @@ from nextview.cli.check import check
 from nextview.cli.correspond import correspond
 from nextview.cli.demo import demo
 from nextview.cli.download import download
+from nextview.cli.evaluate import evaluate
 from nextview.cli.export import export_lem, export_recogniser
 from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
@@ -36,6 +37,7 @@ COMMANDS: dict[str, Any] = {
     "train": {"recogniser": train_recogniser, "lem": train_lem},
     "export": {"recogniser": export_recogniser, "lem": export_lem},
     "predict": predict,
+    "evaluate": evaluate,
     "benchmark": benchmark,
     "report": report,
 }

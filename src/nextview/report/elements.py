@@ -59,17 +59,18 @@ def cell(number: Number | None, digits: int = 3) -> str:
     return text
 
 
-def picture(drawn: Figure, alt: str, caption: str) -> str:
+def picture(drawn: Figure, alt: str, caption: str, broad: bool = False) -> str:
     """A figure as a picture in the page.
 
     Args:
         drawn: the figure.
         alt: its content in words, for those who cannot see it; plain text.
         caption: below it, HTML.
+        broad: as wide as the page, not as a column.
     """
     data = base64.b64encode(to_svg(drawn).encode()).decode()
     return (
-        f'<figure><img src="data:image/svg+xml;base64,{data}" alt="{escape(alt)}">'
+        f'<figure{" class=broad" if broad else ""}><img src="data:image/svg+xml;base64,{data}" alt="{escape(alt)}">'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 

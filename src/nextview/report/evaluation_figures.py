@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -32,8 +33,14 @@ EXAMPLES = 5
 """Examples of each class, from the best to the worst."""
 ROWS = 12
 """Classes at most in a figure of examples."""
-HEAD = 1.15
-"""Height of what is above them, inches."""
+LEFT, HEAD, PITCH, WIDE, BETWEEN = 1.0, 1.0, 1.72, 0.62, 0.36
+"""Inches left of the examples and above them, from one to the next, of a map, and between rows."""
+TRUE_PEAK: dict[str, Any] = {
+    "marker": "o", "linestyle": "", "color": "white", "markeredgecolor": INK, "markeredgewidth": 0.8, "markersize": 6.5,
+}  # fmt: skip
+PREDICTED_PEAK: dict[str, Any] = {
+    "marker": "x", "linestyle": "", "color": PUBLISHED, "markeredgewidth": 1.8, "markersize": 5,
+}  # fmt: skip
 
 
 def confusion(e: Evaluation, looks: int, classes: Sequence[str]) -> Figure:
@@ -53,17 +60,33 @@ def fusion_curve(e: Evaluation) -> Figure:
     published = e.accuracy.query("looks == 1 and label == '' and measure == 'accuracy'")["published"].iloc[0]
     if np.isfinite(published):
         axes.plot(1, published, "D", color=PUBLISHED, markersize=5, clip_on=False, label="published, one view")
-    last = int(table["looks"].iloc[-1])
-    axes.set_xscale("log")
-    ticks = [k for k in (1, 2, 3, 5, 10, 20, 40, 80) if k <= last]
-    axes.set_xticks(ticks, [str(k) for k in ticks])
-    axes.minorticks_off()
-    axes.set_xlim(1 / last**0.02, last * last**0.02)
-    axes.set_xlabel("random views fused")
     axes.set_ylabel("accuracy")
-    axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+    _views_axis(axes, len(table))
     legend(axes)
     return figure
+
+
+def confidence_curve(e: Evaluation) -> Figure:
+    """Mean confidence and accuracy against the number of random views fused: the gap is misplaced trust."""
+    figure, axes = new_figure(4.6, 3.9)
+    table = e.fusion
+    axes.fill_between(table["looks"], table["accuracy"], table["confidence"], color=PUBLISHED, alpha=0.12, linewidth=0)
+    axes.plot(table["looks"], table["confidence"], color=PUBLISHED, label="mean confidence")
+    axes.plot(table["looks"], table["accuracy"], color=ALL, label="accuracy")
+    _views_axis(axes, len(table))
+    legend(axes)
+    return figure
+
+
+def _views_axis(axes: Axes, most: int) -> None:
+    """Shares against numbers of views, from 1 to ``most``."""
+    axes.set_xscale("log")
+    ticks = [k for k in (1, 2, 3, 5, 10, 20, 40, 80) if k <= most]
+    axes.set_xticks(ticks, [str(k) for k in ticks])
+    axes.minorticks_off()
+    axes.set_xlim(1 / most**0.02, most * most**0.02)
+    axes.set_xlabel("random views fused")
+    axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
 
 
 def class_accuracies(e: Evaluation) -> Figure:
@@ -145,57 +168,59 @@ def example_maps(p: Predictions, name: str, rng: np.random.Generator) -> Figure:
     if len(classes) > ROWS:
         order = np.argsort([error[labels == index].mean() for index in classes], kind="stable")
         classes = classes[order[_steps(len(classes), ROWS)]]
-    window = p.sphere.rings / 3
-    height = min(1.25, max(0.55, 0.62 * window)) + 0.36
-    with matplotlib.rc_context(STYLE | {"axes.grid": False, "axes.spines.top": True, "axes.spines.right": True}):
-        figure = Figure((9.6, height * len(classes) + HEAD))
-        grid = figure.add_gridspec(
-            len(classes), EXAMPLES * 3, width_ratios=[1, 1, 0.55] * EXAMPLES, wspace=0.12,
-            hspace=0.36 / (height - 0.36), left=0.1, right=1.0, bottom=0.02,
-            top=1 - 0.9 / (height * len(classes) + HEAD),
-        )  # fmt: skip
+    tall = min(1.25, max(0.45, 0.2 * p.sphere.rings))  # of a map, inches, as all lengths here
+    width, height = LEFT + EXAMPLES * PITCH, HEAD + len(classes) * (tall + BETWEEN)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure((width, height))
+        axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(0, height))
+        axes.axis("off")
         for row, index in enumerate(classes):
+            below = height - HEAD - row * (tall + BETWEEN) - tall
+            axes.text(LEFT - 0.08, below + tall / 2, p.classes[index].replace("_", " "), ha="right", va="center")
             here = np.flatnonzero(labels == index)
             here = here[np.argsort(error[here], kind="stable")]
             for column, at in enumerate(here[_steps(len(here), EXAMPLES)]):
-                pair = [figure.add_subplot(grid[row, 3 * column + k]) for k in range(2)]
-                for axes, values in zip(pair, (true[at], predicted[at]), strict=True):
-                    axes.imshow(values, cmap="viridis", vmin=0, vmax=1, origin="lower", aspect="auto")
-                    axes.set(xticks=[], yticks=[])
-                    _mark(axes, true[at], "o", "white", 6.5)
-                    _mark(axes, predicted[at], "x", PUBLISHED, 5)
+                left = LEFT + column * PITCH
+                for x, values in ((left, true[at]), (left + WIDE + 0.07, predicted[at])):
+                    _draw_map(axes, values, (x, below, tall), true[at], predicted[at])
                 thing = p.names[kept[at]].removeprefix(p.classes[index]).strip("_") or p.names[kept[at]]
-                pair[0].set_title(f"{thing[-12:]} view {view[at]}", fontsize=7.5, loc="left", pad=3)
-                pair[1].set_title(f"{error[at]:.3f}", fontsize=7.5, loc="right", pad=3, color=ALL)
-                if column == 0:
-                    pair[0].set_ylabel(p.classes[index].replace("_", " "), rotation=0, ha="right", va="center")
-        _explain(figure, height * len(classes) + HEAD)
+                text: dict[str, Any] = {"y": below + tall + 0.05, "fontsize": 7.5}
+                axes.text(left, s=f"{thing[-12:]} view {view[at]}".replace("$", r"\$"), **text)
+                axes.text(left + 2 * WIDE + 0.07, s=f"{error[at]:.3f}", ha="right", color=ALL, **text)
+        _explain(axes)
     return figure
 
 
-def _explain(figure: Figure, height: float) -> None:
-    marks = [
-        Line2D([], [], marker="o", color="none", markeredgecolor="#8a949e", markerfacecolor="white", label="true peak"),
-        Line2D(
-            [], [], marker="x", color="none", markeredgecolor=PUBLISHED, markeredgewidth=1.6, label="predicted peak"
-        ),
-    ]
-    top = 1 - 0.12 / height
-    figure.legend(handles=marks, loc="upper right", ncols=2, bbox_to_anchor=(0.97, top + 0.08 / height), fontsize=8.5)
+def _draw_map(
+    axes: Axes,
+    values: NDArray[np.floating],
+    place: tuple[float, float, float],
+    true: NDArray[np.floating],
+    predicted: NDArray[np.floating],
+) -> None:
+    """One map at (left, below, height), with the peaks of the true and the predicted one."""
+    left, below, tall = place
+    extent = (left, left + WIDE, below, below + tall)
+    axes.imshow(values, cmap="viridis", vmin=0, vmax=1, origin="lower", extent=extent, aspect="auto")
+    for peak_of, look in ((true, TRUE_PEAK), (predicted, PREDICTED_PEAK)):
+        ring, column = divmod(int(peak_of.argmax()), peak_of.shape[1])
+        x, y = (column + 0.5) / peak_of.shape[1], (ring + 0.5) / peak_of.shape[0]
+        axes.plot(left + x * WIDE, below + y * tall, **look)
+
+
+def _explain(axes: Axes) -> None:
+    width, height = axes.get_xlim()[1], axes.get_ylim()[1]
+    axes.set(xlim=(0, width), ylim=(0, height))  # pictures and marks leave them alone
+    marks = [Line2D([], [], label="true peak", **TRUE_PEAK), Line2D([], [], label="predicted peak", **PREDICTED_PEAK)]
+    axes.legend(handles=marks, loc="upper right", ncols=2, bbox_to_anchor=(0.97, 1 - 0.05 / height))
     words = (
         "In each pair the true map left, the predicted one right; in blue the squared error.\n"
         "From the best (left) to the worst (right) of each class.\n"
         "Rows of a map are rings, the lowest below; dark is 0, yellow 1."
     )
-    figure.text(0.1, top, words, fontsize=8.5, va="top")
+    axes.text(LEFT, height - 0.12, words, fontsize=8.5, va="top")
 
 
 def _steps(n: int, most: int) -> NDArray[np.int64]:
     """At most so many of n ranks, at equal steps from the first to the last."""
     return np.unique(np.rint(np.linspace(0, n - 1, min(n, most))).astype(np.int64))
-
-
-def _mark(axes: Axes, values: NDArray[np.floating], marker: str, colour: str, size: float) -> None:
-    ring, column = np.unravel_index(values.argmax(), values.shape)
-    edge, width = (INK, 0.8) if marker == "o" else (colour, 1.8)
-    axes.plot(column, ring, marker, color=colour, markersize=size, markeredgecolor=edge, markeredgewidth=width)
