@@ -172,6 +172,18 @@ def test_other_settings_or_meshes_are_refused(dataset, whole, tmp_path):
         list(render(changed, whole, SPHERE, SIZE))
 
 
+def test_views_from_too_far_for_the_store_are_refused(dataset, tmp_path):
+    far = ViewSphere((0.0,), 4, distance=5.6)  # its far side would be at 6.6 radii, and the steps end at 6.5535
+    with pytest.raises(DatasetError, match=r"the distance can be 5\.55 at most, not 5\.6"):
+        list(render(dataset, tmp_path / "views.zarr", far, SIZE, workers=0))
+    assert not list(tmp_path.iterdir())
+    near = ViewSphere((0.0,), 4, distance=5.5)
+    name, _ = next(iter(render(dataset, tmp_path / "views.zarr", near, SIZE, workers=0)))
+    store = ViewStore.open(tmp_path / "views.zarr")
+    depth = store.depth(store.names.index(name))
+    assert 4.5 <= depth[depth > 0].min() <= depth.max() <= 6.5
+
+
 def test_broken_meshes_are_recorded_and_tried_again(tmp_path):
     meshes = make_dataset(tmp_path / "meshes", 3)
     broken = meshes / "box/train/thing_02.off"

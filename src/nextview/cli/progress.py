@@ -12,16 +12,16 @@ from rich.progress import (
     ProgressColumn,
     Task,
     TextColumn,
-    TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 from rich.text import Text
 
 console = Console(stderr=True)
 
 
 def track(done: Iterable[int], total: int, what: str, before: int = 0, views: int = 0) -> None:
-    """Exhaust an iterable that yields how much is done so far, and show it.
+    """Exhaust an iterable that yields how much is done so far; show it, the time left and, at the end, the time taken.
 
     Args:
         done: counts, growing.
@@ -30,8 +30,10 @@ def track(done: Iterable[int], total: int, what: str, before: int = 0, views: in
         before: how much an earlier run had done.
         views: if given, the speed is shown too, in objects of so many views.
     """
-    columns = [TextColumn("{task.description}"), BarColumn(12), MofNCompleteColumn()]
-    columns += [TimeElapsedColumn(), TimeRemainingColumn(), *([Speed(views)] if views else [])]
+    # All of it fits into 80 columns, at thousands of objects and views a second too.
+    name = TextColumn("{task.description}", table_column=Column(no_wrap=True, max_width=20, overflow="ellipsis"))
+    columns = [name, BarColumn(8), MofNCompleteColumn(), TimeRemainingColumn(elapsed_when_finished=True)]
+    columns += [Speed(views)] if views else []
     with Progress(*columns, console=console) as progress:
         task = progress.add_task(what, total=total, completed=before)
         for n in done:

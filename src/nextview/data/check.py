@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from nextview.cloud import visible_points
-from nextview.data.folders import DatasetError
+from nextview.data.correspond import ARRAY, correspondence
 from nextview.data.lock import only_one
 from nextview.data.pool import each
-from nextview.data.store import DEPTH_UNIT, PENDING, POINT_UNIT, ViewStore
+from nextview.data.render import writing
+from nextview.data.store import DEPTH_UNIT, PENDING, POINT_UNIT, RENDERED, ViewStore
 from nextview.measures.registry import MEASURES
+from nextview.observation import POINTS
 
 
 def check(
@@ -22,8 +24,8 @@ def check(
 ) -> Iterator[tuple[str, str | None]]:
     """Read every rendered object and hold its arrays against each other.
 
-    Image and depth must show the same silhouette, points must lie where the depth says, and measures must be those of
-    the depth. Chunks written with a checksum must have it.
+    Image and depth must show the same silhouette, points must lie where the depth says, measures and correspondence,
+    where they are made, must be those of depth and points. Chunks written with a checksum must have it.
 
     Args:
         path: the store.
@@ -35,14 +37,14 @@ def check(
         (name, None) for each sound object, (name, what is wrong with it) for a damaged one.
 
     Raises:
-        DatasetError: there is no store, it lacks an array, or, when repairing, another run is writing it.
+        DatasetError: there is no store, it lacks an array, or, when repairing, another run is writing it or it cannot
+            be written.
     """
     store = ViewStore.open(path)
-    for name in ("image", "depth", "points", "status", "measures/depth_entropy"):
-        if name not in store.group or store.group[name].shape[0] != len(store):
-            raise DatasetError(f"{path}: the array {name} is missing or has the wrong length; render it again")
+    for name in RENDERED:
+        store.array(name)
     items = [int(i) for i in np.flatnonzero(store.done)]
-    with only_one(path) if repair else nullcontext():
+    with only_one(path) if repair else nullcontext(), writing(path) if repair else nullcontext():
         for i, problem in each(partial(_check_object, path.absolute()), items, workers, scheduler):
             if problem is not None and repair:
                 store.group["status"][i] = PENDING
@@ -52,10 +54,11 @@ def check(
 def _check_object(path: Path, i: int) -> str | None:
     store = ViewStore.open(path)
     arrays = {}
-    measures = [name for name in MEASURES if name in store.group["measures"]]
-    for name in ("image", "depth", "points", *(f"measures/{name}" for name in measures)):
+    measures = [name for name in MEASURES if name in store.measures]
+    computed = [ARRAY] if ARRAY in store.group else []
+    for name in ("image", "depth", "points", *(f"measures/{name}" for name in measures), *computed):
         try:
-            arrays[name] = store.group[name][i]
+            arrays[name] = store.array(name)[i]
         except Exception as error:  # a damaged chunk raises whatever its codec makes of it
             return f"{name} cannot be read ({error})"
     image, depth = arrays["image"], arrays["depth"]
@@ -73,4 +76,9 @@ def _check_object(path: Path, i: int) -> str | None:
     # Half a step of the depth, along a ray that is at most a little longer, and half a step of each coordinate.
     if not np.allclose(expected, arrays["points"] * POINT_UNIT, rtol=0, atol=DEPTH_UNIT + POINT_UNIT):
         return "points do not lie where the depth says"
+    if computed and np.isfinite(arrays[ARRAY]).any():
+        true = correspondence(store.points(i), store.depth(i), store.sphere.poses, store.intrinsics)
+        # One point seen or not seen: rounding of the last digit may differ between machines.
+        if not np.allclose(true, arrays[ARRAY], rtol=0, atol=1.5 / POINTS):
+            return "correspondence is not that of points and depth"
     return None

@@ -26,7 +26,9 @@ def correspond(path: Path, workers: int | None = None, scheduler: str | None = N
     Raises:
         DatasetError: there is no store, or it cannot be written.
     """
-    v = len(ViewStore.open(path).sphere)
+    store = ViewStore.open(path)
+    store.array("depth"), store.array("points")  # say if they are missing, before anything is begun
+    v = len(store.sphere)
     yield from keep(path, {ARRAY: (v, v)}, _correspond, workers, scheduler)
 
 

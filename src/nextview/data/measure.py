@@ -40,12 +40,14 @@ def measure(
     for name in names:
         if name not in MEASURES:
             raise DatasetError(f"no measure is called {name!r}; there are {', '.join(MEASURES)}")
-    v = len(ViewStore.open(path).sphere)
+    store = ViewStore.open(path)
+    store.array("depth")  # says if it is missing, before anything is begun
+    v = len(store.sphere)
     yield from keep(path, {f"measures/{n}": (v,) for n in names}, partial(_measure, tuple(names)), workers, scheduler)
 
 
 def _measure(names: tuple[str, ...], store: ViewStore, i: int) -> dict[str, NDArray[np.float32]]:
-    depth = store.group["depth"][i] * DEPTH_UNIT  # float64, as when it was rendered
+    depth = store.read("depth", i) * DEPTH_UNIT  # float64, as when it was rendered
     return {f"measures/{name}": np.array([MEASURES[name](d) for d in depth], np.float32) for name in names}
 
 
@@ -73,13 +75,13 @@ def keep(
     """
     with only_one(path), writing(path):
         store = ViewStore.open(path.absolute())
+        done = np.flatnonzero(store.done)
         for name, shape in shapes.items():
             if name not in store.group:
                 store.add(name, shape, "float32", fill=float("nan"))
-        done = np.flatnonzero(store.done)
         lacking = np.zeros(len(done), bool)
         for name in shapes:
-            lacking |= np.isnan(store.group[name][:].reshape(len(store), -1)[done]).any(1)
+            lacking |= np.isnan(store.array(name)[:].reshape(len(store), -1)[done]).any(1)
         items = [int(i) for i in done[lacking]]
         yield len(done) - len(items), len(done)
         finished = len(done) - len(items)

@@ -18,7 +18,7 @@ from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.folders import DatasetError, Entry, list_dataset
 from nextview.data.lock import only_one
 from nextview.data.pool import each
-from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, ViewStore
+from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, RENDERED, ViewStore
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.mesh import Mesh, MeshError, load_mesh, make_mesh
 from nextview.observation import POINTS
@@ -95,11 +95,17 @@ def render(
         (name, None) for each object done, (name, reason) for one that cannot be rendered.
 
     Raises:
-        DatasetError: the dataset is unusable, the store was begun from another one or with other settings, another run
-            is writing it, or it cannot be written.
+        DatasetError: the dataset is unusable, the viewpoints are too far, the store was begun from another dataset or
+            with other settings or lacks an array, another run is writing it, or it cannot be written.
     """
     entries = [e for e in list_dataset(dataset.absolute()) if split in (None, e.split)]
     deform = deform or Deform()
+    farthest = np.iinfo(np.uint16).max * DEPTH_UNIT
+    if sphere.distance + 1 > farthest:
+        raise DatasetError(
+            f"{path}: depth is stored up to {farthest:.2f} object radii, so the distance can be "
+            f"{farthest - 1:.2f} at most, not {sphere.distance:g}"
+        )
     with only_one(path), writing(path):
         store = _begin(path.absolute(), entries, sphere, size, seed, deform)
         todo = [int(i) for i in np.flatnonzero(~store.done)]
@@ -145,6 +151,8 @@ def _begin(path: Path, entries: list[Entry], sphere: ViewSphere, size: int, seed
     for key, value in wanted.items():
         if store.group.attrs.get(key, value) != value:
             raise DatasetError(f"{path}: was begun with other {key}; give another store or the same settings")
+    for name in RENDERED:
+        store.array(name)  # says what is missing
     for leftover in path.rglob("*.partial"):  # what was being written when a run was killed
         leftover.unlink()
     return store
@@ -163,8 +171,8 @@ def _arrays(path: Path, run: str) -> dict[str, zarr.Array]:
     """The store's arrays, opened once for each process and run."""
     # Finding out whether a chunk is worth writing costs more than writing it.
     with zarr.config.set({"array.write_empty_chunks": True}):
-        group = ViewStore.open(path).group
-        return {name: group[name] for name in ("image", "depth", "points", "measures/depth_entropy", "status")}
+        store = ViewStore.open(path)
+        return {name: store.array(name) for name in RENDERED}
 
 
 def _render_entry(

@@ -21,6 +21,8 @@ DEPTH_UNIT = 1e-4
 POINT_UNIT = 1 / 32767
 """Points are stored as int16 in steps of this many object radii."""
 PENDING, DONE, FAILED = 0, 1, 2
+RENDERED = ("image", "depth", "points", "measures/depth_entropy", "status")
+"""The arrays that rendering makes; others are added later."""
 
 
 @dataclass(frozen=True)
@@ -82,15 +84,52 @@ class ViewStore:
         """Open a store for reading.
 
         Raises:
-            DatasetError: there is none, or it is of another format.
+            DatasetError: there is none, it is of another format, or damaged.
         """
         path = Path(path)
         if not (path / "zarr.json").exists():
             raise DatasetError(f"{path}: there is no view store; make one with nextview render")
-        group = zarr.open_group(path, mode="r+")
+        try:
+            group = zarr.open_group(path, mode="r+")
+        except Exception as error:  # zarr and JSON raise whatever a damaged file makes them raise
+            raise DatasetError(f"{path}: zarr.json cannot be read ({error}); copy or render the store again") from None
         if group.attrs.get("format") != FORMAT:
             raise DatasetError(f"{path}: not a view store of format {FORMAT}; render it again")
         return cls(path, group)
+
+    def array(self, name: str) -> zarr.Array:
+        """One of the store's arrays.
+
+        Raises:
+            DatasetError: it is missing, damaged, or not as long as the store.
+        """
+        remedy = "copy or render the store again"
+        if name.startswith("measures/"):
+            remedy = f"nextview measure {self.path} {name.removeprefix('measures/')} makes it"
+        try:
+            array = self.group[name]
+        except KeyError:
+            raise DatasetError(f"{self.path}: the array {name} is missing; {remedy}") from None
+        except Exception as error:  # zarr and JSON raise whatever a damaged file makes them raise
+            raise DatasetError(f"{self.path}: the array {name} cannot be opened ({error})") from None
+        if array.shape[0] != len(self):
+            raise DatasetError(f"{self.path}: the array {name} is of {array.shape[0]} objects, not {len(self)}")
+        return array
+
+    def read(self, name: str, i: int) -> NDArray:
+        """What one of the arrays holds of object i, as it is stored.
+
+        Raises:
+            DatasetError: the array is missing, or damaged there.
+        """
+        array = self.array(name)
+        try:
+            return array[i]
+        except Exception as error:  # a damaged chunk raises whatever its codec makes of it
+            raise DatasetError(
+                f"{self.path}: {name} of {self.names[i]} cannot be read ({error}); "
+                "nextview check --repair True takes it out, and nextview render makes it anew"
+            ) from None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -130,7 +169,7 @@ class ViewStore:
     @property
     def done(self) -> NDArray[np.bool_]:
         """Objects that are rendered, (N,)."""
-        return self.group["status"][:] == DONE
+        return self.array("status")[:] == DONE
 
     @property
     def failures(self) -> dict[str, str]:
@@ -147,20 +186,25 @@ class ViewStore:
 
     def image(self, i: int) -> NDArray[np.uint8]:
         """All views of object i, (V, S, S) uint8."""
-        return self.group["image"][i]
+        return self.read("image", i)
 
     def depth(self, i: int) -> NDArray[np.float32]:
         """Depth of all views of object i, (V, S, S) float32, object radii, 0 = no object."""
-        return self.group["depth"][i].astype(np.float32) * np.float32(DEPTH_UNIT)
+        return self.read("depth", i).astype(np.float32) * np.float32(DEPTH_UNIT)
 
     def points(self, i: int) -> NDArray[np.float32]:
         """Clouds of all views of object i, (V, 1024, 3) float32, object frame."""
-        return self.group["points"][i].astype(np.float32) * np.float32(POINT_UNIT)
+        return self.read("points", i).astype(np.float32) * np.float32(POINT_UNIT)
 
     def all_points(self) -> NDArray[np.int16]:
         """Clouds of all views of all objects as stored, (N, V, 1024, 3) int16: 240 kB an object."""
-        return self.group["points"][:]
+        return self.array("points")[:]
+
+    @property
+    def measures(self) -> list[str]:
+        """Names of the view measures it holds, sorted."""
+        return sorted(self.group["measures"]) if "measures" in self.group else []
 
     def measure(self, name: str = "depth_entropy") -> NDArray[np.float32]:
-        """A view measure of all objects, (N, V) float32."""
-        return self.group[f"measures/{name}"][:]
+        """A view measure of all objects, (N, V) float32, NaN where it is not made yet."""
+        return self.array(f"measures/{name}")[:]

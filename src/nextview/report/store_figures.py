@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from nextview.data.store import ViewStore
+from nextview.data.store import RENDERED, ViewStore
 from nextview.viewsphere import ViewSphere
 
 BLUE, ORANGE, GREY = "#2f6db3", "#e08a2e", "#8a8a8a"
@@ -29,10 +29,10 @@ def save(figure: Figure, path: Path) -> None:
 def object_figure(store: ViewStore, i: int) -> Figure:
     """Shaded images and depth of all views of object i, and the map of every measure that the store holds of it.
 
-    Rows are rings, the horizon lowest; columns are azimuths.
+    Rows are rings, the horizon lowest; columns are azimuths. A dot marks the view that measures most.
     """
     sphere = store.sphere
-    names = [name for name in sorted(store.group["measures"]) if np.isfinite(store.measure(name)[i]).all()]
+    names = [name for name in store.measures if np.isfinite(store.measure(name)[i]).all()]
     names.sort(key=lambda name: name != "depth_entropy")  # the thesis's first
     wide = sphere.azimuths / sphere.rings
     rows, columns = (2, 1) if wide > 3 else (1, 2)
@@ -57,10 +57,19 @@ def object_figure(store: ViewStore, i: int) -> Figure:
     for axes in (left, right):
         _mosaic_ticks(axes, sphere, depth.shape[-1])
 
-    for axes, name in zip(np.atleast_1d(bottom.subplots(1, len(names))), names, strict=True):
+    panels = bottom.subplots(1, max(len(names), 3))
+    for axes in panels[len(names) :]:
+        axes.axis("off")
+    if len(names) < len(panels):
+        hint = f"nextview measure {store.path.name}\nadds other view measures"
+        spare = panels[len(names)]
+        spare.text(0.5, 0.5, hint, ha="center", va="center", color=GREY, transform=spare.transAxes)
+    for axes, name in zip(panels, names, strict=False):
         values = store.measure(name)[i].reshape(sphere.rings, sphere.azimuths)
         shown = axes.imshow(values, cmap="viridis", origin="lower", aspect="auto")
+        elevation, azimuth = sphere.angles(int(values.argmax()))
         axes.set_title(name.replace("_", " "), fontsize=11)
+        axes.set_xlabel(f"most from {azimuth:g}°, {elevation:g}° up", fontsize=9)
         _map_ticks(axes, sphere)
         bottom.colorbar(shown, ax=axes, pad=0.02)
         best = np.unravel_index(values.argmax(), values.shape)
@@ -83,12 +92,14 @@ def store_figure(store: ViewStore) -> Figure:
         y = 1 - row / len(facts)
         table.text(0, y, what, color=GREY, fontsize=11, va="top")
         table.text(1, y, value, fontsize=11, va="top", ha="right")
-    if done.any():
+    axes.set_title("mean depth entropy of the views", fontsize=11)
+    _map_ticks(axes, sphere)
+    axes.set_xlabel("azimuth", fontsize=9)
+    axes.set_ylabel("elevation", fontsize=9)
+    if done.any() and "depth_entropy" in store.measures:
         mean = store.measure()[done].mean(0).reshape(sphere.rings, sphere.azimuths)
         shown = axes.imshow(mean, cmap="viridis", origin="lower", aspect="auto")
         right.colorbar(shown, ax=axes, label="bits", pad=0.02)
-    _map_ticks(axes, sphere)
-    axes.set_title("mean depth entropy of the views", fontsize=11)
     return figure
 
 
@@ -143,8 +154,13 @@ def summary(store: ViewStore) -> dict[str, str]:
     }
     if rendered:
         facts["per view"] = "  ".join(
-            f"{name} {sizes[name] / rendered / views / 1e3:.1f} kB" for name in ("image", "depth", "points")
+            f"{name} {sizes[name] / rendered / views / 1e3:.1f} kB"
+            for name in ("image", "depth", "points")
+            if name in sizes
         )
+    missing = [name for name in RENDERED if name not in store.group]
+    if missing:
+        facts["arrays that are missing"] = ", ".join(missing)
     if "sha256" not in store.group.attrs:
         facts["byte-identical copies"] = "unknown, made without hashes"
     return facts
