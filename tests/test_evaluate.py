@@ -5,11 +5,13 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy.special import softmax
 from scipy.stats import bootstrap
 from test_predictions import some_predictions
 
 from nextview.benchmark.evaluate import EvaluationError, evaluate, fused_views, yardsticks
 from nextview.benchmark.published import published_map, published_recognisers, read_table
+from nextview.recognition import Calibration
 from nextview.viewsphere import ViewSphere
 
 TEN = tuple(read_table("table8_accuracy_per_class_modelnet10"))
@@ -102,11 +104,12 @@ def test_confusion_and_calibration_by_hand():
 def test_fusing_random_views_against_every_combination():
     rng = np.random.default_rng(2)
     logits, labels = rng.normal(size=(30, 3, 4)), rng.integers(4, size=30)
-    right, confidence = fused_views(logits, labels, rng)
-    for k in (1, 2, 3):  # of three views, the rotations of any order hold every pair once
-        sums = np.stack([logits[:, list(views)].astype(float).sum(1) for views in combinations(range(3), k)])
+    right, confidence = fused_views(logits, labels, Calibration(1.5, 0.4), rng)
+    for k, temperature in ((1, 1.5), (2, 1.5 * 1.4), (3, 1.5 * 1.8)):
+        # of three views, the rotations of any order hold every pair once
+        sums = np.stack([logits[:, list(views)].sum(1) for views in combinations(range(3), k)])
         assert right[k - 1].mean() == pytest.approx((sums.argmax(2) == labels).mean())
-        belief = np.exp(sums) / np.exp(sums).sum(2, keepdims=True)
+        belief = softmax(sums / temperature, axis=2)
         assert confidence[k - 1].mean() == pytest.approx(belief.max(2).mean())
 
 

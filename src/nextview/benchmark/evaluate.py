@@ -14,6 +14,7 @@ from nextview.benchmark.contestants import true_lcm, true_lem
 from nextview.benchmark.published import published_map, published_recognisers
 from nextview.benchmark.scores import map_errors
 from nextview.data.predictions import Predictions
+from nextview.recognition import Calibration
 
 Float = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ class Evaluation:
             low, high, published. The measures: ``accuracy``; ``clean_accuracy``, without the objects whose very mesh
             also has another label; with ``class_`` before it the mean over classes.
         fusion: looks, accuracy, low, high, class_accuracy, confidence (its mean), calibration_error: that many random
-            views fused.
+            views fused, calibrated as the recogniser's card says.
         confusion: looks, label, answer, answers: how many; a view is an answer, or a whole object.
         reliability: looks, bin, confidence, accuracy, answers: after one look and a few more, in random order.
         maps: map, by, label, measure, value, low, high, published; the measures are those of ``scores.map_errors``.
@@ -75,7 +76,7 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
     if samples < 1:
         raise EvaluationError(f"at least one sample of the bootstrap is needed, not {samples}")
     weights = st.resample(len(p), samples, rng)
-    right, confidence = fused_views(p.logits, p.labels, rng)
+    right, confidence = fused_views(p.logits, p.labels, p.calibration, rng)
     judged = {1: p.logits, len(p.sphere): p.logits.astype(np.float64).sum(1, keepdims=True)}
     maps, left_out = _maps(p, weights)
     return Evaluation(
@@ -89,7 +90,7 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
 
 
 def fused_views(
-    logits: NDArray[np.floating], labels: NDArray[np.int64], rng: np.random.Generator
+    logits: NDArray[np.floating], labels: NDArray[np.int64], calibration: Calibration, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations.
 
@@ -98,6 +99,7 @@ def fused_views(
     Args:
         logits: (N, V, classes).
         labels: (N,).
+        calibration: how far a sum of logits is to be trusted.
         rng: draws one order for each object.
 
     Returns:
@@ -106,11 +108,13 @@ def fused_views(
     n, v, _ = logits.shape
     order = rng.permuted(np.tile(np.arange(v), (n, 1)), axis=1)
     shuffled = np.take_along_axis(logits.astype(np.float64), order[:, :, None], axis=1)
+    temperature = np.array([calibration.temperature(k + 1) for k in range(v)])[:, None]
     right, confidence = np.empty((v, n, v), bool), np.empty((v, n, v), np.float32)
     for turn in range(v):
         total = np.roll(shuffled, -turn, axis=1).cumsum(1)
         right[:, :, turn] = (total.argmax(2) == labels[:, None]).T
-        confidence[:, :, turn] = (1 / np.exp(total - total.max(2, keepdims=True)).sum(2)).T  # the softmax's peak
+        below_peak = (total - total.max(2, keepdims=True)) / temperature
+        confidence[:, :, turn] = (1 / np.exp(below_peak).sum(2)).T
     return right, confidence
 
 

@@ -216,8 +216,8 @@ def _calibration(e: Evaluation, figures: dict[str, Figure]) -> str:
             "Mean confidence and accuracy against the number of random views fused. "
             + ", ".join(f"{k}: {curve.confidence[k]:.3f} and {curve.accuracy[k]:.3f}" for k in looks)
             + ".",
-            "Mean confidence against accuracy. Views of one object make alike mistakes, so a sum that takes them for "
-            "independent grows too sure.",
+            "Mean confidence against accuracy. Views of one object make alike mistakes: a sum of logits takes them "
+            "for independent and grows too sure.",
         ),
     )
 
@@ -271,6 +271,14 @@ def _map(e: Evaluation, name: str, figures: dict[str, Figure]) -> str:
     )
 
 
+def _calibration_fact(p: Predictions) -> str:
+    """How the sums of logits became confidences."""
+    c = p.calibration
+    if (c.temperature_of_one, c.correlation) == (1, 0):
+        return "none: the softmax of the sum of the logits as it stands"
+    return f"temperature {c.temperature_of_one:.3g} for one look, correlation {c.correlation:.3g} between looks"
+
+
 def _facts(p: Predictions, settings: dict[str, Any]) -> dict[str, str]:
     splits = zip(*np.unique(p.splits, return_counts=True), strict=True)
     conflicting = [name for name, twice in zip(p.names, p.conflicting, strict=True) if twice]
@@ -279,6 +287,7 @@ def _facts(p: Predictions, settings: dict[str, Any]) -> dict[str, str]:
         **{f"model: {kind}": f"{name}, SHA-256 {sha}" for kind, (name, sha) in p.models.items()},
         "splits": ", ".join(f"{n} {name or 'unnamed'}" for name, n in splits),
         "the same mesh under another label": ", ".join(conflicting) or "none",
+        "calibration": _calibration_fact(p),
         "bootstrap": f"{settings['samples']} samples of objects; seed {settings['seed']}",
         "calibration error": "15 bins of equal width (Guo et al. 2017)",
     }
