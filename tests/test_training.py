@@ -12,6 +12,7 @@ from tests.test_readme import write_off
 from nextview.cli.main import main
 from nextview.data import split
 from nextview.data.folders import Entry
+from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
 from nextview.data.store import ViewStore
 from nextview.models.networks import MapNetwork, Recogniser
@@ -24,27 +25,6 @@ from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
 from nextview.training.valleys import valley_gains  # noqa: E402
-
-BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
-
-
-@pytest.mark.parametrize(("depth", "published"), [(18, 11_689_512), (34, 21_797_672)])
-def test_resnet_is_torchvisions(depth, published):
-    network = ResNet(depth, 1000, 3)
-    assert sum(p.numel() for p in network.parameters()) == published
-    norms = ["bn1"]
-    convolutions = ["conv1"]
-    for stage, blocks in enumerate(BLOCKS[depth], 1):
-        for block in range(blocks):
-            at = f"layer{stage}.{block}."
-            convolutions += [at + "conv1", at + "conv2"]
-            norms += [at + "bn1", at + "bn2"]
-            if stage > 1 and block == 0:
-                convolutions.append(at + "downsample.0")
-                norms.append(at + "downsample.1")
-    parts = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
-    names = {f"{c}.weight" for c in convolutions} | {f"{n}.{p}" for n in norms for p in parts}
-    assert set(network.state_dict()) == names | {"fc.weight", "fc.bias"}
 
 
 def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
@@ -160,7 +140,7 @@ def test_split_keeps_twins_together_and_test_objects_out(trained):
 def test_trained_models_have_cards_and_run(trained):
     card = json.loads((trained / "models/tiny.json").read_text())
     assert card["classes"] == ["monitor", "table"]
-    assert {part.split()[0] for part in card["scores"]} == {"validation", "test"}
+    assert {part.split()[0] for part in card["scores"]} == {"validation"}  # training leaves the test split alone
     recogniser = Recogniser(trained / "models/tiny.json")
     logits, features = recogniser.from_inputs(np.zeros((3, 4, 112, 112), np.uint8))
     assert logits.shape == (3, 2)
@@ -181,6 +161,47 @@ def test_a_finished_run_is_not_trained_again(trained):
     after = torch.load(run / "network.pt", weights_only=True)
     assert all(torch.equal(before[name], after[name]) for name in before)
     assert "1," in log
+
+
+def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
+    store, runs, models = trained / "views.zarr", trained / "runs", trained / "models"
+    small = ["--epochs", "1", "--views", "2", "--batch", "8", "--validation", "0.25"]
+    main(["train", "recogniser", str(store), str(runs / "folds"), "--folds", "2", "--small-epochs", "1", *small])
+    unseen = []
+    for k in range(2):
+        main(["export", "recogniser", str(runs / f"folds/fold{k}"), str(store), str(models), "--name", f"fold{k}"])
+        unseen.append(set(json.loads((models / f"fold{k}.json").read_text())["unseen"]))
+    views = ViewStore.open(store)
+    training, validation = split.split_training(views, 0.25, 0)
+    assert unseen[0] | unseen[1] == {views.names[i] for i in [*training, *validation]}
+    assert unseen[0] & unseen[1] == {views.names[i] for i in validation}
+    out = trained / "unseen.npz"
+    cards = [str(models / f"fold{k}.json") for k in range(2)]
+    main(["predict", str(store), str(out), "--split", "train", "--maps", "--recogniser", *cards, "--workers", "1"])
+    predictions = Predictions.load(out)
+    for k, card in enumerate(cards):  # each network judged what it has not seen, and nothing else
+        name = sorted(unseen[k] - unseen[1 - k])[0]
+        inputs = np.load(trained / "views.zarr.inputs112.npy", mmap_mode="r")[views.names.index(name)]
+        assert predictions.logits[predictions.names.index(name)] == pytest.approx(
+            Recogniser(card).from_inputs(np.array(inputs))[0], abs=1e-4
+        )
+    main(["train", "lcm", str(store), str(out), str(runs / "lcm"), *small])
+    card = ["--name", "tiny-lcm", "--recogniser", str(models / "tiny.json")]
+    main(["export", "lcm", str(runs / "lcm"), str(store), str(out), str(models), *card])
+    assert MapNetwork(models / "tiny-lcm.json").card.kind == "lcm"
+
+
+def test_several_networks_are_exported_as_their_mean(trained):
+    runs, models = trained / "runs", trained / "models"
+    both = ["--also", str(runs / "recogniser"), "--mirror", "True", "--name", "both"]
+    main(["export", "recogniser", str(runs / "recogniser"), str(trained / "views.zarr"), str(models), *both])
+    alone, jury = Recogniser(models / "tiny.json"), Recogniser(models / "both.json")
+    x = np.random.default_rng(0).integers(0, 256, (3, 4, 112, 112), dtype=np.uint8)
+    mean = (alone.from_inputs(x)[0] + alone.from_inputs(x[..., ::-1].copy())[0]) / 2
+    scale = alone.card.facts["temperature"] / jury.card.facts["temperature"]
+    logits, features = jury.from_inputs(x)
+    assert logits == pytest.approx(mean * scale, abs=2e-2)
+    assert features.shape == (3, 1024)
 
 
 def test_folds_divide_every_class_evenly_and_keep_twins_together(tmp_path):

@@ -5,61 +5,96 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-RESNETS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3)}
+RESNETS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3), 152: (3, 8, 36, 3)}
 """Blocks in the four stages of each ResNet (He et al., CVPR 2016, table 1)."""
+
+
+def shortcut(inputs: int, outputs: int, stride: int) -> nn.Module | None:
+    """What brings a block's input to the shape of its output; None where they are alike."""
+    if stride == 1 and inputs == outputs:
+        return None
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
 
 
 class BasicBlock(nn.Module):
     """Two 3x3 convolutions and a shortcut."""
 
-    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+    expansion = 1
+
+    def __init__(self, inputs: int, width: int, stride: int) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(outputs)
+        self.conv1 = nn.Conv2d(inputs, width, 3, stride, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
         self.relu = nn.ReLU(inplace=True)
-        self.conv2 = nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False)
-        self.bn2 = nn.BatchNorm2d(outputs)
-        self.downsample = None
-        if stride != 1 or inputs != outputs:
-            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+        self.conv2 = nn.Conv2d(width, width, 3, 1, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.downsample = shortcut(inputs, width, stride)
 
     def forward(self, x: Tensor) -> Tensor:
-        shortcut = x if self.downsample is None else self.downsample(x)
+        past = x if self.downsample is None else self.downsample(x)
         x = self.relu(self.bn1(self.conv1(x)))
-        return self.relu(self.bn2(self.conv2(x)) + shortcut)
+        return self.relu(self.bn2(self.conv2(x)) + past)
+
+
+class Bottleneck(nn.Module):
+    """Three convolutions, the 3x3 one narrow and with the stride, as in torchvision, and a shortcut."""
+
+    expansion = 4
+
+    def __init__(self, inputs: int, width: int, stride: int) -> None:
+        super().__init__()
+        outputs = width * self.expansion
+        self.conv1 = nn.Conv2d(inputs, width, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, stride, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.conv3 = nn.Conv2d(width, outputs, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(outputs)
+        self.relu = nn.ReLU(inplace=True)
+        self.downsample = shortcut(inputs, outputs, stride)
+
+    def forward(self, x: Tensor) -> Tensor:
+        past = x if self.downsample is None else self.downsample(x)
+        x = self.relu(self.bn1(self.conv1(x)))
+        x = self.relu(self.bn2(self.conv2(x)))
+        return self.relu(self.bn3(self.conv3(x)) + past)
 
 
 class ResNet(nn.Module):
-    """ResNet-18 or -34; ``forward`` returns (logits (B, classes), pooled features (B, 512)).
+    """A ResNet; ``forward`` returns (logits (B, classes), pooled features (B, 512), or (B, 2048) from depth 50 on).
+
+    Parameters carry torchvision's names, so that its checkpoints fit; see ``weights.load_torchvision``.
 
     Args:
-        depth: 18 or 34.
+        depth: 18, 34, 50, 101 or 152.
         classes: outputs.
         channels: of the input image (B, channels, H, W), values in 0 .. 1.
     """
 
     def __init__(self, depth: int, classes: int, channels: int) -> None:
         super().__init__()
+        block = BasicBlock if depth < 50 else Bottleneck
         self.conv1 = nn.Conv2d(channels, 64, 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
         self.relu = nn.ReLU(inplace=True)
         self.maxpool = nn.MaxPool2d(3, 2, 1)
-        width = 64
+        inputs = 64
         for stage, blocks in enumerate(RESNETS[depth]):
-            outputs = 64 << stage
             layer = []
-            for block in range(blocks):
-                layer.append(BasicBlock(width, outputs, 2 if stage and not block else 1))
-                width = outputs
+            for index in range(blocks):
+                layer.append(block(inputs, 64 << stage, 2 if stage and not index else 1))
+                inputs = (64 << stage) * block.expansion
             setattr(self, f"layer{stage + 1}", nn.Sequential(*layer))
         self.avgpool = nn.AdaptiveAvgPool2d(1)
-        self.fc = nn.Linear(width, classes)
+        self.fc = nn.Linear(inputs, classes)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-        for module in self.modules():
-            if isinstance(module, BasicBlock):  # each block begins as the identity, which steadies large rates
+        for module in self.modules():  # each block begins as the identity, which steadies large rates
+            if isinstance(module, BasicBlock):
                 nn.init.zeros_(module.bn2.weight)
+            elif isinstance(module, Bottleneck):
+                nn.init.zeros_(module.bn3.weight)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         x = self.maxpool(self.relu(self.bn1(self.conv1(x))))
