@@ -17,6 +17,7 @@ from nextview.policies.maps import MapPeak, local_peaks, peaks_first
 from nextview.policies.oracle import OracleGain, OracleValley
 from nextview.policies.registry import POLICIES, make_policy
 from nextview.policies.spread import Spread
+from nextview.policies.tables import ClassTable, FixedRing, FixedSequence, cells_from, cells_to
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("40")
@@ -87,6 +88,10 @@ def policies(sphere, rng):
     logits = rng.normal(size=(50, len(sphere), 2))
     yield OracleGain(sphere, logits, labels, objects)
     yield OracleGain(sphere, logits, labels, objects, anywhere=True)
+    for anywhere in (True, False):
+        yield FixedSequence(sphere, rng.integers(len(sphere), size=(sphere.rings, 4)), anywhere)
+        yield ClassTable(sphere, rng.random((2, sphere.rings, len(sphere))), anywhere)
+    yield FixedRing(sphere, sphere.rings - 1, 2)
 
 
 @settings(deadline=None, max_examples=30)
@@ -123,8 +128,8 @@ def test_no_row_depends_on_another(sphere, seed):
     rng = np.random.default_rng(seed)
     state = random_state(sphere, rng)
     for policy in policies(sphere, rng):
-        if isinstance(policy, (Random, RandomAll, Furthest, Spread)):
-            continue  # they draw
+        if isinstance(policy, (Random, RandomAll, Furthest, Spread, FixedSequence, FixedRing)):
+            continue  # they draw, or may
         together = policy.next_views(state, rng)
         for row in range(0, 50, 7):
             alone = EpisodeState(
@@ -252,6 +257,89 @@ def test_spread_breaks_ties_with_equal_chance():
     views, counts = np.unique(chosen, return_counts=True)
     assert views.tolist() == [1, 3]
     assert chisquare(counts).pvalue > 1e-3
+
+
+# Tables
+
+
+@given(spheres)
+def test_cells_turn_with_the_camera_and_keep_their_ring(sphere):
+    views = np.arange(len(sphere))
+    there, back = cells_from(sphere), cells_to(sphere)
+    np.testing.assert_array_equal(there[views[:, None], back], np.tile(views, (len(sphere), 1)))
+    np.testing.assert_array_equal(there[0], views)  # from azimuth 0 a cell is its view
+    for view in views[:: max(1, len(views) // 7)]:
+        for cell in views:
+            elevation, azimuth = sphere.angles(int(there[view, cell]))
+            assert elevation == sphere.angles(cell)[0]
+            ahead = (azimuth - sphere.angles(view)[1]) % 360
+            assert ahead == pytest.approx(sphere.angles(cell)[1], abs=1e-9)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32), st.booleans())
+def test_a_fixed_sequence_makes_the_moves_of_the_ring_it_began_on(seed, anywhere):
+    rng = np.random.default_rng(seed)
+    moves = np.array([rng.permutation(40)[:4] for _ in range(5)])
+    policy = FixedSequence(SPHERE, moves, anywhere)
+    starts = np.arange(40)
+    state = state_of(SPHERE, starts)
+    lost = np.zeros(40, bool)  # a random sequence may come back to where it was; what follows then is another matter
+    expected = starts
+    for k in range(4):
+        expected = cells_from(SPHERE)[expected, moves[SPHERE.ring[starts], k]]
+        lost |= state.visited[np.arange(40), expected]
+        chosen = policy.next_views(replace(state, step=k + 1), rng)
+        sets = {(frozenset(np.flatnonzero(v)), c) for v, c in zip(state.visited, state.current, strict=True)}
+        if len(sets) == 40:  # else two starts led to the same place and cannot be told apart
+            np.testing.assert_array_equal(chosen[~lost], expected[~lost])
+        visited = state.visited.copy()
+        visited[np.arange(40), chosen] = True
+        state = replace(state, current=np.where(lost, chosen, expected), visited=visited)
+
+
+def test_a_fixed_ring_is_entered_where_the_camera_is_and_walked_in_its_steps():
+    policy, state, walked = FixedRing(SPHERE, 3, 3), state_of(SPHERE, 6), []
+    for _ in range(9):
+        state = replace(state, current=policy.next_views(state, np.random.default_rng(0)))
+        state.visited[0, state.current] = True
+        walked.append(SPHERE.angles(int(state.current[0])))
+    assert [e for e, _ in walked[:8]] == [54.0] * 8
+    assert [a for _, a in walked[:8]] == [270.0, 45.0, 180.0, 315.0, 90.0, 225.0, 0.0, 135.0]
+    assert walked[8][0] != 54.0  # round: on to another
+
+
+@pytest.mark.parametrize("anywhere", [True, False])
+def test_a_class_table_takes_the_best_free_cell_of_the_believed_class(anywhere):
+    rng = np.random.default_rng(0)
+    values = rng.random((2, 5, 40))
+    state = random_state(SPHERE, rng)
+    chosen = ClassTable(SPHERE, values, anywhere).next_views(state, rng)
+    for row, view in enumerate(state.current):
+        reachable = range(40) if anywhere else SPHERE.window(view).ravel()
+        of = {}
+        for other in reachable:
+            if not state.visited[row, other]:
+                steps = (other % 8 - view % 8) % 8
+                of[other] = values[state.belief[row].argmax(), view // 8, other // 8 * 8 + steps]
+        if of:
+            assert chosen[row] == max(of, key=of.get)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: FixedSequence(SPHERE, np.zeros((4, 3), np.int64)),
+        lambda: FixedSequence(SPHERE, np.full((5, 3), 40)),
+        lambda: FixedRing(SPHERE, 5),
+        lambda: FixedRing(SPHERE, 0, 0),
+        lambda: ClassTable(SPHERE, np.zeros((3, 5, 39))),
+        lambda: ClassTable(SPHERE, np.full((3, 5, 40), np.nan)),
+    ],
+)
+def test_a_table_that_does_not_fit_the_sphere_is_refused(make):
+    with pytest.raises(ValueError, match=r"ring|finite"):
+        make()
 
 
 # Maps

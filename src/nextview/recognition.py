@@ -41,9 +41,9 @@ class RiskBounds:
 
     Attributes:
         thresholds: of the belief, ascending, (T,).
-        bounds: upper confidence bound of the error among those who reached the threshold, by how many looks they had
-            at most (from 1 on) and threshold, (looks, T).
-        delta: how often such a bound may be wrong itself.
+        bounds: error rate that each threshold can promise among those who reach it, by how many looks they may take
+            (from 1 on), (looks, T); 1 where it can promise nothing.
+        delta: how often such a promise may fail.
     """
 
     thresholds: tuple[float, ...]
@@ -51,23 +51,20 @@ class RiskBounds:
     delta: float
 
     def threshold(self, risk: float, max_views: int) -> float:
-        """The lowest threshold whose bound, and that of every higher one, is at most ``risk``.
-
-        Going down from the highest until the first fails tests each at the full ``delta`` (fixed-sequence testing;
-        Angelopoulos et al., Learn then test, 2021).
+        """The lowest threshold that promises an error rate of at most ``risk``.
 
         Raises:
-            RiskError: not even the highest will do, or so many looks were not calibrated.
+            RiskError: none does, or so many looks were not calibrated.
         """
         if not 0 < risk < 1:
             raise RiskError(f"the risk is an error rate between 0 and 1, not {risk}")
         if max_views > len(self.bounds):
             raise RiskError(f"error rates were calibrated for at most {len(self.bounds)} views, not {max_views}")
-        row = np.array(self.bounds[max_views - 1])
-        held = np.flatnonzero(np.maximum.accumulate(row[::-1]) <= risk)
-        if len(held) == 0:
-            raise RiskError(f"this recogniser cannot promise an error rate of {risk}, only {row[-1]:.3f} and more")
-        return self.thresholds[len(row) - 1 - int(held[-1])]
+        row = self.bounds[max_views - 1]
+        for threshold, bound in zip(self.thresholds, row, strict=True):
+            if bound <= risk:
+                return threshold
+        raise RiskError(f"this recogniser cannot promise an error rate of {risk}, only {min(row):.3f} and more")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from nextview.cli.correspond import correspond
 from nextview.cli.demo import demo
 from nextview.cli.download import download
 from nextview.cli.evaluate import evaluate
-from nextview.cli.export import export_lem, export_recogniser
+from nextview.cli.export import export_lcm, export_lem, export_recogniser
+from nextview.cli.fit import fit_calibration, fit_policies
 from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
 from nextview.cli.models import models
@@ -22,7 +23,7 @@ from nextview.cli.predict import predict
 from nextview.cli.recognise import recognise
 from nextview.cli.render import render
 from nextview.cli.report import report
-from nextview.cli.train import train_lem, train_recogniser
+from nextview.cli.train import train_lcm, train_lem, train_recogniser
 
 COMMANDS: dict[str, Any] = {
     "recognise": recognise,
@@ -34,14 +35,19 @@ COMMANDS: dict[str, Any] = {
     "measure": measure,
     "correspond": correspond,
     "inspect": inspect,
-    "train": {"recogniser": train_recogniser, "lem": train_lem},
-    "export": {"recogniser": export_recogniser, "lem": export_lem},
+    "train": {"recogniser": train_recogniser, "lem": train_lem, "lcm": train_lcm},
+    "export": {"recogniser": export_recogniser, "lem": export_lem, "lcm": export_lcm},
     "predict": predict,
+    "fit": {"calibration": fit_calibration, "policies": fit_policies},
     "evaluate": evaluate,
     "benchmark": benchmark,
     "report": report,
 }
-GROUPS = {"train": "Train a network on a view store.", "export": "Turn a training run into an ONNX model with a card."}
+GROUPS = {
+    "train": "Train a network on a view store.",
+    "export": "Turn a training run into an ONNX model with a card.",
+    "fit": "Fit a recogniser's calibration or simple policies to predictions.",
+}
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -9,11 +9,37 @@ from nextview.data.folders import DatasetError
 from nextview.data.store import ViewStore
 
 
-def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Divide the rendered objects of the training split.
+def divide(
+    labels: NDArray[np.int64], measured: NDArray[np.floating], share: float, seed: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Divide objects into those that train and those that validate.
 
-    Meshes that are byte-identical look identical, so equal depth-entropy from all views marks them; they stay on one
-    side whatever their labels. Objects of a store without a training split all count as training.
+    Meshes that are byte-identical look identical, so an equal measure from all views marks them; they stay on one side
+    whatever their labels.
+
+    Args:
+        labels: (N,).
+        measured: depth-entropy from every view, (N, V).
+        share: part of every class that validates.
+        seed: decides which.
+
+    Returns:
+        Indices of either, sorted.
+    """
+    _, twin = np.unique(measured, axis=0, return_inverse=True)
+    rng = np.random.default_rng(seed)
+    validates = np.zeros(len(labels), bool)
+    for label in np.unique(labels):
+        members = rng.permutation(np.flatnonzero(labels == label))
+        validates[members[: round(share * len(members))]] = True
+    validates = np.isin(twin, twin[validates])
+    return np.flatnonzero(~validates), np.flatnonzero(validates)
+
+
+def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Divide the rendered objects of the training split, see ``divide``.
+
+    Objects of a store without a training split all count as training.
 
     Args:
         store: the views.
@@ -26,15 +52,8 @@ def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple
     usable = np.flatnonzero(store.done & (store.splits != "test"))
     if len(usable) == 0:
         raise DatasetError(f"{store.path}: holds no rendered object of the training split")
-    _, twin = np.unique(store.measure()[usable], axis=0, return_inverse=True)
-    labels = store.labels[usable]
-    rng = np.random.default_rng(seed)
-    validates = np.zeros(len(usable), bool)
-    for label in np.unique(labels):
-        members = rng.permutation(np.flatnonzero(labels == label))
-        validates[members[: round(share * len(members))]] = True
-    validates = np.isin(twin, twin[validates])
-    return usable[~validates], usable[validates]
+    training, validation = divide(store.labels[usable], store.measure()[usable], share, seed)
+    return usable[training], usable[validation]
 
 
 def test_objects(store: ViewStore) -> NDArray[np.int64]:

@@ -1,0 +1,122 @@
+"""``nextview fit``: what is fitted to predictions, in seconds and without torch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tyro
+
+
+def fit_calibration(
+    predictions: tyro.conf.Positional[Path],
+    card: tyro.conf.Positional[Path],
+    /,
+    validation: float = 0.1,
+    split_seed: int = 0,
+    delta: float = 0.1,
+    seed: int = 0,
+) -> None:
+    """Calibrate a recogniser: how far to trust the sum of several looks, and which error rates can be promised.
+
+    Both go into its card; nextview predict takes them into predictions made before, without predicting again.
+
+    Args:
+        predictions: of the training split (nextview predict --split train).
+        card: of the recogniser; "calibration" is written into it.
+        validation: part of every class that the recogniser was not trained on; 1 for out-of-fold predictions.
+        split_seed: the recogniser's seed, which decided which.
+        delta: how often a promised error rate may not hold.
+        seed: decides the walks over which is fitted.
+    """
+    import json
+    import os
+    from dataclasses import replace
+
+    import numpy as np
+
+    from nextview.cli.progress import console
+    from nextview.data.predictions import Predictions, PredictionsError
+    from nextview.fitting.calibration import fit_risk, fit_temperature, loss
+    from nextview.fitting.evidence import fitting_set
+    from nextview.models.card import read_card
+    from nextview.recognition import PLAIN_SUM
+
+    if not 0 < delta < 1:
+        raise ValueError(f"delta is a probability between 0 and 1, not {delta}")
+    model, table = read_card(card), Predictions.load(predictions)
+    if validation < 1 and table.models["recogniser"][1] != model.sha256:
+        raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
+    data = fitting_set(table, validation, split_seed)
+    calibration = fit_temperature(data, np.random.default_rng([seed, 0]))
+    calibration = replace(calibration, risk=fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta))
+    told = {"fitted_to": f"{len(data)} objects of the training split, classes weighted evenly"}
+    part = card.with_name(card.name + ".part")
+    part.write_text(json.dumps(model.facts | {"calibration": calibration.facts() | told}, indent=1) + "\n")
+    os.replace(part, card)
+    before, after = (loss(data, c, np.random.default_rng([seed, 2])) for c in (PLAIN_SUM, calibration))
+    console.print(
+        f"{len(data)} objects: temperature of one look {calibration.temperature_of_one}, correlation of two looks "
+        f"{calibration.correlation}; negative log-likelihood over 1 to 5 looks {before:.3f} before, {after:.3f} after"
+    )
+
+
+def fit_policies(
+    predictions: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    /,
+    validation: float = 0.1,
+    split_seed: int = 0,
+    length: int = 7,
+    looks: int = 5,
+    shrinkage: float = 20.0,
+    seed: int = 0,
+) -> None:
+    """Learn the policies that follow a table: fixed sequence, fixed ring, class table; each local and anywhere.
+
+    Args:
+        predictions: of the training split (nextview predict --split train).
+        out: folder for NAME.json; run one with --policy OUT/NAME.json.
+        validation: part of every class that the recogniser was not trained on; 1 for out-of-fold predictions.
+        split_seed: the recogniser's seed, which decided which.
+        length: moves of the fixed sequence.
+        looks: over which the ring and the class table are chosen.
+        shrinkage: objects by whose weight the gains of one believed class are drawn towards those of all.
+        seed: decides the walks behind the class table.
+    """
+    import numpy as np
+
+    from nextview.cli.progress import console
+    from nextview.data.predictions import Predictions
+    from nextview.fitting.evidence import fitting_set
+    from nextview.fitting.tables import fit_class_table, fit_ring, fit_sequence
+    from nextview.models.card import file_hash
+    from nextview.policies.card import write_policy
+
+    if length < 1 or looks < 2 or shrinkage < 0:
+        raise ValueError("length has to be at least 1, looks at least 2 and shrinkage not negative")
+    table = Predictions.load(predictions)
+    data = fitting_set(table, validation, split_seed)
+    values = fit_class_table(data, looks, shrinkage, table.calibration, np.random.default_rng(seed))
+    out.mkdir(parents=True, exist_ok=True)
+    for anywhere in (True, False):
+        ring, steps = fit_ring(data, anywhere, looks, table.calibration)
+        tables = {
+            "fixed-sequence": {"moves": fit_sequence(data, anywhere, length, table.calibration).tolist()},
+            "fixed-ring": {"ring": ring, "steps": steps},
+            "class-table": {"values": np.round(values, 5).tolist()},
+        }
+        for kind, learned in tables.items():
+            facts = {
+                "kind": kind,
+                "anywhere": anywhere,
+                "elevations": data.sphere.elevations,
+                "azimuths": data.sphere.azimuths,
+                "classes": data.classes,
+                "learned_from": f"{len(data)} objects of the training split, classes weighted evenly",
+                "predictions": {"sha256": file_hash(predictions), "models": table.models},
+                "calibration": [table.calibration.temperature_of_one, table.calibration.correlation],
+                "settings": {"length": length, "looks": looks, "shrinkage": shrinkage, "seed": seed},
+                "table": learned,
+            }
+            write_policy(out / f"{kind}{'' if anywhere else '-local'}.json", facts)
+    console.print(f"6 policies, learned from {len(data)} objects, are in {out}")

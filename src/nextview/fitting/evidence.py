@@ -1,0 +1,86 @@
+"""The predictions that something may be fitted to: never of the test split, nor of objects the recogniser learned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.split import divide
+from nextview.policies.base import EpisodeState, Evidence, Policy
+from nextview.viewsphere import ViewSphere
+
+
+@dataclass(frozen=True)
+class FittingSet:
+    """What an honest recogniser says of N objects from V views.
+
+    Attributes:
+        logits: (N, V, C) float32.
+        labels: (N,) int64.
+        sphere: the viewpoints.
+        classes: names, in the order of the logits.
+    """
+
+    logits: NDArray[np.float32]
+    labels: NDArray[np.int64]
+    sphere: ViewSphere
+    classes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Of the objects, (N,), sum N: every class that there is counts the same, whatever its share."""
+        count = np.bincount(self.labels, minlength=len(self.classes))
+        return len(self) / ((count > 0).sum() * count[self.labels])
+
+
+def fitting_set(predictions: Predictions, validation: float, seed: int) -> FittingSet:
+    """The objects of the training split that the recogniser was not trained on.
+
+    Args:
+        predictions: of the whole training split, as ``nextview predict --split train`` makes them.
+        validation: part of every class that was kept out when the recogniser was trained (see ``data.split``); 1 if
+            all of them are out of fold: each said by a network that has not seen the object.
+        seed: decided which.
+
+    Raises:
+        PredictionsError: there are test objects, or none is left.
+    """
+    if (predictions.splits == "test").any():
+        raise PredictionsError("these predictions hold objects of the test split, to which nothing may be fitted")
+    if not 0 < validation <= 1:
+        raise PredictionsError(f"the validation part lies between 0 and 1, not {validation}")
+    _, kept = divide(predictions.labels, predictions.depth_entropy, validation, seed)
+    if len(kept) == 0:
+        raise PredictionsError("no object is left to fit to")
+    p = predictions
+    return FittingSet(p.logits[kept], p.labels[kept], p.sphere, p.classes)
+
+
+def blind_walks(
+    sphere: ViewSphere, policy: Policy, starts: NDArray[np.int64], looks: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Where a policy goes that looks at nothing but where it has been.
+
+    Args:
+        sphere: the viewpoints.
+        policy: is shown a uniform belief.
+        starts: first views, (E,).
+        looks: how many, at most all views.
+        rng: for policies that draw.
+
+    Returns:
+        Views in order, (E, looks) int64.
+    """
+    rows, nothing = np.arange(len(starts)), np.zeros((len(starts), 1))
+    visited = np.zeros((len(starts), len(sphere)), bool)
+    views = [np.asarray(starts, np.int64)]
+    for k in range(1, looks):
+        visited[rows, views[-1]] = True
+        views.append(policy.next_views(EpisodeState(views[-1], visited, nothing + 1, Evidence(nothing), k, rows), rng))
+    return np.stack(views, 1)

@@ -1,0 +1,145 @@
+"""The tables of ``nextview.policies.tables``, chosen by how much the true class is believed after the looks.
+
+The measure is the logarithm of that belief, calibrated, averaged with the classes weighted evenly: accuracy, made
+smooth.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.fitting.evidence import FittingSet, blind_walks
+from nextview.policies.tables import FixedRing, cells_from, cells_to
+from nextview.recognition import Calibration
+
+Float = NDArray[np.float64]
+
+
+def log_belief(total: NDArray[np.floating], labels: NDArray[np.int64], temperature: float) -> Float:
+    """Logarithm of the belief in the true class.
+
+    Args:
+        total: sum of logits, (N, ..., C).
+        labels: (N,).
+        temperature: what the sum is divided by.
+
+    Returns:
+        (N, ...) float64.
+    """
+    total = np.asarray(total, np.float64) / temperature
+    top = total.max(-1)
+    of_truth = total[np.arange(len(labels)), ..., labels]
+    return of_truth - top - np.log(np.exp(total - top[..., None]).sum(-1))
+
+
+def fit_sequence(data: FittingSet, anywhere: bool, length: int, calibration: Calibration) -> NDArray[np.int64]:
+    """The greedily best moves from each ring: each the best for all objects and azimuths together.
+
+    Args:
+        data: what the recogniser says.
+        anywhere: choose among all views; otherwise in the local window.
+        length: moves.
+        calibration: of the belief.
+
+    Returns:
+        (rings, length) int64, cells as in ``FixedSequence``.
+    """
+    length = min(length, len(data.sphere) - 1)
+    paths = [_greedy_path(data, ring, anywhere, length, calibration) for ring in range(data.sphere.rings)]
+    return np.array([cells_to(data.sphere)[path[:-1], path[1:]] for path in paths])
+
+
+def _greedy_path(
+    data: FittingSet, ring: int, anywhere: bool, length: int, calibration: Calibration
+) -> NDArray[np.int64]:
+    """The best path from a ring, (length + 1,): its views for the start at azimuth 0; other starts turn it."""
+    sphere, n = data.sphere, data.sphere.azimuths
+    path = [ring * n]
+    starts = path[0] + np.arange(n)
+
+    def logits(place: int) -> Float:
+        return data.logits[:, cells_from(sphere)[starts, place]].astype(np.float64)
+
+    total = logits(path[0])
+    for k in range(2, length + 2):
+        reachable = np.arange(len(sphere)) if anywhere else sphere.window(path[-1]).ravel()
+        free = np.setdiff1d(reachable, path)
+        free = free if len(free) else np.setdiff1d(np.arange(len(sphere)), path)
+        beliefs = [log_belief(total + logits(v), data.labels, calibration.temperature(k)).mean(1) for v in free]
+        path.append(int(free[np.argmax(np.array(beliefs) @ data.weights)]))
+        total += logits(path[-1])
+    return np.array(path)
+
+
+def fit_ring(data: FittingSet, anywhere: bool, looks: int, calibration: Calibration) -> tuple[int, int]:
+    """The best ring to go to, and in which steps to walk it, over all starts, after 2 to ``looks`` looks.
+
+    Args:
+        data: what the recogniser says.
+        anywhere: any number of azimuth steps; otherwise 1, which stays in the local window.
+        looks: at most.
+        calibration: of the belief.
+
+    Returns:
+        Ring and steps.
+    """
+    everywhere, nothing_drawn = np.arange(len(data.sphere)), np.random.default_rng(0)
+
+    def walks_from_everywhere(walk: tuple[int, int]) -> NDArray[np.int64]:
+        policy = FixedRing(data.sphere, *walk)
+        return blind_walks(data.sphere, policy, everywhere, min(looks, len(data.sphere)), nothing_drawn)
+
+    def worth(walk: tuple[int, int]) -> float:
+        total, sum_over_looks = np.zeros(data.logits.shape), 0.0
+        for k, views in enumerate(walks_from_everywhere(walk).T, 1):
+            total += data.logits[:, views]
+            if k > 1:
+                belief = log_belief(total, data.labels, calibration.temperature(k))
+                sum_over_looks += float(data.weights @ belief.mean(1))
+        return sum_over_looks
+
+    steps = range(1, data.sphere.azimuths // 2 + 1) if anywhere else (1,)
+    return max(((ring, step) for ring in range(data.sphere.rings) for step in steps), key=worth)
+
+
+def fit_class_table(
+    data: FittingSet, looks: int, shrinkage: float, calibration: Calibration, rng: np.random.Generator, walks: int = 8
+) -> Float:
+    """Mean gain of a next look by believed class, current ring and cell, over random walks through all views.
+
+    Few objects are ever taken for a rare class by mistake, so the mean of each cell is drawn towards that of all
+    believed classes together, as if ``shrinkage`` objects more had shown that one.
+
+    Args:
+        data: what the recogniser says.
+        looks: the gain of looks 2 to this one is averaged.
+        shrinkage: objects.
+        calibration: of the belief.
+        rng: draws the walks.
+        walks: of each object.
+
+    Returns:
+        (classes, rings, V) float64, as in ``ClassTable``.
+    """
+    sphere, c, n = data.sphere, len(data.classes), len(data)
+    gains, weight = np.zeros((c, sphere.rings, len(sphere))), np.zeros((c, sphere.rings, len(sphere)))
+    cell = cells_to(sphere)
+    for _ in range(walks):
+        walk = rng.permuted(np.tile(np.arange(len(sphere)), (n, 1)), axis=1)
+        total = np.zeros((n, c))
+        for k in range(1, min(looks, len(sphere))):
+            current = walk[:, k - 1]
+            total += data.logits[np.arange(n), current]
+            now = log_belief(total, data.labels, calibration.temperature(k))
+            after = log_belief(total[:, None] + data.logits, data.labels, calibration.temperature(k + 1))
+            free = np.ones((n, len(sphere)), bool)
+            free[np.arange(n)[:, None], walk[:, :k]] = False
+            at = (total.argmax(1)[:, None], sphere.ring[current][:, None], cell[current])
+            each = free * data.weights[:, None]
+            np.add.at(gains, at, each * (after - now[:, None]))
+            np.add.at(weight, at, each)
+    alike = gains.sum(0) / np.maximum(weight.sum(0), 1e-12)
+    # A cell is met once in so many looks of a walk: what one object weighs in the sums over all walks.
+    met = walks * (min(looks, len(sphere)) - 1) / sphere.rings
+    return (gains + shrinkage * met * alike) / np.maximum(weight + shrinkage * met, 1e-12)

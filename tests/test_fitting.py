@@ -1,0 +1,285 @@
+"""What is fitted to predictions, against generated evidence whose answer is known."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import log_softmax
+from scipy.stats import binomtest
+from test_predictions import some_predictions
+from tiny_models import make_recogniser
+
+from nextview.cli.main import main
+from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.split import divide
+from nextview.fitting.calibration import error_bound, fit_risk, fit_temperature, loss
+from nextview.fitting.evidence import FittingSet, blind_walks, fitting_set
+from nextview.fitting.tables import fit_class_table, fit_ring, fit_sequence
+from nextview.models.networks import Recogniser
+from nextview.policies.baselines import Random
+from nextview.policies.registry import make_policy
+from nextview.policies.tables import ClassTable, cells_from
+from nextview.recognition import PLAIN_SUM, Calibration
+from nextview.viewsphere import ViewSphere
+
+SPHERE = ViewSphere.named("40")
+SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
+
+
+def correlated(n: int, correlation: float, temperature: float, seed: int = 0) -> FittingSet:
+    """Two classes at -1 and +1, seen through Gaussian noise that is shared in part by all views of an object."""
+    rng, spread = np.random.default_rng(seed), 1.5
+    labels = (rng.random(n) < 0.8).astype(np.int64)  # a mix that the even weights have to undo
+    shared, own = rng.normal(size=(n, 1)), rng.normal(size=(n, len(SMALL)))
+    seen = 2.0 * labels[:, None] - 1 + spread * (np.sqrt(correlation) * shared + np.sqrt(1 - correlation) * own)
+    logits = np.stack([-((seen - m) ** 2) / (2 * spread**2) for m in (-1, 1)], -1)
+    return FittingSet((temperature * logits).astype(np.float32), labels, SMALL, ("minus", "plus"))
+
+
+@pytest.mark.parametrize(("correlation", "temperature"), [(0.0, 1.0), (0.4, 0.5), (0.8, 2.0)])
+def test_the_correlation_and_temperature_of_generated_looks_are_found(correlation, temperature):
+    data = correlated(4000, correlation, temperature)
+    found = fit_temperature(data, np.random.default_rng(1), walks=1)
+    assert found.temperature_of_one == pytest.approx(temperature, rel=0.08)
+    assert found.correlation == pytest.approx(correlation, abs=0.06)
+    losses = [loss(data, c, np.random.default_rng(2), walks=1) for c in (found, Calibration(temperature, correlation))]
+    assert losses[0] == pytest.approx(losses[1], rel=0.01)
+    if correlation:
+        assert losses[0] < loss(data, PLAIN_SUM, np.random.default_rng(2), walks=1)
+
+
+def test_the_bound_of_single_episodes_is_that_of_clopper_and_pearson():
+    rng = np.random.default_rng(0)
+    for n, wrong in [(50, 0), (50, 3), (300, 30), (7, 7)]:
+        stopped = np.concatenate([np.ones(n), np.zeros(20)])
+        failed = np.concatenate([np.ones(wrong), np.zeros(n - wrong), np.zeros(20)])
+        order = rng.permutation(n + 20)
+        bound = error_bound(failed[order], stopped[order], np.full(n + 20, 0.7), 0.05)
+        exact = binomtest(wrong, n, alternative="less").proportion_ci(0.95, "exact").high
+        assert bound == pytest.approx(exact, abs=1e-6)
+    assert error_bound(np.zeros(5), np.zeros(5), np.ones(5), 0.1) == 1
+
+
+def test_several_episodes_of_an_object_count_as_one():
+    once = error_bound(np.eye(20)[0], np.ones(20), np.ones(20), 0.1)
+    halves = error_bound(np.eye(20)[0] / 2, np.ones(20), np.ones(20), 0.1)
+    assert once == pytest.approx(binomtest(1, 20, alternative="less").proportion_ci(0.9, "exact").high, abs=1e-6)
+    # Half the failures, but no more objects than there are.
+    assert halves >= binomtest(0, 20, alternative="less").proportion_ci(0.9, "exact").high
+
+
+def test_promises_are_kept_as_often_as_promised():
+    whole = correlated(40_000, 0.5, 1.0, seed=9)
+    even = whole.weights
+    calibration, risk, looks, delta = Calibration(1.0, 0.5), 0.22, 3, 0.2
+    walks = blind_walks(
+        SMALL, Random(SMALL), np.random.default_rng(0).integers(12, size=len(whole)), looks, np.random.default_rng(1)
+    )
+    total = np.cumsum(whole.logits[np.arange(len(whole))[:, None], walks], axis=1)
+    sure = np.stack(
+        [np.exp(log_softmax(total[:, k] / calibration.temperature(k + 1), 1)).max(1) for k in range(looks)], 1
+    )
+    wrong = total.argmax(2) != whole.labels[:, None]
+
+    def error_at(threshold: float) -> float:
+        reached = sure >= threshold
+        stopped, first = reached.any(1), reached.argmax(1)
+        return np.average(wrong[np.arange(len(whole)), first][stopped], weights=even[stopped])
+
+    promises, broken = 0, 0
+    for seed in range(60):
+        some = np.random.default_rng([5, seed]).choice(len(whole), 300, replace=False)
+        part = replace(whole, logits=whole.logits[some], labels=whole.labels[some])
+        bounds = fit_risk(part, calibration, np.random.default_rng(seed), delta, looks, walks=1)
+        if min(bounds.bounds[looks - 1]) <= risk:  # else it promises nothing, and nothing is broken
+            promises += 1
+            broken += error_at(bounds.threshold(risk, looks)) > risk
+    assert promises > 30
+    assert broken <= 60 * delta + 3 * np.sqrt(60 * delta * (1 - delta))
+
+
+def test_bounds_fall_with_the_threshold_and_promise_nothing_where_few_stop():
+    bounds = fit_risk(correlated(500, 0.5, 1.0), Calibration(1.0, 0.5), np.random.default_rng(0), looks=4)
+    assert len(bounds.bounds) == 4
+    for row in np.array(bounds.bounds):
+        said = row < 1
+        assert (np.diff(row[said]) <= 0).all()
+        assert not said[-1]  # of these noisy looks hardly any is that sure
+        assert said[0]
+
+
+# What may be fitted to
+
+
+def test_nothing_is_fitted_to_the_test_split():
+    p = some_predictions(30)
+    with pytest.raises(PredictionsError, match="test split"):
+        fitting_set(p, 1.0, 0)
+    with pytest.raises(PredictionsError, match="test split"):
+        fitting_set(replace(p, splits=np.array(["train"] * 29 + ["test"])), 1.0, 0)
+
+
+def test_it_is_fitted_to_the_objects_that_validate():
+    p = replace(some_predictions(60), splits=np.array(["train"] * 60))
+    _, validation = divide(p.labels, p.depth_entropy, 0.2, 3)
+    data = fitting_set(p, 0.2, 3)
+    np.testing.assert_array_equal(data.logits, p.logits[validation])
+    assert np.bincount(data.labels).tolist() == [4, 4, 4]
+    assert len(fitting_set(p, 1.0, 3)) == 60
+    for share in (0.0, 1.1, np.nan):
+        with pytest.raises(PredictionsError, match="between 0 and 1"):
+            fitting_set(p, share, 0)
+    with pytest.raises(PredictionsError, match="no object is left"):
+        fitting_set(p, 0.001, 0)
+
+
+def test_every_class_weighs_the_same():
+    data = correlated(1000, 0.5, 1.0)
+    sums = np.bincount(data.labels, data.weights)
+    assert sums[0] == pytest.approx(sums[1])
+    assert data.weights.sum() == pytest.approx(1000)
+
+
+# Tables
+
+
+def telling(sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, seed: int = 0) -> FittingSet:
+    """Every view says little of the class, but those on some rings, which depend on the class, say it loudly."""
+    rng = np.random.default_rng(seed)
+    c = len(rings_of_class)
+    labels = np.arange(n) % c
+    logits = rng.normal(size=(n, len(sphere), c)) * 0.1
+    logits[np.arange(n), :, labels] += 0.3
+    for i, label in enumerate(labels):
+        loud = np.isin(sphere.ring, rings_of_class[label])
+        logits[i, loud, label] += 3
+    return FittingSet(logits.astype(np.float32), labels, sphere, tuple("abcdef"[:c]))
+
+
+@pytest.mark.parametrize("anywhere", [True, False])
+def test_what_tells_most_is_found(anywhere):
+    data = telling(SMALL, [[2], [2]])
+    assert fit_ring(data, anywhere, 4, PLAIN_SUM)[0] == 2
+    moves = fit_sequence(data, anywhere, 3, PLAIN_SUM)
+    assert (SMALL.ring[moves] == 2).all()
+    by_class = fit_class_table(telling(SMALL, [[0], [2]]), 4, 0.0, PLAIN_SUM, np.random.default_rng(0))
+    assert (SMALL.ring[by_class[0].argmax(1)] == 0).all()
+    assert (SMALL.ring[by_class[1].argmax(1)] == 2).all()
+    alike = fit_class_table(telling(SMALL, [[0], [2]]), 4, 1e9, PLAIN_SUM, np.random.default_rng(0))
+    np.testing.assert_allclose(alike[0], alike[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("anywhere", [True, False])
+def test_each_move_of_a_sequence_is_the_best_there_is(anywhere):
+    rng, calibration = np.random.default_rng(0), Calibration(0.8, 0.5)
+    labels = np.array([0, 0, 0, 1, 2])
+    data = FittingSet(rng.normal(size=(5, len(SMALL), 3)).astype(np.float32), labels, SMALL, ("a", "b", "c"))
+    moves = fit_sequence(data, anywhere, 2, calibration)
+
+    def turned(view: int, steps: int) -> int:
+        ring, azimuth = divmod(view, 4)
+        return ring * 4 + (azimuth + steps) % 4
+
+    def worth(path: list[int]) -> float:
+        by_class = {0: [], 1: [], 2: []}
+        for i, label in enumerate(labels):
+            for steps in range(4):
+                total = data.logits[i, [turned(v, steps) for v in path]].astype(float).sum(0)
+                by_class[label].append(log_softmax(total / calibration.temperature(len(path)))[label])
+        return np.mean([np.mean(values) for values in by_class.values()])
+
+    for ring in range(3):
+        path = [ring * 4]
+        for move in moves[ring]:
+            reachable = range(12) if anywhere else SMALL.window(path[-1]).ravel()
+            values = {v: worth([*path, v]) for v in reachable if v not in path}
+            path.append(int(cells_from(SMALL)[path[-1], move]))
+            assert values[path[-1]] == pytest.approx(max(values.values()), abs=1e-9)
+
+
+# The commands
+
+
+@pytest.fixture
+def training_predictions(tmp_path):
+    """A recogniser's card, and predictions of the training split that claim to be its own."""
+    card = make_recogniser(tmp_path, ["ball", "box", "pillar"])
+    p = some_predictions(90)
+    logits = p.logits.copy()
+    logits[np.arange(90), :, p.labels] += np.random.default_rng(0).normal(0.6, 0.8, (90, 1))
+    recogniser = ("tiny", json.loads(card.read_text())["sha256"])
+    models = {**p.models, "recogniser": recogniser}
+    path = tmp_path / "training.npz"
+    replace(p, logits=logits.astype(np.float32), splits=np.array(["train"] * 90), models=models).save(path)
+    return card, path
+
+
+def test_a_calibration_goes_into_the_card_and_is_used(training_predictions):
+    card, path = training_predictions
+    before = json.loads(card.read_text())
+    main(["fit", "calibration", str(path), str(card), "--validation", "0.5"])
+    after = json.loads(card.read_text())
+    assert {k: v for k, v in after.items() if k != "calibration"} == before
+    calibration = Recogniser(card).calibration
+    assert calibration.correlation > 0.1
+    assert calibration.risk is not None
+    assert "45 objects" in after["calibration"]["fitted_to"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        ({"splits": np.array(["test"] * 90)}, "test split"),
+        ({"models": {"recogniser": ("other", "f" * 64)}}, "another recogniser"),
+    ],
+)
+def test_a_calibration_from_the_wrong_predictions_leaves_the_card_alone(training_predictions, spoil, sentence, capsys):
+    card, path = training_predictions
+    before = card.read_bytes()
+    replace(Predictions.load(path), **spoil).save(path)
+    with pytest.raises(SystemExit) as end:
+        main(["fit", "calibration", str(path), str(card)])
+    assert end.value.code == 2
+    assert sentence in capsys.readouterr().err
+    assert card.read_bytes() == before
+
+
+def test_learned_policies_can_be_run_from_their_cards(training_predictions, tmp_path):
+    _, path = training_predictions
+    main(["fit", "policies", str(path), str(tmp_path / "learned"), "--length", "3"])
+    cards = sorted((tmp_path / "learned").iterdir(), key=lambda path: path.stem)
+    assert [c.stem for c in cards] == [
+        "class-table", "class-table-local", "fixed-ring", "fixed-ring-local", "fixed-sequence", "fixed-sequence-local",
+    ]  # fmt: skip
+    for card in cards:
+        policy = make_policy(str(card), SPHERE, classes=("ball", "box", "pillar"))
+        if isinstance(policy, ClassTable):
+            data = fitting_set(Predictions.load(path), 0.1, 0)
+            values = fit_class_table(data, 5, 20.0, PLAIN_SUM, np.random.default_rng(0))
+            np.testing.assert_allclose(policy.values, values, atol=1e-5)
+        with pytest.raises(ValueError, match="other classes"):
+            make_policy(str(card), SPHERE, classes=("ball", "box"))
+        with pytest.raises(ValueError, match="not for this sphere"):
+            make_policy(str(card), ViewSphere((0.0, 18.0, 36.0, 54.0, 71.0), 8))
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda facts: "no JSON",
+        lambda facts: json.dumps({**facts, "kind": "magic"}),
+        lambda facts: json.dumps({**facts, "table": {"moves": [[99]] * 5}}),
+        lambda facts: json.dumps({**facts, "table": {}}),
+        lambda facts: json.dumps([]),
+    ],
+)
+def test_a_damaged_policy_card_is_refused_in_one_sentence(training_predictions, tmp_path, spoil):
+    _, path = training_predictions
+    main(["fit", "policies", str(path), str(tmp_path), "--length", "2"])
+    card = tmp_path / "fixed-sequence.json"
+    card.write_text(spoil(json.loads(card.read_text())))
+    with pytest.raises(ValueError, match=r"fixed-sequence\.json: not a policy card"):
+        make_policy(str(card), SPHERE)
+    with pytest.raises(ValueError, match="no such policy card"):
+        make_policy(str(tmp_path / "none.json"), SPHERE)
