@@ -175,3 +175,10 @@ def test_what_is_not_ours_is_left_alone(tmp_path, capsys):
     (tmp_path / "bad.npz").write_bytes(b"not an archive")
     assert "not a predictions file" in refused(capsys, tmp_path / "bad.npz", "--out", tmp_path / "out")
     assert "no such file" in refused(capsys, tmp_path / "none.npz", "--out", tmp_path / "out")
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path, capsys):
+    some_predictions(6).save(tmp_path / "p.npz")
+    with pytest.raises(SystemExit):  # a file is in the way
+        main(["evaluate", str(tmp_path / "p.npz"), "--out", str(tmp_path / "p.npz" / "out"), "--samples", "5"])
+    assert "cannot be written" in capsys.readouterr().err

@@ -71,10 +71,17 @@ def check_target(folder: Path, mark: str = "benchmark.json", what: str = "benchm
 
 @contextmanager
 def written_whole(folder: Path) -> Iterator[Path]:
-    """A new folder to write into, which takes the place of ``folder`` when all is written."""
+    """A new folder to write into, which takes the place of ``folder`` when all is written.
+
+    Raises:
+        ResultsError: it cannot be made.
+    """
     part = folder.with_name(folder.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
+    try:
+        part.mkdir(parents=True)
+    except OSError as error:
+        raise ResultsError(f"{folder}: cannot be written ({error.strerror})") from None
     yield part
     shutil.rmtree(folder, ignore_errors=True)
     part.rename(folder)

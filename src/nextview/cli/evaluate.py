@@ -67,12 +67,13 @@ def evaluate(
     for name in found.maps["map"].unique():
         console.print(_map(found, name))
     for name, why in found.left_out.items():
-        console.print(f"{name}: {why}", highlight=False)
-    console.print(f"numbers, figures and {evaluation.PAGE} in {out}", highlight=False)
+        console.print(f"{name}: {why}", highlight=False, markup=False)
+    console.print(f"numbers, figures and {evaluation.PAGE} in {out}", highlight=False, markup=False)
 
 
 def _recogniser(found: Evaluation, views: int) -> Table:
     """Accuracy of each class and of all."""
+    from rich.markup import escape
     from rich.table import Table
 
     from nextview.report.elements import numbers
@@ -86,7 +87,7 @@ def _recogniser(found: Evaluation, views: int) -> Table:
     lines += [("  without duplicates", "", "clean_accuracy")]
     for heading, label, measure in lines:
         cells = (_cell(right[looks, label, measure], 3) for looks in (1, views))
-        shown.add_row(heading, str(objects[label, measure]), *cells, end_section=label == labels[-1])
+        shown.add_row(escape(heading), str(objects[label, measure]), *cells, end_section=label == labels[-1])
     published = right[1, "", "accuracy"].published
     if isfinite(published):
         shown.add_row("  published", "", f"{published:.3f}")
@@ -102,14 +103,17 @@ def _map(found: Evaluation, name: str) -> Table:
     measures = {"mse": "MSE", "d0": "d = 0", "d_le_1": "d <= 1", "d_lt_2": "d < 2", "regret": "regret"}
     scores = numbers(found.maps[(found.maps["map"] == name) & (found.maps["label"] == "")], "by", "measure")
     yardsticks = [by for by in found.maps["by"].unique() if by != "network"]
-    shown = Table(name.upper(), "mean of objects", "of classes", "published of classes", *yardsticks)
+    printed = any(isfinite(score.published) for score in scores.values())
+    caption = "published: squared error over objects, peaks over classes (table 4)" if printed else None
+    shown = Table(name.upper(), "mean of objects", "of classes", "published", *yardsticks, caption=caption)
     shown.columns[1].no_wrap = True
     for measure, heading in measures.items():
         digits = 4 if measure == "mse" else 3
-        over_classes = scores["network", f"class_{measure}"]
-        rest = [over_classes.value, over_classes.published, *(scores[by, measure].value for by in yardsticks)]
+        over_objects, over_classes = scores["network", measure], scores["network", f"class_{measure}"]
+        published = over_objects.published if measure == "mse" else over_classes.published
+        rest = [over_classes.value, published, *(scores[by, measure].value for by in yardsticks)]
         cells = (f"{value:.{digits}f}" if isfinite(value) else "-" for value in rest)
-        shown.add_row(heading, _cell(scores["network", measure], digits), *cells)
+        shown.add_row(heading, _cell(over_objects, digits), *cells)
     return shown
 
 
