@@ -278,7 +278,7 @@ def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(meshes, 
     calibrated = json.loads(recogniser.read_text()) | {"calibration": Calibration(0.6, 0.7).facts()}
     recogniser.write_text(json.dumps(calibrated))
     lem = make_map_network(tmp_path, valleys=(classes[0],))
-    cards = read_card(recogniser), {"lem": read_card(lem)}
+    cards = [read_card(recogniser)], {"lem": read_card(lem)}
     list(predict(tmp_path / "views.zarr", tmp_path / "p.npz", *cards, workers=1))
     p = Predictions.load(tmp_path / "p.npz")
     trials = make_trials(p, runs=2, seed=0)

@@ -193,7 +193,7 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
 
 def test_several_networks_are_exported_as_their_mean(trained):
     runs, models = trained / "runs", trained / "models"
-    both = ["--also", str(runs / "recogniser"), "--mirror", "True", "--name", "both"]
+    both = ["--also", str(runs / "recogniser"), "--mirror", "--name", "both"]
     main(["export", "recogniser", str(runs / "recogniser"), str(trained / "views.zarr"), str(models), *both])
     alone, jury = Recogniser(models / "tiny.json"), Recogniser(models / "both.json")
     x = np.random.default_rng(0).integers(0, 256, (3, 4, 112, 112), dtype=np.uint8)

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from nextview.models.networks import Recogniser
+    from nextview.training.targets import Target
 
 
 def export_recogniser(
@@ -19,16 +20,20 @@ def export_recogniser(
     store: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     /,
+    also: tuple[Path, ...] = (),
+    mirror: bool = False,
     name: str = "resnet18-modelnet10",
     commands: tuple[str, ...] = (),
     note: str = "",
 ) -> None:
-    """Export a trained recogniser: ONNX, calibrated on validation views, with a card of scores on validation and test.
+    """Export a trained recogniser: ONNX, calibrated on validation views, with a card of its validation scores.
 
     Args:
         run: folder made by nextview train recogniser.
         store: the store that it was trained on.
         out: folder for NAME.onnx and NAME.json.
+        also: further runs on the same store, with the same input; the logits of all are averaged.
+        mirror: average what the networks say of a view and of its mirror image.
         name: what to call the model.
         commands: the commands that made the run, for the card.
         note: what else the card should say.
@@ -39,7 +44,7 @@ def export_recogniser(
 
     from nextview.benchmark.scores import recogniser_scores
     from nextview.cli.progress import console
-    from nextview.data.split import split_training, test_objects
+    from nextview.data.split import split_training
     from nextview.data.store import ViewStore
     from nextview.models.card import ModelError
     from nextview.models.geometry_input import CHANNELS
@@ -49,56 +54,64 @@ def export_recogniser(
     from nextview.training.networks import ResNet
     from nextview.training.recipes import RecogniserRecipe
 
-    recipe = RecogniserRecipe(**json.loads((run / "recipe.json").read_text()))
+    runs = (run, *also)
+    recipes = [RecogniserRecipe(**json.loads((r / "recipe.json").read_text())) for r in runs]
     views = ViewStore.open(store)
-    inputs = load_inputs(store, recipe.size)
-    training, validation = split_training(views, recipe.validation, recipe.seed)
-    network = ResNet(recipe.depth, len(views.classes), len(CHANNELS))
-    load_weights(network, run)
-    network.eval()
+    size = recipes[0].size
+    if {r.size for r in recipes} != {size}:
+        raise ModelError(f"{run} and the other runs take images of different sizes")
+    inputs = load_inputs(store, size)
+    validation, held = np.arange(len(views)), []
+    for r, recipe in zip(runs, recipes, strict=True):
+        training, aside = split_training(views, recipe.validation, recipe.seed)
+        validation = np.intersect1d(validation, aside)
+        note_of_held = r / "held_out.json"
+        held.append(set(json.loads(note_of_held.read_text())) if note_of_held.exists() else set())
+    if len(validation) == 0:
+        raise ModelError(f"{run} and the other runs have no validation object in common")
+    unseen = set.intersection(*held) | {views.names[i] for i in validation}
+    networks = [
+        load_weights(ResNet(recipe.depth, len(views.classes), len(CHANNELS)), r)
+        for r, recipe in zip(runs, recipes, strict=True)
+    ]
 
     out.mkdir(parents=True, exist_ok=True)
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
     facts: dict[str, Any] = {
         "name": name,
         "kind": "recogniser",
-        "network": f"ResNet-{recipe.depth}",
+        "network": " + ".join(f"ResNet-{recipe.depth}" for recipe in recipes) + (", mirrored too" if mirror else ""),
         "input": "4 channels from a depth image and its pose: facing, up, height, nearness; uint8, 0 = background",
-        "input_size": recipe.size,
+        "input_size": size,
         "classes": views.classes,
         "temperature": 1.0,
     }
     example = np.array(inputs[validation[0], :2])
-    export_onnx(CalibratedRecogniser(network, 1.0), example, "input", ["logits", "features"], weights)
+    export_onnx(CalibratedRecogniser(networks, 1.0, mirror), example, "input", ["logits", "features"], weights)
     _write_card(card, weights, facts)
     raw = _all_logits(Recogniser(card), inputs, validation, "validation views")
-    labels = views.labels
-    temperature = fit_temperature(raw.reshape(-1, raw.shape[2]), np.repeat(labels[validation], raw.shape[1]))
+    labels = views.labels[validation]
+    temperature = fit_temperature(raw.reshape(-1, raw.shape[2]), np.repeat(labels, raw.shape[1]))
 
-    shipped = CalibratedRecogniser(network, temperature).eval()
+    shipped = CalibratedRecogniser(networks, temperature, mirror).eval()
     export_onnx(shipped, example, "input", ["logits", "features"], weights)
     _write_card(card, weights, facts)
-    recogniser = Recogniser(card)
     sample = np.array(inputs[validation[:: max(1, len(validation) // 8)][:8], 5])
-    difference = float(np.abs(answer(shipped, sample) - recogniser.from_inputs(sample)[0]).max())
+    difference = float(np.abs(answer(shipped, sample) - Recogniser(card).from_inputs(sample)[0]).max())
     console.print(f"largest difference between torch and ONNX logits on real views: {difference:.2g}")
     if not difference < 0.1:
         raise ModelError(f"{weights}: its logits differ from the network's by up to {difference:.2g}")
-    test = test_objects(views)
-    tested = _all_logits(recogniser, inputs, test, "test views")
     facts |= {
         "temperature": round(temperature, 4),
         "training": {
             "data": f"{len(training)} objects of the training split, {len(views.sphere)} views each",
-            "recipe": json.loads((run / "recipe.json").read_text()),
+            "recipes": [json.loads((r / "recipe.json").read_text()) for r in runs],
             "commands": list(commands),
         },
-        "scores": {
-            f"validation ({len(validation)} objects of the training split)": recogniser_scores(raw, labels[validation]),
-            f"test ({len(test)} objects)": recogniser_scores(tested, labels[test]),
-        },
+        "scores": {f"validation ({len(validation)} objects of the training split)": recogniser_scores(raw, labels)},
         "largest_difference_to_torch": round(difference, 4),
         "note": note,
+        "unseen": sorted(unseen),
     }
     _write_card(card, weights, facts)
 
@@ -124,32 +137,80 @@ def export_lem(
         commands: the commands that made the run, for the card.
         note: what else the card should say.
     """
+    from nextview.data.store import ViewStore
+    from nextview.training.targets import entropy_target
+
+    target = entropy_target(ViewStore.open(store))
+    what = "depth-entropy, 0 .. 1 over the object's views"
+    _export_map("lem", what, target, run, store, out, recogniser, name, commands, note)
+
+
+def export_lcm(
+    run: tyro.conf.Positional[Path],
+    store: tyro.conf.Positional[Path],
+    predictions: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    /,
+    recogniser: str = "resnet18-modelnet10",
+    name: str = "lcm-modelnet10",
+    commands: tuple[str, ...] = (),
+    note: str = "",
+) -> None:
+    """Export a trained LCM: ONNX, with a card of scores and the classes that prefer the valley, chosen on validation.
+
+    Args:
+        run: folder made by nextview train lcm.
+        store: the store that it was trained on.
+        predictions: those that it was trained on.
+        out: folder for NAME.onnx and NAME.json.
+        recogniser: the model, or its card, whose beliefs decide which classes prefer the valley.
+        name: what to call the model.
+        commands: the commands that made the run, for the card.
+        note: what else the card should say.
+    """
+    from nextview.data.predictions import Predictions
+    from nextview.data.store import ViewStore
+    from nextview.training.targets import confidence_target
+
+    target = confidence_target(ViewStore.open(store), Predictions.load(predictions))
+    what = "the recogniser's confidence where it is right, else 0"
+    _export_map("lcm", what, target, run, store, out, recogniser, name, commands, note)
+
+
+def _export_map(
+    kind: str,
+    what: str,
+    target: Target,
+    run: Path,
+    store: Path,
+    out: Path,
+    recogniser: str,
+    name: str,
+    commands: tuple[str, ...],
+    note: str,
+) -> None:
     import json
 
     import numpy as np
 
     from nextview.benchmark.scores import map_scores
     from nextview.cli.progress import console
-    from nextview.data.split import split_training, test_objects
+    from nextview.data.split import split_training
     from nextview.data.store import POINT_UNIT, ViewStore
-    from nextview.measures.depth_entropy import normalise_per_object
     from nextview.models.card import ModelError
     from nextview.models.cloud_input import cloud_input
     from nextview.models.networks import MapNetwork, Recogniser
     from nextview.training.export import MapOnly, answer, export_onnx, load_weights
     from nextview.training.inputs import load_inputs
     from nextview.training.networks import PointNet
-    from nextview.training.recipes import LemRecipe
+    from nextview.training.recipes import MapRecipe
     from nextview.training.valleys import valley_gains
 
-    recipe = LemRecipe(**json.loads((run / "recipe.json").read_text()))
+    recipe = MapRecipe(**json.loads((run / "recipe.json").read_text()))
     views = ViewStore.open(store)
     sphere = views.sphere
-    training, validation = split_training(views, recipe.validation, recipe.seed)
-    test = test_objects(views)
-    network = PointNet(sphere.rings)
-    load_weights(network, run)
-    shipped = MapOnly(network).eval()
+    training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
+    shipped = MapOnly(load_weights(PointNet(sphere.rings), run)).eval()
 
     out.mkdir(parents=True, exist_ok=True)
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
@@ -158,10 +219,10 @@ def export_lem(
     export_onnx(shipped, clouds, "cloud", ["map"], weights)
     facts: dict[str, Any] = {
         "name": name,
-        "kind": "lem",
+        "kind": kind,
         "network": "PointNet with both transforms",
         "input": "1,024 visible points, upright, camera at azimuth zero, scaled to [0, 1] by their own extent",
-        "output": f"depth-entropy, 0 .. 1 over the object's views, of {sphere.rings} rings x azimuth -1, 0, +1",
+        "output": f"{what}, of {sphere.rings} rings x azimuth -1, 0, +1",
     }
     _write_card(card, weights, facts)
     predictor = MapNetwork(card)
@@ -170,20 +231,17 @@ def export_lem(
     if not difference < 0.02:
         raise ModelError(f"{weights}: its maps differ from the network's by up to {difference:.2g}")
 
-    true = normalise_per_object(views.measure())[:, sphere.windows]
     stored = views.all_points()
 
-    def predict(objects: NDArray, what: str) -> NDArray:
-        def one(i: int) -> NDArray:
-            return predictor.from_clouds(cloud_input(stored[i] * np.float32(POINT_UNIT), sphere.poses))
+    def one(i: int) -> NDArray:
+        return predictor.from_clouds(cloud_input(stored[i] * np.float32(POINT_UNIT), sphere.poses))
 
-        return _tracked(one, objects, what)
-
-    valid_maps, test_maps = predict(validation, "validation maps"), predict(test, "test maps")
+    maps = _tracked(one, validation, "validation maps")
     judge = Recogniser(recogniser)
     logits = _all_logits(judge, load_inputs(store, judge.size), validation, "validation views")
-    gains = valley_gains(sphere, logits, valid_maps, views.labels[validation])
+    gains = valley_gains(sphere, logits, maps, views.labels[validation])
     shape = (-1, sphere.rings, 3)
+    true = target.values[validation][:, sphere.windows]
     facts |= {
         "training": {
             "data": f"{len(training)} objects of the training split, {len(sphere)} views each",
@@ -192,9 +250,8 @@ def export_lem(
         },
         "scores": {
             f"validation ({len(validation)} objects of the training split)": map_scores(
-                valid_maps.reshape(shape), true[validation].reshape(shape)
+                maps.reshape(shape), true.reshape(shape)
             ),
-            f"test ({len(test)} objects)": map_scores(test_maps.reshape(shape), true[test].reshape(shape)),
         },
         "valley_gain_on_validation": {views.classes[c]: round(gain, 4) for c, gain in gains.items()},
         "valley_classes": [views.classes[c] for c, gain in gains.items() if gain > 0],

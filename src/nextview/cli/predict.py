@@ -13,7 +13,7 @@ def predict(
     out: tyro.conf.Positional[Path],
     /,
     split: Literal["train", "test"] | None = None,
-    recogniser: str | None = None,
+    recogniser: tuple[str, ...] = (),
     maps: tuple[str, ...] = ("lem",),
     batch: int = 8,
     workers: int | None = None,
@@ -25,7 +25,8 @@ def predict(
         store: view store made by nextview render.
         out: predictions to make (.npz), from which nextview benchmark replays policies.
         split: only this split.
-        recogniser: name of a bundled model or path of a card; the bundled one by default.
+        recogniser: name of a bundled model or path of a card; the bundled one by default. Of several (nextview train
+            recogniser --folds), each judges objects that it has not seen in training.
         maps: maps to predict with the bundled networks, or NAME=CARD for others.
         batch: views a call of the networks.
         workers: processes; one for each core by default.
@@ -45,6 +46,8 @@ def predict(
         if not card and name not in MAPS:
             raise ModelError(f"no bundled network predicts the map {name!r}; there are {', '.join(MAPS)}")
         cards[name] = find_card(card or MAPS[name])
-    steps = job.predict(store, out, find_card(recogniser or RECOGNISER), cards, split, batch, workers, scheduler)
+    steps = job.predict(
+        store, out, [find_card(r) for r in recogniser or (RECOGNISER,)], cards, split, batch, workers, scheduler
+    )
     before, total = next(steps)
     track((done for done, _ in steps), total, f"predicting {store.name}", before, len(ViewStore.open(store).sphere))

@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
-from nextview.training.recipes import LemRecipe, RecogniserRecipe
+from nextview.training.recipes import MapRecipe, RecogniserRecipe
+
+if TYPE_CHECKING:
+    from nextview.training.targets import Target
 
 
 def train_recogniser(
@@ -64,7 +68,7 @@ def train_recogniser(
 def train_lem(
     store: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
-    recipe: tyro.conf.OmitArgPrefixes[LemRecipe] = LemRecipe(),
+    recipe: tyro.conf.OmitArgPrefixes[MapRecipe] = MapRecipe(),
 ) -> None:
     """Train the LEM on a store's training split. Resumes if OUT holds a run that was cut off.
 
@@ -73,17 +77,44 @@ def train_lem(
         out: folder for checkpoints, logs and network.pt.
         recipe: how to train.
     """
+    from nextview.data.store import ViewStore
+    from nextview.training.targets import entropy_target
 
+    _train_map(store, entropy_target(ViewStore.open(store)), out, recipe)
+
+
+def train_lcm(
+    store: tyro.conf.Positional[Path],
+    predictions: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    recipe: tyro.conf.OmitArgPrefixes[MapRecipe] = MapRecipe(),
+) -> None:
+    """Train the LCM on what recognisers say of a store's training split. Resumes if OUT holds a run that was cut off.
+
+    Args:
+        store: view store made by nextview render, with the 40 views.
+        predictions: of its training split, from recognisers that have not seen the objects (nextview train recogniser
+            --folds, export each, nextview predict --split train --recogniser CARD CARD).
+        out: folder for checkpoints, logs and network.pt.
+        recipe: how to train.
+    """
+    from nextview.data.predictions import Predictions
+    from nextview.data.store import ViewStore
+    from nextview.training.targets import confidence_target
+
+    _train_map(store, confidence_target(ViewStore.open(store), Predictions.load(predictions)), out, recipe)
+
+
+def _train_map(store: Path, target: Target, out: Path, recipe: MapRecipe) -> None:
     from nextview.data.split import split_training
     from nextview.data.store import ViewStore
-    from nextview.measures.depth_entropy import normalise_per_object
-    from nextview.training import lem
+    from nextview.training import maps
     from nextview.training.export import save_weights
 
     views = ViewStore.open(store)
-    training, validation = split_training(views, recipe.validation, recipe.seed)
-    maps = normalise_per_object(views.measure())[:, views.sphere.windows]
+    training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
     out.mkdir(parents=True, exist_ok=True)
     (out / "recipe.json").write_text(json.dumps(asdict(recipe), indent=1) + "\n")
-    network = lem.train(views.all_points(), maps, views.sphere.poses, training, validation, recipe, out)
+    windows = target.values[:, views.sphere.windows]
+    network = maps.train(views.all_points(), windows, views.sphere.poses, training, validation, recipe, out)
     save_weights(network, out)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -39,7 +39,7 @@ def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
 def predict(
     path: Path,
     out: Path,
-    recogniser: Card,
+    recognisers: Sequence[Card],
     maps: dict[str, Card],
     split: str | None = None,
     batch: int = 8,
@@ -53,7 +53,8 @@ def predict(
     Args:
         path: the view store.
         out: the .npz file to make.
-        recogniser: card of the recogniser.
+        recognisers: card of the recogniser; of several, each judges objects that it has not seen in training, and
+            objects that all of them have seen are left out.
         maps: card of the network for each map.
         split: only this split.
         batch: views a call of the networks.
@@ -74,12 +75,17 @@ def predict(
     chosen = np.flatnonzero(store.done & (True if split is None else store.splits == split))
     if len(chosen) == 0:
         raise DatasetError(f"{path}: holds no rendered object" + (f" of the split {split!r}" if split else ""))
+    judge = judges(recognisers, [store.names[i] for i in chosen])
+    chosen, judge = chosen[judge >= 0], judge[judge >= 0]
+    if len(chosen) == 0:
+        raise DatasetError(f"{path}: holds no object that one of these recognisers has not seen in training")
+    recogniser = recognisers[0]
     classes = tuple(recogniser.facts["classes"])
     unknown = sorted({store.classes[label] for label in store.labels[chosen]} - set(classes))
     if unknown:
         raise DatasetError(f"{path}: recogniser {recogniser.name} does not know the class {unknown[0]!r}")
     names = tuple(store.names[i] for i in chosen)
-    models = {kind: (card.name, card.sha256) for kind, card in {"recogniser": recogniser, **maps}.items()}
+    models = {"recogniser": identity(recognisers), **{name: identity([card]) for name, card in maps.items()}}
     valleys = {name: tuple(card.facts.get("valley_classes", ())) for name, card in maps.items()}
     calibration = Calibration.of_facts(recogniser.facts.get("calibration"))
     entropy = store.measure()[chosen]  # differs where the views do
@@ -102,12 +108,13 @@ def predict(
         total = n - len(todo)
         yield total, n
         paths = (
-            recogniser.path.with_suffix(".json").absolute(),
+            tuple(card.path.with_suffix(".json").absolute() for card in recognisers),
             tuple((kind, card.path.with_suffix(".json").absolute()) for kind, card in maps.items()),
         )
         say = partial(_predict_object, path.absolute(), *paths, batch)
         row = {int(i): at for at, i in enumerate(chosen)}
-        for i, found in each(say, [int(i) for i in chosen[todo]], workers, scheduler):
+        items = list(zip(chosen[todo].tolist(), judge[todo].tolist(), strict=True))
+        for (i, _), found in each(say, items, workers, scheduler):
             if isinstance(found, WorkerDied):
                 raise PredictionsError(f"{path}: object {store.names[i]} cannot be predicted: {found}")
             for name, values in found.items():
@@ -132,6 +139,30 @@ def predict(
         shutil.rmtree(out.with_name(out.name + ".part"))
 
 
+def judges(recognisers: Sequence[Card], names: Sequence[str]) -> NDArray[np.int64]:
+    """Which recogniser judges each object: of several, the first that has not seen it in training; -1 for none.
+
+    Raises:
+        DatasetError: one of several does not say what it has not seen, or they do not know the same classes.
+    """
+    if len(recognisers) == 1:
+        return np.zeros(len(names), np.int64)
+    for card in recognisers:
+        if "unseen" not in card.facts:
+            raise DatasetError(f"recogniser {card.name} does not say which objects it has not seen in training")
+        if card.facts["classes"] != recognisers[0].facts["classes"]:
+            raise DatasetError(f"recognisers {recognisers[0].name} and {card.name} do not know the same classes")
+    unseen = np.array([np.isin(names, card.facts["unseen"]) for card in recognisers])
+    return np.where(unseen.any(0), unseen.argmax(0), -1)
+
+
+def identity(cards: Sequence[Card]) -> tuple[str, str]:
+    """Name and SHA-256 of a model; of several together, their names and the hash of their hashes."""
+    if len(cards) == 1:
+        return cards[0].name, cards[0].sha256
+    return "+".join(c.name for c in cards), hashlib.sha256("".join(c.sha256 for c in cards).encode()).hexdigest()
+
+
 def _begin(part: Path, recipe: dict, shapes: dict[str, tuple[int, ...]]) -> dict[str, np.memmap]:
     """Open the files of a run that was cut off, or begin them full of NaN: logits before maps, recipe last."""
     recipe = json.loads(json.dumps(recipe))
@@ -150,24 +181,26 @@ def _begin(part: Path, recipe: dict, shapes: dict[str, tuple[int, ...]]) -> dict
 
 @lru_cache(maxsize=1)
 def _open(
-    path: Path, recogniser: Path, maps: tuple[tuple[str, Path], ...]
-) -> tuple[ViewStore, Recogniser, dict[str, MapNetwork]]:
+    path: Path, recognisers: tuple[Path, ...], maps: tuple[tuple[str, Path], ...]
+) -> tuple[ViewStore, list[Recogniser], dict[str, MapNetwork]]:
     """Each process has its own store and networks, and one thread: objects are what runs side by side."""
     networks = {name: MapNetwork(card, threads=1) for name, card in maps}
-    return ViewStore.open(path), Recogniser(recogniser, threads=1), networks
+    return ViewStore.open(path), [Recogniser(card, threads=1) for card in recognisers], networks
 
 
 def _predict_object(
-    path: Path, recogniser: Path, maps: tuple[tuple[str, Path], ...], batch: int, i: int
+    path: Path, recognisers: tuple[Path, ...], maps: tuple[tuple[str, Path], ...], batch: int, item: tuple[int, int]
 ) -> dict[str, NDArray[np.float32]]:
     """Maps and logits of all views of one object, by the names of their files; the logits last."""
-    store, names_it, networks = _open(path, recogniser, maps)
+    i, judge = item
+    store, names_it, networks = _open(path, recognisers, maps)
+    recogniser = names_it[judge]
     poses, intrinsics = store.sphere.poses, store.intrinsics
     depth, clouds = store.depth(i), cloud_input(store.points(i), store.sphere.poses)
     # One view at a time stays in the processor's cache.
     inputs = np.concatenate(
-        [geometry_input(depth[v : v + 1], poses[v : v + 1], intrinsics, names_it.size) for v in range(len(poses))]
+        [geometry_input(depth[v : v + 1], poses[v : v + 1], intrinsics, recogniser.size) for v in range(len(poses))]
     )
     parts = [slice(start, start + batch) for start in range(0, len(poses), batch)]
     found = {f"map_{k}": np.concatenate([net.from_clouds(clouds[p]) for p in parts]) for k, net in networks.items()}
-    return {**found, "logits": np.concatenate([names_it.from_inputs(inputs[p])[0] for p in parts])}
+    return {**found, "logits": np.concatenate([recogniser.from_inputs(inputs[p])[0] for p in parts])}

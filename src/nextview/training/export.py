@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,26 @@ OPSET = 18
 
 
 class CalibratedRecogniser(nn.Module):
-    """The recogniser as it ships: raw input bytes in, logits over a temperature and pooled features out."""
+    """The recogniser as it ships: raw input bytes in, logits over a temperature and pooled features out.
 
-    def __init__(self, network: nn.Module, temperature: float) -> None:
+    Args:
+        networks: their logits are averaged and their features set side by side.
+        temperature: what the logits are divided by.
+        mirror: whether every network also sees the mirrored view, and what it says of either is averaged.
+    """
+
+    def __init__(self, networks: Sequence[nn.Module], temperature: float, mirror: bool = False) -> None:
         super().__init__()
-        self.network, self.temperature = network, temperature
+        self.networks, self.temperature, self.mirror = nn.ModuleList(networks), temperature, mirror
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        logits, features = self.network(x.float() / 255)
-        return logits / self.temperature, features
+        x = x.float() / 255
+        logits, features = [], []
+        for network in self.networks:
+            said = [network(x), network(x.flip(3))] if self.mirror else [network(x)]
+            logits += [each[0] for each in said]
+            features.append(torch.stack([each[1] for each in said]).mean(0))
+        return torch.stack(logits).mean(0) / self.temperature, torch.cat(features, 1)
 
 
 class MapOnly(nn.Module):

@@ -41,8 +41,8 @@ class RecogniserRecipe:
 
 
 @dataclass(frozen=True)
-class LemRecipe:
-    """How the LEM is trained.
+class MapRecipe:
+    """How a map network, LEM or LCM, is trained.
 
     Attributes:
         epochs: passes over the training objects.

@@ -1,4 +1,4 @@
-"""Train the LEM: a PointNet that predicts the local depth-entropy map from one partial cloud."""
+"""Train a map network: a PointNet that predicts the local map around a view from its partial cloud."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torch.utils.data import IterableDataset
 from nextview.models.cloud_input import cloud_input
 from nextview.training.fit import fit
 from nextview.training.networks import PointNet, orthogonality
-from nextview.training.recipes import LemRecipe
+from nextview.training.recipes import MapRecipe
 
 
 class Clouds(IterableDataset):
@@ -29,7 +29,7 @@ class Clouds(IterableDataset):
         maps: NDArray[np.float32],
         poses: NDArray[np.float64],
         objects: NDArray[np.int64],
-        recipe: LemRecipe,
+        recipe: MapRecipe,
         training: bool,
     ) -> None:
         self.points, self.maps, self.poses, self.objects = points, maps, poses, objects
@@ -62,10 +62,10 @@ class Clouds(IterableDataset):
             yield torch.from_numpy(cloud), torch.from_numpy(target)
 
 
-class LemModule(L.LightningModule):
+class MapModule(L.LightningModule):
     """One-cycle Adam on the squared error plus the transforms' regulariser (thesis, section 2.2.3)."""
 
-    def __init__(self, recipe: LemRecipe, rings: int, steps: int) -> None:
+    def __init__(self, recipe: MapRecipe, rings: int, steps: int) -> None:
         super().__init__()
         self.recipe, self.steps = recipe, steps
         self.net = PointNet(rings)
@@ -92,7 +92,7 @@ def train(
     poses: NDArray[np.float64],
     training: NDArray[np.int64],
     validation: NDArray[np.int64],
-    recipe: LemRecipe,
+    recipe: MapRecipe,
     out: Path,
 ) -> nn.Module:
     """Train and return the network; checkpoints in ``out``, from which a second call resumes.
@@ -109,5 +109,5 @@ def train(
     train_clouds = Clouds(points, maps, poses, training, recipe, training=True)
     validation_clouds = Clouds(points, maps, poses, validation, recipe, training=False)
     L.seed_everything(recipe.seed, verbose=False)
-    module = LemModule(recipe, maps.shape[2], recipe.epochs * len(train_clouds))
+    module = MapModule(recipe, maps.shape[2], recipe.epochs * len(train_clouds))
     return fit(module, train_clouds, validation_clouds, recipe.epochs, out).net.eval()

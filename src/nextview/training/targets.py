@@ -1,0 +1,54 @@
+"""What the map networks learn: one value for every view of every object that has any."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.store import ViewStore
+from nextview.measures.confidence_map import confidence_maps
+from nextview.measures.depth_entropy import normalise_per_object
+
+
+@dataclass(frozen=True)
+class Target:
+    """Values of all views of a store's objects.
+
+    Attributes:
+        values: (N, V) float32, 0 .. 1.
+        there: which objects have values, (N,) bool.
+    """
+
+    values: NDArray[np.float32]
+    there: NDArray[np.bool_]
+
+    def known(self, objects: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of some objects that have values."""
+        return objects[self.there[objects]]
+
+
+def entropy_target(store: ViewStore) -> Target:
+    """Depth-entropy, scaled to 0 .. 1 over each object's views: the LEM's."""
+    return Target(normalise_per_object(store.measure()), store.done)
+
+
+def confidence_target(store: ViewStore, predictions: Predictions) -> Target:
+    """The recogniser's confidence where it is right: the LCM's.
+
+    Let the predictions come from recognisers that have not seen the objects (nextview train recogniser --folds): a
+    network is too sure of what it was trained on. Objects without predictions, and those that are right from no view,
+    have no values.
+
+    Raises:
+        PredictionsError: the predictions are of none of the store's objects, or of other views.
+    """
+    row = {name: i for i, name in enumerate(store.names)}
+    here = np.array([row.get(name, -1) for name in predictions.names])
+    if (here < 0).all() or predictions.sphere != store.sphere:
+        raise PredictionsError(f"these predictions are not of the views of {store.path}")
+    values = np.zeros((len(store), len(store.sphere)), np.float32)
+    values[here[here >= 0]] = confidence_maps(predictions.logits, predictions.labels)[here >= 0]
+    return Target(values, values.any(1) & store.done)
