@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from test_predictions import some_predictions
 from test_report import Page
 
 from nextview.cli.main import main
+from nextview.models.card import file_hash, write_card
 
 TABLES = ("accuracy", "fusion", "confusion", "reliability", "maps")
 
@@ -182,3 +184,22 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):  # a file is in the way
         main(["evaluate", str(tmp_path / "p.npz"), "--out", str(tmp_path / "p.npz" / "out"), "--samples", "5"])
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(tmp_path, capsys):
+    p = some_predictions(30, seed=1)
+    for kind, name in (("recogniser", "net"), ("lem", "map"), ("lem", "other")):
+        (tmp_path / f"{name}.onnx").write_bytes(name.encode())
+        write_card(tmp_path / f"{name}.json", {"name": name, "kind": kind, "scores": {"validation": 1}})
+    models = {"recogniser": "net", "lem": "map"}
+    models = {kind: (name, file_hash(tmp_path / f"{name}.onnx")) for kind, name in models.items()}
+    replace(p, models=models, splits=np.full(30, "test")).save(tmp_path / "p.npz")
+    cards = [str(tmp_path / "net.json"), str(tmp_path / "map.json")]
+    main(["evaluate", str(tmp_path / "p.npz"), "--out", str(tmp_path / "o"), "--samples", "50", "--cards", *cards])
+    net, lem = (json.loads(Path(card).read_text())["scores"] for card in cards)
+    right = p.logits.argmax(2) == p.labels[:, None]
+    assert net["test (30 objects)"]["single_view"]["instance"] == pytest.approx(right.mean(), abs=1e-4)
+    assert net["validation"] == 1
+    assert lem["test (30 objects)"].keys() >= {"mse", "regret"}
+    capsys.readouterr()
+    assert "not made by model other" in refused(capsys, tmp_path / "p.npz", "--cards", tmp_path / "other.json")

@@ -5,6 +5,7 @@ import math
 import sys
 
 import numpy as np
+import onnxruntime as ort
 import pytest
 from scipy.special import softmax
 from tests.test_readme import write_off
@@ -221,3 +222,20 @@ def test_folds_divide_every_class_evenly_and_keep_twins_together(tmp_path):
     assert any((a != b).any() for a, b in zip(folds, hold_out(store, objects, 3, 2), strict=True) if len(a) == len(b))
     with pytest.raises(ValueError, match="cannot be divided"):
         hold_out(store, objects, 1, seed=0)
+
+
+def test_eight_bits_a_weight_are_enough_for_the_answers_and_halve_the_file_again(tmp_path):
+    torch.manual_seed(0)
+    network = ResNet(18, 10, 4).eval()
+    with torch.no_grad():  # every row of another magnitude, as in trained networks
+        network.layer4[1].conv1.weight *= torch.logspace(-2, 1, 512)[:, None, None, None]
+    x = np.random.default_rng(0).random((2, 4, 64, 64)).astype(np.float32)
+    said = {}
+    for bits in (16, 8):
+        export_onnx(network, x, "input", ["logits", "features"], tmp_path / f"{bits}.onnx", bits)
+        session = ort.InferenceSession(tmp_path / f"{bits}.onnx", providers=["CPUExecutionProvider"])
+        said[bits] = session.run(["features"], {"input": x})[0]
+    true = network(torch.from_numpy(x))[1].detach().numpy()
+    assert np.abs(said[8] - true).max() < 0.02 * np.abs(true).max()
+    assert np.abs(said[8] - true).max() > np.abs(said[16] - true).max()  # so they do have fewer
+    assert (tmp_path / "8.onnx").stat().st_size < 0.52 * (tmp_path / "16.onnx").stat().st_size

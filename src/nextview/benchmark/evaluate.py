@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 from nextview.benchmark import statistics as st
 from nextview.benchmark.contestants import true_lcm, true_lem
 from nextview.benchmark.published import published_map, published_recognisers
-from nextview.benchmark.scores import map_errors
+from nextview.benchmark.scores import map_errors, map_scores, recogniser_scores
 from nextview.data.predictions import Predictions
+from nextview.models.card import Card
 from nextview.recognition import Calibration
 
 Float = NDArray[np.float64]
@@ -243,3 +245,20 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
                     rows.append((name, by, label, over + measure, value[i], low[i], high[i], beside))
     columns = ["map", "by", "label", "measure", "value", "low", "high", "published"]
     return pd.DataFrame(rows, columns=columns).astype({"published": "float64"}), left_out
+
+
+def scores_for_card(card: Card, p: Predictions) -> dict[str, Any]:
+    """The scores of one of the models that made some predictions, as its card notes them.
+
+    Raises:
+        EvaluationError: the model did not make them, or they hold nothing that it can be judged by.
+    """
+    if p.models.get(card.kind) != (card.name, card.sha256):
+        raise EvaluationError(f"these predictions were not made by model {card.name}")
+    if card.kind == "recogniser":
+        return recogniser_scores(p.logits, p.labels)
+    kept = judged_objects(p, card.kind) if card.kind in TRUTHS else []
+    if len(kept) == 0:
+        raise EvaluationError(f"these predictions hold no object by which model {card.name} can be judged")
+    shape = (-1, p.sphere.rings, 3)
+    return map_scores(p.maps[card.kind][kept].reshape(shape), TRUTHS[card.kind](p)[kept].reshape(shape))

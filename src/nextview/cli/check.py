@@ -44,5 +44,5 @@ def check(
         f"{store}: {done - len(damaged)} objects are sound, {len(damaged)} damaged, {missing} not rendered yet"
     )
     if damaged:
-        what = "nextview render makes them anew" if repair else "with --repair True, nextview render makes them anew"
+        what = "nextview render makes them anew" if repair else "with --repair, nextview render makes them anew"
         raise DatasetError(f"{store}: {len(damaged)} of {done} objects are damaged; {what}")

@@ -20,6 +20,7 @@ def evaluate(
     /,
     out: Path = Path("evaluation"),
     split: Literal["train", "test"] | None = None,
+    cards: tuple[str, ...] = (),
     samples: int = 2000,
     seed: int = 0,
 ) -> None:
@@ -29,6 +30,7 @@ def evaluate(
         predictions: made by nextview predict.
         out: folder for numbers, tables, figures and evaluate.html; an earlier evaluation there is replaced.
         split: take only the objects of this one; needed where the predictions hold several.
+        cards: of the models that made the predictions; their scores are noted on these.
         samples: of the bootstrap.
         seed: decides the bootstrap, the orders of views and the examples.
     """
@@ -37,7 +39,7 @@ def evaluate(
     from nextview.cli.extra import needs_extra
     from nextview.cli.progress import track
     from nextview.data.predictions import Predictions
-    from nextview.models.card import file_hash
+    from nextview.models.card import file_hash, find_card, write_card
 
     with needs_extra("benchmark"):
         from nextview.benchmark import evaluate as judge
@@ -50,6 +52,13 @@ def evaluate(
         table = table.of_split(split)
     elif len(set(table.splits)) > 1:
         raise ValueError(f"{predictions}: holds training and test objects; choose with --split which are judged")
+    noted = {}
+    for name in cards:
+        card = find_card(name)
+        of = f"{split or table.splits[0] or 'all'} ({len(table)} objects)"
+        noted[card.path] = card.facts | {
+            "scores": card.facts.get("scores", {}) | {of: judge.scores_for_card(card, table)}
+        }
     found = judge.evaluate(table, samples, np.random.default_rng([seed, 0]))
     settings = {
         "predictions": predictions.name,
@@ -62,6 +71,8 @@ def evaluate(
     }
     figures = evaluation.all_figures(found, table, np.random.default_rng([seed, 1]))
     track(evaluation.save(out, found, table, settings, figures), len(figures) + 1, "writing figures")
+    for path, facts in noted.items():
+        write_card(path.with_suffix(".json"), facts)
     console = Console()
     console.print(_recogniser(found, len(table.sphere)))
     for name in found.maps["map"].unique():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -22,6 +22,7 @@ def export_recogniser(
     /,
     also: tuple[Path, ...] = (),
     mirror: bool = False,
+    bits: Literal[8, 16] = 16,
     name: str = "resnet18-modelnet10",
     commands: tuple[str, ...] = (),
     note: str = "",
@@ -34,6 +35,7 @@ def export_recogniser(
         out: folder for NAME.onnx and NAME.json.
         also: further runs on the same store, with the same input; the logits of all are averaged.
         mirror: average what the networks say of a view and of its mirror image.
+        bits: that a weight takes in the file.
         name: what to call the model.
         commands: the commands that made the run, for the card.
         note: what else the card should say.
@@ -46,7 +48,7 @@ def export_recogniser(
     from nextview.cli.progress import console
     from nextview.data.split import split_training
     from nextview.data.store import ViewStore
-    from nextview.models.card import ModelError
+    from nextview.models.card import ModelError, write_card
     from nextview.models.geometry_input import CHANNELS
     from nextview.models.networks import Recogniser
     from nextview.training.export import CalibratedRecogniser, answer, export_onnx, fit_temperature, load_weights
@@ -87,15 +89,15 @@ def export_recogniser(
         "temperature": 1.0,
     }
     example = np.array(inputs[validation[0], :2])
-    export_onnx(CalibratedRecogniser(networks, 1.0, mirror), example, "input", ["logits", "features"], weights)
-    _write_card(card, weights, facts)
+    export_onnx(CalibratedRecogniser(networks, 1.0, mirror), example, "input", ["logits", "features"], weights, bits)
+    write_card(card, facts)
     raw = _all_logits(Recogniser(card), inputs, validation, "validation views")
     labels = views.labels[validation]
     temperature = fit_temperature(raw.reshape(-1, raw.shape[2]), np.repeat(labels, raw.shape[1]))
 
     shipped = CalibratedRecogniser(networks, temperature, mirror).eval()
-    export_onnx(shipped, example, "input", ["logits", "features"], weights)
-    _write_card(card, weights, facts)
+    export_onnx(shipped, example, "input", ["logits", "features"], weights, bits)
+    write_card(card, facts)
     sample = np.array(inputs[validation[:: max(1, len(validation) // 8)][:8], 5])
     difference = float(np.abs(answer(shipped, sample) - Recogniser(card).from_inputs(sample)[0]).max())
     console.print(f"largest difference between torch and ONNX logits on real views: {difference:.2g}")
@@ -113,7 +115,7 @@ def export_recogniser(
         "note": note,
         "unseen": sorted(unseen),
     }
-    _write_card(card, weights, facts)
+    write_card(card, facts)
 
 
 def export_lem(
@@ -197,7 +199,7 @@ def _export_map(
     from nextview.cli.progress import console
     from nextview.data.split import split_training
     from nextview.data.store import POINT_UNIT, ViewStore
-    from nextview.models.card import ModelError
+    from nextview.models.card import ModelError, write_card
     from nextview.models.cloud_input import cloud_input
     from nextview.models.networks import MapNetwork, Recogniser
     from nextview.training.export import MapOnly, answer, export_onnx, load_weights
@@ -224,7 +226,7 @@ def _export_map(
         "input": "1,024 visible points, upright, camera at azimuth zero, scaled to [0, 1] by their own extent",
         "output": f"{what}, of {sphere.rings} rings x azimuth -1, 0, +1",
     }
-    _write_card(card, weights, facts)
+    write_card(card, facts)
     predictor = MapNetwork(card)
     difference = float(np.abs(answer(shipped, clouds) - predictor.from_clouds(clouds)).max())
     console.print(f"largest difference between torch and ONNX maps on real views: {difference:.2g}")
@@ -258,17 +260,7 @@ def _export_map(
         "largest_difference_to_torch": round(difference, 4),
         "note": note,
     }
-    _write_card(card, weights, facts)
-
-
-def _write_card(card: Path, weights: Path, facts: dict[str, Any]) -> None:
-    import json
-
-    from nextview.models.card import file_hash
-
-    part = card.with_suffix(".part")
-    part.write_text(json.dumps(facts | {"sha256": file_hash(weights)}, indent=1) + "\n")
-    part.rename(card)
+    write_card(card, facts)
 
 
 def _tracked(one: Callable[[int], NDArray], objects: NDArray, what: str) -> NDArray:

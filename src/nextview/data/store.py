@@ -128,7 +128,7 @@ class ViewStore:
         except Exception as error:  # a damaged chunk raises whatever its codec makes of it
             raise DatasetError(
                 f"{self.path}: {name} of {self.names[i]} cannot be read ({error}); "
-                "nextview check --repair True takes it out, and nextview render makes it anew"
+                "nextview check --repair takes it out, and nextview render makes it anew"
             ) from None
 
     def __len__(self) -> int:

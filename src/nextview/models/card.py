@@ -71,6 +71,13 @@ def find_card(model: str | Path) -> Card:
     return read_card(Path(model))
 
 
+def write_card(path: Path, facts: dict[str, Any]) -> None:
+    """Write a card, aside and then renamed, with the hash of the weights beside it."""
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(facts | {"sha256": file_hash(path.with_suffix(".onnx"))}, indent=1) + "\n")
+    part.rename(path)
+
+
 def file_hash(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal."""
     with path.open("rb") as file:

@@ -68,8 +68,10 @@ def answer(network: nn.Module, inputs: NDArray) -> NDArray[np.float32]:
     return (outputs[0] if isinstance(outputs, tuple) else outputs).numpy()
 
 
-def export_onnx(network: nn.Module, example: NDArray, inputs: str, outputs: list[str], path: Path) -> None:
-    """Write a network as ONNX, batch size free, weights in half precision and arithmetic in single.
+def export_onnx(
+    network: nn.Module, example: NDArray, inputs: str, outputs: list[str], path: Path, bits: int = 16
+) -> None:
+    """Write a network as ONNX, batch size free, weights in fewer bits and arithmetic in single precision.
 
     Args:
         network: in evaluation mode.
@@ -77,6 +79,7 @@ def export_onnx(network: nn.Module, example: NDArray, inputs: str, outputs: list
         inputs: name of the input.
         outputs: names of the outputs.
         path: the file, written aside and renamed.
+        bits: that a weight takes, 16 or 8; see ``shrink_weights``.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -90,7 +93,7 @@ def export_onnx(network: nn.Module, example: NDArray, inputs: str, outputs: list
             opset_version=OPSET,
             verbose=False,
         )
-    model = strip_traces(halve_weights(program.model_proto))
+    model = strip_traces(shrink_weights(program.model_proto, bits))
     onnx.checker.check_model(model, full_check=True)
     part = path.with_suffix(".part")
     onnx.save(model, part)
@@ -106,17 +109,31 @@ def strip_traces(model: onnx.ModelProto) -> onnx.ModelProto:
     return model
 
 
-def halve_weights(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Store large float32 weights as float16 and cast them back where they are used: half the file, same arithmetic."""
-    casts = []
+def shrink_weights(model: onnx.ModelProto, bits: int) -> onnx.ModelProto:
+    """Store large float32 weights in fewer bits and turn them back where they are used: the arithmetic stays single.
+
+    Args:
+        model: changed in place.
+        bits: 16 for half precision; 8 for integers, with a scale of its own for every output (row of the weight).
+    """
+    nodes, scales = [], []
     for weight in model.graph.initializer:
         if weight.data_type != TensorProto.FLOAT or np.prod(weight.dims) < 1024:
             continue
-        name = weight.name
-        half = numpy_helper.from_array(numpy_helper.to_array(weight).astype(np.float16), name + "_half")
-        weight.CopyFrom(half)
-        casts.append(helper.make_node("Cast", [half.name], [name], to=TensorProto.FLOAT))
-    nodes = [*casts, *model.graph.node]
+        name, values = weight.name, numpy_helper.to_array(weight)
+        small = f"{name}_small"
+        if bits == 16:
+            weight.CopyFrom(numpy_helper.from_array(values.astype(np.float16), small))
+            nodes.append(helper.make_node("Cast", [small], [name], to=TensorProto.FLOAT))
+            continue
+        scale = np.abs(values).max(tuple(range(1, values.ndim)), keepdims=True) / 127
+        scale[scale == 0] = 1
+        weight.CopyFrom(numpy_helper.from_array(np.rint(values / scale).astype(np.int8), small))
+        scales.append(numpy_helper.from_array(scale.astype(np.float32), f"{name}_scale"))
+        nodes.append(helper.make_node("Cast", [small], [f"{name}_steps"], to=TensorProto.FLOAT))
+        nodes.append(helper.make_node("Mul", [f"{name}_steps", f"{name}_scale"], [name]))
+    nodes += list(model.graph.node)
+    model.graph.initializer.extend(scales)
     del model.graph.node[:]
     model.graph.node.extend(nodes)
     return model
