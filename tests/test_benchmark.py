@@ -15,6 +15,7 @@ from nextview.benchmark.replay import ContestantError, cut, make_trials, replay
 from nextview.benchmark.statistics import calibration_error
 from nextview.cli.benchmark import benchmark
 from nextview.data.predictions import PredictionsError
+from nextview.recognition import Calibration, RiskBounds
 
 TEN = tuple(read_table(ACCURACY[10]))
 
@@ -133,6 +134,26 @@ def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes
     assert set(found.settings["failures"]) == {"test_replay:Raises", "lcm", "best-99"}
 
 
+def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(folder, predictions):
+    bounds = RiskBounds((0.6, 0.8), tuple((0.2, 0.1) for _ in range(5)), 0.1)
+    calibrated = replace(predictions, calibration=Calibration(0.7, 0.5, bounds))
+    calibrated.save(folder / "c.npz")
+    settings = {"policies": ("random",), "thresholds": (0.9,), "runs": 2, "samples": 20}
+    benchmark(folder / "c.npz", out=folder / "risk", risks=(0.15,), **settings)
+    found = results.load(folder / "risk")
+    assert found.settings["thresholds"] == [0.8, 0.9]
+    assert found.settings["risks"] == {"0.15": 0.8}
+    row = found.episodes("random", 0.9).iloc[0]
+    i = predictions.names.index(row.object)
+    total = predictions.logits[i, list(row.views)].astype(float).sum(0) / (0.7 * (1 + 0.5 * (row.looks - 1)))
+    assert row.confidence == pytest.approx((np.exp(total) / np.exp(total).sum()).max())
+
+    benchmark(folder / "c.npz", out=folder / "plain", uncalibrated=True, **settings)
+    benchmark(folder / "p.npz", out=folder / "as published", **settings)
+    plain, published = (results.load(folder / name).episodes("random", 0.9) for name in ("plain", "as published"))
+    pd.testing.assert_frame_equal(plain, published)
+
+
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [
@@ -141,6 +162,7 @@ def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes
         ({"runs": 0}, "at least one run"),
         ({"max_views": 0}, "at least one view"),
         ({"valley_classes": ("sofa",)}, "no class 'sofa'"),
+        ({"risks": (0.05,)}, "promises no error rate"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(folder, wrong, sentence):

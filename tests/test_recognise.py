@@ -17,6 +17,7 @@ from nextview.cli.main import main
 from nextview.data.samples import SAMPLES, sample_mesh
 from nextview.models.card import BUNDLED, ModelError, bundled_cards
 from nextview.models.networks import RECOGNISER, MapNetwork, Recogniser
+from nextview.policies.card import bundled_policies
 
 DATA = os.environ.get("NEXTVIEW_DATA")
 
@@ -50,6 +51,34 @@ def test_same_seed_same_episode(chair, capsys):
             main(["recognise", str(chair), "--policy", policy, "--threshold", "1", "--seed", "7", "--json"])
             runs.append(capsys.readouterr().out)
         assert runs[0] == runs[1]
+
+
+def test_a_risk_stops_at_the_threshold_that_the_recogniser_promises(chair, capsys):
+    main(["recognise", str(chair), "--risk", "0.1", "--start", "3", "--json"])
+    by_risk = capsys.readouterr().out
+    threshold = Recogniser().calibration.threshold(0.1, 5)
+    main(["recognise", str(chair), "--threshold", str(threshold), "--start", "3", "--json"])
+    assert capsys.readouterr().out == by_risk
+    for arguments in (["--risk", "0.000001"], ["--risk", "2"], ["--risk", "0.1", "--max-views", "40"]):
+        with pytest.raises(SystemExit) as end:
+            main(["recognise", str(chair), *arguments])
+        assert end.value.code == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_every_bundled_policy_runs_live(chair, capsys):
+    for name in bundled_policies():
+        arguments = ["--policy", name, "--threshold", "1", "--max-views", "3", "--start", "9", "--json"]
+        main(["recognise", str(chair), *arguments])
+        looks = json.loads(capsys.readouterr().out)["looks"]
+        assert len({look["view"] for look in looks}) == 3
+        if name.endswith("local"):
+            sphere = ViewSphere.named("40")
+            for look in looks[:-1]:
+                assert look["next_view"] in sphere.window(look["view"])
+    with pytest.raises(SystemExit) as end:
+        main(["recognise", str(chair), "--policy", "clairvoyant"])
+    assert end.value.code == 2
 
 
 def test_table_figure_and_timing(chair, tmp_path, capsys):

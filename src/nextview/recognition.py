@@ -95,6 +95,16 @@ class Calibration:
         """What the sum of the logits of so many looks is divided by."""
         return self.temperature_of_one * (1 + self.correlation * (looks - 1))
 
+    def threshold(self, risk: float, max_views: int) -> float:
+        """The lowest threshold of the belief that promises an error rate, see ``RiskBounds``.
+
+        Raises:
+            RiskError: it cannot be promised.
+        """
+        if self.risk is None:
+            raise RiskError("this recogniser promises no error rate; calibrate it with nextview fit calibration")
+        return self.risk.threshold(risk, max_views)
+
     @classmethod
     def of_facts(cls, facts: Mapping[str, Any] | None) -> Calibration:
         """From what a model's card says under "calibration"; the plain sum if it says nothing.

@@ -14,6 +14,8 @@ def benchmark(
     out: Path = Path("benchmark"),
     policies: tuple[str, ...] = (),
     thresholds: tuple[float, ...] = (0.85, 0.9, 0.95, 0.97, 0.99),
+    risks: tuple[float, ...] = (),
+    uncalibrated: bool = False,
     split: Literal["train", "test"] | None = None,
     runs: int = 10,
     max_views: int = 5,
@@ -29,6 +31,8 @@ def benchmark(
         out: folder for the results; earlier results there are replaced.
         policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
         thresholds: of the belief.
+        risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too.
+        uncalibrated: believe the plain sum of the logits, as published, whatever the recogniser's card says.
         split: take only the objects of this one; needed where the predictions hold several.
         runs: random first views of each object.
         max_views: looks at most.
@@ -39,6 +43,7 @@ def benchmark(
     """
     import sys
     import time
+    from dataclasses import replace
 
     from nextview.benchmark.contestants import default_contestants
     from nextview.benchmark.replay import ContestantError, make_trials
@@ -47,7 +52,7 @@ def benchmark(
     from nextview.cli.progress import console, track
     from nextview.data.predictions import Predictions
     from nextview.models.card import file_hash
-    from nextview.recognition import Stopping
+    from nextview.recognition import PLAIN_SUM, Stopping
 
     with needs_extra("benchmark"):
         from nextview.benchmark.results import check_target, save
@@ -61,6 +66,9 @@ def benchmark(
     for threshold in thresholds:
         Stopping(threshold, max_views)  # says what is wrong with it
     table = Predictions.load(predictions)
+    if uncalibrated:
+        table = replace(table, calibration=PLAIN_SUM)
+    promised = {risk: table.calibration.threshold(risk, max_views) for risk in risks}
     if split:
         table = table.of_split(split)
     elif len(set(table.splits)) > 1:
@@ -72,7 +80,7 @@ def benchmark(
     trials = make_trials(table, runs, seed, valleys)
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
     names = list(dict.fromkeys([*([reference] if policies else []), *(policies or default_contestants(trials))]))
-    grid = Grid(trials, runs, tuple(sorted(set(thresholds))), max_views, seed)
+    grid = Grid(trials, runs, tuple(sorted({*thresholds, *promised.values()})), max_views, seed)
     track(run_grid(grid, names), len(names), "replaying policies")
     if grid.paths:
         tables = summarise(grid, reference, samples, np.random.default_rng([seed, 1]))
@@ -85,6 +93,8 @@ def benchmark(
             "split": split,
             "reference": reference,
             "thresholds": grid.thresholds,
+            "risks": {str(risk): threshold for risk, threshold in promised.items()},
+            "calibration": [table.calibration.temperature_of_one, table.calibration.correlation],
             "runs": runs,
             "max_views": max_views,
             "valley_classes": [table.classes[i] for i in trials.valley_classes],

@@ -47,13 +47,15 @@ def fit_calibration(
     if validation < 1 and table.models["recogniser"][1] != model.sha256:
         raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
     data = fitting_set(table, validation, split_seed)
-    calibration = fit_temperature(data, np.random.default_rng([seed, 0]))
-    calibration = replace(calibration, risk=fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta))
+    walks = 1 + 8000 // len(data)  # few objects are walked over more often
+    calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=walks)
+    risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
+    calibration = replace(calibration, risk=risk)
     told = {"fitted_to": f"{len(data)} objects of the training split, classes weighted evenly"}
     part = card.with_name(card.name + ".part")
     part.write_text(json.dumps(model.facts | {"calibration": calibration.facts() | told}, indent=1) + "\n")
     os.replace(part, card)
-    before, after = (loss(data, c, np.random.default_rng([seed, 2])) for c in (PLAIN_SUM, calibration))
+    before, after = (loss(data, c, np.random.default_rng([seed, 2]), walks=walks) for c in (PLAIN_SUM, calibration))
     console.print(
         f"{len(data)} objects: temperature of one look {calibration.temperature_of_one}, correlation of two looks "
         f"{calibration.correlation}; negative log-likelihood over 1 to 5 looks {before:.3f} before, {after:.3f} after"

@@ -12,14 +12,13 @@ if TYPE_CHECKING:
     from nextview.cli.timing import Stopwatch
     from nextview.mesh import Mesh
 
-PolicyName = Literal["lem", "lem-peak", "random", "random-all", "furthest", "unidirectional", "spread", "spread-local"]
-
 
 def recognise(
     mesh: tyro.conf.Positional[Path],
     /,
-    policy: PolicyName = "lem",
+    policy: str = "lem",
     threshold: float = 0.97,
+    risk: float | None = None,
     max_views: int = 5,
     start: int | None = None,
     up: Literal["y", "z"] | None = None,
@@ -32,8 +31,10 @@ def recognise(
 
     Args:
         mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
-        policy: how the next view is chosen.
+        policy: how the next view is chosen: lem, lem-peak, random, random-all, furthest, unidirectional, spread,
+            spread-local, a learned one that is bundled, or the card of one (.json).
         threshold: stop when the belief in one class reaches this.
+        risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
         max_views: stop after so many views.
         start: first view, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
         up: the file's up axis; z if not given, but y for GLB.
@@ -50,14 +51,14 @@ def recognise(
     def load() -> Mesh:
         return load_mesh(mesh, up)
 
-    show(load, mesh.name, watch, policy, threshold, max_views, start, seed, figure, json, timing)
+    show(load, mesh.name, watch, policy, threshold, max_views, start, seed, figure, json, timing, risk)
 
 
 def show(
     load: Callable[[], Mesh],
     name: str,
     watch: Stopwatch,
-    policy: PolicyName = "lem",
+    policy: str = "lem",
     threshold: float = 0.97,
     max_views: int = 5,
     start: int | None = None,
@@ -65,6 +66,7 @@ def show(
     figure: Path | None = None,
     json: bool = False,
     timing: bool = False,
+    risk: float | None = None,
 ) -> None:
     """Recognise what ``load`` returns and print the episode; the rest as for ``recognise``."""
     import numpy as np
@@ -84,7 +86,9 @@ def show(
     camera = SimulatedCamera(load())
     watch.lap("building the scene")
     models = load_models(("lem",) if policy.startswith("lem") else ())
-    chosen = make_policy(policy, sphere, models.valley_classes("lem"))
+    chosen = make_policy(policy, sphere, models.valley_classes("lem"), models.classes)
+    if risk is not None:
+        stopping = Stopping(models.recogniser.calibration.threshold(risk, max_views), max_views)
     session = Session(models, chosen, sphere, drawn if start is None else start, stopping, rng)
     watch.lap("loading the models")
     while not session.done:
