@@ -178,8 +178,9 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
     assert unseen[0] & unseen[1] == {views.names[i] for i in validation}
     out = trained / "unseen.npz"
     cards = [str(models / f"fold{k}.json") for k in range(2)]
-    main(["predict", str(store), str(out), "--split", "train", "--maps", "--recogniser", *cards, "--workers", "1"])
+    main(["predict", str(store), str(out), "--unseen", "--maps", "--recogniser", *cards, "--workers", "1"])
     predictions = Predictions.load(out)
+    assert set(predictions.names) == unseen[0] | unseen[1]
     for k, card in enumerate(cards):  # each network judged what it has not seen, and nothing else
         name = sorted(unseen[k] - unseen[1 - k])[0]
         inputs = np.load(trained / "views.zarr.inputs112.npy", mmap_mode="r")[views.names.index(name)]

@@ -14,6 +14,7 @@ def predict(
     /,
     split: Literal["train", "test"] | None = None,
     recogniser: tuple[str, ...] = (),
+    unseen: bool = False,
     maps: tuple[str, ...] = ("lem",),
     batch: int = 8,
     workers: int | None = None,
@@ -25,8 +26,9 @@ def predict(
         store: view store made by nextview render.
         out: predictions to make (.npz), from which nextview benchmark replays policies.
         split: only this split.
-        recogniser: name of a bundled model or path of a card; the bundled one by default. Of several (nextview train
-            recogniser --folds), each judges objects that it has not seen in training.
+        recogniser: name of a bundled model or path of a card; the bundled one by default. Several with --unseen.
+        unseen: let each object be judged by a recogniser that has not seen it in training (nextview train recogniser
+            --folds makes such), and leave out those that all have seen.
         maps: maps to predict with the bundled networks, or NAME=CARD for others.
         batch: views a call of the networks.
         workers: processes; one for each core by default.
@@ -38,6 +40,8 @@ def predict(
     from nextview.models.card import ModelError, find_card
     from nextview.models.networks import MAPS, RECOGNISER
 
+    if len(recogniser) > 1 and not unseen:
+        raise ValueError("several recognisers can only share the work with --unseen")
     if out.suffix != ".npz":
         raise ValueError(f"{out}: predictions are one .npz file; end the name in .npz")
     cards = {}
@@ -47,7 +51,7 @@ def predict(
             raise ModelError(f"no bundled network predicts the map {name!r}; there are {', '.join(MAPS)}")
         cards[name] = find_card(card or MAPS[name])
     steps = job.predict(
-        store, out, [find_card(r) for r in recogniser or (RECOGNISER,)], cards, split, batch, workers, scheduler
+        store, out, [find_card(r) for r in recogniser or (RECOGNISER,)], cards, split, unseen, batch, workers, scheduler
     )
     before, total = next(steps)
     track((done for done, _ in steps), total, f"predicting {store.name}", before, len(ViewStore.open(store).sphere))

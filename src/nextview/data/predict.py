@@ -42,6 +42,7 @@ def predict(
     recognisers: Sequence[Card],
     maps: dict[str, Card],
     split: str | None = None,
+    unseen: bool = False,
     batch: int = 8,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -53,10 +54,11 @@ def predict(
     Args:
         path: the view store.
         out: the .npz file to make.
-        recognisers: card of the recogniser; of several, each judges objects that it has not seen in training, and
-            objects that all of them have seen are left out.
+        recognisers: cards; each object is judged by the first of them, or see ``unseen``.
         maps: card of the network for each map.
         split: only this split.
+        unseen: let each object be judged by a recogniser that has not seen it in training, and leave out those that
+            all have seen.
         batch: views a call of the networks.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
@@ -75,7 +77,7 @@ def predict(
     chosen = np.flatnonzero(store.done & (True if split is None else store.splits == split))
     if len(chosen) == 0:
         raise DatasetError(f"{path}: holds no rendered object" + (f" of the split {split!r}" if split else ""))
-    judge = judges(recognisers, [store.names[i] for i in chosen])
+    judge = judges(recognisers, [store.names[i] for i in chosen]) if unseen else np.zeros(len(chosen), np.int64)
     chosen, judge = chosen[judge >= 0], judge[judge >= 0]
     if len(chosen) == 0:
         raise DatasetError(f"{path}: holds no object that one of these recognisers has not seen in training")
@@ -140,13 +142,11 @@ def predict(
 
 
 def judges(recognisers: Sequence[Card], names: Sequence[str]) -> NDArray[np.int64]:
-    """Which recogniser judges each object: of several, the first that has not seen it in training; -1 for none.
+    """Which recogniser judges each object: the first that has not seen it in training; -1 for none.
 
     Raises:
-        DatasetError: one of several does not say what it has not seen, or they do not know the same classes.
+        DatasetError: one of them does not say what it has not seen, or they do not know the same classes.
     """
-    if len(recognisers) == 1:
-        return np.zeros(len(names), np.int64)
     for card in recognisers:
         if "unseen" not in card.facts:
             raise DatasetError(f"recogniser {card.name} does not say which objects it has not seen in training")
