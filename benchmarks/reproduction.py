@@ -7,6 +7,7 @@ Every number and every verdict on the page is worked out here from the predictio
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from nextview.benchmark.run import THRESHOLDS, Grid, run_grid
 from nextview.benchmark.summary import Tables, summarise
 from nextview.data.predictions import Predictions
 from nextview.models.card import file_hash
+from nextview.recognition import PLAIN_SUM
 
 AT = 0.97
 BASELINES = ("random", "furthest", "unidirectional")
@@ -67,7 +69,7 @@ def tests_of(tables: Tables, measure: str) -> dict[tuple[str, float], Compared]:
 
 
 def page(predictions: Path, samples: int = 2000) -> str:
-    table = Predictions.load(predictions)
+    table = replace(Predictions.load(predictions), calibration=PLAIN_SUM)  # as published
     trials = make_trials(table, 10, 0)
     grid = Grid(trials, 10, THRESHOLDS, 5, 0)
     list(run_grid(grid, default_contestants(trials)))

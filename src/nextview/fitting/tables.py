@@ -45,24 +45,35 @@ def fit_sequence(data: FittingSet, anywhere: bool, length: int, calibration: Cal
     Returns:
         (rings, length) int64, cells as in ``FixedSequence``.
     """
-    length = min(length, len(data.sphere) - 1)
-    paths = [_greedy_path(data, ring, anywhere, length, calibration) for ring in range(data.sphere.rings)]
+    n = data.sphere.azimuths
+    rings = [n * ring + np.arange(n) for ring in range(data.sphere.rings)]
+    paths = [greedy_path(data, starts, anywhere, length, calibration) for starts in rings]
     return np.array([cells_to(data.sphere)[path[:-1], path[1:]] for path in paths])
 
 
-def _greedy_path(
-    data: FittingSet, ring: int, anywhere: bool, length: int, calibration: Calibration
+def greedy_path(
+    data: FittingSet, starts: NDArray[np.int64], anywhere: bool, length: int, calibration: Calibration
 ) -> NDArray[np.int64]:
-    """The best path from a ring, (length + 1,): its views for the start at azimuth 0; other starts turn it."""
-    sphere, n = data.sphere, data.sphere.azimuths
-    path = [ring * n]
-    starts = path[0] + np.arange(n)
+    """The greedily best path from some views of one ring: each move the best for all objects and starts together.
+
+    Args:
+        data: what the recogniser says.
+        starts: views of one ring.
+        anywhere: choose among all views; otherwise in the local window.
+        length: moves.
+        calibration: of the belief.
+
+    Returns:
+        (length + 1,) int64: the cell of each look, seen from the start, the start's own first.
+    """
+    sphere = data.sphere
+    path = [int(sphere.ring[starts[0]]) * sphere.azimuths]
 
     def logits(place: int) -> Float:
         return data.logits[:, cells_from(sphere)[starts, place]].astype(np.float64)
 
     total = logits(path[0])
-    for k in range(2, length + 2):
+    for k in range(2, min(length, len(sphere) - 1) + 2):
         reachable = np.arange(len(sphere)) if anywhere else sphere.window(path[-1]).ravel()
         free = np.setdiff1d(reachable, path)
         free = free if len(free) else np.setdiff1d(np.arange(len(sphere)), path)
