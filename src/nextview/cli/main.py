@@ -20,6 +20,7 @@ from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
 from nextview.cli.models import models
 from nextview.cli.predict import predict
+from nextview.cli.presets import with_preset
 from nextview.cli.recognise import recognise
 from nextview.cli.render import render
 from nextview.cli.report import report
@@ -58,6 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
     if arguments and isinstance(commands.get(arguments[0]), dict):  # a group, such as nextview train
         prog, description = f"{prog} {arguments[0]}", GROUPS[arguments[0]]
         commands, arguments = commands[arguments[0]], arguments[1:]
+        commands = {name: with_preset(command, arguments) for name, command in commands.items()}
     else:
         commands = {name: _group(name) if isinstance(c, dict) else c for name, c in commands.items()}
     try:

@@ -9,9 +9,14 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from nextview.training.hardware import Hardware
 from nextview.training.recipes import MapRecipe, RecogniserRecipe
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from nextview.data.store import ViewStore
     from nextview.training.targets import Target
 
 
@@ -19,50 +24,96 @@ def train_recogniser(
     store: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     deformed: Path | None = None,
+    weights: Path | None = None,
     folds: int = 0,
+    fold: int | None = None,
     recipe: tyro.conf.OmitArgPrefixes[RecogniserRecipe] = RecogniserRecipe(),
+    hardware: tyro.conf.OmitArgPrefixes[Hardware] = Hardware(),
 ) -> None:
     """Train the recogniser on a store's training split. Resumes if OUT holds a run that was cut off.
 
     Args:
         store: view store made by nextview render.
-        out: folder for checkpoints, logs and network.pt.
+        out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the best class mean.
         deformed: a store of the same objects, stretched and turned (nextview render --stretch .25 --turn).
+        weights: a torchvision checkpoint of the same depth to start from.
         folds: train so many recognisers instead, OUT/fold0 and so on, each without its share of the training objects,
             for evidence from networks that have not seen the object.
+        fold: train only this one of them, 0 the first.
         recipe: how to train.
+        hardware: on what.
     """
     import numpy as np
 
-    from nextview.cli.progress import track
+    from nextview.cli.progress import console
     from nextview.data.split import split_training
     from nextview.data.store import ViewStore
+    from nextview.models.card import ModelError
     from nextview.training import recogniser
-    from nextview.training.export import save_weights
     from nextview.training.folds import hold_out
-    from nextview.training.inputs import load_inputs, prepare_inputs
+    from nextview.training.runs import begin, finish, is_done
 
+    if fold is not None and not 0 <= fold < folds:
+        raise ModelError(f"there is no fold {fold} of {folds}: they are counted from 0")
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation, recipe.seed)
-    sources = []
-    for path in filter(None, (store, deformed)):
-        other = ViewStore.open(path)
-        track(prepare_inputs(path, recipe.size), int(other.done.sum()), f"inputs of {path.name}")
-        row = {name: i for i, name in enumerate(other.names)}
-        sources.append((load_inputs(path, recipe.size), np.array([row.get(name, -1) for name in views.names])))
-        missing = [views.names[i] for i in training if sources[-1][1][i] < 0]
-        if missing:
-            raise ValueError(f"{path}: lacks {len(missing)} of the training objects, {missing[0]} among them")
+    sources = [_source(path, views, training, recipe) for path in (store, deformed) if path]
     runs = {out: training[:0]}
     if folds:
         runs = {out / f"fold{k}": held for k, held in enumerate(hold_out(views, training, folds, recipe.seed))}
+    if fold is not None:
+        runs = dict([list(runs.items())[fold]])
     for run, held in runs.items():
-        run.mkdir(parents=True, exist_ok=True)
-        (run / "recipe.json").write_text(json.dumps(asdict(recipe), indent=1) + "\n")
-        (run / "held_out.json").write_text(json.dumps([views.names[i] for i in held]) + "\n")
-        seen = np.setdiff1d(training, held)
-        network = recogniser.train(sources, views.labels, seen, validation, recipe, run)
-        save_weights(network, run)
+        with begin(run, recipe):
+            if is_done(run):
+                console.print(f"{run}: is trained already", soft_wrap=True)
+                continue
+            (run / "held_out.json").write_text(json.dumps([views.names[i] for i in held]) + "\n")
+            seen = np.setdiff1d(training, held)
+            network = recogniser.train(sources, views.labels, seen, validation, recipe, run, weights, hardware)
+            _draw_curves(run)
+            finish(network, run)
+
+
+def _source(
+    path: Path, views: ViewStore, needed: NDArray[np.int64], recipe: RecogniserRecipe
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Inputs of a store, prepared if they are not yet, and the row of each object of ``views`` in them, -1 for none."""
+    import time
+
+    import numpy as np
+
+    from nextview.cli.progress import track
+    from nextview.data.folders import DatasetError
+    from nextview.data.lock import only_one
+    from nextview.data.store import ViewStore
+    from nextview.training.fit import is_first
+    from nextview.training.inputs import inputs_path, load_inputs, prepare_inputs
+
+    store = ViewStore.open(path)
+    row = {name: i for i, name in enumerate(store.names)}
+    rows = np.array([row.get(name, -1) for name in views.names])
+    missing = [views.names[i] for i in needed if rows[i] < 0]
+    if missing:
+        raise DatasetError(f"{path}: lacks {len(missing)} of the training objects, {missing[0]} among them")
+    target = inputs_path(path, recipe.size, recipe.input)
+    if is_first() and not target.exists():
+        with only_one(target):
+            what = f"inputs of {path.name}"
+            track(prepare_inputs(path, recipe.size, recipe.input), int(store.done.sum()), what)
+    while not target.exists():  # the first process makes it
+        time.sleep(1)
+    return load_inputs(path, recipe.size, recipe.input), rows
+
+
+def _draw_curves(run: Path) -> None:
+    """Draw how a training went, from its log, as curves.png."""
+    from nextview.report.style import to_png
+    from nextview.report.training_curves import read_log, training_curves
+    from nextview.training.fit import is_first
+
+    if is_first():
+        to_png(training_curves(read_log(run)), run / "curves.png")
 
 
 def train_lem(
@@ -117,4 +168,5 @@ def _train_map(store: Path, target: Target, out: Path, recipe: MapRecipe) -> Non
     (out / "recipe.json").write_text(json.dumps(asdict(recipe), indent=1) + "\n")
     windows = target.values[:, views.sphere.windows]
     network = maps.train(views.all_points(), windows, views.sphere.poses, training, validation, recipe, out)
+    _draw_curves(out)
     save_weights(network, out)

@@ -13,29 +13,33 @@ from numpy.typing import NDArray
 
 from nextview.data.store import ViewStore
 from nextview.models.geometry_input import CHANNELS, geometry_input
+from nextview.models.image_input import image_input
+
+CHANNELS_OF = {"geometry": len(CHANNELS), "image": 1}
+"""Channels of what a recogniser may see."""
 
 
-def inputs_path(store: Path, size: int) -> Path:
+def inputs_path(store: Path, size: int, kind: str = "geometry") -> Path:
     """Where the inputs of a store are kept."""
-    return store.with_name(f"{store.name}.inputs{size}.npy")
+    return store.with_name(f"{store.name}.{'inputs' if kind == 'geometry' else kind}{size}.npy")
 
 
-def prepare_inputs(path: Path, size: int, workers: int | None = None) -> Iterator[int]:
-    """Compute the inputs of every object (N, V, 4, size, size) uint8, unless they are there.
+def prepare_inputs(path: Path, size: int, kind: str = "geometry", workers: int | None = None) -> Iterator[int]:
+    """Compute the inputs of every object (N, V, C, size, size) uint8, unless they are there.
 
     Yields:
         Objects done so far. The file appears under its name only when it is whole.
     """
-    target = inputs_path(path, size)
+    target = inputs_path(path, size, kind)
     if target.exists():
         return
     store = ViewStore.open(path)
-    shape = (len(store), len(store.sphere), len(CHANNELS), size, size)
+    shape = (len(store), len(store.sphere), CHANNELS_OF[kind], size, size)
     part = target.with_suffix(".part")
     np.lib.format.open_memmap(part, "w+", np.uint8, shape).flush()
     with ProcessPoolExecutor(workers or os.cpu_count(), get_context("spawn")) as pool:
         jobs = [
-            pool.submit(_prepare, path, part, objects, size)
+            pool.submit(_prepare, path, part, objects, size, kind)
             for objects in np.array_split(np.flatnonzero(store.done), max(1, len(store) // 25))
         ]
         total = 0
@@ -45,16 +49,19 @@ def prepare_inputs(path: Path, size: int, workers: int | None = None) -> Iterato
     part.rename(target)
 
 
-def load_inputs(path: Path, size: int) -> NDArray[np.uint8]:
-    """The inputs of a store, memory-mapped, (N, V, 4, size, size) uint8."""
-    return np.load(inputs_path(path, size), mmap_mode="r")
+def load_inputs(path: Path, size: int, kind: str = "geometry") -> NDArray[np.uint8]:
+    """The inputs of a store, memory-mapped, (N, V, C, size, size) uint8."""
+    return np.load(inputs_path(path, size, kind), mmap_mode="r")
 
 
-def _prepare(path: Path, part: Path, objects: NDArray[np.int64], size: int) -> int:
+def _prepare(path: Path, part: Path, objects: NDArray[np.int64], size: int, kind: str) -> int:
     store = ViewStore.open(path)
     inputs = np.lib.format.open_memmap(part, "r+")
     poses, intrinsics = store.sphere.poses, store.intrinsics
     for i in objects:
+        if kind == "image":
+            inputs[i] = image_input(store.image(int(i)), size)
+            continue
         depth = store.depth(int(i))
         for v, pose in enumerate(poses):  # one view at a time stays in the cache
             inputs[i, v] = geometry_input(depth[v : v + 1], pose[None], intrinsics, size)[0]

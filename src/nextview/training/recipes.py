@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -10,7 +11,7 @@ class RecogniserRecipe:
     """How the recogniser is trained.
 
     Attributes:
-        depth: ResNet-18 or -34.
+        depth: ResNet-18, -34, -50, -101 or -152.
         size: side of the input image, pixels.
         small: side of the images in the first epochs, which are faster so; see ``small_epochs``.
         small_epochs: how many epochs see small images.
@@ -23,9 +24,14 @@ class RecogniserRecipe:
         validation: part of the training split held out for validation.
         deformed_share: chance that a view is drawn from the deformed objects, where such a store is given.
         seed: decides everything random.
+        input: what the network sees: the geometry that a depth camera sees, or the shaded image.
+        augment: vary what is seen; see ``recogniser.augment``.
+        balanced: draw rare classes more often; otherwise every view comes once before any comes again.
+        schedule: of the learning rate: up and down once, or halved every fifth epoch from the peak.
+        patience: stop after so many epochs without a better class mean on validation; 0 never stops early.
     """
 
-    depth: int = 18
+    depth: Literal[18, 34, 50, 101, 152] = 18
     size: int = 112
     small: int = 80
     small_epochs: int = 0
@@ -38,6 +44,32 @@ class RecogniserRecipe:
     validation: float = 0.1
     deformed_share: float = 0.5
     seed: int = 0
+    input: Literal["geometry", "image"] = "geometry"
+    augment: bool = True
+    balanced: bool = True
+    schedule: Literal["one-cycle", "halving"] = "one-cycle"
+    patience: int = 0
+
+
+THESIS_RECOGNISER = RecogniserRecipe(
+    depth=34,
+    size=224,
+    epochs=15,
+    views=40,
+    batch=32,
+    rate=1e-3,
+    decay=0.0,
+    smoothing=0.0,
+    deformed_share=0.0,
+    input="image",
+    augment=False,
+    balanced=False,
+    schedule="halving",
+)
+"""As published (thesis, section 5.1): Adam, 1e-3 halved every fifth epoch, batches of 32, the shaded image of 224
+pixels, every view once an epoch, cross-entropy and nothing else. The text does not say for how many epochs; its map
+networks settle around the tenth (section 6.2.2). It names no validation part either: ours is kept from the training
+split."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,51 @@
+"""Commands that take a recipe offer named ones: --preset sets the defaults of all its options."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Literal, get_type_hints
+
+import tyro
+
+from nextview.cli.train import train_recogniser
+from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe
+
+PRESETS: dict[Callable, dict[str, Any]] = {
+    train_recogniser: {"default": RecogniserRecipe(), "thesis": THESIS_RECOGNISER},
+}
+"""The recipes of each command that has several."""
+
+
+def with_preset(command: Callable, arguments: Sequence[str]) -> Callable:
+    """A command whose recipe begins as the preset that the arguments name, so that any option of it can be changed.
+
+    Args:
+        command: with a parameter ``recipe``; one that has no presets is returned as it is.
+        arguments: of the command line.
+    """
+    presets = PRESETS.get(command)
+    if presets is None:
+        return command
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--preset", default="default")
+    try:
+        chosen = parser.parse_known_args(list(arguments))[0].preset
+    except argparse.ArgumentError:  # --preset without a name: tyro says so
+        chosen = "default"
+    signature = inspect.signature(command)
+    recipe = signature.parameters["recipe"].replace(default=presets.get(chosen, presets["default"]))
+    help_text = "which recipe the options below begin as: the published one, or ours"
+    kind = Annotated[Literal[tuple(presets)], tyro.conf.arg(help=help_text)]  # type: ignore[valid-type]
+    preset = inspect.Parameter("preset", inspect.Parameter.KEYWORD_ONLY, default="default", annotation=kind)
+
+    def started(*args: Any, **options: Any) -> Any:
+        del options["preset"]
+        return command(*args, **options)
+
+    parameters = [recipe if name == "recipe" else p for name, p in signature.parameters.items()]
+    started.__doc__ = command.__doc__
+    started.__signature__ = signature.replace(parameters=[*parameters, preset])  # type: ignore[attr-defined]
+    started.__annotations__ = get_type_hints(command, include_extras=True) | {"preset": kind}
+    return started

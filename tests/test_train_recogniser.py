@@ -1,0 +1,253 @@
+"""What the recogniser is trained on and how, the published recipe to the letter, and the command around it."""
+
+import inspect
+import json
+import os
+import subprocess
+import sys
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from skimage.measure import block_reduce
+
+torch = pytest.importorskip("torch")
+
+from nextview.cli.main import main  # noqa: E402
+from nextview.cli.presets import with_preset  # noqa: E402
+from nextview.cli.train import train_recogniser  # noqa: E402
+from nextview.data.folders import DatasetError, Entry  # noqa: E402
+from nextview.data.lock import only_one  # noqa: E402
+from nextview.data.store import DONE, ViewStore  # noqa: E402
+from nextview.models.card import ModelError  # noqa: E402
+from nextview.models.image_input import image_input  # noqa: E402
+from nextview.training.inputs import load_inputs  # noqa: E402
+from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe  # noqa: E402
+from nextview.training.recogniser import RecogniserModule, ValidationViews, Views, augment  # noqa: E402
+from nextview.training.runs import begin  # noqa: E402
+from nextview.viewsphere import ViewSphere  # noqa: E402
+
+V, SIZE = 5, 64
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """A store of ten objects of two classes, their views squares of noise."""
+    root = tmp_path_factory.mktemp("store")
+    rng = np.random.default_rng(0)
+    entries = [Entry(root / f"{i}.off", f"object_{i}", "ab"[i % 2], "test" if i > 7 else "train") for i in range(10)]
+    views = ViewStore.create(root / "views.zarr", entries, ViewSphere((0.0,), V, 3.0), SIZE, {})
+    inside = np.zeros((SIZE, SIZE), bool)
+    inside[16:48, 16:48] = True
+    noise = rng.integers(1, 255, (10, V, SIZE, SIZE))
+    views.group["image"][:] = np.where(inside, noise, 0).astype(np.uint8)
+    views.group["depth"][:] = np.where(inside, 20_000 + noise, 0).astype(np.uint16)
+    views.group["measures/depth_entropy"][:] = rng.random((10, V))
+    views.group["status"][:] = DONE
+    return root / "views.zarr"
+
+
+def views_of(recipe, objects=6, views=V):
+    """Inputs whose pixels say which object and view they are."""
+    which = np.arange(objects * views, dtype=np.uint8).reshape(objects, views, 1, 1, 1)
+    labels = np.arange(objects) % 2
+    return Views(
+        [(np.broadcast_to(which, (objects, views, 4, 2, 2)), np.arange(objects))], np.arange(objects), labels, recipe
+    )
+
+
+def drawn(views):
+    return [int(x) for images, _ in views for x in images[:, 0, 0, 0]]
+
+
+def test_the_published_recipe_sees_every_view_once_an_epoch_in_a_new_order():
+    views = views_of(replace(THESIS_RECOGNISER, batch=5))
+    first = drawn(views)
+    views.epoch = 1
+    second = drawn(views)
+    assert sorted(first) == sorted(second) == list(range(6 * V))
+    assert first != second
+    labels = np.concatenate([label for _, label in views])
+    assert (labels == np.array(second) // V % 2).all()
+
+
+def test_balanced_draws_even_out_the_classes():
+    labels = np.repeat([0, 1], [90, 10])
+    inputs = np.zeros((100, V, 1, 1, 1), np.uint8)
+    recipe = RecogniserRecipe(views=100, batch=100)
+    views = Views([(inputs, np.arange(100))], np.arange(100), labels, recipe)
+    seen = np.concatenate([label for _, label in views])
+    share = 10**0.5 / (10**0.5 + 90**0.5)  # a class of n objects is drawn with weight n / sqrt(n)
+    assert (seen == 1).mean() == pytest.approx(share, abs=4 * (share * (1 - share) / len(seen)) ** 0.5)
+
+
+@pytest.mark.parametrize("balanced", [True, False])
+def test_devices_share_every_batch(balanced):
+    recipe = replace(THESIS_RECOGNISER, batch=6, balanced=balanced, views=V)
+    whole, parts = views_of(recipe), [views_of(recipe) for _ in range(2)]
+    for rank, part in enumerate(parts):
+        part.share = slice(rank, None, 2)
+    for (images, labels), (a, la), (b, lb) in zip(whole, *parts, strict=True):
+        assert torch.equal(torch.stack([a, b], 1).flatten(0, 1), images)
+        assert torch.equal(torch.stack([la, lb], 1).flatten(), labels)
+
+
+def test_devices_share_the_validation():
+    inputs = np.arange(7 * 10, dtype=np.uint8).reshape(7, 10, 1, 1, 1)
+    labels = np.arange(7)
+    shares = []
+    for rank in range(2):
+        validation = ValidationViews(inputs, np.arange(7), labels)
+        validation.share = slice(rank, None, 2)
+        shares.append({int(x) for images, _ in validation for x in images.flatten()})
+    whole = {int(x) for images, _ in ValidationViews(inputs, np.arange(7), labels) for x in images.flatten()}
+    assert shares[0] | shares[1] == whole
+    assert not shares[0] & shares[1]
+
+
+def test_the_published_rate_halves_every_fifth_epoch():
+    chosen = RecogniserModule(replace(THESIS_RECOGNISER, depth=18), 10, 1000).configure_optimizers()
+    assert chosen["lr_scheduler"]["interval"] == "epoch"
+    rates = []
+    for _ in range(15):
+        rates.append(chosen["optimizer"].param_groups[0]["lr"])
+        chosen["optimizer"].step()
+        chosen["lr_scheduler"]["scheduler"].step()
+    assert rates == pytest.approx([1e-3] * 5 + [5e-4] * 5 + [2.5e-4] * 5)
+
+
+def test_the_published_optimiser_is_adam():
+    torch.manual_seed(0)
+    module = RecogniserModule(replace(THESIS_RECOGNISER, depth=18), 10, 1000)
+    twin = RecogniserModule(replace(THESIS_RECOGNISER, depth=18), 10, 1000)
+    twin.load_state_dict(module.state_dict())
+    for network, optimizer in (
+        (module.net, module.configure_optimizers()["optimizer"]),
+        (twin.net, torch.optim.Adam(twin.net.parameters(), lr=1e-3)),
+    ):
+        for _ in range(2):
+            for k, parameter in enumerate(network.parameters()):
+                parameter.grad = torch.full_like(parameter, 0.1 * (k % 3 - 1)) + parameter.detach()
+            optimizer.step()
+    for ours, theirs in zip(module.net.parameters(), twin.net.parameters(), strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-7)
+
+
+def test_the_published_recipe_is_what_the_thesis_says():
+    published = {"depth": 34, "size": 224, "batch": 32, "rate": 1e-3, "input": "image", "views": 40}
+    ours = asdict(THESIS_RECOGNISER)
+    assert {name: ours[name] for name in published} == published
+    assert (ours["decay"], ours["smoothing"], ours["augment"], ours["balanced"]) == (0, 0, False, False)
+
+
+def test_augmented_background_stays_empty():
+    torch.manual_seed(0)
+    x = torch.zeros(8, 1, 32, 32)
+    assert augment(x, 32).abs().max() == 0
+    x[:, :, 8:24, 8:24] = 0.5
+    y = augment(x, 16)
+    assert y.shape == (8, 1, 16, 16)
+    assert (y[:, :, 8, 8] > 0).float().mean() > 0.5
+
+
+def test_image_input_is_the_mean_of_squares():
+    images = np.random.default_rng(0).integers(0, 256, (3, 64, 64), dtype=np.uint8)
+    expected = block_reduce(images, (1, 2, 2), np.mean)
+    assert np.abs(image_input(images, 32)[:, 0] - expected).max() <= 0.5
+    assert (image_input(images, 64)[:, 0] == images).all()
+    with pytest.raises(ValueError, match="use a multiple of 48"):
+        image_input(images, 48)
+
+
+def test_a_preset_sets_defaults_that_options_change():
+    for arguments, recipe in (([], RecogniserRecipe()), (["--preset", "thesis"], THESIS_RECOGNISER)):
+        offered = inspect.signature(with_preset(train_recogniser, arguments)).parameters["recipe"].default
+        assert offered == recipe
+    assert with_preset(main, ["--preset", "thesis"]) is main
+
+
+FAST = ["--epochs", "1", "--size", "32", "--views", "2", "--batch", "4", "--validation", "0.25"]
+
+
+def test_published_recipe_on_images_by_the_command(store, tmp_path, capsys):
+    run = tmp_path / "run"
+    # depth 18 is the default's value: given with a preset of another, it counts
+    main(["train", "recogniser", str(store), str(run), "--preset", "thesis", "--depth", "18", *FAST])
+    noted = json.loads((run / "recipe.json").read_text())
+    assert noted == asdict(replace(THESIS_RECOGNISER, depth=18, epochs=1, size=32, views=2, batch=4, validation=0.25))
+    assert {path.name for path in run.iterdir()} == {
+        "recipe.json", "held_out.json", "network.pt", "best.ckpt", "last.ckpt", "log", "curves.png",
+    }  # fmt: skip
+    assert torch.load(run / "network.pt", weights_only=True)["conv1.weight"].shape == (64, 1, 7, 7)
+    images = load_inputs(store, 32, "image")
+    assert (images[3] == image_input(ViewStore.open(store).image(3), 32)).all()
+    assert not store.with_name("views.zarr.inputs32.npy").exists()
+
+    before = (run / "network.pt").read_bytes()
+    main(["train", "recogniser", str(store), str(run), "--preset", "thesis", "--depth", "18", *FAST])
+    assert "is trained already" in capsys.readouterr().err
+    assert (run / "network.pt").read_bytes() == before
+    with pytest.raises(SystemExit) as stopped:
+        main(["train", "recogniser", str(store), str(run), "--preset", "thesis", *FAST])
+    assert stopped.value.code == 2
+    assert "holds a run of another recipe (depth was 18, not 34)" in capsys.readouterr().err
+
+
+def test_one_fold_alone_starts_from_weights(store, tmp_path, capsys):
+    with torch.device("meta"):
+        shapes = RecogniserModule(RecogniserRecipe(), 1000, 10).net.state_dict()
+    state = {name: torch.zeros(value.shape, dtype=value.dtype) for name, value in shapes.items()}
+    state["conv1.weight"] = torch.zeros(64, 3, 7, 7)
+    torch.save(state, tmp_path / "zeros.pth")
+    command = ["train", "recogniser", str(store), str(tmp_path / "out"), "--folds", "2", "--weights"]
+    main([*command, str(tmp_path / "zeros.pth"), "--fold", "1", "--rate", "0", *FAST])
+    assert [path.name for path in (tmp_path / "out").iterdir() if path.is_dir()] == ["fold1"]
+    trained = torch.load(tmp_path / "out/fold1/network.pt", weights_only=True)
+    assert not trained["layer4.1.conv2.weight"].any()  # a rate of 0 leaves the weights that it was given
+    for options, message in (
+        ([str(tmp_path / "missing.pth"), "--fold", "0"], "there is no such checkpoint"),
+        ([str(tmp_path / "zeros.pth"), "--fold", "2"], "there is no fold 2 of 2"),
+    ):
+        with pytest.raises(SystemExit):
+            main([*command, *options, *FAST])
+        assert message in capsys.readouterr().err
+
+
+def test_a_run_resumes_with_a_recipe_from_before_new_options_and_refuses_what_it_cannot_read(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    old = {name: value for name, value in asdict(RecogniserRecipe()).items() if name not in ("input", "schedule")}
+    (run / "recipe.json").write_text(json.dumps(old))
+    with begin(run, RecogniserRecipe()):
+        pass
+    with pytest.raises(ModelError, match=r"\(seed was 0, not 1\)"), begin(run, RecogniserRecipe(seed=1)):
+        pass
+    for text in ("{", "[]", json.dumps({"flavour": 3})):
+        (run / "recipe.json").write_text(text)
+        with pytest.raises(ModelError, match="not a recipe of this version"), begin(run, RecogniserRecipe()):
+            pass
+
+
+def test_two_processes_do_not_train_in_one_folder(tmp_path):
+    with (
+        only_one(tmp_path / "run"),
+        pytest.raises(DatasetError, match="another run"),
+        begin(tmp_path / "run", RecogniserRecipe()),
+    ):
+        pass
+
+
+def test_two_devices_train_one_network(store, tmp_path):
+    """As Lightning starts them; each is a process of its own."""
+    run = tmp_path / "run"
+    options = ["--devices", "2", "--accelerator", "cpu", "--precision", "32-true", *FAST]
+    command = [sys.executable, "-m", "nextview.cli.main", "train", "recogniser", str(store), str(run), *options]
+    done = subprocess.run(
+        command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert "MEMBER: 2/2" in done.stderr
+    assert (run / "network.pt").exists()
+    assert (run / "curves.png").exists()
+    state = torch.load(run / "last.ckpt", weights_only=True)
+    assert state["global_step"] == 6 * 2 // 4  # the batch is that of all devices together
