@@ -19,7 +19,7 @@ from nextview.fitting.tables import fit_class_table, fit_ring, fit_sequence
 from nextview.models.networks import Recogniser
 from nextview.policies.baselines import Random
 from nextview.policies.registry import make_policy
-from nextview.policies.tables import ClassTable, cells_from
+from nextview.policies.tables import ClassTable, cells_from, cells_to
 from nextview.recognition import PLAIN_SUM, Calibration
 from nextview.viewsphere import ViewSphere
 
@@ -175,7 +175,8 @@ def test_each_move_of_a_sequence_is_the_best_there_is(anywhere):
     rng, calibration = np.random.default_rng(0), Calibration(0.8, 0.5)
     labels = np.array([0, 0, 0, 1, 2])
     data = FittingSet(rng.normal(size=(5, len(SMALL), 3)).astype(np.float32), labels, SMALL, ("a", "b", "c"))
-    moves = fit_sequence(data, anywhere, 2, calibration)
+    price = 0.05
+    moves = fit_sequence(data, anywhere, 2, calibration, price)
 
     def turned(view: int, steps: int) -> int:
         ring, azimuth = divmod(view, 4)
@@ -193,7 +194,7 @@ def test_each_move_of_a_sequence_is_the_best_there_is(anywhere):
         path = [ring * 4]
         for move in moves[ring]:
             reachable = range(12) if anywhere else SMALL.window(path[-1]).ravel()
-            values = {v: worth([*path, v]) for v in reachable if v not in path}
+            values = {v: worth([*path, v]) - price * SMALL.travel[path[-1], v] for v in reachable if v not in path}
             path.append(int(cells_from(SMALL)[path[-1], move]))
             assert values[path[-1]] == pytest.approx(max(values.values()), abs=1e-9)
 
@@ -250,14 +251,20 @@ def test_learned_policies_can_be_run_from_their_cards(training_predictions, tmp_
     main(["fit", "policies", str(path), str(tmp_path / "learned"), "--length", "3"])
     cards = sorted((tmp_path / "learned").iterdir(), key=lambda path: path.stem)
     assert [c.stem for c in cards] == [
-        "class-table", "class-table-local", "fixed-ring", "fixed-ring-local", "fixed-sequence", "fixed-sequence-local",
+        "class-table", "class-table-local", "class-table-near", "fixed-ring", "fixed-ring-local",
+        "fixed-sequence", "fixed-sequence-local", "fixed-sequence-near",
     ]  # fmt: skip
     for card in cards:
         policy = make_policy(str(card), SPHERE, classes=("ball", "box", "pillar"))
         if isinstance(policy, ClassTable):
             data = fitting_set(Predictions.load(path), 0.1, 0)
             values = fit_class_table(data, 5, 20.0, PLAIN_SUM, np.random.default_rng(0))
-            np.testing.assert_allclose(policy.values, values, atol=1e-5)
+            price = 0.01 if card.stem.endswith("near") else 0.0
+            for ring, azimuth in [(0, 0), (2, 5)]:
+                view = 8 * ring + azimuth
+                paid = values[:, ring, cells_to(SPHERE)[view]] - price * SPHERE.travel[view]
+                here = policy.values[:, ring, cells_to(SPHERE)[view]]
+                np.testing.assert_allclose(here, paid, atol=1e-5)
         with pytest.raises(ValueError, match="other classes"):
             make_policy(str(card), SPHERE, classes=("ball", "box"))
         with pytest.raises(ValueError, match="not for this sphere"):

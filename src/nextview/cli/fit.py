@@ -71,9 +71,13 @@ def fit_policies(
     length: int = 7,
     looks: int = 5,
     shrinkage: float = 20.0,
+    price: float = 0.01,
     seed: int = 0,
 ) -> None:
-    """Learn the policies that follow a table: fixed sequence, fixed ring, class table; each local and anywhere.
+    """Learn the policies that follow a table: fixed sequence, fixed ring, class table.
+
+    Each in three variants: over the whole sphere (NAME), in the local window (NAME-local), and over the whole sphere at
+    a price for travel (NAME-near; a ring has none).
 
     Args:
         predictions: of the training split (nextview predict --split train).
@@ -83,6 +87,7 @@ def fit_policies(
         length: moves of the fixed sequence.
         looks: over which the ring and the class table are chosen.
         shrinkage: objects by whose weight the gains of one believed class are drawn towards those of all.
+        price: of one cell of travel for NAME-near, in units of the logarithm of the belief in the true class.
         seed: decides the walks behind the class table.
     """
     import numpy as np
@@ -94,31 +99,34 @@ def fit_policies(
     from nextview.models.card import file_hash
     from nextview.policies.card import write_policy
 
-    if length < 1 or looks < 2 or shrinkage < 0:
-        raise ValueError("length has to be at least 1, looks at least 2 and shrinkage not negative")
+    if length < 1 or looks < 2 or shrinkage < 0 or price < 0:
+        raise ValueError("length has to be at least 1, looks at least 2, shrinkage and price not negative")
     table = Predictions.load(predictions)
-    data = fitting_set(table, validation, split_seed)
-    values = fit_class_table(data, looks, shrinkage, table.calibration, np.random.default_rng(seed))
+    data, calibration = fitting_set(table, validation, split_seed), table.calibration
+    sphere = data.sphere
+    values = fit_class_table(data, looks, shrinkage, calibration, np.random.default_rng(seed))
+    travel = sphere.travel[:: sphere.azimuths]  # from each ring to each cell
+    learned = {}
+    for suffix, anywhere, paid in (("", True, 0.0), ("-local", False, 0.0), ("-near", True, price)):
+        moves = fit_sequence(data, anywhere, length, calibration, paid)
+        learned[f"fixed-sequence{suffix}"] = (anywhere, paid, {"moves": moves.tolist()})
+        learned[f"class-table{suffix}"] = (anywhere, paid, {"values": np.round(values - paid * travel, 5).tolist()})
+        if not paid:
+            ring, steps = fit_ring(data, anywhere, looks, calibration)
+            learned[f"fixed-ring{suffix}"] = (anywhere, paid, {"ring": ring, "steps": steps})
     out.mkdir(parents=True, exist_ok=True)
-    for anywhere in (True, False):
-        ring, steps = fit_ring(data, anywhere, looks, table.calibration)
-        tables = {
-            "fixed-sequence": {"moves": fit_sequence(data, anywhere, length, table.calibration).tolist()},
-            "fixed-ring": {"ring": ring, "steps": steps},
-            "class-table": {"values": np.round(values, 5).tolist()},
+    for name, (anywhere, paid, content) in learned.items():
+        facts = {
+            "kind": "-".join(name.split("-")[:2]),
+            "anywhere": anywhere,
+            "elevations": sphere.elevations,
+            "azimuths": sphere.azimuths,
+            "classes": data.classes,
+            "learned_from": f"{len(data)} objects of the training split, classes weighted evenly",
+            "predictions": {"sha256": file_hash(predictions), "models": table.models},
+            "calibration": [calibration.temperature_of_one, calibration.correlation],
+            "settings": {"length": length, "looks": looks, "shrinkage": shrinkage, "price": paid, "seed": seed},
+            "table": content,
         }
-        for kind, learned in tables.items():
-            facts = {
-                "kind": kind,
-                "anywhere": anywhere,
-                "elevations": data.sphere.elevations,
-                "azimuths": data.sphere.azimuths,
-                "classes": data.classes,
-                "learned_from": f"{len(data)} objects of the training split, classes weighted evenly",
-                "predictions": {"sha256": file_hash(predictions), "models": table.models},
-                "calibration": [table.calibration.temperature_of_one, table.calibration.correlation],
-                "settings": {"length": length, "looks": looks, "shrinkage": shrinkage, "seed": seed},
-                "table": learned,
-            }
-            write_policy(out / f"{kind}{'' if anywhere else '-local'}.json", facts)
-    console.print(f"6 policies, learned from {len(data)} objects, are in {out}")
+        write_policy(out / f"{name}.json", facts)
+    console.print(f"{len(learned)} policies, learned from {len(data)} objects, are in {out}")

@@ -33,7 +33,9 @@ def log_belief(total: NDArray[np.floating], labels: NDArray[np.int64], temperatu
     return of_truth - top - np.log(np.exp(total - top[..., None]).sum(-1))
 
 
-def fit_sequence(data: FittingSet, anywhere: bool, length: int, calibration: Calibration) -> NDArray[np.int64]:
+def fit_sequence(
+    data: FittingSet, anywhere: bool, length: int, calibration: Calibration, price: float = 0.0
+) -> NDArray[np.int64]:
     """The greedily best moves from each ring: each the best for all objects and azimuths together.
 
     Args:
@@ -41,18 +43,24 @@ def fit_sequence(data: FittingSet, anywhere: bool, length: int, calibration: Cal
         anywhere: choose among all views; otherwise in the local window.
         length: moves.
         calibration: of the belief.
+        price: of one cell of travel, in the measure.
 
     Returns:
         (rings, length) int64, cells as in ``FixedSequence``.
     """
     n = data.sphere.azimuths
     rings = [n * ring + np.arange(n) for ring in range(data.sphere.rings)]
-    paths = [greedy_path(data, starts, anywhere, length, calibration) for starts in rings]
+    paths = [greedy_path(data, starts, anywhere, length, calibration, price) for starts in rings]
     return np.array([cells_to(data.sphere)[path[:-1], path[1:]] for path in paths])
 
 
 def greedy_path(
-    data: FittingSet, starts: NDArray[np.int64], anywhere: bool, length: int, calibration: Calibration
+    data: FittingSet,
+    starts: NDArray[np.int64],
+    anywhere: bool,
+    length: int,
+    calibration: Calibration,
+    price: float = 0.0,
 ) -> NDArray[np.int64]:
     """The greedily best path from some views of one ring: each move the best for all objects and starts together.
 
@@ -62,6 +70,7 @@ def greedy_path(
         anywhere: choose among all views; otherwise in the local window.
         length: moves.
         calibration: of the belief.
+        price: of one cell of travel, in the measure.
 
     Returns:
         (length + 1,) int64: the cell of each look, seen from the start, the start's own first.
@@ -78,7 +87,8 @@ def greedy_path(
         free = np.setdiff1d(reachable, path)
         free = free if len(free) else np.setdiff1d(np.arange(len(sphere)), path)
         beliefs = [log_belief(total + logits(v), data.labels, calibration.temperature(k)).mean(1) for v in free]
-        path.append(int(free[np.argmax(np.array(beliefs) @ data.weights)]))
+        worth = np.array(beliefs) @ data.weights / len(data) - price * sphere.travel[path[-1], free]
+        path.append(int(free[np.argmax(worth)]))
         total += logits(path[-1])
     return np.array(path)
 
