@@ -97,7 +97,8 @@ def contestant_policy(name: str, trials: Trials) -> Policy:
 def _make(name: str, trials: Trials) -> Policy:
     if name in ORACLES:
         return ORACLES[name](trials)
-    if name in POLICIES or name in bundled_policies() or name.endswith(".json") or ":" in name:
+    card = name.partition("@")[0]
+    if name in POLICIES or card in bundled_policies() or card.endswith(".json") or ":" in name:
         p = trials.predictions
         return make_policy(name, p.sphere, trials.valley_classes, p.classes)
     names = [*POLICIES, *bundled_policies(), *ORACLES, *(f"{kind}-K" for kind in FIXED)]

@@ -25,6 +25,7 @@ from nextview.cli.recognise import recognise
 from nextview.cli.render import render
 from nextview.cli.report import report
 from nextview.cli.train import train_lcm, train_lem, train_recogniser
+from nextview.cli.train_gain import train_gain
 
 COMMANDS: dict[str, Any] = {
     "recognise": recognise,
@@ -36,7 +37,7 @@ COMMANDS: dict[str, Any] = {
     "measure": measure,
     "correspond": correspond,
     "inspect": inspect,
-    "train": {"recogniser": train_recogniser, "lem": train_lem, "lcm": train_lcm},
+    "train": {"recogniser": train_recogniser, "lem": train_lem, "lcm": train_lcm, "gain": train_gain},
     "export": {"recogniser": export_recogniser, "lem": export_lem, "lcm": export_lcm},
     "predict": predict,
     "fit": {"calibration": fit_calibration, "policies": fit_policies},

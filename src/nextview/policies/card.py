@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from nextview.policies.base import Policy
+from nextview.policies.gain import Gain
 from nextview.policies.tables import ClassTable, FixedRing, FixedSequence
 from nextview.viewsphere import ViewSphere
 
@@ -19,6 +20,7 @@ KINDS: dict[str, Callable[[ViewSphere, Any, bool], Policy]] = {
     "fixed-sequence": lambda sphere, table, anywhere: FixedSequence(sphere, np.array(table["moves"]), anywhere),
     "fixed-ring": lambda sphere, table, anywhere: FixedRing(sphere, table["ring"], table["steps"]),
     "class-table": lambda sphere, table, anywhere: ClassTable(sphere, np.array(table["values"]), anywhere),
+    "gain": Gain.of_table,
 }
 """How to make a policy of each kind from the sphere, the card's table, and whether it may leave the local window."""
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
 from nextview.policies.card import bundled_policies, read_policy
+from nextview.policies.gain import Gain
 from nextview.policies.maps import MapPeak
 from nextview.policies.spread import Spread
 from nextview.viewsphere import ViewSphere
@@ -34,7 +36,8 @@ def make_policy(
 
     Args:
         name: one of POLICIES, a learned one that is bundled, the path of a learned one's card (.json), or
-            "module:Class" for one of your own, which is called with the sphere alone.
+            "module:Class" for one of your own, which is called with the sphere alone. A learned one that pays a price
+            for travel is had at another price as NAME@PRICE.
         sphere: the viewpoints.
         valley_classes: classes (indices) whose believers go to the map's valley; only "lem" and "lcm" use it.
         classes: names of the recogniser's classes; a learned policy for others is refused.
@@ -45,11 +48,22 @@ def make_policy(
     if name in POLICIES:
         return POLICIES[name](sphere, tuple(valley_classes))
     learned = bundled_policies()
-    if name in learned or name.endswith(".json"):
-        return read_policy(learned.get(name, Path(name)), sphere, classes)
+    card, priced, price = name.partition("@")
+    if card in learned or card.endswith(".json"):
+        policy = read_policy(learned.get(card, Path(card)), sphere, classes)
+        return _at_price(policy, name, price) if priced else policy
     if ":" in name:
         return _import_policy(name, sphere)
     raise ValueError(f"no policy is called {name!r}; there are {', '.join([*POLICIES, *learned])}")
+
+
+def _at_price(policy: Policy, name: str, price: str) -> Policy:
+    if not isinstance(policy, Gain):
+        raise ValueError(f"{name}: this policy pays no price for travel")
+    try:
+        return replace(policy, price=float(price))
+    except ValueError:
+        raise ValueError(f"{name}: a price is a number of at least 0") from None
 
 
 def _import_policy(path: str, sphere: ViewSphere) -> Policy:

@@ -95,3 +95,40 @@ class MapRecipe:
     regular: float = 1e-4
     validation: float = 0.1
     seed: int = 0
+
+
+@dataclass(frozen=True)
+class GainRecipe:
+    """How the gain policy is trained.
+
+    Attributes:
+        inputs: what the networks are told: belief, look, place, lem.
+        outcome: of a look: belief in the true class after it, its logarithm, or whether the answer is right.
+        looks: the outcome of looks 2 to this one is learned.
+        hidden: width of the two hidden layers.
+        networks: that are averaged; each weighs the objects by a bootstrap draw of its own.
+        epochs: each over new walks of all objects.
+        walks: of each object in an epoch.
+        batch: states in a step.
+        rate: AdamW's learning rate at its peak (one-cycle).
+        decay: AdamW's weight decay.
+        temperature: of the soft choice, in the unit of the outcome.
+        regression: weight of the mean squared error beside the expected outcome.
+        top_price: prices are drawn between 0 and this, in the unit of the outcome for each grid cell.
+        seed: of everything random.
+    """
+
+    inputs: tuple[Literal["belief", "look", "place", "lem"], ...] = ("belief", "look", "place", "lem")
+    outcome: Literal["belief", "log-belief", "right"] = "belief"
+    looks: int = 5
+    hidden: int = 32
+    networks: int = 5
+    epochs: int = 40
+    walks: int = 4
+    batch: int = 1024
+    rate: float = 3e-3
+    decay: float = 0.1
+    temperature: float = 0.03
+    regression: float = 1.0
+    top_price: float = 0.05
+    seed: int = 0

@@ -1,0 +1,91 @@
+"""``nextview train gain``: learn what a look from each view is worth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tyro
+
+from nextview.training.recipes import GainRecipe
+
+
+def train_gain(
+    predictions: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    /,
+    validation: Path | None = None,
+    price: float | None = None,
+    local: bool = False,
+    recipe: tyro.conf.OmitArgPrefixes[GainRecipe] = GainRecipe(),
+) -> None:
+    """Train the gain policy on what a recogniser says of objects that it has not seen. Takes a minute or two.
+
+    Args:
+        predictions: of objects of the training split that the recogniser was not trained on, from recognisers that each
+            kept some unseen (nextview predict --split train --unseen).
+        out: card of the policy (.json); run it with --policy OUT, or OUT@PRICE for another price.
+        validation: predictions of other objects of the training split, which choose the epoch and the price; those
+            among them are left out of the training. A fifth of PREDICTIONS by default.
+        price: of a grid cell of travel; by default the lowest at which the policy travels no farther than a random walk
+            in the local window.
+        local: let it choose in the local window only.
+        recipe: how to train.
+    """
+    from collections.abc import Iterator
+    from dataclasses import asdict, replace
+
+    import numpy as np
+
+    from nextview.cli.progress import console, track
+    from nextview.data.predictions import Predictions, PredictionsError
+    from nextview.data.split import divide
+    from nextview.fitting.choices import ReplayTable, Worth, travel_price
+    from nextview.models.card import file_hash
+    from nextview.policies.card import write_policy
+    from nextview.policies.gain import Gain
+    from nextview.training.gain import best_epoch, train
+
+    if out.suffix != ".json":
+        raise ValueError(f"{out}: the card of a policy is called NAME.json")
+    table = Predictions.load(predictions)
+    other = table if validation is None else Predictions.load(validation)
+    if (other.classes, other.sphere) != (table.classes, table.sphere):
+        raise PredictionsError(f"{validation}: is of other classes or viewpoints than {predictions}")
+    if validation is None:
+        learning, checking = divide(table.labels, table.depth_entropy, 0.2, recipe.seed)
+    else:
+        learning, checking = np.flatnonzero(~np.isin(table.names, other.names)), np.arange(len(other))
+    rng = np.random.default_rng([recipe.seed, 1])
+    learned, checked = ReplayTable.of(table, learning, rng), ReplayTable.of(other, checking, rng)
+    found: list[tuple[Gain, Worth]] = []
+
+    def epochs() -> Iterator[int]:
+        for best in best_epoch(train(learned, recipe), checked, recipe):
+            found.append(best)
+            yield len(found)
+
+    track(epochs(), recipe.epochs, "training")
+    best, worth = found[-1]
+    policy = replace(best, anywhere=not local)
+    if price is None:
+        price = travel_price(checked, policy, recipe.looks, recipe.outcome, recipe.seed)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    sources = [(path, source) for path, source in ((predictions, table), (validation, other)) if path is not None]
+    facts = {
+        "kind": "gain",
+        "anywhere": policy.anywhere,
+        "elevations": table.sphere.elevations,
+        "azimuths": table.sphere.azimuths,
+        "classes": table.classes,
+        "learned_from": f"{len(learned.data)} objects of the training split, classes weighted evenly; epoch and price "
+        f"chosen on {len(checked.data)} others",
+        "predictions": [{"sha256": file_hash(path), "models": source.models} for path, source in sources],
+        "calibration": [learned.calibration.temperature_of_one, learned.calibration.correlation],
+        "settings": asdict(recipe),
+        "table": replace(policy, price=price).facts(),
+    }
+    write_policy(out, facts)
+    console.print(
+        f"learned from {len(learned.data)} objects; on {len(checked.data)} others the {recipe.outcome} after 2, 3, ... "
+        f"looks is {', '.join(f'{x:.4f}' for x in worth.outcome)} at price 0; price {price:g}: {out}"
+    )

@@ -1,0 +1,173 @@
+"""States on the way of a policy, and what every choice there would have led to: the predictions know all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.predictions import Predictions, PredictionsError
+from nextview.fitting.calibration import fit_temperature
+from nextview.fitting.evidence import FittingSet, fitting_set
+from nextview.fitting.tables import log_belief
+from nextview.policies.base import EpisodeState, Evidence, Policy
+from nextview.policies.baselines import Random
+from nextview.policies.gain import Gain
+from nextview.recognition import PLAIN_SUM, Calibration, fuse
+
+Float = NDArray[np.float64]
+
+OUTCOMES = ("belief", "log-belief", "right")
+"""What what was seen is worth: the belief in the true class, its logarithm, or whether the answer is right."""
+
+
+@dataclass(frozen=True)
+class ReplayTable:
+    """What honest models say of N objects, and how far it is to be trusted.
+
+    Attributes:
+        data: what the recogniser says, and the truth.
+        maps: predicted local maps by name, each (N, V, R, 3).
+        calibration: of the belief.
+    """
+
+    data: FittingSet
+    maps: dict[str, NDArray[np.float32]]
+    calibration: Calibration
+
+    @classmethod
+    def of(cls, predictions: Predictions, kept: NDArray, rng: np.random.Generator) -> ReplayTable:
+        """Some of the objects of predictions, by index; calibrated anew where their recogniser is not.
+
+        Raises:
+            PredictionsError: there are test objects among the predictions, or none is kept.
+        """
+        if len(kept) == 0:
+            raise PredictionsError("no object is left to learn from")
+        whole = fitting_set(predictions, 1.0, 0)
+        data = replace(whole, logits=whole.logits[kept], labels=whole.labels[kept])
+        maps = {name: values[kept] for name, values in predictions.maps.items()}
+        known = predictions.calibration != PLAIN_SUM
+        return cls(data, maps, predictions.calibration if known else fit_temperature(data, rng))
+
+
+@dataclass(frozen=True)
+class Moment:
+    """N episodes, one for each object, when the next view is to be chosen.
+
+    Attributes:
+        state: what the policy is shown.
+        total: sum of the logits so far, (N, C) float64.
+        travel: so far, grid cells, (N,) float64.
+    """
+
+    state: EpisodeState
+    total: Float
+    travel: Float
+
+
+def follow(table: ReplayTable, policy: Policy, looks: int, rng: np.random.Generator) -> Iterator[Moment]:
+    """Every object once, from a random first view to where the policy leads.
+
+    Args:
+        table: what is seen.
+        policy: which is followed.
+        looks: at most.
+        rng: draws the first views, and what the policy draws.
+
+    Yields:
+        The moment after each look.
+    """
+    data = table.data
+    rows, sphere = np.arange(len(data)), data.sphere
+    current = rng.integers(len(sphere), size=len(data))
+    visited, total = np.zeros((len(data), len(sphere)), bool), np.zeros((len(data), len(data.classes)))
+    travel = np.zeros(len(data))
+    for k in range(1, looks + 1):
+        visited[rows, current] = True
+        total = total + data.logits[rows, current]
+        maps = {name: values[rows, current] for name, values in table.maps.items()}
+        belief = fuse(total[:, None], table.calibration.temperature(k))
+        state = EpisodeState(current, visited.copy(), belief, Evidence(data.logits[rows, current], maps), k, rows)
+        yield Moment(state, total, travel)
+        if k < looks:
+            following = policy.next_views(state, rng)
+            travel = travel + sphere.travel[current, following]
+            current = following
+
+
+def outcome(total: Float, labels: NDArray[np.int64], temperature: float, kind: str) -> Float:
+    """What sums of logits are worth.
+
+    Args:
+        total: (N, ..., C).
+        labels: true classes, (N,).
+        temperature: what the sum is divided by.
+        kind: one of OUTCOMES.
+
+    Returns:
+        (N, ...) float64.
+    """
+    if kind == "right":
+        return np.equal(total.argmax(-1).T, labels).T.astype(np.float64)
+    logs = log_belief(total, labels, temperature)
+    return logs if kind == "log-belief" else np.exp(logs)
+
+
+def choices(table: ReplayTable, moment: Moment, kind: str) -> Float:
+    """The outcome of looking from every view next, (N, V) float64."""
+    after = moment.total[:, None] + table.data.logits
+    return outcome(after, table.data.labels, table.calibration.temperature(moment.state.step + 1), kind)
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What a policy reaches on average, classes weighted evenly, after 2, 3, ... looks.
+
+    Attributes:
+        outcome: (looks - 1,).
+        travel: grid cells, (looks - 1,).
+    """
+
+    outcome: Float
+    travel: Float
+
+
+def judge(
+    table: ReplayTable, policy: Policy, looks: int, kind: str, rng: np.random.Generator, rounds: int = 8
+) -> Worth:
+    """Follow a policy ``rounds`` times over every object; the other arguments as for ``follow`` and ``outcome``."""
+    data = table.data
+    weights = data.weights / len(data) / rounds
+    reached = np.zeros((2, looks - 1))
+    for _ in range(rounds):
+        for moment in follow(table, policy, looks, rng):
+            k = moment.state.step
+            if k > 1:
+                worth = outcome(moment.total, data.labels, table.calibration.temperature(k), kind)
+                reached[:, k - 2] += weights @ worth, weights @ moment.travel
+    return Worth(*reached)
+
+
+PRICES = (0.0, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
+"""Of a grid cell of travel, in the unit of the outcome."""
+
+
+def travel_price(table: ReplayTable, policy: Gain, looks: int, kind: str, seed: int) -> float:
+    """The lowest of PRICES at which a policy travels no farther than a random walk in the local window, at any look.
+
+    Args:
+        table: what is seen.
+        policy: whose price is set.
+        looks: at most.
+        kind: one of OUTCOMES.
+        seed: of the first views.
+    """
+    limit = judge(table, Random(table.data.sphere), looks, kind, np.random.default_rng(seed)).travel
+    for price in PRICES:
+        reached = judge(table, replace(policy, price=price), looks, kind, np.random.default_rng(seed))
+        if (reached.travel <= limit).all():
+            return price
+    return PRICES[-1]

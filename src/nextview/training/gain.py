@@ -1,0 +1,152 @@
+"""Training of the gain policy: the outcome of every choice is known, so the choice itself is optimised.
+
+A network scores the cells; a soft choice of score over temperature, less the price of travel, takes one of them. Its
+expected outcome over all cells is maximised, which is the exact policy gradient of one step (full information), mixed
+with the plain regression of the outcomes, which keeps the scores in their unit. The price is drawn anew for every
+state, so that one network serves all prices. States come from random walks and from the networks' own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from nextview.fitting.choices import ReplayTable, Worth, choices, follow, judge
+from nextview.policies.base import Policy
+from nextview.policies.baselines import Random, RandomAll
+from nextview.policies.gain import Gain, Layers, mirrored, told, told_mirrored
+from nextview.policies.tables import cells_from
+from nextview.training.recipes import GainRecipe
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class States:
+    """S states on walks, and what each choice would lead to; cells as in ``policies.tables``.
+
+    Attributes:
+        told: to the networks, (S, D).
+        outcomes: of a look at each cell, less the mean over the free ones, (S, V).
+        free: whether the cell is unvisited, (S, V) bool.
+        travel: to the cell, (S, V).
+        objects: rows of the fitting set, (S,).
+    """
+
+    told: NDArray[np.float32]
+    outcomes: NDArray[np.float32]
+    free: NDArray[np.bool_]
+    travel: NDArray[np.float32]
+    objects: NDArray[np.int64]
+
+
+def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np.random.Generator) -> States:
+    """The states met when each of the policies is followed once over every object."""
+    sphere, parts = table.data.sphere, []
+    for policy in policies:
+        for moment in follow(table, policy, recipe.looks - 1, rng):
+            state = moment.state
+            view = cells_from(sphere)[state.current]
+            worth = np.take_along_axis(choices(table, moment, recipe.outcome), view, 1)
+            free = ~np.take_along_axis(state.visited, view, 1)
+            travel = np.take_along_axis(sphere.travel[state.current], view, 1)
+            mean = (worth * free).sum(1, keepdims=True) / free.sum(1, keepdims=True)
+            seen = told(sphere, state, recipe.inputs)
+            numbers = (array.astype(np.float32) for array in (seen, worth - mean))
+            parts.append((*numbers, free, travel.astype(np.float32), state.episodes))
+    return States(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+class Networks(nn.Module):
+    """Several perceptrons side by side: weights (E, in, out), biases (E, 1, out)."""
+
+    def __init__(self, widths: list[int], networks: int, generator: torch.Generator) -> None:
+        super().__init__()
+        pairs = list(pairwise(widths))
+        last = len(pairs) - 1
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for i, (a, b) in enumerate(pairs):
+            scale = 0.0 if i == last else (2 / a) ** 0.5
+            self.weights.append(nn.Parameter(scale * torch.randn(networks, a, b, generator=generator)))
+            self.biases.append(nn.Parameter(torch.zeros(networks, 1, b)))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        x = x.expand(len(self.weights[0]), *x.shape)
+        for i, (weights, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = torch.baddbmm(bias, torch.relu(x) if i else x, weights)
+        return x
+
+    def layers(self) -> tuple[Layers, ...]:
+        """As ``Gain`` wants them."""
+        weights, biases = ([p.detach().double().numpy().copy() for p in part] for part in (self.weights, self.biases))
+        chains = range(len(weights[0]))
+        return tuple(tuple((w[e], b[e, 0]) for w, b in zip(weights, biases, strict=True)) for e in chains)
+
+
+def train(table: ReplayTable, recipe: GainRecipe) -> Iterator[Gain]:
+    """Train the networks.
+
+    Args:
+        table: what is learned from.
+        recipe: how.
+
+    Yields:
+        After every epoch, the policy as it then is, at price 0 and over all views.
+    """
+    rng, data = np.random.default_rng([recipe.seed]), table.data
+    generator = torch.Generator().manual_seed(recipe.seed)
+    sphere, c = data.sphere, len(data.classes)
+    flip = torch.from_numpy(told_mirrored(sphere, c, recipe.inputs))
+    cells_flip = torch.from_numpy(mirrored(sphere))
+    widths = [len(flip), recipe.hidden, recipe.hidden, len(sphere)]
+    networks = Networks(widths, recipe.networks, generator)
+    drawn = rng.multinomial(len(data), np.full(len(data), 1 / len(data)), size=recipe.networks)
+    weights = torch.from_numpy(drawn * data.weights).float()
+    optimiser = torch.optim.AdamW(networks.parameters(), recipe.rate, weight_decay=recipe.decay)
+    states_each = recipe.walks * (recipe.looks - 1) * len(data)
+    steps = recipe.epochs * -(-states_each // recipe.batch)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.rate, total_steps=steps)
+    policy: Policy = RandomAll(sphere)
+    for _ in range(recipe.epochs):
+        blind: list[Policy] = [Random(sphere), RandomAll(sphere)]
+        policies = [blind[i % 2] for i in range(recipe.walks)]
+        if isinstance(policy, Gain):
+            policies[::2] = [replace(policy, price=recipe.top_price * rng.random() ** 2) for _ in policies[::2]]
+        states = walk(table, policies, recipe, rng)
+        order = rng.permutation(len(states.objects))
+        for batch in np.array_split(order, -(-states_each // recipe.batch)):
+            seen, worth, free, travel = (
+                torch.from_numpy(a[batch]) for a in (states.told, states.outcomes, states.free, states.travel)
+            )
+            turned = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
+            seen = torch.where(turned, seen[:, flip], seen)
+            worth, free, travel = (torch.where(turned, a[:, cells_flip], a) for a in (worth, free, travel))
+            price = recipe.top_price * torch.from_numpy(rng.random((len(batch), 1)) ** 2).float()
+            scores = networks(seen)
+            soft = ((scores - price * travel) / recipe.temperature).masked_fill(~free, -torch.inf).softmax(-1)
+            expected = (soft * (worth - price * travel)).sum(-1)
+            error = (((scores - worth) ** 2) * free).sum(-1) / free.sum(-1)
+            weight = weights[:, states.objects[batch]]
+            loss = (weight * (recipe.regression * error / recipe.temperature - expected)).sum() / len(batch)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+        policy = Gain(sphere, c, networks.layers(), recipe.inputs)
+        yield policy
+
+
+def best_epoch(policies: Iterable[Gain], table: ReplayTable, recipe: GainRecipe) -> Iterator[tuple[Gain, Worth]]:
+    """After every epoch, the best policy so far by its outcome over 2 to ``recipe.looks`` looks, and its worth."""
+    best = None
+    for policy in policies:
+        worth = judge(table, policy, recipe.looks, recipe.outcome, np.random.default_rng([recipe.seed, 2]), rounds=4)
+        if best is None or worth.outcome.mean() > best[1].outcome.mean():
+            best = policy, worth
+        yield best
