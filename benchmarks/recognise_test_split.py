@@ -60,7 +60,7 @@ def run_object(entry: Entry, starts: np.ndarray, settings: Settings) -> np.ndarr
         for r, start in enumerate(starts):
             begun = time.perf_counter()
             rng = np.random.default_rng([settings.seed, int(start), r])
-            stopping = Stopping(settings.threshold, settings.max_views)
+            stopping = Stopping(settings.threshold, settings.max_views, models.recogniser.calibration.correlation)
             result = recognise(camera, models, policy, sphere, int(start), stopping, rng)
             seconds = time.perf_counter() - begun
             last = result.looks[-1]

@@ -163,6 +163,8 @@ def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(fold
         ({"max_views": 0}, "at least one view"),
         ({"valley_classes": ("sofa",)}, "no class 'sofa'"),
         ({"risks": (0.05,)}, "promises no error rate"),
+        ({"risks": (0.05,), "decline": 0.5}, "without a decline"),
+        ({"decline": -1.0}, "decline"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(folder, wrong, sentence):

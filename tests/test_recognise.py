@@ -56,9 +56,13 @@ def test_same_seed_same_episode(chair, capsys):
 def test_a_risk_stops_at_the_threshold_that_the_recogniser_promises(chair, capsys):
     main(["recognise", str(chair), "--risk", "0.1", "--start", "3", "--json"])
     by_risk = capsys.readouterr().out
-    threshold = Recogniser().calibration.threshold(0.1, 5)
-    main(["recognise", str(chair), "--threshold", str(threshold), "--start", "3", "--json"])
-    assert capsys.readouterr().out == by_risk
+    models, sphere = load_models(), ViewSphere.named("40")
+    stopping = Stopping(models.recogniser.calibration.threshold(0.1, 5))
+    policy = make_policy("lem", sphere, models.valley_classes("lem"))
+    result = recognise(SimulatedCamera(load_mesh(chair)), models, policy, sphere, 3, stopping)
+    found = json.loads(by_risk)
+    assert [look["view"] for look in found["looks"]] == [look.view for look in result.looks]
+    assert found["confidence"] == pytest.approx(result.confidence, abs=1e-6)
     for arguments in (["--risk", "0.000001"], ["--risk", "2"], ["--risk", "0.1", "--max-views", "40"]):
         with pytest.raises(SystemExit) as end:
             main(["recognise", str(chair), *arguments])

@@ -116,6 +116,28 @@ def test_a_threshold_is_a_probability(threshold):
         Stopping(threshold)
 
 
+@pytest.mark.parametrize("decline", [-0.1, np.nan, np.inf])
+def test_a_bar_comes_down_or_stays(decline):
+    with pytest.raises(ValueError, match="decline"):
+        Stopping(0.9, 5, decline)
+
+
+@given(st.floats(0.5, 0.999), st.floats(0, 2), st.integers(1, 8), st.integers(0, 2**32))
+def test_with_a_decline_of_its_correlation_a_calibrated_belief_stops_where_the_plain_sum_does(bar, c, looks, seed):
+    # Of two classes, where the peak of the belief is one to one with the difference of the logits.
+    logits = np.random.default_rng(seed).normal(size=(50, looks, 2))
+    plain = fuse(logits).max(-1) >= Stopping(bar).bar(looks)
+    belief = fuse(logits, Calibration(1.0, c).temperature(looks)).max(-1)
+    near = np.abs(belief - Stopping(bar, 8, c).bar(looks)) < 1e-9
+    np.testing.assert_array_equal((belief >= Stopping(bar, 8, c).bar(looks)) | near, plain | near)
+
+
+def test_a_threshold_that_is_certain_or_nothing_stays_so():
+    for threshold in (0.0, 1.0):
+        assert Stopping(threshold, 5, 0.7).bar(np.arange(1, 6)).tolist() == [threshold] * 5
+    assert Stopping(0.9).bar(4) == 0.9
+
+
 @pytest.mark.parametrize("views", [0, -3])
 def test_at_least_one_view(views):
     with pytest.raises(ValueError, match="at least one view"):

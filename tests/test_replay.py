@@ -41,16 +41,22 @@ def evidence_of(predictions: Predictions, objects: np.ndarray):
     return observe
 
 
+@pytest.mark.parametrize("decline", [0.0, 0.6])
 @pytest.mark.parametrize("threshold", [0.0, 0.7, 0.9, 0.99])
 @pytest.mark.parametrize("name", ["lem", "lem-peak", "unidirectional"])
-def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(trials, name, threshold):
+def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(trials, name, threshold, decline):
     p = trials.predictions
     policy = make_policy(name, p.sphere, trials.valley_classes)
     episodes = run_episodes(
-        evidence_of(p, trials.objects), p.sphere, policy, trials.starts, Stopping(threshold), np.random.default_rng(0)
+        evidence_of(p, trials.objects),
+        p.sphere,
+        policy,
+        trials.starts,
+        Stopping(threshold, 5, decline),
+        np.random.default_rng(0),
     ).outcome
     paths = replay(name, trials, max_views=5, seed=0)
-    ends = cut(paths, threshold)
+    ends = cut(paths, threshold, decline)
     for field in ("answer", "confidence", "looks", "confident", "travel", "arc"):
         np.testing.assert_allclose(getattr(ends, field), getattr(episodes, field), atol=1e-12, err_msg=field)
     taken = np.arange(5) < ends.looks[:, None]

@@ -50,7 +50,7 @@ class Outcome:
         answer: most believed class, (B,) int64.
         confidence: its belief, (B,) float64.
         looks: views taken, (B,) int64.
-        confident: whether the threshold was reached (else the views ran out), (B,) bool.
+        confident: whether the bar was reached (else the views ran out), (B,) bool.
         travel: sum over the moves in grid cells, (B,) float64.
         arc: sum over the moves in radians, (B,) float64.
         views: the views in order, (B, max looks) int64, -1 after the end.
@@ -114,7 +114,7 @@ class Episodes:
         belief = fuse(total[:, None], self.calibration.temperature(looks))
         visited = self._visited[now]
         visited[np.arange(len(now)), views] = True
-        stopped = belief.max(1) >= self.stopping.threshold
+        stopped = belief.max(1) >= self.stopping.bar(looks)
         if looks >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
         going = ~stopped
@@ -192,7 +192,7 @@ class Episodes:
             answer,
             confidence,
             looks,
-            confidence >= self.stopping.threshold,
+            confidence >= self.stopping.bar(looks),
             (self.sphere.travel[legs] * moved).sum(1),
             (self.sphere.arc[legs] * moved).sum(1),
             views,

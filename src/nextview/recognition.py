@@ -139,17 +139,36 @@ PLAIN_SUM = Calibration()
 
 @dataclass(frozen=True)
 class Stopping:
-    """Stop when the belief's peak reaches ``threshold``, or after ``max_views`` looks.
+    """Stop when the belief's peak reaches a bar, or after ``max_views`` looks.
+
+    The bar is ``threshold`` at the first look. With a ``decline`` it comes down after that: its log-odds are divided by
+    ``1 + decline * (looks - 1)``, because what is unclear after several looks is seldom cleared up by another one. The
+    plain sum of logits does so unawares: a calibrated belief whose decline is its correlation stops where the sum does.
+
+    Attributes:
+        threshold: of the belief.
+        max_views: looks at most.
+        decline: how fast the bar comes down; 0 keeps it.
 
     Raises:
-        ValueError: a threshold outside 0 .. 1 or fewer than one view.
+        ValueError: a threshold outside 0 .. 1, fewer than one view, or a negative decline.
     """
 
     threshold: float = 0.97
     max_views: int = 5
+    decline: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.threshold <= 1:
             raise ValueError(f"the threshold is a probability between 0 and 1, not {self.threshold}")
         if self.max_views < 1:
             raise ValueError(f"at least one view has to be taken, not {self.max_views}")
+        if not 0 <= self.decline < np.inf:
+            raise ValueError(f"the decline is a number from 0 on, not {self.decline}")
+
+    def bar(self, looks: NDArray[np.int64] | int) -> NDArray[np.float64]:
+        """The belief at which to stop after so many looks, same shape."""
+        if self.decline == 0 or self.threshold in (0, 1):
+            return np.full(np.shape(looks), float(self.threshold))
+        odds = np.log(self.threshold / (1 - self.threshold)) / (1 + self.decline * (np.asarray(looks) - 1))
+        return 1 / (1 + np.exp(-odds))

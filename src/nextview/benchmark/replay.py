@@ -139,10 +139,11 @@ def _moved(sphere: ViewSphere, views: NDArray[np.int64]) -> tuple[NDArray[np.flo
     return travel, arc
 
 
-def cut(paths: Paths, threshold: float | None) -> Ends:
-    """The episodes under a threshold; None for one that is never reached."""
+def cut(paths: Paths, threshold: float | None, decline: float = 0.0) -> Ends:
+    """The episodes under a threshold, None for one that is never reached, and its decline (see ``Stopping``)."""
     e, last = np.arange(len(paths.views)), (paths.views >= 0).sum(1) - 1
-    bar = np.inf if threshold is None or paths.fixed else threshold
+    looks = np.arange(1, paths.views.shape[1] + 1)
+    bar = np.inf if threshold is None or paths.fixed else Stopping(threshold, len(looks), decline).bar(looks)
     reached = paths.confidences >= bar
     confident = np.asarray(reached.any(1))
     at = np.where(confident, reached.argmax(1), last)

@@ -25,6 +25,7 @@ class Grid:
         thresholds: of the belief, ascending.
         max_views: looks at most.
         seed: of everything random.
+        decline: how fast the bar of each threshold comes down with the looks, see ``Stopping``.
         paths: of each contestant that came to its end, by name.
         failures: a sentence for each that did not.
     """
@@ -34,6 +35,7 @@ class Grid:
     thresholds: tuple[float, ...]
     max_views: int
     seed: int
+    decline: float = 0.0
     paths: dict[str, Paths] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
 
@@ -41,7 +43,7 @@ class Grid:
         """Every contestant under every threshold; fixed views once, with threshold None."""
         for name, paths in self.paths.items():
             for threshold in (None,) if paths.fixed else self.thresholds:
-                yield name, threshold, cut(paths, threshold)
+                yield name, threshold, cut(paths, threshold, self.decline)
 
     def right(self, answer: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which answers, (E,), name the true class, (runs, N)."""

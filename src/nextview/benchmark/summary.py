@@ -174,7 +174,7 @@ def _areas(grid: Grid, reference: str, weights: Float) -> tuple[pd.DataFrame, pd
     points, drawn = {}, {}  # of each policy: (T, measures), and its bootstrap samples (S, T, measures)
     for name, paths in grid.paths.items():
         if not paths.fixed:
-            _, top, _ = _columns(grid, [(name, t, cut(paths, t)) for t in SWEEP], measures)
+            _, top, _ = _columns(grid, [(name, t, cut(paths, t, grid.decline)) for t in SWEEP], measures)
             points[name] = top.mean(0).reshape(len(SWEEP), -1)
             drawn[name] = (weights @ top / len(top)).reshape(len(weights), len(SWEEP), -1)
     rows = [(name, t, *values) for name, curve in points.items() for t, values in zip(SWEEP, curve, strict=True)]

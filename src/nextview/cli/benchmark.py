@@ -15,6 +15,7 @@ def benchmark(
     policies: tuple[str, ...] = (),
     thresholds: tuple[float, ...] = (0.85, 0.9, 0.95, 0.97, 0.99),
     risks: tuple[float, ...] = (),
+    decline: float = 0.0,
     uncalibrated: bool = False,
     split: Literal["train", "test"] | None = None,
     runs: int = 10,
@@ -32,6 +33,7 @@ def benchmark(
         policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
         thresholds: of the belief.
         risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too.
+        decline: how fast a threshold comes down with the looks; with the recogniser's correlation, as the plain sum's.
         uncalibrated: believe the plain sum of the logits, as published, whatever the recogniser's card says.
         split: take only the objects of this one; needed where the predictions hold several.
         runs: random first views of each object.
@@ -64,10 +66,12 @@ def benchmark(
     if not thresholds:
         raise ValueError("at least one threshold is needed")
     for threshold in thresholds:
-        Stopping(threshold, max_views)  # says what is wrong with it
+        Stopping(threshold, max_views, decline)  # says what is wrong with it
     table = Predictions.load(predictions)
     if uncalibrated:
         table = replace(table, calibration=PLAIN_SUM)
+    if risks and decline:
+        raise ValueError("error rates are promised for thresholds without a decline")
     promised = {risk: table.calibration.threshold(risk, max_views) for risk in risks}
     if split:
         table = table.of_split(split)
@@ -80,7 +84,7 @@ def benchmark(
     trials = make_trials(table, runs, seed, valleys)
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
     names = list(dict.fromkeys([*([reference] if policies else []), *(policies or default_contestants(trials))]))
-    grid = Grid(trials, runs, tuple(sorted({*thresholds, *promised.values()})), max_views, seed)
+    grid = Grid(trials, runs, tuple(sorted({*thresholds, *promised.values()})), max_views, seed, decline)
     track(run_grid(grid, names), len(names), "replaying policies")
     if grid.paths:
         tables = summarise(grid, reference, samples, np.random.default_rng([seed, 1]))
@@ -95,6 +99,7 @@ def benchmark(
             "thresholds": grid.thresholds,
             "risks": {str(risk): threshold for risk, threshold in promised.items()},
             "calibration": [table.calibration.temperature_of_one, table.calibration.correlation],
+            "decline": decline,
             "runs": runs,
             "max_views": max_views,
             "valley_classes": [table.classes[i] for i in trials.valley_classes],

@@ -54,7 +54,8 @@ def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: 
         )
     console = Console()
     console.print(table)
-    reason = f"threshold {stopping.threshold} reached" if result.confident else "no views left"
+    bar = float(stopping.bar(len(result.looks)))
+    reason = f"threshold {bar:.3g} reached" if result.confident else "no views left"
     console.print(
         f"It is a [bold]{result.answer}[/bold], belief {result.confidence:.3f}, after {len(result.looks)} "
         f"look{'s' * (len(result.looks) > 1)} and {result.travel:.2f} cells of travel ({reason})."

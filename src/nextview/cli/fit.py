@@ -94,16 +94,20 @@ def fit_policies(
 
     from nextview.cli.progress import console
     from nextview.data.predictions import Predictions
+    from nextview.fitting.calibration import fit_temperature
     from nextview.fitting.evidence import fitting_set
     from nextview.fitting.tables import fit_class_table, fit_ring, fit_sequence
     from nextview.models.card import file_hash
     from nextview.policies.card import write_policy
+    from nextview.recognition import PLAIN_SUM
 
     if length < 1 or looks < 2 or shrinkage < 0 or price < 0:
         raise ValueError("length has to be at least 1, looks at least 2, shrinkage and price not negative")
     table = Predictions.load(predictions)
-    data, calibration = fitting_set(table, validation, split_seed), table.calibration
-    sphere = data.sphere
+    data = fitting_set(table, validation, split_seed)
+    calibration, sphere = table.calibration, data.sphere
+    if calibration == PLAIN_SUM:  # its recogniser was not calibrated when these were made
+        calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=1 + 8000 // len(data))
     values = fit_class_table(data, looks, shrinkage, calibration, np.random.default_rng(seed))
     travel = sphere.travel[:: sphere.azimuths]  # from each ring to each cell
     learned = {}

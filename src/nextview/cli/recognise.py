@@ -33,7 +33,7 @@ def recognise(
         mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
         policy: how the next view is chosen: lem, lem-peak, random, random-all, furthest, unidirectional, spread,
             spread-local, a learned one that is bundled, or the card of one (.json).
-        threshold: stop when the belief in one class reaches this.
+        threshold: stop when the belief in one class reaches this after one look, less after several.
         risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
         max_views: stop after so many views.
         start: first view, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
@@ -78,7 +78,7 @@ def show(
     from nextview.session import Session
     from nextview.viewsphere import ViewSphere
 
-    stopping = Stopping(threshold, max_views)
+    Stopping(threshold, max_views)  # says what is wrong with it
     sphere = ViewSphere.named("40")
     rng = np.random.default_rng(seed)
     drawn = int(rng.integers(len(sphere)))
@@ -87,8 +87,10 @@ def show(
     watch.lap("building the scene")
     models = load_models(("lem",) if policy.startswith("lem") else ())
     chosen = make_policy(policy, sphere, models.valley_classes("lem"), models.classes)
+    calibration = models.recogniser.calibration
+    stopping = Stopping(threshold, max_views, calibration.correlation)
     if risk is not None:
-        stopping = Stopping(models.recogniser.calibration.threshold(risk, max_views), max_views)
+        stopping = Stopping(calibration.threshold(risk, max_views), max_views)
     session = Session(models, chosen, sphere, drawn if start is None else start, stopping, rng)
     watch.lap("loading the models")
     while not session.done:
