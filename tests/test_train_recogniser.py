@@ -1,5 +1,6 @@
 """What the recogniser is trained on and how, the published recipe to the letter, and the command around it."""
 
+import csv
 import inspect
 import json
 import os
@@ -21,7 +22,9 @@ from nextview.data.lock import only_one  # noqa: E402
 from nextview.data.store import DONE, ViewStore  # noqa: E402
 from nextview.models.card import ModelError  # noqa: E402
 from nextview.models.image_input import image_input  # noqa: E402
+from nextview.training.grid import published_cells  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
+from nextview.training.networks import ResNet  # noqa: E402
 from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe  # noqa: E402
 from nextview.training.recogniser import RecogniserModule, ValidationViews, Views, augment  # noqa: E402
 from nextview.training.runs import begin  # noqa: E402
@@ -235,6 +238,44 @@ def test_two_processes_do_not_train_in_one_folder(tmp_path):
         begin(tmp_path / "run", RecogniserRecipe()),
     ):
         pass
+
+
+TEN = ("bathtub", "bed", "chair", "desk", "dresser", "monitor", "night_stand", "sofa", "table", "toilet")
+
+
+def test_the_grid_holds_the_networks_of_table_6():
+    assert published_cells(TEN, 40) == {  # two numbers are printed for ResNet-34 in batches of 4
+        (18, 4): [0.8588], (34, 4): [0.8599, 0.8588], (34, 8): [0.8642], (34, 16): [0.8662], (34, 32): [0.871],
+        (34, 64): [0.8704], (50, 4): [0.8444], (101, 4): [0.8523], (152, 4): [0.862],
+    }  # fmt: skip
+    assert published_cells(TEN, 12) == {(18, 32): [0.8901]}
+    elsewhere = published_cells(("a", "b"), 5)
+    assert {depth for depth, _ in elsewhere} == {18, 34, 50, 101, 152}
+    assert not any(elsewhere.values())
+
+
+def test_the_grid_is_one_command(store, tmp_path, monkeypatch):
+    monkeypatch.setattr("nextview.training.grid.published_cells", lambda *_: {(18, 4): [0.5, 0.75], (34, 4): []})
+    command = ["train", "grid", str(store), str(tmp_path), "--depths", "18", *FAST, "--augment"]
+    main(command)
+    rows = list(csv.DictReader((tmp_path / "grid.csv").read_text().splitlines()))
+    assert [(row["depth"], row["batch_size"], row["published"]) for row in rows] == [
+        ("18", "4", "0.5"),
+        ("18", "4", "0.75"),
+    ]
+    network = ResNet(18, 2, 1)
+    network.load_state_dict(torch.load(tmp_path / "resnet18-batch4/network.pt", weights_only=True))
+    views = ViewStore.open(store)
+    with torch.no_grad():  # objects 8 and 9, of class a and b, are the test split
+        answers = [
+            network.eval()(torch.from_numpy(image_input(views.image(i), 32)).float() / 255)[0].argmax(1) == i % 2
+            for i in (8, 9)
+        ]
+    assert float(rows[0]["accuracy"]) == pytest.approx(torch.cat(answers).float().mean().item(), abs=1e-4)
+    assert (tmp_path / "grid.png").exists()
+    (tmp_path / "grid.csv").unlink()
+    main(command)  # nothing is trained or judged again
+    assert list(csv.DictReader((tmp_path / "grid.csv").read_text().splitlines())) == rows
 
 
 def test_two_devices_train_one_network(store, tmp_path):

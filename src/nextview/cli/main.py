@@ -16,6 +16,7 @@ from nextview.cli.download import download
 from nextview.cli.evaluate import evaluate
 from nextview.cli.export import export_lcm, export_lem, export_recogniser
 from nextview.cli.fit import fit_calibration, fit_policies
+from nextview.cli.grid import train_grid
 from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
 from nextview.cli.models import models
@@ -37,7 +38,13 @@ COMMANDS: dict[str, Any] = {
     "measure": measure,
     "correspond": correspond,
     "inspect": inspect,
-    "train": {"recogniser": train_recogniser, "lem": train_lem, "lcm": train_lcm, "gain": train_gain},
+    "train": {
+        "recogniser": train_recogniser,
+        "grid": train_grid,
+        "lem": train_lem,
+        "lcm": train_lcm,
+        "gain": train_gain,
+    },
     "export": {"recogniser": export_recogniser, "lem": export_lem, "lcm": export_lcm},
     "predict": predict,
     "fit": {"calibration": fit_calibration, "policies": fit_policies},
