@@ -4,9 +4,11 @@ import csv
 import inspect
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from skimage.measure import block_reduce
 
 torch = pytest.importorskip("torch")
 
-from nextview.cli.main import main  # noqa: E402
+from nextview.cli.main import COMMANDS, main  # noqa: E402
 from nextview.cli.presets import with_preset  # noqa: E402
 from nextview.cli.train import train_recogniser  # noqa: E402
 from nextview.data.folders import DatasetError, Entry  # noqa: E402
@@ -292,3 +294,17 @@ def test_two_devices_train_one_network(store, tmp_path):
     assert (run / "curves.png").exists()
     state = torch.load(run / "last.ckpt", weights_only=True)
     assert state["global_step"] == 6 * 2 // 4  # the batch is that of all devices together
+
+
+GUIDE = (Path(__file__).parent.parent / "docs/training.md").read_text()
+
+
+@pytest.mark.parametrize("line", re.findall(r"^nextview .*?(?=  +#|$)", GUIDE, re.M))
+def test_the_guide_names_commands_and_options_that_exist(line, capsys):
+    words = line.split()
+    command = words[1:3] if isinstance(COMMANDS[words[1]], dict) else words[1:2]
+    with pytest.raises(SystemExit):
+        main([*command, "--help"])
+    offered = capsys.readouterr().out
+    for option in re.findall(r"--[a-z-]+", line):
+        assert option == "--help" or f"{option} " in offered, f"{option} is no option of {command}"
