@@ -22,7 +22,7 @@ from nextview import SimulatedCamera, Stopping, ViewSphere, load_mesh, load_mode
 from nextview.cli.progress import track
 from nextview.data.folders import Entry, list_dataset
 
-POLICIES = ("random", "random-all", "furthest", "unidirectional", "lem-peak", "lem")
+POLICIES = ("random", "random-all", "furthest", "unidirectional", "lem", "lcm-peak", "fixed-sequence-local")
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Settings:
 
 def begin() -> None:
     global models, sphere
-    models, sphere = load_models(threads=1), ViewSphere.named("40")
+    models, sphere = load_models(("lem", "lcm"), threads=1), ViewSphere.named("40")
 
 
 def run_object(entry: Entry, starts: np.ndarray, settings: Settings) -> np.ndarray:
@@ -56,7 +56,7 @@ def run_object(entry: Entry, starts: np.ndarray, settings: Settings) -> np.ndarr
     camera = SimulatedCamera(load_mesh(entry.path))
     found = np.zeros((len(POLICIES), len(starts), 5))
     for p, name in enumerate(POLICIES):
-        policy = make_policy(name, sphere, models.valley_classes("lem"))
+        policy = make_policy(name, sphere, models.valley_classes("lem"), models.classes)
         for r, start in enumerate(starts):
             begun = time.perf_counter()
             rng = np.random.default_rng([settings.seed, int(start), r])

@@ -15,7 +15,7 @@ def predict(
     split: Literal["train", "test"] | None = None,
     recogniser: tuple[str, ...] = (),
     unseen: bool = False,
-    maps: tuple[str, ...] = ("lem",),
+    maps: tuple[str, ...] = ("lem", "lcm"),
     batch: int = 8,
     workers: int | None = None,
     scheduler: str | None = None,

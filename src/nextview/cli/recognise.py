@@ -31,8 +31,8 @@ def recognise(
 
     Args:
         mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
-        policy: how the next view is chosen: lem, lem-peak, random, random-all, furthest, unidirectional, spread,
-            spread-local, a learned one that is bundled, or the card of one (.json).
+        policy: how the next view is chosen: lem, lem-peak, lcm, lcm-peak, random, random-all, furthest, unidirectional,
+            spread, spread-local, a learned one that is bundled, or the card of one (.json).
         threshold: stop when the belief in one class reaches this after one look, less after several.
         risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
         max_views: stop after so many views.
@@ -85,8 +85,10 @@ def show(
     watch.lap("importing")
     camera = SimulatedCamera(load())
     watch.lap("building the scene")
-    models = load_models(("lem",) if policy.startswith("lem") else ())
-    chosen = make_policy(policy, sphere, models.valley_classes("lem"), models.classes)
+    needs = make_policy(policy, sphere).needs
+    models = load_models(needs)
+    valleys = models.valley_classes(needs[0]) if needs else ()
+    chosen = make_policy(policy, sphere, valleys, models.classes)
     calibration = models.recogniser.calibration
     stopping = Stopping(threshold, max_views, calibration.correlation)
     if risk is not None:

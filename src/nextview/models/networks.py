@@ -18,7 +18,7 @@ from nextview.policies.base import Evidence
 from nextview.recognition import Calibration
 
 RECOGNISER = "resnet18-modelnet10"
-MAPS = {"lem": "lem-modelnet10"}
+MAPS = {"lem": "lem-modelnet10", "lcm": "lcm-modelnet10"}
 
 
 def open_weights(card: Card, threads: int = 0) -> ort.InferenceSession:
