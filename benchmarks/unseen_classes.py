@@ -1,0 +1,69 @@
+"""How well a map network does on objects of classes that it has never seen (the thesis's third research question).
+
+    nextview render data/PSB unseen.zarr
+    python benchmarks/unseen_classes.py unseen.zarr [--card lem-modelnet10]
+
+The store's classes must not be among those that the network was trained on; that is up to you. Prints the scores over
+all views, overall and by class, beside a yardstick: the mean map of these very objects, the same for every view.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from nextview.benchmark.evaluate import yardsticks
+from nextview.benchmark.scores import map_scores
+from nextview.benchmark.statistics import interval, ratio, resample
+from nextview.cli.progress import track
+from nextview.data.store import ViewStore
+from nextview.measures.depth_entropy import normalise_per_object
+from nextview.models.cloud_input import cloud_input
+from nextview.models.networks import MapNetwork
+
+PUBLISHED = "published LEM, trained on 10 classes, tested on its own unseen ones (table 4): d <= 1 0.364"
+
+
+def main(store: tyro.conf.Positional[Path], card: str = "lem-modelnet10", samples: int = 2000, seed: int = 0) -> None:
+    """Print the table.
+
+    Args:
+        store: views of objects of unseen classes.
+        card: the map network, by name or card.
+        samples: of the bootstrap over objects.
+        seed: of the bootstrap.
+    """
+    views, network = ViewStore.open(store), MapNetwork(card)
+    objects = np.flatnonzero(views.done)
+    maps = np.empty((len(objects), len(views.sphere), views.sphere.rings, 3), np.float32)
+
+    def predict() -> object:
+        for row, i in enumerate(objects):
+            maps[row] = network.from_clouds(cloud_input(views.points(int(i)), views.sphere.poses))
+            yield row + 1
+
+    track(predict(), len(objects), f"maps of {views.path.name}")
+    true = normalise_per_object(views.measure()[objects])[:, views.sphere.windows]
+    labels = views.labels[objects]
+
+    def flat(values: np.ndarray) -> np.ndarray:
+        return values.reshape(-1, *values.shape[2:])
+
+    print(f"{len(objects)} objects of {len(views.classes)} classes, {len(views.sphere)} views each; {PUBLISHED}\n")
+    print(f"{'':22}{'objects':>8}{'MSE':>9}{'d = 0':>8}{'d <= 1':>8}{'d < 2':>8}{'regret':>8}")
+    rows = {"all": (maps, true)}
+    rows |= {name: (maps[labels == k], true[labels == k]) for k, name in enumerate(views.classes)}
+    rows["yardstick: mean map"] = (yardsticks(true, labels)["mean map"], true)
+    for name, (said, right) in rows.items():
+        scores = map_scores(flat(said), flat(right))
+        print(f"{name:22}{len(right):8}{scores['mse']:9.4f}", *(f"{v:7.3f}" for k, v in scores.items() if k != "mse"))
+    near = np.array([map_scores(m, t)["d_le_1"] for m, t in zip(maps, true, strict=True)])
+    weights = resample(len(objects), samples, np.random.default_rng(seed))
+    (low,), (high,) = interval(ratio(near[:, None], np.ones((len(near), 1)), weights))
+    print(f"\nd <= 1 of all: {near.mean():.3f}, 95 % of the bootstrap over objects {low:.3f} .. {high:.3f}")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
