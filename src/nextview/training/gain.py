@@ -1,15 +1,14 @@
-"""Training of the gain policy: the outcome of every choice is known, so the choice itself is optimised.
+"""Training of the gain policy: networks regress the outcome of every choice, which the predictions know.
 
-A network scores the cells; a soft choice of score over temperature, less the price of travel, takes one of them. Its
-expected outcome over all cells is maximised, which is the exact policy gradient of one step (full information), mixed
-with the plain regression of the outcomes, which keeps the scores in their unit. The price is drawn anew for every
-state, so that one network serves all prices. States come from random walks and from the networks' own.
+States come from random walks and from the networks' own. Several networks, each of which weighs the objects by a
+bootstrap draw of its own, are averaged: the highest of many noisy estimates is too high by chance, and less so if it
+is a mean.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -35,14 +34,12 @@ class States:
         told: to the networks, (S, D).
         outcomes: of a look at each cell, less the mean over the free ones, (S, V).
         free: whether the cell is unvisited, (S, V) bool.
-        travel: to the cell, (S, V).
         objects: rows of the fitting set, (S,).
     """
 
     told: NDArray[np.float32]
     outcomes: NDArray[np.float32]
     free: NDArray[np.bool_]
-    travel: NDArray[np.float32]
     objects: NDArray[np.int64]
 
 
@@ -55,11 +52,9 @@ def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np
             view = cells_from(sphere)[state.current]
             worth = np.take_along_axis(choices(table, moment, recipe.outcome), view, 1)
             free = ~np.take_along_axis(state.visited, view, 1)
-            travel = np.take_along_axis(sphere.travel[state.current], view, 1)
             mean = (worth * free).sum(1, keepdims=True) / free.sum(1, keepdims=True)
             seen = told(sphere, state, recipe.inputs)
-            numbers = (array.astype(np.float32) for array in (seen, worth - mean))
-            parts.append((*numbers, free, travel.astype(np.float32), state.episodes))
+            parts.append((seen.astype(np.float32), (worth - mean).astype(np.float32), free, state.episodes))
     return States(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
@@ -117,23 +112,16 @@ def train(table: ReplayTable, recipe: GainRecipe) -> Iterator[Gain]:
         blind: list[Policy] = [Random(sphere), RandomAll(sphere)]
         policies = [blind[i % 2] for i in range(recipe.walks)]
         if isinstance(policy, Gain):
-            policies[::2] = [replace(policy, price=recipe.top_price * rng.random() ** 2) for _ in policies[::2]]
+            policies[::2] = [policy] * len(policies[::2])
         states = walk(table, policies, recipe, rng)
         order = rng.permutation(len(states.objects))
         for batch in np.array_split(order, -(-states_each // recipe.batch)):
-            seen, worth, free, travel = (
-                torch.from_numpy(a[batch]) for a in (states.told, states.outcomes, states.free, states.travel)
-            )
+            seen, worth, free = (torch.from_numpy(a[batch]) for a in (states.told, states.outcomes, states.free))
             turned = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
             seen = torch.where(turned, seen[:, flip], seen)
-            worth, free, travel = (torch.where(turned, a[:, cells_flip], a) for a in (worth, free, travel))
-            price = recipe.top_price * torch.from_numpy(rng.random((len(batch), 1)) ** 2).float()
-            scores = networks(seen)
-            soft = ((scores - price * travel) / recipe.temperature).masked_fill(~free, -torch.inf).softmax(-1)
-            expected = (soft * (worth - price * travel)).sum(-1)
-            error = (((scores - worth) ** 2) * free).sum(-1) / free.sum(-1)
-            weight = weights[:, states.objects[batch]]
-            loss = (weight * (recipe.regression * error / recipe.temperature - expected)).sum() / len(batch)
+            worth, free = (torch.where(turned, a[:, cells_flip], a) for a in (worth, free))
+            error = (((networks(seen) - worth) ** 2) * free).sum(-1) / free.sum(-1)
+            loss = (weights[:, states.objects[batch]] * error).sum() / len(batch)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

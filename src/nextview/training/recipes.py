@@ -112,23 +112,17 @@ class GainRecipe:
         batch: states in a step.
         rate: AdamW's learning rate at its peak (one-cycle).
         decay: AdamW's weight decay.
-        temperature: of the soft choice, in the unit of the outcome.
-        regression: weight of the mean squared error beside the expected outcome.
-        top_price: prices are drawn between 0 and this, in the unit of the outcome for each grid cell.
         seed: of everything random.
     """
 
     inputs: tuple[Literal["belief", "look", "place", "lem"], ...] = ("belief", "look", "place", "lem")
-    outcome: Literal["belief", "log-belief", "right"] = "belief"
+    outcome: Literal["belief", "log-belief", "right"] = "log-belief"
     looks: int = 5
     hidden: int = 32
     networks: int = 5
-    epochs: int = 40
-    walks: int = 4
+    epochs: int = 15
+    walks: int = 2
     batch: int = 1024
     rate: float = 3e-3
     decay: float = 0.1
-    temperature: float = 0.03
-    regression: float = 1.0
-    top_price: float = 0.05
     seed: int = 0
