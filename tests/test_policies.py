@@ -293,9 +293,8 @@ def test_a_fixed_sequence_makes_the_moves_of_the_ring_it_began_on(seed, anywhere
         sets = {(frozenset(np.flatnonzero(v)), c) for v, c in zip(state.visited, state.current, strict=True)}
         if len(sets) == 40:  # else two starts led to the same place and cannot be told apart
             np.testing.assert_array_equal(chosen[~lost], expected[~lost])
-        visited = state.visited.copy()
-        visited[np.arange(40), chosen] = True
-        state = replace(state, current=np.where(lost, chosen, expected), visited=visited)
+        state = replace(state, current=np.where(lost, chosen, expected), visited=state.visited.copy())
+        state.visited[np.arange(40), state.current] = True
 
 
 def test_a_fixed_ring_is_entered_where_the_camera_is_and_walked_in_its_steps():
