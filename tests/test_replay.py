@@ -111,6 +111,17 @@ def test_oracle_valley_differs_from_the_peak_for_valley_classes_alone(trials):
     assert (peak[valley] != oracle[valley]).all()
 
 
+def test_each_map_has_the_valley_classes_of_its_own_card():
+    p = some_predictions(6)
+    lcm = {"maps": p.maps | {"lcm": p.maps["lem"]}, "valley_classes": {"lem": p.classes[:1], "lcm": p.classes[1:2]}}
+    trials = make_trials(replace(p, **lcm), 2, 0)
+    assert (trials.valley_classes, trials.lcm_valley_classes) == ((0,), (1,))
+    peak, valley = (replay(name, trials, 2, 0).views[:, 1] for name in ("lcm-peak", "lcm-oracle-valley"))
+    assert {*np.flatnonzero(peak != valley)} == {*np.flatnonzero(trials.labels == 1)}
+    given = make_trials(replace(p, **lcm), 2, 0, (2,))
+    assert given.valley_classes == given.lcm_valley_classes == (2,)
+
+
 def test_true_maps_are_the_truth_around_each_view():
     p = some_predictions(4)
     i, v = 2, 9

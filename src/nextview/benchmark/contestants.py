@@ -29,13 +29,15 @@ class Trials:
         predictions: what the models say, and the truth.
         objects: row of each episode's object, (E,) int64.
         starts: first view of each, (E,) int64.
-        valley_classes: classes (indices) for which the map's valley is taken to be the better view.
+        valley_classes: classes (indices) for which the valley of the LEM is taken to be the better view.
+        lcm_valley_classes: the same for the LCM.
     """
 
     predictions: Predictions
     objects: NDArray[np.int64]
     starts: NDArray[np.int64]
     valley_classes: tuple[int, ...]
+    lcm_valley_classes: tuple[int, ...] = ()
 
     @property
     def labels(self) -> NDArray[np.int64]:
@@ -48,7 +50,7 @@ ORACLES: dict[str, Callable[[Trials], Policy]] = {
     "true-lem": lambda t: MapPeak(t.predictions.sphere, "true-lem", t.valley_classes),
     "true-lem-peak": lambda t: MapPeak(t.predictions.sphere, "true-lem"),
     "true-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes, "true-lem"),
-    "lcm-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes, "lcm"),
+    "lcm-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.lcm_valley_classes, "lcm"),
     "true-lcm": lambda t: MapPeak(t.predictions.sphere, "true-lcm"),
     "oracle-gain": lambda t: _gain(t, anywhere=False),
     "oracle-gain-all": lambda t: _gain(t, anywhere=True),
@@ -100,7 +102,8 @@ def _make(name: str, trials: Trials) -> Policy:
     card = name.partition("@")[0]
     if name in POLICIES or card in bundled_policies() or card.endswith(".json") or ":" in name:
         p = trials.predictions
-        return make_policy(name, p.sphere, trials.valley_classes, p.classes)
+        valleys = trials.lcm_valley_classes if name.startswith("lcm") else trials.valley_classes
+        return make_policy(name, p.sphere, valleys, p.classes)
     names = [*POLICIES, *bundled_policies(), *ORACLES, *(f"{kind}-K" for kind in FIXED)]
     raise ValueError(f"no policy is called {name!r}; there are {', '.join(names)}")
 

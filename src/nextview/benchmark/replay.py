@@ -68,16 +68,19 @@ def make_trials(
         predictions: what the models say.
         runs: first views of each object.
         seed: decides them, alone: they are the same for every policy and threshold.
-        valley_classes: classes (indices) for the policies that need them; those of the LEM's card by default.
+        valley_classes: classes (indices) for the policies that need them; those of each map's card by default.
     """
     if runs < 1:
         raise ValueError(f"at least one run is needed, not {runs}")
     n = len(predictions)
-    if valley_classes is None:
-        named = predictions.valley_classes.get("lem", ())
-        valley_classes = tuple(predictions.classes.index(name) for name in named if name in predictions.classes)
+
+    def on_card(map_name: str) -> tuple[int, ...]:
+        named = predictions.valley_classes.get(map_name, ())
+        return tuple(predictions.classes.index(name) for name in named if name in predictions.classes)
+
+    lem, lcm = (on_card(name) if valley_classes is None else valley_classes for name in ("lem", "lcm"))
     starts = np.random.default_rng([seed]).integers(len(predictions.sphere), size=runs * n)
-    return Trials(predictions, np.tile(np.arange(n), runs), starts, valley_classes)
+    return Trials(predictions, np.tile(np.arange(n), runs), starts, lem, lcm)
 
 
 def replay(name: str, trials: Trials, max_views: int, seed: int) -> Paths:
