@@ -22,7 +22,7 @@ from nextview import SimulatedCamera, Stopping, ViewSphere, load_mesh, load_mode
 from nextview.cli.progress import track
 from nextview.data.folders import Entry, list_dataset
 
-POLICIES = ("random", "random-all", "furthest", "unidirectional", "lem", "lcm-peak", "fixed-sequence-local")
+POLICIES = ("random", "random-all", "furthest", "unidirectional", "lem", "lcm-peak", "fixed-sequence-near", "gain")
 
 
 @dataclass(frozen=True)

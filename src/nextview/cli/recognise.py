@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def recognise(
     mesh: tyro.conf.Positional[Path],
     /,
-    policy: str = "lem",
+    policy: str = "gain",
     threshold: float = 0.97,
     risk: float | None = None,
     max_views: int = 5,
@@ -31,8 +31,9 @@ def recognise(
 
     Args:
         mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
-        policy: how the next view is chosen: lem, lem-peak, lcm, lcm-peak, random, random-all, furthest, unidirectional,
-            spread, spread-local, a learned one that is bundled, or the card of one (.json).
+        policy: how the next view is chosen: gain (what a look is worth less its price), lem, lem-peak, lcm, lcm-peak,
+            random, random-all, furthest, unidirectional, spread, spread-local, another learned one that is bundled, or
+            the card of one (.json).
         threshold: stop when the belief in one class reaches this after one look, less after several.
         risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
         max_views: stop after so many views.
@@ -58,7 +59,7 @@ def show(
     load: Callable[[], Mesh],
     name: str,
     watch: Stopwatch,
-    policy: str = "lem",
+    policy: str = "gain",
     threshold: float = 0.97,
     max_views: int = 5,
     start: int | None = None,
