@@ -148,6 +148,17 @@ def test_the_best_epoch_is_kept(tmp_path, mode, best):
     assert read_log(tmp_path)["score"] == pytest.approx([0.5, 0.9, 0.7, 0.1])
 
 
+class Nothing(torch.utils.data.IterableDataset):
+    def __iter__(self):
+        return iter(())
+
+
+def test_without_validation_the_last_epoch_is_kept(tmp_path):
+    module = Scripted([])
+    fitting.fit(module, One(), Nothing(), 3, tmp_path, "score", hardware=EXACT)
+    assert module.weight.item() == 3
+
+
 def test_a_run_without_progress_stops_and_stays_stopped(tmp_path):
     scores = [0.5, 0.9, 0.7, 0.6, 1.0]
     module = Scripted(scores)

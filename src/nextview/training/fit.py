@@ -176,7 +176,9 @@ def fit(
             trainer.fit(module, datamodule=Batches(training, validation), ckpt_path=resume, weights_only=True)
         finally:
             torch.set_flush_denormal(False)  # it holds for the whole process
-    module.load_state_dict(_read(out / "best.ckpt")["state_dict"])
+    best = out / "best.ckpt"
+    # Too few objects for one batch of validation leave nothing to choose by: the last epoch is kept.
+    module.load_state_dict(_read(best if best.exists() else last)["state_dict"])
     return module
 
 
