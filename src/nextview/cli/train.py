@@ -145,7 +145,7 @@ def train_lcm(
     Args:
         store: view store made by nextview render, with the 40 views.
         predictions: of its training split, from recognisers that have not seen the objects (nextview train recogniser
-            --folds, export each, nextview predict --split train --recogniser CARD CARD).
+            --folds, export each, nextview predict --unseen --recogniser CARD CARD).
         out: folder for checkpoints, logs and network.pt.
         recipe: how to train.
     """
