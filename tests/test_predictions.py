@@ -139,7 +139,7 @@ def test_nothing_is_unpickled(tmp_path):
 
 def test_predictions_are_what_the_networks_say_of_each_look(shop):
     recogniser, maps = cards(shop)
-    *_, last = predict(shop / "views.zarr", shop / "all.npz", recogniser, maps, workers=2)
+    *_, last = predict(shop / "views.zarr", shop / "all.npz", [recogniser], maps, workers=2)
     assert last == (6, 6)
     found, store = Predictions.load(shop / "all.npz"), ViewStore.open(shop / "views.zarr")
     assert found.names == tuple(store.names)
@@ -156,7 +156,7 @@ def test_predictions_are_what_the_networks_say_of_each_look(shop):
 
 def test_the_same_mesh_under_two_labels_is_marked_across_splits(shop):
     recogniser, maps = cards(shop)
-    list(predict(shop / "views.zarr", shop / "test.npz", recogniser, maps, "test", workers=1))
+    list(predict(shop / "views.zarr", shop / "test.npz", [recogniser], maps, "test", workers=1))
     found = Predictions.load(shop / "test.npz")
     assert dict(zip(found.names, found.conflicting, strict=True)) == {
         "ball_test": False, "box_test": False, "pillar_test": True,
@@ -172,7 +172,7 @@ from nextview.models.card import read_card
 if __name__ == "__main__":
     shop, out = map(Path, sys.argv[1:])
     maps = {"lem": read_card(shop / "tiny-lem.json")}
-    for done, _ in predict(shop / "views.zarr", out, read_card(shop / "tiny.json"), maps, workers=1):
+    for done, _ in predict(shop / "views.zarr", out, [read_card(shop / "tiny.json")], maps, workers=1):
         if done == 2:
             os.kill(os.getpid(), signal.SIGKILL)
 """
@@ -185,36 +185,36 @@ def test_a_killed_run_goes_on_where_it_was(shop):
     killed = subprocess.run([sys.executable, shop / "killed.py", shop, out], check=False)
     assert killed.returncode == -signal.SIGKILL
     assert not out.exists()
-    steps = predict(shop / "views.zarr", out, recogniser, maps, workers=1)
+    steps = predict(shop / "views.zarr", out, [recogniser], maps, workers=1)
     assert next(steps) == (2, 6)
     list(steps)
     assert not out.with_name("again.npz.part").exists()
-    list(predict(shop / "views.zarr", shop / "whole.npz", recogniser, maps, workers=1))
+    list(predict(shop / "views.zarr", shop / "whole.npz", [recogniser], maps, workers=1))
     np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(shop / "whole.npz").logits)
 
 
 def test_predictions_of_other_models_or_views_are_not_overwritten(shop):
     recogniser, maps = cards(shop)
     out = shop / "kept.npz"
-    list(predict(shop / "views.zarr", out, recogniser, {}, workers=1))
+    list(predict(shop / "views.zarr", out, [recogniser], {}, workers=1))
     with pytest.raises(PredictionsError, match="other objects or models"):
-        list(predict(shop / "views.zarr", out, recogniser, maps, workers=1))
+        list(predict(shop / "views.zarr", out, [recogniser], maps, workers=1))
     list(render(shop / "meshes", shop / "turned.zarr", ViewSphere.named("40"), 32, deform=Deform(turn=True), workers=1))
     with pytest.raises(PredictionsError, match="other objects or models"):
-        list(predict(shop / "turned.zarr", out, recogniser, {}, workers=1))
-    assert list(predict(shop / "views.zarr", out, recogniser, {}, workers=1)) == [(6, 6)]  # done already
+        list(predict(shop / "turned.zarr", out, [recogniser], {}, workers=1))
+    assert list(predict(shop / "views.zarr", out, [recogniser], {}, workers=1)) == [(6, 6)]  # done already
 
 
 def test_a_class_that_the_recogniser_does_not_know_is_named(shop, tmp_path):
     card = read_card(make_recogniser(tmp_path, ["ball", "box"]))
     with pytest.raises(DatasetError, match="'pillar'"):
-        list(predict(shop / "views.zarr", tmp_path / "p.npz", card, {}))
+        list(predict(shop / "views.zarr", tmp_path / "p.npz", [card], {}))
 
 
 def test_a_split_without_objects_is_named(shop, tmp_path):
     recogniser, maps = cards(shop)
     with pytest.raises(DatasetError, match="'validation'"):
-        list(predict(shop / "views.zarr", tmp_path / "p.npz", recogniser, maps, "validation"))
+        list(predict(shop / "views.zarr", tmp_path / "p.npz", [recogniser], maps, "validation"))
 
 
 def test_predictions_made_before_there_were_calibrations_are_read(tmp_path):
@@ -227,10 +227,10 @@ def test_predictions_made_before_there_were_calibrations_are_read(tmp_path):
 
 def test_a_card_that_was_calibrated_since_brings_predictions_up_to_date(shop):
     (recogniser, maps), out = cards(shop), shop / "calibrated.npz"
-    list(predict(shop / "views.zarr", out, recogniser, maps, workers=1))
+    list(predict(shop / "views.zarr", out, [recogniser], maps, workers=1))
     before = Predictions.load(out)
     later = replace(recogniser, facts={**recogniser.facts, "calibration": Calibration(0.5, 0.25).facts()})
-    assert list(predict(shop / "views.zarr", out, later, maps, workers=1)) == [(6, 6)]
+    assert list(predict(shop / "views.zarr", out, [later], maps, workers=1)) == [(6, 6)]
     after = Predictions.load(out)
     assert (before.calibration, after.calibration) == (Calibration(), Calibration(0.5, 0.25))
     np.testing.assert_array_equal(after.logits, before.logits)
