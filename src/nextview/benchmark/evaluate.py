@@ -257,8 +257,8 @@ def scores_for_card(card: Card, p: Predictions) -> dict[str, Any]:
         raise EvaluationError(f"these predictions were not made by model {card.name}")
     if card.kind == "recogniser":
         return recogniser_scores(p.logits, p.labels)
-    kept = judged_objects(p, card.kind) if card.kind in TRUTHS else []
-    if len(kept) == 0:
+    kept = judged_objects(p, card.kind)
+    if card.kind not in TRUTHS or len(kept) == 0:
         raise EvaluationError(f"these predictions hold no object by which model {card.name} can be judged")
     shape = (-1, p.sphere.rings, 3)
     return map_scores(p.maps[card.kind][kept].reshape(shape), TRUTHS[card.kind](p)[kept].reshape(shape))
