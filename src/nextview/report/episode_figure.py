@@ -114,7 +114,7 @@ def _draw_path(axis: Axes3D, looks: tuple[Look, ...], sphere: ViewSphere) -> Non
     # Look from the side where the path is, a little from above.
     middle = d[views].sum(0)
     axis.view_init(elev=24, azim=float(np.degrees(np.arctan2(middle[1], middle[0]))) - 25)
-    axis.set_box_aspect((1, 1, 0.75), zoom=1.35)
+    axis.set_box_aspect((1, 1, 0.75), zoom=1.2)  # room for the numbers at its rim
     axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-0.5, 1))
     axis.set_axis_off()
     axis.set_title("where it looked from, and the points it saw", fontsize=10, color=INK)
