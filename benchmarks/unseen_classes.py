@@ -18,9 +18,9 @@ from nextview.benchmark.evaluate import yardsticks
 from nextview.benchmark.scores import map_scores
 from nextview.benchmark.statistics import interval, ratio, resample
 from nextview.cli.progress import track
+from nextview.data.seen import seen_views
 from nextview.data.store import ViewStore
 from nextview.measures.depth_entropy import normalise_per_object
-from nextview.models.cloud_input import cloud_input
 from nextview.models.networks import MapNetwork
 
 PUBLISHED = "published LEM, trained on 10 classes, tested on its own unseen ones (table 4): d <= 1 0.364"
@@ -41,7 +41,7 @@ def main(store: tyro.conf.Positional[Path], card: str = "lem-modelnet10", sample
 
     def predict() -> object:
         for row, i in enumerate(objects):
-            maps[row] = network.from_clouds(cloud_input(views.points(int(i)), views.sphere.poses))
+            maps[row] = network.from_inputs(seen_views(views, int(i), *network.sees))[network.card.kind]
             yield row + 1
 
     track(predict(), len(objects), f"maps of {views.path.name}")

@@ -15,6 +15,7 @@ from nextview.data import split
 from nextview.data.folders import Entry
 from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
+from nextview.data.seen import seen_views
 from nextview.data.store import ViewStore
 from nextview.models.networks import MapNetwork, Recogniser
 from nextview.viewsphere import ViewSphere
@@ -24,7 +25,9 @@ torch = pytest.importorskip("torch")
 from nextview.benchmark.scores import map_scores, recogniser_scores  # noqa: E402
 from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
+from nextview.training.maps import Windows  # noqa: E402
 from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
+from nextview.training.recipes import MapRecipe  # noqa: E402
 from nextview.training.valleys import valley_gains  # noqa: E402
 
 
@@ -146,11 +149,56 @@ def test_trained_models_have_cards_and_run(trained):
     logits, features = recogniser.from_inputs(np.zeros((3, 4, 112, 112), np.uint8))
     assert logits.shape == (3, 2)
     assert features.shape == (3, 512)
-    assert MapNetwork(trained / "models/tiny-lem.json").from_clouds(np.zeros((2, 1024, 3), np.float32)).shape == (
-        2,
-        5,
-        3,
-    )
+    lem = MapNetwork(trained / "models/tiny-lem.json").from_inputs(np.zeros((2, 4, 56, 56), np.uint8))
+    assert lem["lem"].shape == (2, 5, 3)
+    assert lem["lem-sphere"].shape == (2, 5, 8)
+    assert (lem["lem"] == lem["lem-sphere"][:, :, [-1, 0, 1]]).all()
+
+
+def test_a_mirrored_view_has_the_mirrored_map(trained):
+    run, store = trained / "runs/lem", trained / "views.zarr"
+    options = ["--mirror", "--bits", "8", "--name", "both", "--recogniser", str(trained / "models/tiny.json")]
+    main(["export", "lem", str(run), str(store), str(trained / "models"), *options])
+    network = MapNetwork(trained / "models/both.json")
+    seen = seen_views(ViewStore.open(store), 0, "geometry", 56)
+    maps, flipped = (network.from_inputs(np.ascontiguousarray(views)) for views in (seen, seen[..., ::-1]))
+    assert np.abs(maps["lem"] - flipped["lem"][..., ::-1]).max() < 1e-5
+    assert np.abs(maps["lem"] - maps["lem"][..., ::-1]).max() > 1e-4  # or nothing would be tested
+    assert np.abs(maps["lem-sphere"] - flipped["lem-sphere"][..., -np.arange(8) % 8]).max() < 1e-5
+
+
+def test_the_published_map_network_trains_on_clouds_and_predicts_the_window(trained):
+    store, run = str(trained / "views.zarr"), trained / "runs/published"
+    main(["train", "lem", store, str(run), "--preset", "thesis", "--epochs", "1", "--views", "2", "--points", "64"])
+    recipe = json.loads((run / "recipe.json").read_text())
+    assert (recipe["input"], recipe["batch"], recipe["schedule"]) == ("cloud", 16, "tenth")
+    name = ["--name", "published", "--recogniser", str(trained / "models/tiny.json")]
+    main(["export", "lem", str(run), store, str(trained / "models"), *name])
+    cloud = seen_views(ViewStore.open(trained / "views.zarr"), 0, "cloud", 0)[:2]
+    assert {k: v.shape for k, v in MapNetwork(trained / "models/published.json").from_inputs(cloud).items()} == {
+        "lem": (2, 5, 3)
+    }
+
+
+def test_map_batches_hold_each_view_with_its_own_map():
+    sphere, rng = ViewSphere.named("40"), np.random.default_rng(0)
+    values = rng.random((7, 40)).astype(np.float32)
+    seen = np.zeros((7, 40, 4, 2, 2), np.uint8)  # object and view, in the left half of the image
+    seen[..., 0, 0, 0], seen[..., 1, 0, 0] = np.arange(7)[:, None] + 1, np.arange(40) + 1
+    windows = Windows(seen, values, sphere, np.array([1, 2, 5]), MapRecipe(views=6, batch=4), training=True)
+    drawn, flips = [], []
+    for images, targets in windows:
+        assert len(images) == 4
+        for image, target in zip(images.numpy(), targets.numpy(), strict=True):
+            o, v = int(image[0].max()) - 1, int(image[1].max()) - 1
+            drawn.append((o, v))
+            flips.append(image[0, 0, 1] > 0)
+            steps = np.arange(8) * (-1 if flips[-1] else 1)
+            assert (target == values[o, np.arange(5)[:, None] * 8 + (v + steps) % 8]).all()
+    assert len(drawn) == 16
+    assert len(set(drawn)) == 16  # no view comes twice before all have come
+    assert {o for o, _ in drawn} == {1, 2, 5}
+    assert 0 < sum(flips) < 16
 
 
 def test_a_finished_run_is_not_trained_again(trained):

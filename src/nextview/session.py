@@ -95,7 +95,7 @@ class Session:
         stopping: Stopping = Stopping(),
         rng: np.random.Generator | None = None,
     ) -> None:
-        missing = [name for name in policy.needs if name not in models.maps]
+        missing = [name for name in policy.needs if name.removesuffix("-sphere") not in models.maps]
         if missing:
             raise ValueError(f"this policy needs the map {missing[0]!r}; load it with the models")
         self.models, self.sphere = models, sphere

@@ -11,8 +11,15 @@ import tyro
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from nextview.models.networks import Recogniser
     from nextview.training.targets import Target
+
+
+SEEN = {
+    "geometry": "4 channels from a depth image and its pose: facing, up, height, nearness; uint8, 0 = background",
+    "image": "the shaded image, grey; uint8, 0 = background",
+    "cloud": "1,024 visible points, upright, camera at azimuth zero, scaled to [0, 1] by their own extent",
+}
+"""What a network sees, in words."""
 
 
 def export_recogniser(
@@ -49,20 +56,19 @@ def export_recogniser(
     from nextview.data.split import split_training
     from nextview.data.store import ViewStore
     from nextview.models.card import ModelError, write_card
-    from nextview.models.geometry_input import CHANNELS
     from nextview.models.networks import Recogniser
     from nextview.training.export import CalibratedRecogniser, answer, export_onnx, fit_temperature, load_weights
-    from nextview.training.inputs import load_inputs
+    from nextview.training.inputs import CHANNELS_OF, load_inputs
     from nextview.training.networks import ResNet
     from nextview.training.recipes import RecogniserRecipe
 
     runs = (run, *also)
     recipes = [RecogniserRecipe(**json.loads((r / "recipe.json").read_text())) for r in runs]
     views = ViewStore.open(store)
-    size = recipes[0].size
-    if {r.size for r in recipes} != {size}:
-        raise ModelError(f"{run} and the other runs take images of different sizes")
-    inputs = load_inputs(store, size)
+    size, sees = recipes[0].size, recipes[0].input
+    if {(r.size, r.input) for r in recipes} != {(size, sees)}:
+        raise ModelError(f"{run} and the other runs do not see the same: geometry or image, of one size")
+    inputs = load_inputs(store, size, sees)
     validation, held = np.arange(len(views)), []
     for r, recipe in zip(runs, recipes, strict=True):
         training, aside = split_training(views, recipe.validation, recipe.seed)
@@ -73,7 +79,7 @@ def export_recogniser(
         raise ModelError(f"{run} and the other runs have no validation object in common")
     unseen = set.intersection(*held) | {views.names[i] for i in validation}
     networks = [
-        load_weights(ResNet(recipe.depth, len(views.classes), len(CHANNELS)), r)
+        load_weights(ResNet(recipe.depth, len(views.classes), CHANNELS_OF[sees]), r)
         for r, recipe in zip(runs, recipes, strict=True)
     ]
 
@@ -83,7 +89,8 @@ def export_recogniser(
         "name": name,
         "kind": "recogniser",
         "network": " + ".join(f"ResNet-{recipe.depth}" for recipe in recipes) + (", mirrored too" if mirror else ""),
-        "input": "4 channels from a depth image and its pose: facing, up, height, nearness; uint8, 0 = background",
+        "input": SEEN[sees],
+        "sees": sees,
         "input_size": size,
         "classes": views.classes,
         "temperature": 1.0,
@@ -91,7 +98,8 @@ def export_recogniser(
     example = np.array(inputs[validation[0], :2])
     export_onnx(CalibratedRecogniser(networks, 1.0, mirror), example, "input", ["logits", "features"], weights, bits)
     write_card(card, facts)
-    raw = _all_logits(Recogniser(card), inputs, validation, "validation views")
+    plain = Recogniser(card)
+    raw = _tracked(lambda i: plain.from_inputs(np.array(inputs[i]))[0], validation, "validation views")
     labels = views.labels[validation]
     temperature = fit_temperature(raw.reshape(-1, raw.shape[2]), np.repeat(labels, raw.shape[1]))
 
@@ -123,6 +131,8 @@ def export_lem(
     store: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     /,
+    mirror: bool = False,
+    bits: Literal[8, 16] = 16,
     recogniser: str = "resnet18-modelnet10",
     name: str = "lem-modelnet10",
     commands: tuple[str, ...] = (),
@@ -134,6 +144,8 @@ def export_lem(
         run: folder made by nextview train lem.
         store: the store that it was trained on.
         out: folder for NAME.onnx and NAME.json.
+        mirror: average what a ResNet says of a view and of its mirror image.
+        bits: that a weight takes in the file.
         recogniser: the model, or its card, whose beliefs decide which classes prefer the valley.
         name: what to call the model.
         commands: the commands that made the run, for the card.
@@ -144,7 +156,7 @@ def export_lem(
 
     target = entropy_target(ViewStore.open(store))
     what = "depth-entropy, 0 .. 1 over the object's views"
-    _export_map("lem", what, target, run, store, out, recogniser, name, commands, note)
+    _export_map("lem", what, target, run, store, out, mirror, bits, recogniser, name, commands, note)
 
 
 def export_lcm(
@@ -153,6 +165,8 @@ def export_lcm(
     predictions: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     /,
+    mirror: bool = False,
+    bits: Literal[8, 16] = 16,
     recogniser: str = "resnet18-modelnet10",
     name: str = "lcm-modelnet10",
     commands: tuple[str, ...] = (),
@@ -165,6 +179,8 @@ def export_lcm(
         store: the store that it was trained on.
         predictions: those that it was trained on.
         out: folder for NAME.onnx and NAME.json.
+        mirror: average what a ResNet says of a view and of its mirror image.
+        bits: that a weight takes in the file.
         recogniser: the model, or its card, whose beliefs decide which classes prefer the valley.
         name: what to call the model.
         commands: the commands that made the run, for the card.
@@ -176,7 +192,7 @@ def export_lcm(
 
     target = confidence_target(ViewStore.open(store), Predictions.load(predictions))
     what = "the recogniser's confidence where it is right, else 0"
-    _export_map("lcm", what, target, run, store, out, recogniser, name, commands, note)
+    _export_map("lcm", what, target, run, store, out, mirror, bits, recogniser, name, commands, note)
 
 
 def _export_map(
@@ -186,6 +202,8 @@ def _export_map(
     run: Path,
     store: Path,
     out: Path,
+    mirror: bool,
+    bits: int,
     recogniser: str,
     name: str,
     commands: tuple[str, ...],
@@ -197,14 +215,13 @@ def _export_map(
 
     from nextview.benchmark.scores import map_scores
     from nextview.cli.progress import console
+    from nextview.data.seen import seen_views
     from nextview.data.split import split_training
-    from nextview.data.store import POINT_UNIT, ViewStore
+    from nextview.data.store import ViewStore
     from nextview.models.card import ModelError, write_card
-    from nextview.models.cloud_input import cloud_input
     from nextview.models.networks import MapNetwork, Recogniser
-    from nextview.training.export import MapOnly, answer, export_onnx, load_weights
-    from nextview.training.inputs import load_inputs
-    from nextview.training.networks import PointNet
+    from nextview.training.export import ShippedMap, answer, export_onnx, load_weights
+    from nextview.training.networks import map_network
     from nextview.training.recipes import MapRecipe
     from nextview.training.valleys import valley_gains
 
@@ -212,35 +229,42 @@ def _export_map(
     views = ViewStore.open(store)
     sphere = views.sphere
     training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
-    shipped = MapOnly(load_weights(PointNet(sphere.rings), run)).eval()
+    network = load_weights(map_network(recipe, sphere), run)
+    shipped = ShippedMap(network, mirror).eval()
 
     out.mkdir(parents=True, exist_ok=True)
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
-    points = np.stack([views.points(int(i)) for i in validation[:2]])[:, 3]
-    clouds = cloud_input(points, sphere.poses[[3, 3]])
-    export_onnx(shipped, clouds, "cloud", ["map"], weights)
+    size = recipe.size if recipe.input != "cloud" else 0
+    sample = seen_views(views, int(validation[0]), recipe.input, size)[3:11]
+    export_onnx(shipped, sample, "seen", ["map", "sphere"] if shipped.whole else ["map"], weights, bits)
     facts: dict[str, Any] = {
         "name": name,
         "kind": kind,
-        "network": "PointNet with both transforms",
-        "input": "1,024 visible points, upright, camera at azimuth zero, scaled to [0, 1] by their own extent",
-        "output": f"{what}, of {sphere.rings} rings x azimuth -1, 0, +1",
+        "network": f"ResNet-{recipe.depth}{', mirrored too' * mirror}" if size else "PointNet with both transforms",
+        "input": SEEN[recipe.input],
+        "sees": recipe.input,
+        "input_size": size,
+        "output": f"{what}, of {sphere.rings} rings x azimuth -1, 0, +1"
+        + f"; and of {sphere.rings} x {sphere.azimuths}, once round from the view" * shipped.whole,
+        "around": recipe.around,
     }
     write_card(card, facts)
     predictor = MapNetwork(card)
-    difference = float(np.abs(answer(shipped, clouds) - predictor.from_clouds(clouds)).max())
+    difference = float(np.abs(answer(shipped, sample) - predictor.from_inputs(sample)[kind]).max())
     console.print(f"largest difference between torch and ONNX maps on real views: {difference:.2g}")
     if not difference < 0.02:
         raise ModelError(f"{weights}: its maps differ from the network's by up to {difference:.2g}")
 
-    stored = views.all_points()
-
     def one(i: int) -> NDArray:
-        return predictor.from_clouds(cloud_input(stored[i] * np.float32(POINT_UNIT), sphere.poses))
+        return predictor.from_inputs(seen_views(views, i, *predictor.sees))[kind]
 
     maps = _tracked(one, validation, "validation maps")
     judge = Recogniser(recogniser)
-    logits = _all_logits(judge, load_inputs(store, judge.size), validation, "validation views")
+
+    def judged(i: int) -> NDArray:
+        return judge.from_inputs(seen_views(views, i, *judge.sees))[0]
+
+    logits = _tracked(judged, validation, "validation views")
     gains = valley_gains(sphere, logits, maps, views.labels[validation])
     shape = (-1, sphere.rings, 3)
     true = target.values[validation][:, sphere.windows]
@@ -278,10 +302,3 @@ def _tracked(one: Callable[[int], NDArray], objects: NDArray, what: str) -> NDAr
 
     track(done(), len(objects), what)
     return np.stack(found)
-
-
-def _all_logits(recogniser: Recogniser, inputs: NDArray, objects: NDArray, what: str) -> NDArray:
-    """Logits (objects, V, classes) of all views."""
-    import numpy as np
-
-    return _tracked(lambda i: recogniser.from_inputs(np.ascontiguousarray(inputs[i]))[0], objects, what)

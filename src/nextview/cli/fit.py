@@ -28,8 +28,6 @@ def fit_calibration(
         delta: how often a promised error rate may not hold.
         seed: decides the walks over which is fitted.
     """
-    import json
-    import os
     from dataclasses import replace
 
     import numpy as np
@@ -38,7 +36,7 @@ def fit_calibration(
     from nextview.data.predictions import Predictions, PredictionsError
     from nextview.fitting.calibration import fit_risk, fit_temperature, loss
     from nextview.fitting.evidence import fitting_set
-    from nextview.models.card import read_card
+    from nextview.models.card import read_card, write_card
     from nextview.recognition import PLAIN_SUM
 
     if not 0 < delta < 1:
@@ -52,9 +50,7 @@ def fit_calibration(
     risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
     calibration = replace(calibration, risk=risk)
     told = {"fitted_to": f"{len(data)} objects of the training split, classes weighted evenly"}
-    part = card.with_name(card.name + ".part")
-    part.write_text(json.dumps(model.facts | {"calibration": calibration.facts() | told}, indent=1) + "\n")
-    os.replace(part, card)
+    write_card(card, model.facts | {"calibration": calibration.facts() | told})
     before, after = (loss(data, c, np.random.default_rng([seed, 2]), walks=walks) for c in (PLAIN_SUM, calibration))
     console.print(
         f"{len(data)} objects: temperature of one look {calibration.temperature_of_one}, correlation of two looks "

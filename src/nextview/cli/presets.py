@@ -9,11 +9,13 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
-from nextview.cli.train import train_recogniser
-from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe
+from nextview.cli.train import train_lcm, train_lem, train_recogniser
+from nextview.training.recipes import THESIS_MAP, THESIS_RECOGNISER, MapRecipe, RecogniserRecipe
 
 PRESETS: dict[Callable, dict[str, Any]] = {
     train_recogniser: {"default": RecogniserRecipe(), "thesis": THESIS_RECOGNISER},
+    train_lem: {"default": MapRecipe(), "thesis": THESIS_MAP},
+    train_lcm: {"default": MapRecipe(), "thesis": THESIS_MAP},
 }
 """The recipes of each command that has several."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 def train_recogniser(
     store: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
-    deformed: Path | None = None,
+    deformed: tuple[Path, ...] = (),
     weights: Path | None = None,
     folds: int = 0,
     fold: int | None = None,
@@ -35,7 +34,8 @@ def train_recogniser(
     Args:
         store: view store made by nextview render.
         out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the best class mean.
-        deformed: a store of the same objects, stretched and turned (nextview render --stretch .25 --turn).
+        deformed: stores of the same objects, stretched and turned (nextview render --stretch .25 --turn --seed 1 and so
+            on); their views may be others.
         weights: a torchvision checkpoint of the same depth to start from.
         folds: train so many recognisers instead, OUT/fold0 and so on, each without its share of the training objects,
             for evidence from networks that have not seen the object.
@@ -57,7 +57,7 @@ def train_recogniser(
         raise ModelError(f"there is no fold {fold} of {folds}: they are counted from 0")
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation, recipe.seed)
-    sources = [_source(path, views, training, recipe) for path in (store, deformed) if path]
+    sources = [_source(path, views, training, recipe) for path in (store, *deformed)]
     runs = {out: training[:0]}
     if folds:
         runs = {out / f"fold{k}": held for k, held in enumerate(hold_out(views, training, folds, recipe.seed))}
@@ -79,16 +79,10 @@ def _source(
     path: Path, views: ViewStore, needed: NDArray[np.int64], recipe: RecogniserRecipe
 ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """Inputs of a store, prepared if they are not yet, and the row of each object of ``views`` in them, -1 for none."""
-    import time
-
     import numpy as np
 
-    from nextview.cli.progress import track
     from nextview.data.folders import DatasetError
-    from nextview.data.lock import only_one
     from nextview.data.store import ViewStore
-    from nextview.training.fit import is_first
-    from nextview.training.inputs import inputs_path, load_inputs, prepare_inputs
 
     store = ViewStore.open(path)
     row = {name: i for i, name in enumerate(store.names)}
@@ -96,14 +90,25 @@ def _source(
     missing = [views.names[i] for i in needed if rows[i] < 0]
     if missing:
         raise DatasetError(f"{path}: lacks {len(missing)} of the training objects, {missing[0]} among them")
-    target = inputs_path(path, recipe.size, recipe.input)
+    return _prepared(path, store, recipe.size, recipe.input), rows
+
+
+def _prepared(path: Path, store: ViewStore, size: int, kind: str) -> NDArray[np.uint8]:
+    """Inputs of a store (N, V, C, size, size), prepared if they are not yet."""
+    import time
+
+    from nextview.cli.progress import track
+    from nextview.data.lock import only_one
+    from nextview.training.fit import is_first
+    from nextview.training.inputs import inputs_path, load_inputs, prepare_inputs
+
+    target = inputs_path(path, size, kind)
     if is_first() and not target.exists():
         with only_one(target):
-            what = f"inputs of {path.name}"
-            track(prepare_inputs(path, recipe.size, recipe.input), int(store.done.sum()), what)
+            track(prepare_inputs(path, size, kind), int(store.done.sum()), f"inputs of {path.name}")
     while not target.exists():  # the first process makes it
         time.sleep(1)
-    return load_inputs(path, recipe.size, recipe.input), rows
+    return load_inputs(path, size, kind)
 
 
 def _draw_curves(run: Path) -> None:
@@ -120,18 +125,20 @@ def train_lem(
     store: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     recipe: tyro.conf.OmitArgPrefixes[MapRecipe] = MapRecipe(),
+    hardware: tyro.conf.OmitArgPrefixes[Hardware] = Hardware(),
 ) -> None:
     """Train the LEM on a store's training split. Resumes if OUT holds a run that was cut off.
 
     Args:
         store: view store made by nextview render, with the 40 views.
-        out: folder for checkpoints, logs and network.pt.
+        out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the lowest squared error.
         recipe: how to train.
+        hardware: on what.
     """
     from nextview.data.store import ViewStore
     from nextview.training.targets import entropy_target
 
-    _train_map(store, entropy_target(ViewStore.open(store)), out, recipe)
+    _train_map(store, entropy_target(ViewStore.open(store)), out, recipe, hardware)
 
 
 def train_lcm(
@@ -139,6 +146,7 @@ def train_lcm(
     predictions: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     recipe: tyro.conf.OmitArgPrefixes[MapRecipe] = MapRecipe(),
+    hardware: tyro.conf.OmitArgPrefixes[Hardware] = Hardware(),
 ) -> None:
     """Train the LCM on what recognisers say of a store's training split. Resumes if OUT holds a run that was cut off.
 
@@ -146,27 +154,32 @@ def train_lcm(
         store: view store made by nextview render, with the 40 views.
         predictions: of its training split, from recognisers that have not seen the objects (nextview train recogniser
             --folds, export each, nextview predict --unseen --recogniser CARD CARD).
-        out: folder for checkpoints, logs and network.pt.
+        out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the lowest squared error.
         recipe: how to train.
+        hardware: on what.
     """
     from nextview.data.predictions import Predictions
     from nextview.data.store import ViewStore
     from nextview.training.targets import confidence_target
 
-    _train_map(store, confidence_target(ViewStore.open(store), Predictions.load(predictions)), out, recipe)
+    _train_map(store, confidence_target(ViewStore.open(store), Predictions.load(predictions)), out, recipe, hardware)
 
 
-def _train_map(store: Path, target: Target, out: Path, recipe: MapRecipe) -> None:
+def _train_map(store: Path, target: Target, out: Path, recipe: MapRecipe, hardware: Hardware) -> None:
+    from nextview.cli.progress import console
     from nextview.data.split import split_training
     from nextview.data.store import ViewStore
     from nextview.training import maps
-    from nextview.training.export import save_weights
+    from nextview.training.runs import begin, finish, is_done
 
     views = ViewStore.open(store)
     training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "recipe.json").write_text(json.dumps(asdict(recipe), indent=1) + "\n")
-    windows = target.values[:, views.sphere.windows]
-    network = maps.train(views.all_points(), windows, views.sphere.poses, training, validation, recipe, out)
-    _draw_curves(out)
-    save_weights(network, out)
+    with begin(out, recipe):
+        if is_done(out):
+            console.print(f"{out}: is trained already", soft_wrap=True)
+            return
+        cloud = recipe.input == "cloud"
+        seen: NDArray = views.all_points() if cloud else _prepared(store, views, recipe.size, recipe.input)
+        network = maps.train(seen, target.values, views.sphere, training, validation, recipe, out, hardware)
+        _draw_curves(out)
+        finish(network, out)

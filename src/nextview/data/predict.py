@@ -17,12 +17,12 @@ from nextview.data.folders import DatasetError
 from nextview.data.lock import only_one
 from nextview.data.pool import WorkerDied, each
 from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.seen import seen_views
 from nextview.data.store import ViewStore
 from nextview.models.card import Card
-from nextview.models.cloud_input import cloud_input
-from nextview.models.geometry_input import geometry_input
-from nextview.models.networks import MapNetwork, Recogniser
+from nextview.models.networks import MapNetwork, Recogniser, knows_sphere
 from nextview.recognition import Calibration
+from nextview.viewsphere import ViewSphere
 
 
 def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
@@ -102,8 +102,9 @@ def predict(
 
     recipe = {"names": names, "models": models, "views": hashlib.sha256(entropy.tobytes()).hexdigest()}
     with only_one(out):
-        n, v, rings = len(chosen), len(store.sphere), store.sphere.rings
-        shapes = {"logits": (n, v, len(classes)), **{f"map_{name}": (n, v, rings, 3) for name in maps}}
+        n, v = len(chosen), len(store.sphere)
+        windows = {name: shape for kind, card in maps.items() for name, shape in map_shapes(kind, card, store.sphere)}
+        shapes = {"logits": (n, v, len(classes)), **{f"map_{name}": (n, v, *shape) for name, shape in windows.items()}}
         arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
         # Logits are written last: an object counts as done when none of its logits is the NaN that the file began with.
         todo = np.flatnonzero(np.isnan(arrays["logits"]).any((1, 2)))
@@ -126,7 +127,7 @@ def predict(
 
         Predictions(
             np.array(arrays["logits"]),
-            {name: np.array(arrays[f"map_{name}"]) for name in maps},
+            {name: np.array(arrays[f"map_{name}"]) for name in windows},
             entropy,
             names,
             np.array([classes.index(store.classes[label]) for label in store.labels[chosen]]),
@@ -139,6 +140,12 @@ def predict(
             calibration,
         ).save(out)
         shutil.rmtree(out.with_name(out.name + ".part"))
+
+
+def map_shapes(name: str, card: Card, sphere: ViewSphere) -> list[tuple[str, tuple[int, int]]]:
+    """Names and shapes of what a map network says of a view: its window and, if it knows it, its sphere."""
+    window = (name, (sphere.rings, 3))
+    return [window, (f"{name}-sphere", (sphere.rings, sphere.azimuths))] if knows_sphere(card) else [window]
 
 
 def judges(recognisers: Sequence[Card], names: Sequence[str]) -> NDArray[np.int64]:
@@ -195,12 +202,12 @@ def _predict_object(
     i, judge = item
     store, names_it, networks = _open(path, recognisers, maps)
     recogniser = names_it[judge]
-    poses, intrinsics = store.sphere.poses, store.intrinsics
-    depth, clouds = store.depth(i), cloud_input(store.points(i), store.sphere.poses)
-    # One view at a time stays in the processor's cache.
-    inputs = np.concatenate(
-        [geometry_input(depth[v : v + 1], poses[v : v + 1], intrinsics, recogniser.size) for v in range(len(poses))]
-    )
-    parts = [slice(start, start + batch) for start in range(0, len(poses), batch)]
-    found = {f"map_{k}": np.concatenate([net.from_clouds(clouds[p]) for p in parts]) for k, net in networks.items()}
-    return {**found, "logits": np.concatenate([recogniser.from_inputs(inputs[p])[0] for p in parts])}
+    seen = {what: seen_views(store, i, *what) for what in {recogniser.sees} | {n.sees for n in networks.values()}}
+    parts = [slice(start, start + batch) for start in range(0, len(store.sphere), batch)]
+    found = {}
+    for name, network in networks.items():
+        said = [network.from_inputs(seen[network.sees][p]) for p in parts]
+        for kind in said[0]:
+            found[f"map_{name}{kind.removeprefix(network.card.kind)}"] = np.concatenate([part[kind] for part in said])
+    logits = [recogniser.from_inputs(seen[recogniser.sees][p])[0] for p in parts]
+    return {**found, "logits": np.concatenate(logits)}

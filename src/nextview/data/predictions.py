@@ -28,7 +28,8 @@ class Predictions:
 
     Attributes:
         logits: of the recogniser for each view alone, (N, V, C) float32.
-        maps: predicted local maps around each view by name ("lem"), each (N, V, R, 3) float32.
+        maps: predicted local maps around each view by name ("lem"), each (N, V, R, 3) float32; those of
+            the whole sphere, (N, V, R, azimuths), once round from the view, are called so ("lem-sphere").
         depth_entropy: the true measure, bits, (N, V) float32.
         names: of the objects, unique.
         labels: true class of each as an index into ``classes``, (N,) int64.
@@ -66,7 +67,8 @@ class Predictions:
         wanted = {"logits": (n, v, c), "depth_entropy": (n, v), "labels": (n,), "splits": (n,), "conflicting": (n,)}
         arrays = {name: getattr(self, name) for name in wanted}
         for name, values in self.maps.items():
-            wanted[f"map {name}"], arrays[f"map {name}"] = (n, v, self.sphere.rings, 3), values
+            columns = self.sphere.azimuths if name.endswith("-sphere") else 3
+            wanted[f"map {name}"], arrays[f"map {name}"] = (n, v, self.sphere.rings, columns), values
         for name, shape in wanted.items():
             if arrays[name].shape != shape:
                 raise PredictionsError(f"{name} of these predictions has the shape {arrays[name].shape}, not {shape}")

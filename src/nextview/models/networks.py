@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from nextview.models.card import Card, ModelError, file_hash, find_card
 from nextview.models.cloud_input import cloud_input
 from nextview.models.geometry_input import geometry_input
+from nextview.models.image_input import image_input
 from nextview.observation import Observation
 from nextview.policies.base import Evidence
 from nextview.recognition import Calibration
@@ -42,6 +44,38 @@ def open_weights(card: Card, threads: int = 0) -> ort.InferenceSession:
         raise ModelError(f"{card.path}: not a usable ONNX model ({str(error).splitlines()[0]})") from None
 
 
+def sight(card: Card) -> tuple[str, int]:
+    """What a network sees, "geometry", "image" or "cloud", and the side of its image in pixels, 0 for clouds.
+
+    Cards that do not say it are of the first recognisers, which see geometry, and of the first maps, which see clouds.
+    """
+    return card.facts.get("sees", "geometry" if card.kind == "recogniser" else "cloud"), card.facts.get("input_size", 0)
+
+
+def knows_sphere(card: Card) -> bool:
+    """Whether a map network predicts all views of the sphere, not those of the local window alone."""
+    return card.facts.get("around") == "sphere"
+
+
+def see(observations: Sequence[Observation], sees: str, size: int) -> NDArray[Any]:
+    """What a network sees of looks from one camera.
+
+    Args:
+        observations: B looks.
+        sees: "geometry", "image" or "cloud".
+        size: side of the network's image, pixels; clouds have none.
+
+    Returns:
+        Geometry (B, 4, size, size) or image (B, 1, size, size), uint8; or clouds (B, 1024, 3) float32.
+    """
+    poses = np.stack([o.pose for o in observations])
+    if sees == "cloud":
+        return cloud_input(np.stack([o.points for o in observations]), poses)
+    if sees == "image":
+        return image_input(np.stack([o.image for o in observations]), size)
+    return geometry_input(np.stack([o.depth for o in observations]), poses, observations[0].intrinsics, size)
+
+
 class Recogniser:
     """Names the object in each view.
 
@@ -55,7 +89,7 @@ class Recogniser:
         if self.card.kind != "recogniser":
             raise ModelError(f"model {self.card.name} is a {self.card.kind}, not a recogniser")
         self.classes: tuple[str, ...] = tuple(self.card.facts["classes"])
-        self.size: int = self.card.facts["input_size"]
+        self.sees = sight(self.card)
         try:
             self.calibration = Calibration.of_facts(self.card.facts.get("calibration"))
         except ValueError as error:
@@ -64,23 +98,16 @@ class Recogniser:
 
     def __call__(self, observations: Sequence[Observation]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Calibrated logits (B, classes) and pooled features (B, D) of looks from one camera."""
-        return self.from_inputs(
-            geometry_input(
-                np.stack([o.depth for o in observations]),
-                np.stack([o.pose for o in observations]),
-                observations[0].intrinsics,
-                self.size,
-            )
-        )
+        return self.from_inputs(see(observations, *self.sees))
 
-    def from_inputs(self, inputs: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The same from prepared inputs, (B, 4, size, size) uint8."""
+    def from_inputs(self, inputs: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The same from what is seen, see ``see``."""
         logits, features = self._session.run(["logits", "features"], {"input": inputs})
         return logits, features
 
 
 class MapNetwork:
-    """Predicts the local map around each view from its partial cloud.
+    """Predicts the local map around each view from the geometry seen, or from its partial cloud, as its card says.
 
     Args:
         model: name of a bundled model, or path of a card.
@@ -91,17 +118,23 @@ class MapNetwork:
         self.card = find_card(model)
         if self.card.kind == "recogniser":
             raise ModelError(f"model {self.card.name} is a recogniser, not a map network")
+        self.sees = sight(self.card)
         self.valley_classes: tuple[str, ...] = tuple(self.card.facts.get("valley_classes", ()))
         self._session = open_weights(self.card, threads)
 
-    def __call__(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
-        """Maps (B, rings, 3); rows are rings, columns azimuth -1, 0, +1."""
-        points = np.stack([o.points for o in observations])
-        return self.from_clouds(cloud_input(points, np.stack([o.pose for o in observations])))
+    def __call__(self, observations: Sequence[Observation]) -> dict[str, NDArray[np.float32]]:
+        """Maps of looks from one camera, by name.
 
-    def from_clouds(self, clouds: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The same from prepared clouds, (B, P, 3) float32."""
-        return self._session.run(["map"], {"cloud": clouds})[0]
+        The local one, (B, rings, 3), columns azimuth -1, 0, +1, has the name of the card's kind ("lem"). If the network
+        knows it, that of the sphere, (B, rings, azimuths), columns azimuth 0, 1, ... from here, is NAME-sphere.
+        """
+        return self.from_inputs(see(observations, *self.sees))
+
+    def from_inputs(self, seen: NDArray[Any]) -> dict[str, NDArray[np.float32]]:
+        """The same from what is seen, see ``see``."""
+        names = {"map": self.card.kind} | ({"sphere": f"{self.card.kind}-sphere"} if knows_sphere(self.card) else {})
+        found = self._session.run(list(names), {self._session.get_inputs()[0].name: seen})
+        return dict(zip(names.values(), found, strict=True))
 
 
 @dataclass(frozen=True)
@@ -124,7 +157,8 @@ class Models:
     def evidence(self, observations: Sequence[Observation]) -> Evidence:
         """What the models say of looks from one camera."""
         logits, features = self.recogniser(observations)
-        return Evidence(logits, {name: network(observations) for name, network in self.maps.items()}, features)
+        maps = {name: values for network in self.maps.values() for name, values in network(observations).items()}
+        return Evidence(logits, maps, features)
 
 
 def load_models(maps: Sequence[str] = ("lem",), recogniser: str | Path = RECOGNISER, threads: int = 0) -> Models:
@@ -133,7 +167,8 @@ def load_models(maps: Sequence[str] = ("lem",), recogniser: str | Path = RECOGNI
     Raises:
         ModelError: a model is missing, damaged or of the wrong kind.
     """
-    unknown = [name for name in maps if name not in MAPS]
+    names = list(dict.fromkeys(name.removesuffix("-sphere") for name in maps))
+    unknown = [name for name in names if name not in MAPS]
     if unknown:
         raise ModelError(f"no map is called {unknown[0]!r}; there are {', '.join(MAPS)}")
-    return Models(Recogniser(recogniser, threads), {name: MapNetwork(MAPS[name], threads) for name in maps})
+    return Models(Recogniser(recogniser, threads), {name: MapNetwork(MAPS[name], threads) for name in names})

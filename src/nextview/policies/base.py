@@ -17,7 +17,8 @@ class Evidence:
 
     Attributes:
         logits: (B, classes) float.
-        maps: predicted local maps by name ("lem"), each (B, rings, 3) float; those that the policy needs.
+        maps: those that the policy needs, by name: predicted local maps ("lem"), each (B, rings, 3) float, and maps of
+            the whole sphere ("lem-sphere"), (B, rings, azimuths), columns once round from the view.
         features: pooled image features, (B, D) float.
     """
 

@@ -39,20 +39,28 @@ class CalibratedRecogniser(nn.Module):
         return torch.stack(logits).mean(0) / self.temperature, torch.cat(features, 1)
 
 
-class MapOnly(nn.Module):
-    """A map network without the transforms that only training needs."""
+class ShippedMap(nn.Module):
+    """A map network as it ships: the map of the window and, if it knows it, of the sphere, (B, rings, azimuths).
 
-    def __init__(self, network: nn.Module) -> None:
+    Args:
+        network: a ``PointNet`` or a ``ViewMap``.
+        mirror: whether it also sees the mirrored view, and what it says of either, mirrored back, is averaged.
+    """
+
+    def __init__(self, network: nn.Module, mirror: bool = False) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.mirror = network, mirror
+        columns = network.shape[1]
+        self.whole = columns > 3
+        self.flipped = [-step % columns for step in range(columns)] if self.whole else [2, 1, 0]
 
-    def forward(self, cloud: Tensor) -> Tensor:
-        return self.network(cloud)[0]
-
-
-def save_weights(network: nn.Module, run: Path) -> None:
-    """Keep a trained network's parameters in its run's folder, as network.pt."""
-    torch.save(network.state_dict(), run / "network.pt")
+    def forward(self, seen: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+        if seen.dtype == torch.uint8:
+            seen = seen.float() / 255
+        said = self.network(seen)[0]
+        if self.mirror:
+            said = (said + self.network(seen.flip(3))[0][..., self.flipped]) / 2
+        return (said[..., [-1, 0, 1]], said) if self.whole else said
 
 
 def load_weights(network: nn.Module, run: Path) -> nn.Module:

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.data.seen import seen_views
 from nextview.data.store import ViewStore
-from nextview.models.geometry_input import CHANNELS, geometry_input
-from nextview.models.image_input import image_input
+from nextview.models.geometry_input import CHANNELS
 
 CHANNELS_OF = {"geometry": len(CHANNELS), "image": 1}
 """Channels of what a recogniser may see."""
@@ -55,14 +55,7 @@ def load_inputs(path: Path, size: int, kind: str = "geometry") -> NDArray[np.uin
 
 
 def _prepare(path: Path, part: Path, objects: NDArray[np.int64], size: int, kind: str) -> int:
-    store = ViewStore.open(path)
-    inputs = np.lib.format.open_memmap(part, "r+")
-    poses, intrinsics = store.sphere.poses, store.intrinsics
+    store, inputs = ViewStore.open(path), np.lib.format.open_memmap(part, "r+")
     for i in objects:
-        if kind == "image":
-            inputs[i] = image_input(store.image(int(i)), size)
-            continue
-        depth = store.depth(int(i))
-        for v, pose in enumerate(poses):  # one view at a time stays in the cache
-            inputs[i, v] = geometry_input(depth[v : v + 1], pose[None], intrinsics, size)[0]
+        inputs[i] = seen_views(store, int(i), kind, size)
     return len(objects)

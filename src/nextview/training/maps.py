@@ -1,4 +1,4 @@
-"""Train a map network: a PointNet that predicts the local map around a view from its partial cloud."""
+"""Train a map network: it predicts the local map around a view from the view, or from its partial cloud."""
 
 from __future__ import annotations
 
@@ -16,98 +16,139 @@ from torch.utils.data import IterableDataset
 
 from nextview.models.cloud_input import cloud_input
 from nextview.training.fit import fit
-from nextview.training.networks import PointNet, orthogonality
+from nextview.training.hardware import Hardware
+from nextview.training.networks import map_columns, map_network, orthogonality
 from nextview.training.recipes import MapRecipe
+from nextview.viewsphere import ViewSphere
 
 
-class Clouds(IterableDataset):
-    """Batches of (cloud (B, P, 3), map (B, rings, 3)); in half of them left and right are exchanged in both."""
+class Windows(IterableDataset):
+    """Batches of (what the network sees, map (B, rings, columns)), new draws each epoch.
+
+    Mirrored, left and right are exchanged in both, in half of the views.
+    """
 
     def __init__(
         self,
-        points: NDArray[np.int16],
-        maps: NDArray[np.float32],
-        poses: NDArray[np.float64],
+        seen: NDArray[Any],
+        values: NDArray[np.float32],
+        sphere: ViewSphere,
         objects: NDArray[np.int64],
         recipe: MapRecipe,
         training: bool,
     ) -> None:
-        self.points, self.maps, self.poses, self.objects = points, maps, poses, objects
-        self.recipe, self.training, self.epoch = recipe, training, 0
+        self.seen, self.values, self.poses, self.objects = seen, values, sphere.poses, objects
+        steps, n = np.array(map_columns(recipe, sphere)), sphere.azimuths
+        azimuths = (sphere.azimuth_index[:, None] + steps) % n
+        self.around = np.arange(sphere.rings)[None, :, None] * n + azimuths[:, None, :]  # (V, rings, columns)
+        self.mirror = [list(steps % n).index(-step % n) for step in steps]
+        self.recipe, self.training, self.epoch, self.share = recipe, training, 0, slice(None)
 
     def __len__(self) -> int:
         return len(self.objects) * self.recipe.views // self.recipe.batch
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
         rng = np.random.default_rng([self.recipe.seed, self.epoch])
-        n, v, b = len(self) * self.recipe.batch, len(self.poses), self.recipe.batch
-        if self.training:
-            objects = np.concatenate([rng.permutation(self.objects) for _ in range(self.recipe.views)])[:n]
-            views = rng.integers(v, size=n)
+        n, v, batch = len(self) * self.recipe.batch, len(self.poses), self.recipe.batch
+        if self.training:  # every object as often as any other, and each of its views before one comes again
+            turns = np.argsort(rng.random((v, len(self.objects))), axis=0)
+            views = np.resize(turns, (self.recipe.views, len(self.objects))).flatten()
+            objects, order = np.tile(self.objects, self.recipe.views), rng.permutation(len(views))[:n]
+            objects, views = objects[order], views[order]
         else:  # the same spread of views every time
-            objects = np.repeat(self.objects, self.recipe.views)[:n]
-            views = (np.arange(n) * 7) % v
-        for start in range(0, n, b):
-            o, w = objects[start : start + b], views[start : start + b]
-            cloud = self.points[o, w].astype(np.float32)
-            if self.training:
-                cloud = cloud[:, rng.permutation(cloud.shape[1])[: self.recipe.points]]
-            cloud = cloud_input(cloud, self.poses[w])
-            target = self.maps[o, w]
-            if self.training and rng.random() < 0.5:
-                # y runs to the left of the camera; mirroring it about the cloud's own middle exchanges the columns.
-                y = cloud[..., 1]
-                cloud[..., 1] = y.max(1, keepdims=True) + y.min(1, keepdims=True) - y
-                target = target[..., ::-1].copy()
-            yield torch.from_numpy(cloud), torch.from_numpy(target)
+            objects, views = np.repeat(self.objects, self.recipe.views)[:n], (np.arange(n) * 7) % v
+        mirrored = rng.random(n) < 0.5 * (self.training and self.recipe.mirror)
+        for start in range(0, n, batch):
+            points = rng.permutation(1024)[: self.recipe.points] if self.training else np.arange(1024)
+            here = np.arange(start, start + batch)[self.share]
+            o, w, m = objects[here], views[here], mirrored[here]
+            seen: NDArray[Any] = np.stack([self.seen[i, k] for i, k in zip(o, w, strict=True)])
+            target = self.values[o[:, None, None], self.around[w]]
+            if self.recipe.input == "cloud":
+                seen = cloud_input(seen[:, points].astype(np.float32), self.poses[w])
+                # y runs to the left of the camera; the mirror stands in the cloud's own middle.
+                y = seen[m][..., 1]
+                seen[m, :, 1] = y.max(1, keepdims=True) + y.min(1, keepdims=True) - y
+            else:
+                seen[m] = seen[m][..., ::-1]
+            target[m] = target[m][..., self.mirror]
+            yield torch.from_numpy(seen), torch.from_numpy(target)
 
 
 class MapModule(L.LightningModule):
-    """One-cycle Adam on the squared error plus the transforms' regulariser (thesis, section 2.2.3)."""
+    """AdamW on the squared error, plus the regulariser of the PointNet's transforms (thesis, section 2.2.3).
 
-    def __init__(self, recipe: MapRecipe, rings: int, steps: int) -> None:
+    Without weight decay AdamW is Adam, the published optimiser.
+    """
+
+    def __init__(self, recipe: MapRecipe, sphere: ViewSphere, steps: int) -> None:
         super().__init__()
         self.recipe, self.steps = recipe, steps
-        self.net = PointNet(rings)
+        self.net = map_network(recipe, sphere)
+        columns = [step % sphere.azimuths for step in map_columns(recipe, sphere)]
+        self.window = [columns.index(step % sphere.azimuths) for step in (-1, 0, 1)]
+
+    def forward(self, seen: Tensor) -> tuple[Tensor, ...]:
+        if self.recipe.input == "cloud":
+            return self.net(seen)
+        return self.net((seen.float() / 255).to(memory_format=torch.channels_last))
 
     def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
-        predicted, a, b = self.net(batch[0])
-        error = F.mse_loss(predicted.float(), batch[1])
-        self.log("mse", error, prog_bar=True, on_step=False, on_epoch=True)
-        return error + self.recipe.regular * (orthogonality(a.float()) + orthogonality(b.float()))
+        predicted, *transforms = self(batch[0])
+        predicted, true = predicted.float(), batch[1]
+        error = F.mse_loss(predicted[..., self.window], true[..., self.window])
+        self.log("mse", error, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True)
+        if self.recipe.around == "sphere":
+            error = (error + F.mse_loss(predicted, true)) / 2
+        return error + self.recipe.regular * sum(orthogonality(t.float()) for t in transforms)
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
-        predicted = self.net(batch[0])[0].float()
-        self.log("validation_mse", F.mse_loss(predicted, batch[1]), prog_bar=True, batch_size=len(predicted))
+        error = F.mse_loss(self(batch[0])[0].float()[..., self.window], batch[1][..., self.window])
+        self.log("validation_mse", error, prog_bar=True, batch_size=len(batch[1]), sync_dist=True)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        optimizer = torch.optim.Adam(self.parameters(), lr=self.recipe.rate)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, self.recipe.rate, self.steps, pct_start=0.2)
+        r = self.recipe
+        optimizer = torch.optim.AdamW(self.parameters(), lr=r.rate, weight_decay=r.decay)
+        if r.schedule == "tenth":
+            tenth = torch.optim.lr_scheduler.StepLR(optimizer, step_size=5, gamma=0.1)
+            return {"optimizer": optimizer, "lr_scheduler": {"scheduler": tenth, "interval": "epoch"}}
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, r.rate, self.steps, pct_start=0.2)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
 def train(
-    points: NDArray[np.int16],
-    maps: NDArray[np.float32],
-    poses: NDArray[np.float64],
+    seen: NDArray[Any],
+    values: NDArray[np.float32],
+    sphere: ViewSphere,
     training: NDArray[np.int64],
     validation: NDArray[np.int64],
     recipe: MapRecipe,
     out: Path,
+    hardware: Hardware = Hardware(),
 ) -> nn.Module:
-    """Train and return the network; checkpoints in ``out``, from which a second call resumes.
+    """Train and return the network of the best epoch; checkpoints in ``out``, from which a second call resumes.
+
+    The score is the squared error in the local window, whatever else the network predicts.
 
     Args:
-        points: clouds of all views, (N, V, 1024, 3), any scale.
-        maps: local maps around every view, (N, V, rings, 3), 0 .. 1.
-        poses: of the views, (V, 4, 4).
+        seen: what the recipe's network sees of every view: inputs (N, V, C, S, S) uint8, or clouds (N, V, 1024, 3) of
+            any scale.
+        values: of every view, (N, V), 0 .. 1: what the maps are made of.
+        sphere: the views.
         training: objects that train.
         validation: objects that validate.
         recipe: how.
         out: folder for checkpoints and logs.
+        hardware: on what.
+
+    Raises:
+        ModelError: a checkpoint in ``out`` cannot be used.
     """
-    train_clouds = Clouds(points, maps, poses, training, recipe, training=True)
-    validation_clouds = Clouds(points, maps, poses, validation, recipe, training=False)
+    windows = Windows(seen, values, sphere, training, recipe, training=True)
+    validation_windows = Windows(seen, values, sphere, validation, recipe, training=False)
     L.seed_everything(recipe.seed, verbose=False)
-    module = MapModule(recipe, maps.shape[2], recipe.epochs * len(train_clouds))
-    return fit(module, train_clouds, validation_clouds, recipe.epochs, out).net.eval()
+    module = MapModule(recipe, sphere, recipe.epochs * len(windows))
+    score = "validation_mse"
+    return fit(
+        module, windows, validation_windows, recipe.epochs, out, score, "min", recipe.patience, hardware
+    ).net.eval()

@@ -1,9 +1,13 @@
-"""The networks: ResNet with torchvision's parameter names, and PointNet with its two transforms."""
+"""The networks: ResNet with torchvision's parameter names, PointNet with its two transforms, and a ResNet of maps."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+
+from nextview.training.inputs import CHANNELS_OF
+from nextview.training.recipes import MapRecipe
+from nextview.viewsphere import ViewSphere
 
 RESNETS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3), 152: (3, 8, 36, 3)}
 """Blocks in the four stages of each ResNet (He et al., CVPR 2016, table 1)."""
@@ -139,12 +143,12 @@ class Transform(nn.Module):
 
 
 class PointNet(nn.Module):
-    """PointNet (Qi et al., CVPR 2017) that predicts a map of rings x 3 values from a cloud (B, P, 3) in [0, 1].
+    """PointNet (Qi et al., CVPR 2017) that predicts a map of rings x columns values from a cloud (B, P, 3) in [0, 1].
 
-    ``forward`` returns the map (B, rings, 3) and the two transforms, (B, 3, 3) and (B, 64, 64).
+    ``forward`` returns the map (B, rings, columns) and the two transforms, (B, 3, 3) and (B, 64, 64).
     """
 
-    def __init__(self, rings: int, dropout: float = 0.3) -> None:
+    def __init__(self, rings: int, columns: int = 3, dropout: float = 0.3) -> None:
         super().__init__()
         self.input_transform = Transform(3)
         self.first = PointLayer(3, 64)
@@ -154,18 +158,46 @@ class PointNet(nn.Module):
         self.head = nn.Sequential(
             nn.Linear(1024, 512), nn.BatchNorm1d(512), nn.ReLU(inplace=True),
             nn.Linear(512, 256), nn.Dropout(dropout), nn.BatchNorm1d(256), nn.ReLU(inplace=True),
-            nn.Linear(256, rings * 3),
+            nn.Linear(256, rings * columns),
         )  # fmt: skip
         # A ReLU whose input begins below zero stays dead: begin inside the range of the targets.
         nn.init.constant_(self.head[-1].bias, 0.5)
-        self.rings = rings
+        self.shape = (rings, columns)
 
     def forward(self, cloud: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         a = self.input_transform(cloud)
         x = self.first(torch.bmm(cloud, a))
         b = self.feature_transform(x)
         x = self.third(self.second(torch.bmm(x, b))).amax(1)
-        return torch.relu(self.head(x)).unflatten(1, (self.rings, 3)), a, b
+        return torch.relu(self.head(x)).unflatten(1, self.shape), a, b
+
+
+class ViewMap(nn.Module):
+    """A ResNet that predicts a map of rings x columns values in 0 .. 1 from a view, (B, channels, H, W) in 0 .. 1.
+
+    ``forward`` returns the map (B, rings, columns), alone in a tuple.
+    """
+
+    def __init__(self, rings: int, columns: int, depth: int, channels: int) -> None:
+        super().__init__()
+        self.resnet, self.shape = ResNet(depth, rings * columns, channels), (rings, columns)
+
+    def forward(self, view: Tensor) -> tuple[Tensor]:
+        return (self.resnet(view)[0].sigmoid().unflatten(1, self.shape),)
+
+
+def map_network(recipe: MapRecipe, sphere: ViewSphere) -> nn.Module:
+    """The network of a recipe, untrained. The columns of its map are ``map_columns``."""
+    columns = len(map_columns(recipe, sphere))
+    if recipe.input == "cloud":
+        return PointNet(sphere.rings, columns)
+    network = ViewMap(sphere.rings, columns, recipe.depth, CHANNELS_OF[recipe.input])
+    return network.to(memory_format=torch.channels_last)
+
+
+def map_columns(recipe: MapRecipe, sphere: ViewSphere) -> list[int]:
+    """Azimuth steps from the view to each column of a map: -1, 0, +1, or 0, 1, ... once round."""
+    return [-1, 0, 1] if recipe.around == "window" else list(range(sphere.azimuths))
 
 
 def orthogonality(matrix: Tensor) -> Tensor:

@@ -77,24 +77,58 @@ class MapRecipe:
     """How a map network, LEM or LCM, is trained.
 
     Attributes:
+        input: what the network sees: the view as the recogniser does, geometry, through a ResNet; or the partial cloud,
+            through a PointNet, as published.
+        depth: of the ResNet.
+        size: side of the ResNet's input image, pixels.
+        points: drawn from each cloud in training; validation and use take all 1,024.
+        around: what the network predicts: the local window alone, or all views of the sphere, of which the window is a
+            part; the others are of use to policies that look farther.
         epochs: passes over the training objects.
         views: views of each object in one epoch, drawn at random.
-        points: points drawn from each cloud in training; validation and use take all 1,024.
-        batch: clouds a step.
-        rate: peak learning rate of Adam under a one-cycle schedule.
-        regular: weight of the transforms' orthogonality terms (thesis: 1e-4).
+        batch: views a step.
+        rate: peak learning rate of Adam.
+        decay: weight decay of AdamW.
+        regular: weight of the orthogonality terms of the PointNet's transforms.
+        mirror: exchange left and right in half of the views, in the map too.
+        schedule: of the learning rate: up and down once, or a tenth every fifth epoch from the peak.
         validation: part of the training split held out for validation.
         seed: decides everything random.
+        patience: stop after so many epochs without a lower squared error on validation; 0 never stops early.
     """
 
-    epochs: int = 5
-    views: int = 6
+    input: Literal["geometry", "cloud"] = "geometry"
+    depth: Literal[18, 34, 50, 101, 152] = 18
+    size: int = 56
     points: int = 256
-    batch: int = 16
-    rate: float = 1e-3
+    around: Literal["window", "sphere"] = "sphere"
+    epochs: int = 8
+    views: int = 12
+    batch: int = 64
+    rate: float = 2e-3
+    decay: float = 0.05
     regular: float = 1e-4
+    mirror: bool = True
+    schedule: Literal["one-cycle", "tenth"] = "one-cycle"
     validation: float = 0.1
     seed: int = 0
+    patience: int = 0
+
+
+THESIS_MAP = MapRecipe(
+    input="cloud",
+    points=1024,
+    around="window",
+    epochs=15,
+    views=40,
+    batch=16,
+    rate=1e-3,
+    decay=0.0,
+    mirror=False,
+    schedule="tenth",
+)
+"""As published (thesis, sections 2.2.3 and 5.1): PointNet, Adam, 1e-3 and a tenth of it every fifth epoch, batches of
+16, every view once an epoch. The text does not say for how many epochs."""
 
 
 @dataclass(frozen=True)

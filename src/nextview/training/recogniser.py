@@ -27,8 +27,8 @@ class Views(IterableDataset):
 
     Balanced, objects are drawn with weight 1/sqrt(objects of their class), so that rare classes are seen more often,
     and views at random. Otherwise every view comes at most once an epoch, and once exactly if ``recipe.views`` takes
-    all of them. The views of an object come from its own store or, with chance ``recipe.deformed_share``, from its
-    deformed twin.
+    all of them. The views of an object come from its own store or, with chance ``recipe.deformed_share``, from one of
+    its deformed twins, which may have other views.
     """
 
     def __init__(
@@ -52,18 +52,18 @@ class Views(IterableDataset):
         n, v = len(self) * self.recipe.batch, self.sources[0][0].shape[1]
         if self.recipe.balanced:
             objects = rng.choice(self.objects, n, p=self.weights)
+            turn = rng.random(n)  # of the view, as a part of all views
         else:
             objects, views = np.divmod(rng.permutation(len(self.objects) * v)[:n], v)
-            objects = self.objects[objects]
+            objects, turn = self.objects[objects], (views + 0.5) / v
         deformed = (rng.random(n) < self.recipe.deformed_share) & (len(self.sources) > 1)
-        if self.recipe.balanced:
-            views = (rng.random(n) * v).astype(int)
+        source = np.where(deformed, rng.integers(1, max(2, len(self.sources)), n), 0)
         for start in range(0, n, self.recipe.batch):
             batch = np.arange(start, start + self.recipe.batch)[self.share]
             images = []
             for k in batch:
-                inputs, row = self.sources[int(deformed[k])]
-                images.append(inputs[row[objects[k]], views[k]])
+                inputs, row = self.sources[source[k]]
+                images.append(inputs[row[objects[k]], int(turn[k] * inputs.shape[1])])
             yield torch.from_numpy(np.stack(images)), torch.from_numpy(self.labels[objects[batch]])
 
 
@@ -174,7 +174,7 @@ def train(
 
     Args:
         sources: inputs (rows, V, C, S, S) uint8 and each object's row in them (N,); the store's own, whose rows are the
-            objects, and maybe those of its deformed twin.
+            objects, and maybe those of deformed twins.
         labels: class of each object, (N,).
         training: objects that train.
         validation: objects that validate.
