@@ -1,6 +1,8 @@
 """The gain policy: what it may know, what it costs, and that training finds the views that tell."""
 
 import json
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from itertools import pairwise
@@ -16,9 +18,11 @@ from nextview.cli.main import main
 from nextview.fitting.choices import OUTCOMES, ReplayTable, choices, follow, judge, outcome, travel_price
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Random, RandomAll
+from nextview.policies.card import PolicyCardError, bundled_policies
 from nextview.policies.gain import INPUTS, Gain, mirrored, told, told_mirrored
 from nextview.policies.registry import make_policy
 from nextview.recognition import PLAIN_SUM, Calibration
+from nextview.training.perceptrons import Perceptrons
 from nextview.training.recipes import GainRecipe
 
 CLASSES = 4
@@ -29,9 +33,10 @@ def some_gain(sphere=SPHERE, inputs=INPUTS, networks=2, seed=0, **rest) -> Gain:
     rng = np.random.default_rng(seed)
     widths = [len(told_mirrored(sphere, CLASSES, inputs)), 8, 8, len(sphere)]
     layers = [
-        tuple((rng.normal(size=(a, b)), rng.normal(size=b)) for a, b in pairwise(widths)) for _ in range(networks)
+        tuple((rng.normal(size=(a, b)) / a**0.5, rng.normal(size=b)) for a, b in pairwise(widths))
+        for _ in range(networks)
     ]
-    return Gain(sphere, CLASSES, tuple(layers), inputs, **rest)
+    return Gain(sphere, CLASSES, Perceptrons.of(sphere, CLASSES, inputs, tuple(layers)), inputs, **rest)
 
 
 def some_state(sphere=SPHERE, episodes=60, seed=0):
@@ -83,11 +88,16 @@ def test_absolute_azimuth_means_nothing(price):
         np.testing.assert_array_equal(policy.next_views(other, np.random.default_rng(0))[going], views[chosen][going])
 
 
+def reflected(state):
+    """The same episodes in the mirror, azimuth to minus azimuth, and where each view is then."""
+    flip = mirrored(SPHERE)
+    evidence = Evidence(state.evidence.logits, {"lem": state.evidence.maps["lem"][:, :, ::-1]})
+    return replace(state, current=flip[state.current], visited=state.visited[:, flip], evidence=evidence), flip
+
+
 def test_an_object_and_its_mirror_image_are_alike():
     state, policy = some_state(), some_gain()
-    flip = mirrored(SPHERE)  # also the reflection of the world, azimuth to minus azimuth
-    evidence = Evidence(state.evidence.logits, {"lem": state.evidence.maps["lem"][:, :, ::-1]})
-    other = replace(state, current=flip[state.current], visited=state.visited[:, flip], evidence=evidence)
+    other, flip = reflected(state)
     np.testing.assert_allclose(policy.gains(other)[:, flip], policy.gains(state), atol=1e-7)
     np.testing.assert_array_equal(
         told(SPHERE, other, INPUTS), told(SPHERE, state, INPUTS)[:, told_mirrored(SPHERE, CLASSES, INPUTS)]
@@ -161,11 +171,181 @@ def test_the_calibration_is_the_predictions_own_or_fitted_to_what_is_learned_fro
     assert ReplayTable.of(p, np.arange(60), np.random.default_rng(0)).calibration != PLAIN_SUM
 
 
+# The file that ships
+
+onnx = pytest.importorskip("onnx")
+
+from nextview.models.card import file_hash  # noqa: E402
+from nextview.training.gain_export import gain_graph, write_gain  # noqa: E402
+
+
+def write_card(card, policy, state=None):
+    """The card of a policy, and the ONNX file beside it."""
+    facts = {"kind": "gain", "anywhere": policy.anywhere, "elevations": SPHERE.elevations, "azimuths": SPHERE.azimuths}
+    seen = told(SPHERE, state or some_state(), policy.inputs)
+    return write_gain(card, policy, facts | {"classes": ["a", "b", "c", "d"]}, seen.astype(np.float32))
+
+
+def shipped(folder, policy) -> Gain:
+    """The policy as it comes from its files."""
+    write_card(folder / "mine.json", policy)
+    return make_policy(str(folder / "mine.json"), SPHERE)
+
+
+@pytest.mark.parametrize("networks", [1, 3])
+def test_the_file_decides_each_episode_by_itself_to_the_last_bit(networks, tmp_path):
+    policy = shipped(tmp_path, some_gain(networks=networks))
+    seen = told(SPHERE, some_state(episodes=300), INPUTS).astype(np.float32)
+    together = policy.score(seen)
+    assert together.dtype == np.float32
+    assert together.std(0).min() > 1e-3
+    for size in (1, 2, 7, 64):
+        parts = [policy.score(seen[begin : begin + size]) for begin in range(0, 300, size)]
+        np.testing.assert_array_equal(np.concatenate(parts), together)
+
+
+@pytest.mark.parametrize("price", [0.0, 0.3])
+def test_a_mirrored_object_gets_the_mirrored_choice(price, tmp_path):
+    state, policy = some_state(episodes=300), shipped(tmp_path, some_gain(price=price))
+    other, flip = reflected(state)
+    seen = (told(SPHERE, each, INPUTS).astype(np.float32) for each in (state, other))
+    here, there = (policy.score(each) for each in seen)
+    np.testing.assert_array_equal(there[:, flip], here)
+    chosen, mirror = (policy.next_views(each, np.random.default_rng(0)) for each in (state, other))
+    going = ~state.visited.all(1)
+    assert len(np.unique(chosen[going])) > 10
+    np.testing.assert_array_equal(mirror[going], flip[chosen][going])
+
+
+@pytest.mark.parametrize("anywhere", [True, False])
+@pytest.mark.parametrize("inputs", [INPUTS, ("belief",), ("look", "place")])
+def test_the_file_chooses_as_the_networks_do(anywhere, inputs, tmp_path):
+    state, policy = some_state(episodes=300), some_gain(inputs=inputs, anywhere=anywhere, price=0.1)
+    other = shipped(tmp_path, policy)
+    assert (other.inputs, other.anywhere, other.price) == (inputs, anywhere, 0.1)
+    seen = told(SPHERE, state, inputs)
+    np.testing.assert_allclose(other.score(seen.astype(np.float32)), policy.score(seen), atol=1e-5)
+    random = np.random.default_rng(0)
+    np.testing.assert_array_equal(other.next_views(state, random), policy.next_views(state, random))
+
+
+def test_networks_that_single_precision_cannot_hold_are_not_written(tmp_path):
+    policy = some_gain()
+    networks = [[(1e4 * weights, bias) for weights, bias in layers] for layers in policy.score.networks]
+    huge = replace(policy, score=replace(policy.score, networks=tuple(tuple(layers) for layers in networks)))
+    with pytest.raises(ValueError, match=r"differ by .* from the networks'"):
+        write_card(tmp_path / "mine.json", huge)
+    assert not list(tmp_path.iterdir())
+    assert write_card(tmp_path / "mine.json", policy) < 1e-5
+    with pytest.raises(ValueError, match="just trained"):
+        write_card(tmp_path / "again.json", make_policy(str(tmp_path / "mine.json"), SPHERE))
+
+
+def test_networks_of_other_shapes_or_with_numbers_that_are_none_are_refused():
+    score = some_gain().score
+    with pytest.raises(ValueError, match="do not lead from"):
+        replace(score, networks=(score.networks[0][1:],))
+    with pytest.raises(ValueError, match="not a finite number"):
+        replace(score, networks=(tuple((np.full_like(weights, np.inf), bias) for weights, bias in score.networks[0]),))
+    with pytest.raises(ValueError, match="at least one network"):
+        replace(score, networks=())
+
+
+def set_number(weights, name, number):
+    """Change one weight of an ONNX file."""
+    model = onnx.load(weights)
+    place = next(i for i, part in enumerate(model.graph.initializer) if part.name == name)
+    values = onnx.numpy_helper.to_array(model.graph.initializer[place]).copy()
+    values.flat[3] = number
+    model.graph.initializer[place].CopyFrom(onnx.numpy_helper.from_array(values, name))
+    onnx.save(model, weights)
+
+
+FAULTS = {
+    "missing": (lambda w: w.unlink(), False, "mine.onnx: the weights are missing"),
+    "truncated": (lambda w: w.write_bytes(w.read_bytes()[:-500]), False, "not the file that its card describes"),
+    "changed": (lambda w: set_number(w, "bias1", 0.5), False, "not the file that its card describes"),
+    "no network": (lambda w: w.write_bytes(w.read_bytes()[:-500]), True, "not a usable ONNX model"),
+    "other inputs": (
+        lambda w: onnx.save(gain_graph(some_gain(inputs=("belief",)).score), w),
+        True,
+        "not told (batch, ",
+    ),
+    "nan": (lambda w: set_number(w, "weights0", np.nan), True, "a weight is not a finite number"),
+    "infinite": (lambda w: set_number(w, "weights2", np.inf), True, "a weight is not a finite number"),
+    "hidden by a ReLU": (lambda w: set_number(w, "bias0", -np.inf), True, "a weight is not a finite number"),
+}
+"""What is done to the ONNX file, whether the card then holds its new hash, and what is said of it."""
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_damaged_weights_are_refused_in_one_sentence(fault, tmp_path):
+    spoil, hashed, sentence = FAULTS[fault]
+    card, weights = tmp_path / "mine.json", tmp_path / "mine.onnx"
+    write_card(card, some_gain())
+    make_policy(str(card), SPHERE)
+    spoil(weights)
+    if hashed:
+        card.write_text(json.dumps(json.loads(card.read_text()) | {"sha256": file_hash(weights)}))
+    with pytest.raises(PolicyCardError) as error:
+        make_policy(str(card), SPHERE)
+    assert sentence in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("lost", ["sha256", "table", "anywhere"])
+def test_a_card_that_lacks_something_is_refused(lost, tmp_path):
+    card = tmp_path / "mine.json"
+    write_card(card, some_gain())
+    facts = json.loads(card.read_text())
+    facts.pop(lost)
+    card.write_text(json.dumps(facts))
+    with pytest.raises(PolicyCardError, match=rf"mine\.json: not a policy card \(KeyError: '{lost}'\)"):
+        make_policy(str(card), SPHERE)
+
+
+def test_the_bundled_policy_runs_without_what_training_needs():
+    """And its card says of which file: the two are read in a process that cannot import torch or onnx."""
+    script = """
+import sys
+sys.modules |= {"torch": None, "onnx": None}
+import numpy as np
+from nextview.policies.base import EpisodeState, Evidence
+from nextview.policies.registry import make_policy
+from nextview.viewsphere import ViewSphere
+sphere = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
+evidence = Evidence(np.zeros((1, 10)), {"lem": np.zeros((1, 5, 3))})
+state = EpisodeState(np.array([3]), np.arange(40)[None] == 3, np.full((1, 10), 0.1), evidence, 1)
+print(*make_policy("gain", sphere).next_views(state, np.random.default_rng(0)))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert int(done.stdout) in set(range(40)) - {3}
+    card = bundled_policies()["gain"]
+    assert file_hash(card.with_suffix(".onnx")) == json.loads(card.read_text())["sha256"]
+
+
 # Training
 
 torch = pytest.importorskip("torch")
 
-from nextview.training.gain import best_epoch, train  # noqa: E402
+from nextview.training.gain import Networks, best_epoch, train  # noqa: E402
+
+
+def test_what_ships_says_what_torch_says(tmp_path):
+    width = len(told_mirrored(SPHERE, CLASSES, INPUTS))
+    networks = Networks([width, 8, 8, len(SPHERE)], 3, torch.Generator().manual_seed(0))
+    for part in networks.parameters():
+        part.data += 0.3 * torch.randn(part.shape, generator=torch.Generator().manual_seed(1))
+    score = Perceptrons.of(SPHERE, CLASSES, INPUTS, networks.layers())
+    policy = shipped(tmp_path, Gain(SPHERE, CLASSES, score))
+    state = some_state()
+    other, flip = reflected(state)
+    with torch.no_grad():
+        here, there = (networks(torch.from_numpy(told(SPHERE, s, INPUTS)).float()).mean(0) for s in (state, other))
+    expected = ((here + there[:, flip]) / 2).numpy()
+    assert expected.std(0).min() > 0.01
+    np.testing.assert_allclose(policy.score(told(SPHERE, state, INPUTS).astype(np.float32)), expected, atol=1e-5)
+
 
 QUICK = GainRecipe(epochs=6, walks=2, batch=128, networks=2, looks=3, rate=1e-2)
 
@@ -198,7 +378,7 @@ def test_the_same_seed_gives_the_same_policy():
 
     def weights(seed):
         *_, policy = train(table, replace(recipe, seed=seed))
-        return np.concatenate([np.ravel(part) for net in policy.networks for layer in net for part in layer])
+        return np.concatenate([np.ravel(part) for net in policy.score.networks for layer in net for part in layer])
 
     np.testing.assert_array_equal(weights(0), weights(0))
     assert np.abs(weights(0) - weights(1)).max() > 0.01
@@ -229,10 +409,8 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
         make_policy("class-table@1", SPHERE)
     with pytest.raises(ValueError, match="other classes"):
         make_policy(str(card), SPHERE, classes=("ball", "box"))
-    facts["table"]["networks"][0].pop()
-    card.write_text(json.dumps(facts))
-    with pytest.raises(ValueError, match="do not lead from"):
-        make_policy(str(card), SPHERE)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.json", "mine.onnx", "unseen.npz"]
+    assert "its answers differ from the networks' by" in " ".join(capsys.readouterr().err.split())
     main(["train", "gain", str(unseen), str(card), "--epochs", "1", "--local", "--price", "0.2"])
     policy = make_policy(str(card), SPHERE)
     assert (policy.anywhere, policy.price, policy.needs) == (False, 0.2, ("lem",))

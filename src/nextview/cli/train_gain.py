@@ -23,7 +23,8 @@ def train_gain(
     Args:
         predictions: of objects of the training split that the recogniser was not trained on, from recognisers that each
             kept some unseen (nextview predict --split train --unseen).
-        out: card of the policy (.json); run it with --policy OUT, or OUT@PRICE for another price.
+        out: card of the policy (.json), the weights beside it (.onnx); run it with --policy OUT, or OUT@PRICE for
+            another price.
         validation: predictions of other objects of the training split, which choose the epoch and the price; those
             among them are left out of the training. A fifth of PREDICTIONS by default.
         price: of a grid cell of travel; by default the lowest at which the policy travels no farther than a random walk
@@ -41,9 +42,9 @@ def train_gain(
     from nextview.data.split import divide
     from nextview.fitting.choices import ReplayTable, Worth, travel_price
     from nextview.models.card import file_hash
-    from nextview.policies.card import write_policy
     from nextview.policies.gain import Gain
-    from nextview.training.gain import best_epoch, train
+    from nextview.training.gain import best_epoch, train, walk
+    from nextview.training.gain_export import write_gain
 
     if out.suffix != ".json":
         raise ValueError(f"{out}: the card of a policy is called NAME.json")
@@ -82,10 +83,14 @@ def train_gain(
         "predictions": [{"sha256": file_hash(path), "models": source.models} for path, source in sources],
         "calibration": [learned.calibration.temperature_of_one, learned.calibration.correlation],
         "settings": asdict(recipe),
-        "table": replace(policy, price=price).facts(),
     }
-    write_policy(out, facts)
+    seen = walk(checked, [policy], recipe, rng).told
+    difference = write_gain(out, replace(policy, price=price), facts, seen)
     console.print(
         f"learned from {len(learned.data)} objects; on {len(checked.data)} others the {recipe.outcome} after 2, 3, ... "
         f"looks is {', '.join(f'{x:.4f}' for x in worth.outcome)} at price 0; price {price:g}: {out}"
+    )
+    console.print(
+        f"weights: {out.with_suffix('.onnx')}; in {len(seen)} states its answers differ from the networks' by "
+        f"{difference:.1g} at most"
     )

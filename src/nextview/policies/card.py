@@ -1,4 +1,4 @@
-"""The card of a policy that was learned from predictions: one JSON file, table and all."""
+"""The card of a policy that was learned from predictions: one JSON file, table and all; weights are ONNX beside it."""
 
 from __future__ import annotations
 
@@ -10,19 +10,24 @@ from typing import Any
 import numpy as np
 
 from nextview.policies.base import Policy
-from nextview.policies.gain import Gain
+from nextview.policies.gain_weights import read_gain
 from nextview.policies.tables import ClassTable, FixedRing, FixedSequence
 from nextview.viewsphere import ViewSphere
+from nextview.weights import WeightsError
 
 BUNDLED = Path(__file__).parent / "bundled"
 
-KINDS: dict[str, Callable[[ViewSphere, Any, bool], Policy]] = {
-    "fixed-sequence": lambda sphere, table, anywhere: FixedSequence(sphere, np.array(table["moves"]), anywhere),
-    "fixed-ring": lambda sphere, table, anywhere: FixedRing(sphere, table["ring"], table["steps"]),
-    "class-table": lambda sphere, table, anywhere: ClassTable(sphere, np.array(table["values"]), anywhere),
-    "gain": Gain.of_table,
+KINDS: dict[str, Callable[[ViewSphere, dict[str, Any], Path], Policy]] = {
+    "fixed-sequence": lambda sphere, facts, weights: FixedSequence(
+        sphere, np.array(facts["table"]["moves"]), facts["anywhere"]
+    ),
+    "fixed-ring": lambda sphere, facts, weights: FixedRing(sphere, facts["table"]["ring"], facts["table"]["steps"]),
+    "class-table": lambda sphere, facts, weights: ClassTable(
+        sphere, np.array(facts["table"]["values"]), facts["anywhere"]
+    ),
+    "gain": read_gain,
 }
-"""How to make a policy of each kind from the sphere, the card's table, and whether it may leave the local window."""
+"""How to make a policy of each kind from the sphere, what the card says, and the ONNX file, which most have not."""
 
 
 class PolicyCardError(ValueError):
@@ -45,23 +50,26 @@ def read_policy(path: Path, sphere: ViewSphere, classes: Sequence[str] | None = 
     """Make the policy that a card describes.
 
     Args:
-        path: the card.
+        path: the card; weights, where it has any, are the file beside it with the same name that ends in .onnx.
         sphere: the viewpoints; they have to be those that it was learned for.
         classes: of the recogniser, which have to be those too; not compared by default.
 
     Raises:
-        PolicyCardError: there is no such card, it is damaged, or it is for other viewpoints or classes.
+        PolicyCardError: there is no such card, it or its weights are damaged, or it is for other viewpoints or classes.
     """
     try:
         facts = json.loads(path.read_text())
-        place = (tuple(facts["elevations"]), facts["azimuths"])
-        made = KINDS[facts["kind"]](sphere, facts["table"], facts["anywhere"])
+        place = (tuple(facts["elevations"]), int(facts["azimuths"]))
         known = tuple(facts["classes"])
+        make, fits = KINDS[facts["kind"]], place == (sphere.elevations, sphere.azimuths)
+        made = make(sphere, facts, path.with_suffix(".onnx")) if fits else None
     except FileNotFoundError:
         raise PolicyCardError(f"{path}: there is no such policy card") from None
+    except WeightsError as error:
+        raise PolicyCardError(str(error)) from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise PolicyCardError(f"{path}: not a policy card ({type(error).__name__}: {error})") from None
-    if place != (sphere.elevations, sphere.azimuths):
+    if made is None:
         raise PolicyCardError(f"{path}: was learned for {len(place[0])} rings of {place[1]} views, not for this sphere")
     if classes is not None and known != tuple(classes):
         raise PolicyCardError(f"{path}: was learned for other classes ({', '.join(known)})")

@@ -6,9 +6,8 @@ seen from where the camera stands. An object and its mirror image are taken to b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from nextview.policies.tables import cells_from, cells_to
 from nextview.viewsphere import ViewSphere
 
 Float = NDArray[np.float64]
-Layers = tuple[tuple[Float, Float], ...]
 
 INPUTS = ("belief", "look", "place", "lem")
 """What a network may be told: the belief over all looks; what the last look alone says; the ring and the views that are
@@ -91,16 +89,16 @@ class Gain:
     Attributes:
         sphere: the viewpoints.
         classes: how many.
-        networks: some multilayer perceptrons, each a chain of weights (in, out) and biases (out,), ReLU between them;
-            what they give for each cell is averaged.
-        inputs: what they are told, some of INPUTS.
+        score: from what is told, (B, D) float32, to what each cell is worth, (B, V) float32: the mean over some
+            networks and over the object and its mirror image. Each row by itself, to the last bit.
+        inputs: what the score is told, some of INPUTS.
         price: of a grid cell of travel, in what the networks were trained to predict.
         anywhere: among all views; otherwise among those of the local window.
     """
 
     sphere: ViewSphere
     classes: int
-    networks: tuple[Layers, ...]
+    score: Callable[[NDArray[np.float32]], NDArray[np.floating]]
     inputs: tuple[str, ...] = INPUTS
     price: float = 0.0
     anywhere: bool = True
@@ -108,48 +106,22 @@ class Gain:
     def __post_init__(self) -> None:
         if unknown := set(self.inputs) - set(INPUTS):
             raise ValueError(f"a gain policy is told some of {', '.join(INPUTS)}, not {', '.join(sorted(unknown))}")
-        width = len(told_mirrored(self.sphere, self.classes, self.inputs))
-        for layers in self.networks:
-            shapes = [weights.shape for weights, _ in layers]
-            wide = [width, *(bias.size for _, bias in layers)]
-            if shapes != list(pairwise(wide)) or wide[-1] != len(self.sphere):
-                raise ValueError(f"weights of the shapes {shapes} do not lead from {width} inputs to the views")
-            if not all(np.isfinite(numbers).all() for layer in layers for numbers in layer):
-                raise ValueError("a weight is not a finite number")
-        if not self.networks or not np.isfinite(self.price) or self.price < 0:
-            raise ValueError(f"needs at least one network and a price that is not negative, not {self.price}")
+        if not np.isfinite(self.price) or self.price < 0:
+            raise ValueError(f"needs a price that is not negative, not {self.price}")
 
     @property
     def needs(self) -> tuple[str, ...]:
         """The local entropy map, if the networks are told it."""
         return ("lem",) if "lem" in self.inputs else ()
 
-    @classmethod
-    def of_table(cls, sphere: ViewSphere, table: dict[str, Any], anywhere: bool) -> Gain:
-        """From what a policy's card says."""
-        networks = [[(np.array(w, np.float64), np.array(b, np.float64)) for w, b in n] for n in table["networks"]]
-        chains = tuple(tuple(layers) for layers in networks)
-        return cls(sphere, table["classes"], chains, tuple(table["inputs"]), table["price"], anywhere)
-
     def facts(self) -> dict[str, Any]:
-        """What ``of_table`` reads, for JSON; weights to four digits."""
-
-        def rounded(numbers: Float) -> Any:
-            return [rounded(row) for row in numbers] if numbers.ndim > 1 else [float(f"{x:.4g}") for x in numbers]
-
-        networks = [[(rounded(weights), rounded(bias)) for weights, bias in layers] for layers in self.networks]
-        return {"classes": self.classes, "inputs": self.inputs, "price": self.price, "networks": networks}
+        """What a card says of it beside the sphere, for JSON."""
+        return {"classes": self.classes, "inputs": self.inputs, "price": self.price}
 
     def gains(self, state: EpisodeState) -> Float:
         """What each view is predicted to be worth, (B, V); only differences between views mean anything."""
-        seen = told(self.sphere, state, self.inputs)
-        flip = mirrored(self.sphere)
-        cells = np.zeros((len(seen), len(self.sphere)))
-        for layers in self.networks:
-            cells += _forward(seen, layers)
-            cells += _forward(seen[:, told_mirrored(self.sphere, self.classes, self.inputs)], layers)[:, flip]
-        cells /= 2 * len(self.networks)
-        cells -= 1e-9 * np.arange(len(self.sphere))  # else rounding decides between two cells that are mirror images
+        cells = self.score(told(self.sphere, state, self.inputs).astype(np.float32)).astype(np.float64)
+        cells -= 1e-9 * np.arange(len(self.sphere))  # cells that are mirror images may tie; the first of them is taken
         return np.take_along_axis(cells, cells_to(self.sphere)[state.current], 1)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -159,10 +131,3 @@ class Gain:
             return np.where(state.visited, -np.inf, scores).argmax(1)
         rows = np.arange(len(scores))[:, None, None]
         return best_in_window(self.sphere, state, scores[rows, self.sphere.windows[state.current]])
-
-
-def _forward(values: Float, layers: Layers) -> Float:
-    for weights, bias in layers[:-1]:
-        values = np.maximum(values @ weights + bias, 0)
-    weights, bias = layers[-1]
-    return values @ weights + bias

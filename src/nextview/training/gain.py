@@ -19,8 +19,9 @@ from torch import nn
 from nextview.fitting.choices import ReplayTable, Worth, choices, follow, judge
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Random, RandomAll
-from nextview.policies.gain import Gain, Layers, mirrored, told, told_mirrored
+from nextview.policies.gain import Gain, mirrored, told, told_mirrored
 from nextview.policies.tables import cells_from
+from nextview.training.perceptrons import Layers, Perceptrons
 from nextview.training.recipes import GainRecipe
 
 Float = NDArray[np.float64]
@@ -78,8 +79,8 @@ class Networks(nn.Module):
         return x
 
     def layers(self) -> tuple[Layers, ...]:
-        """As ``Gain`` wants them."""
-        weights, biases = ([p.detach().double().numpy().copy() for p in part] for part in (self.weights, self.biases))
+        """As ``Perceptrons`` wants them, float32."""
+        weights, biases = ([p.detach().numpy().copy() for p in part] for part in (self.weights, self.biases))
         chains = range(len(weights[0]))
         return tuple(tuple((w[e], b[e, 0]) for w, b in zip(weights, biases, strict=True)) for e in chains)
 
@@ -126,7 +127,8 @@ def train(table: ReplayTable, recipe: GainRecipe) -> Iterator[Gain]:
             loss.backward()
             optimiser.step()
             schedule.step()
-        policy = Gain(sphere, c, networks.layers(), recipe.inputs)
+        score = Perceptrons.of(sphere, c, recipe.inputs, networks.layers())
+        policy = Gain(sphere, c, score, recipe.inputs)
         yield policy
 
 

@@ -1,0 +1,45 @@
+"""The gain policy from its card and the ONNX file beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.policies.gain import Gain, told_mirrored
+from nextview.viewsphere import ViewSphere
+from nextview.weights import WeightsError, open_onnx
+
+
+def read_gain(sphere: ViewSphere, facts: dict[str, Any], weights: Path) -> Gain:
+    """The policy that a card describes.
+
+    Args:
+        sphere: the viewpoints.
+        facts: what the card says.
+        weights: the ONNX file, from "told" (B, D) to "cells" (B, V), both float32; see ``Gain.score``.
+
+    Raises:
+        WeightsError: the file cannot be used, or is one for other inputs or viewpoints.
+        ValueError, KeyError or TypeError: the card is damaged.
+    """
+    table = facts["table"]
+    session = open_onnx(weights, facts["sha256"], threads=1)
+
+    def score(told: NDArray[np.float32]) -> NDArray[np.float32]:
+        return session.run(["cells"], {"told": told})[0]
+
+    policy = Gain(sphere, table["classes"], score, tuple(table["inputs"]), table["price"], facts["anywhere"])
+    width = len(told_mirrored(sphere, policy.classes, policy.inputs))
+    wanted = [("told", "tensor(float)", [width]), ("cells", "tensor(float)", [len(sphere)])]
+    ends = [*session.get_inputs(), *session.get_outputs()]
+    found = [(end.name, end.type, list(end.shape[1:])) for end in ends]
+    if found != wanted or any(isinstance(end.shape[0], int) for end in ends):
+        shapes = ", ".join(f"{end.name} {tuple(end.shape)}" for end in ends)
+        raise WeightsError(f"{weights}: has {shapes}, not told (batch, {width}) and cells (batch, {len(sphere)})")
+    # The graph answers with what is not a number if any weight is not finite, whatever it is told.
+    if not np.isfinite(score(np.zeros((1, width), np.float32))).all():
+        raise WeightsError(f"{weights}: a weight is not a finite number")
+    return policy

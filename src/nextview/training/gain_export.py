@@ -1,0 +1,120 @@
+"""From the trained networks of the gain policy to one ONNX file that gives the same answers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from nextview.models.card import file_hash
+from nextview.policies.card import write_policy
+from nextview.policies.gain import Gain
+from nextview.training.perceptrons import Perceptrons
+from nextview.weights import open_onnx
+
+OPSET = 18
+IR_VERSION = 8
+"""That of the ONNX releases with this opset: older ONNX Runtimes read it too."""
+
+BOUND = 1e-5
+"""How far the file's answers may be from those of the networks in double precision. A fiftieth of the lowest price of a
+cell of travel that is tried."""
+
+
+def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
+    """One graph: "told" (B, D) float32 in, "cells" (B, V) float32 out, B free, weights in single precision.
+
+    Every row is a product of its own: (B, 2, E, 1, in) by (2, E, in, out), the 2 being the object and its mirror image.
+    ONNX Runtime multiplies one row and many rows by different kernels, which differ in the last bit; in one product,
+    what a row is answered would depend on how many others were asked with it.
+
+    Added to every answer is zero times the sum of all weights, which is not a number if one of them is not finite: so
+    such a file shows without its weights being read, even where a ReLU hides the fault. It is worked out once, on
+    loading.
+    """
+    p, e = perceptrons, len(perceptrons.networks)
+    depths = {len(layers) for layers in p.networks}
+    if len(depths) > 1:
+        raise ValueError("the networks are not equally deep")
+    d, v = len(p.told_flip), len(p.cells_flip)
+    faces = np.stack([np.arange(d), p.told_flip])[:, None, None, :]
+    straight = np.arange(e * v).reshape(e, v)
+    constants: dict[str, NDArray[Any]] = {
+        "faces": faces,
+        "flat": np.array([-1, 2 * e * v]),
+        "straight": straight,
+        "turned": e * v + straight[:, p.cells_flip],
+        "networks": np.array([1]),
+        "half": np.array(0.5, np.float32),
+        "nothing": np.array(0, np.float32),
+    }
+    nodes = [helper.make_node("Gather", ["told", "faces"], ["values0"], axis=1)]
+    for i, layer in enumerate(zip(*p.networks, strict=True)):
+        constants[f"weights{i}"] = np.stack([weights for weights, _ in layer])[None].astype(np.float32)
+        constants[f"bias{i}"] = np.stack([bias for _, bias in layer])[:, None].astype(np.float32)
+        nodes += [
+            helper.make_node("Concat", [f"weights{i}", f"weights{i}"], [f"twice{i}"], axis=0),
+            helper.make_node("MatMul", [f"values{i}", f"twice{i}"], [f"product{i}"]),
+            helper.make_node("Add", [f"product{i}", f"bias{i}"], [f"sum{i}"]),
+            helper.make_node("ReduceSum", [f"weights{i}"], [f"weights{i}_sum"], keepdims=0),
+            helper.make_node("ReduceSum", [f"bias{i}"], [f"bias{i}_sum"], keepdims=0),
+            helper.make_node("Relu", [f"sum{i}"], [f"values{i + 1}"]),
+        ]
+    last = nodes.pop().input[0]
+    nodes += [
+        helper.make_node("Reshape", [last, "flat"], ["all"]),
+        helper.make_node("Gather", ["all", "straight"], ["object"], axis=1),
+        helper.make_node("Gather", ["all", "turned"], ["mirror"], axis=1),
+        helper.make_node("Add", ["object", "mirror"], ["both"]),
+        helper.make_node("ReduceMean", ["both", "networks"], ["mean"], keepdims=0),
+        helper.make_node("Mul", ["mean", "half"], ["worth"]),
+        helper.make_node("Sum", [name for node in nodes for name in node.output if name.endswith("_sum")], ["total"]),
+        helper.make_node("Mul", ["total", "nothing"], ["fault"]),
+        helper.make_node("Add", ["worth", "fault"], ["cells"]),
+    ]
+    inputs = [helper.make_tensor_value_info("told", TensorProto.FLOAT, ["batch", d])]
+    outputs = [helper.make_tensor_value_info("cells", TensorProto.FLOAT, ["batch", v])]
+    initial = [numpy_helper.from_array(np.ascontiguousarray(values), name) for name, values in constants.items()]
+    graph = helper.make_graph(nodes, "gain", inputs, outputs, initial)
+    model = helper.make_model(
+        graph, producer_name="nextview", opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION
+    )
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def write_gain(card: Path, policy: Gain, facts: dict[str, Any], told: NDArray[np.float32]) -> float:
+    """Write a policy that was trained: the ONNX file, then the card, each aside and then renamed.
+
+    Args:
+        card: NAME.json; the ONNX file is NAME.onnx.
+        policy: whose score is of ``Perceptrons``.
+        facts: what the card is to say beside the hash and what the policy itself says.
+        told: states on which the file is compared with the networks, (S, D).
+
+    Returns:
+        By how much their answers differ at most.
+
+    Raises:
+        ValueError: by more than BOUND, or the policy is of other networks; then nothing is written.
+    """
+    if not isinstance(policy.score, Perceptrons):
+        raise ValueError("only a policy that was just trained can be written")
+    weights = card.with_suffix(".onnx")
+    part = weights.with_name(weights.name + ".part")
+    onnx.save(gain_graph(policy.score), part)
+    sha256 = file_hash(part)
+    answers = open_onnx(part, sha256, threads=1).run(["cells"], {"told": told.astype(np.float32)})[0]
+    difference = float(np.abs(answers - policy.score(told.astype(np.float64))).max())
+    if not difference <= BOUND:
+        part.unlink()
+        raise ValueError(
+            f"{weights}: ONNX Runtime's answers differ by {difference:.2g} from the networks'; not written"
+        )
+    part.rename(weights)
+    write_policy(card, facts | {"sha256": sha256, "table": policy.facts()})
+    return difference
