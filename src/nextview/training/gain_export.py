@@ -29,8 +29,8 @@ def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
     """One graph: "told" (B, D) float32 in, "cells" (B, V) float32 out, B free, weights in single precision.
 
     Every row is a product of its own: (B, 2, E, 1, in) by (2, E, in, out), the 2 being the object and its mirror image.
-    ONNX Runtime multiplies one row and many rows by different kernels, which differ in the last bit; in one product,
-    what a row is answered would depend on how many others were asked with it.
+    Which kernel ONNX Runtime takes for a product depends on its shape and on the machine, and kernels may differ in the
+    last bit; so it is the same product whether a row is asked alone, live, or with many others, in replay.
 
     Added to every answer is zero times the sum of all weights, which is not a number if one of them is not finite: so
     such a file shows without its weights being read, even where a ReLU hides the fault. It is worked out once, on
