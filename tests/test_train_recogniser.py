@@ -86,6 +86,16 @@ def test_balanced_draws_even_out_the_classes():
     assert (seen == 1).mean() == pytest.approx(share, abs=4 * (share * (1 - share) / len(seen)) ** 0.5)
 
 
+def test_deformed_twins_may_have_fewer_views_and_each_gets_its_share():
+    own = np.zeros((6, 40, 1, 1, 1), np.uint8)
+    twins = [np.full((3, 20, 1, 1, 1), k, np.uint8) for k in (1, 2)]
+    row = np.array([0, 1, 2, -1, -1, -1])
+    recipe = RecogniserRecipe(views=2000, batch=50, deformed_share=0.5)
+    views = Views([(own, np.arange(6)), *((twin, row) for twin in twins)], np.arange(3), np.zeros(6, int), recipe)
+    found = np.concatenate([images.numpy().ravel() for images, _ in views])
+    assert np.bincount(found) / len(found) == pytest.approx([0.5, 0.25, 0.25], abs=0.03)
+
+
 @pytest.mark.parametrize("balanced", [True, False])
 def test_devices_share_every_batch(balanced):
     recipe = replace(THESIS_RECOGNISER, batch=6, balanced=balanced, views=V)

@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import replace
 
 import numpy as np
 import onnxruntime as ort
@@ -18,6 +19,7 @@ from nextview.data.samples import SAMPLES, boxes_mesh
 from nextview.data.seen import seen_views
 from nextview.data.store import ViewStore
 from nextview.models.networks import MapNetwork, Recogniser
+from nextview.observation import Observation
 from nextview.viewsphere import ViewSphere
 
 torch = pytest.importorskip("torch")
@@ -239,6 +241,28 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
     card = ["--name", "tiny-lcm", "--recogniser", str(models / "tiny.json")]
     main(["export", "lcm", str(runs / "lcm"), str(store), str(out), str(models), *card])
     assert MapNetwork(models / "tiny-lcm.json").card.kind == "lcm"
+
+
+def test_a_recogniser_of_images_sees_images_live_and_in_predictions(trained):
+    store, run, models = trained / "views.zarr", trained / "runs/image", trained / "models"
+    small = ["--epochs", "1", "--views", "2", "--batch", "8", "--validation", "0.25", "--size", "56"]
+    main(["train", "recogniser", str(store), str(run), "--input", "image", *small])
+    main(["export", "recogniser", str(run), str(store), str(models), "--name", "of-images"])
+    out = trained / "images.npz"
+    main(["predict", str(store), str(out), "--maps", "--recogniser", str(models / "of-images.json"), "--workers", "1"])
+    views, predictions = ViewStore.open(store), Predictions.load(out)
+    look = Observation(
+        views.image(3)[7], views.depth(3)[7], views.points(3)[7], views.sphere.poses[7], views.intrinsics
+    )
+    at = predictions.names.index(views.names[3])
+    live = Recogniser(models / "of-images.json")([look])[0]
+    assert predictions.logits[at, 7] == pytest.approx(live[0], abs=1e-4)
+    dark = Recogniser(models / "of-images.json")([replace(look, image=look.image // 4)])[0]
+    assert np.abs(live - dark).max() > 1e-3  # it does look at the image
+    mixture = ["export", "recogniser", str(run), str(store), str(models), "--also", str(trained / "runs/recogniser")]
+    with pytest.raises(SystemExit) as mixed:
+        main(mixture)
+    assert mixed.value.code == 2
 
 
 def test_several_networks_are_exported_as_their_mean(trained):

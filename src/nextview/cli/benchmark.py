@@ -15,7 +15,7 @@ def benchmark(
     policies: tuple[str, ...] = (),
     thresholds: tuple[float, ...] = (0.85, 0.9, 0.95, 0.97, 0.99),
     risks: tuple[float, ...] = (),
-    decline: float = 0.0,
+    decline: float | None = None,
     uncalibrated: bool = False,
     split: Literal["train", "test"] | None = None,
     runs: int = 10,
@@ -33,7 +33,8 @@ def benchmark(
         policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
         thresholds: of the belief.
         risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too.
-        decline: how fast a threshold comes down with the looks; with the recogniser's correlation, as the plain sum's.
+        decline: how fast a threshold comes down with the looks; by default with the recogniser's correlation, as in
+            nextview recognise, or not at all with --risks, which are promised for thresholds that stay.
         uncalibrated: believe the plain sum of the logits, as published, whatever the recogniser's card says.
         split: take only the objects of this one; needed where the predictions hold several.
         runs: random first views of each object.
@@ -65,11 +66,13 @@ def benchmark(
     check_target(out)
     if not thresholds:
         raise ValueError("at least one threshold is needed")
-    for threshold in thresholds:
-        Stopping(threshold, max_views, decline)  # says what is wrong with it
     table = Predictions.load(predictions)
     if uncalibrated:
         table = replace(table, calibration=PLAIN_SUM)
+    if decline is None:
+        decline = 0.0 if risks else table.calibration.correlation
+    for threshold in thresholds:
+        Stopping(threshold, max_views, decline)  # says what is wrong with it
     if risks and decline:
         raise ValueError("error rates are promised for thresholds without a decline")
     promised = {risk: table.calibration.threshold(risk, max_views) for risk in risks}

@@ -19,9 +19,12 @@ from nextview.viewsphere import ViewSphere
 
 Float = NDArray[np.float64]
 
-INPUTS = ("belief", "look", "place", "lem")
+MAPS = ("lem", "lcm", "lem-sphere", "lcm-sphere")
+"""Predicted maps that a network may be told, of the local window or of the whole sphere."""
+
+INPUTS = ("belief", "look", "place", *MAPS)
 """What a network may be told: the belief over all looks; what the last look alone says; the ring and the views that are
-visited; the predicted local entropy map."""
+visited; the maps that were predicted from the last look."""
 
 FLOOR = np.log(1e-4)
 """Beliefs below this are taken for it: nobody knows such small ones."""
@@ -55,8 +58,7 @@ def told(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str]) -> Floa
     if "place" in inputs:
         parts.append(np.eye(sphere.rings)[sphere.ring[state.current]])
         parts.append(state.visited[rows[:, None], cells_from(sphere)[state.current]])
-    if "lem" in inputs:
-        parts.append(np.asarray(state.evidence.maps["lem"]).reshape(len(rows), -1))
+    parts += [np.asarray(state.evidence.maps[name]) for name in MAPS if name in inputs]
     return np.concatenate([np.asarray(part, np.float64).reshape(len(rows), -1) for part in parts], 1)
 
 
@@ -73,8 +75,9 @@ def told_mirrored(sphere: ViewSphere, classes: int, inputs: Sequence[str]) -> ND
         "belief": np.arange(facets),
         "look": np.arange(facets),
         "place": np.concatenate([np.arange(sphere.rings), sphere.rings + mirrored(sphere)]),
-        "lem": np.arange(sphere.rings * 3).reshape(-1, 3)[:, ::-1].ravel(),
     }
+    window = np.arange(sphere.rings * 3).reshape(-1, 3)[:, ::-1].ravel()
+    blocks |= {name: mirrored(sphere) if name.endswith("-sphere") else window for name in MAPS}
     found, begin = [], 0
     for name in [name for name in INPUTS if name in inputs]:
         found.append(begin + blocks[name])
@@ -111,8 +114,8 @@ class Gain:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The local entropy map, if the networks are told it."""
-        return ("lem",) if "lem" in self.inputs else ()
+        """The maps that the score is told."""
+        return tuple(name for name in MAPS if name in self.inputs)
 
     def facts(self) -> dict[str, Any]:
         """What a card says of it beside the sphere, for JSON."""

@@ -136,7 +136,7 @@ class GainRecipe:
     """How the gain policy is trained.
 
     Attributes:
-        inputs: what the networks are told: belief, look, place, lem.
+        inputs: what the networks are told; see ``policies.gain.INPUTS``.
         outcome: of a look: belief in the true class after it, its logarithm, or whether the answer is right.
         looks: the outcome of looks 2 to this one is learned.
         hidden: width of the two hidden layers.
@@ -149,7 +149,12 @@ class GainRecipe:
         seed: of everything random.
     """
 
-    inputs: tuple[Literal["belief", "look", "place", "lem"], ...] = ("belief", "look", "place", "lem")
+    inputs: tuple[Literal["belief", "look", "place", "lem", "lcm", "lem-sphere", "lcm-sphere"], ...] = (
+        "belief",
+        "look",
+        "place",
+        "lem",
+    )
     outcome: Literal["belief", "log-belief", "right"] = "log-belief"
     looks: int = 5
     hidden: int = 32
