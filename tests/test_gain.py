@@ -19,7 +19,7 @@ from nextview.fitting.choices import OUTCOMES, ReplayTable, choices, follow, jud
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.card import PolicyCardError, bundled_policies
-from nextview.policies.gain import INPUTS, Gain, mirrored, told, told_mirrored
+from nextview.policies.gain import INPUTS, MAPS, Gain, mirrored, told, told_mirrored
 from nextview.policies.registry import make_policy
 from nextview.recognition import PLAIN_SUM, Calibration
 from nextview.training.perceptrons import Perceptrons
@@ -43,7 +43,8 @@ def some_state(sphere=SPHERE, episodes=60, seed=0):
     rng = np.random.default_rng(seed)
     state = state_of(sphere, rng.integers(len(sphere), size=episodes), belief=rng.dirichlet([1] * CLASSES, episodes))
     state.visited[:] |= rng.random(state.visited.shape) < rng.random((episodes, 1))
-    maps = {"lem": rng.random((episodes, sphere.rings, 3))}
+    columns = {name: sphere.azimuths if name.endswith("-sphere") else 3 for name in MAPS}
+    maps = {name: rng.random((episodes, sphere.rings, wide)) for name, wide in columns.items()}
     return replace(state, evidence=Evidence(rng.normal(size=(episodes, CLASSES)), maps))
 
 
@@ -64,7 +65,7 @@ def test_an_unvisited_view_is_chosen_in_each_episode_by_itself(anywhere, inputs)
             current=state.current[[i]],
             visited=state.visited[[i]],
             belief=state.belief[[i]],
-            evidence=Evidence(state.evidence.logits[[i]], {"lem": state.evidence.maps["lem"][[i]]}),
+            evidence=Evidence(state.evidence.logits[[i]], {n: m[[i]] for n, m in state.evidence.maps.items()}),
         )
         assert policy.next_views(alone, np.random.default_rng(1)) == chosen[i]
 
@@ -91,7 +92,12 @@ def test_absolute_azimuth_means_nothing(price):
 def reflected(state):
     """The same episodes in the mirror, azimuth to minus azimuth, and where each view is then."""
     flip = mirrored(SPHERE)
-    evidence = Evidence(state.evidence.logits, {"lem": state.evidence.maps["lem"][:, :, ::-1]})
+    # Columns are azimuths from here: -1, 0, 1 of a window, 0, 1, ... once round.
+    maps = {
+        name: np.concatenate([m[:, :, :1], m[:, :, :0:-1]], 2) if name.endswith("-sphere") else m[:, :, ::-1]
+        for name, m in state.evidence.maps.items()
+    }
+    evidence = Evidence(state.evidence.logits, maps)
     return replace(state, current=flip[state.current], visited=state.visited[:, flip], evidence=evidence), flip
 
 
