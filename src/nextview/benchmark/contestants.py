@@ -14,7 +14,7 @@ from nextview.data.predictions import Predictions
 from nextview.measures.confidence_map import confidence_maps
 from nextview.measures.depth_entropy import normalise_per_object
 from nextview.policies.base import Policy
-from nextview.policies.card import PolicyCardError, bundled_policies
+from nextview.policies.card import OtherUseError, bundled_policies
 from nextview.policies.fixed import orbit, ranked
 from nextview.policies.maps import MapPeak
 from nextview.policies.oracle import OracleGain, OracleValley
@@ -112,7 +112,7 @@ def _fits(name: str, trials: Trials) -> bool:
     """Whether a bundled policy was learned for these viewpoints and classes."""
     try:
         _make(name, trials)
-    except PolicyCardError:
+    except OtherUseError:
         return False
     return True
 

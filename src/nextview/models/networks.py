@@ -11,13 +11,14 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from nextview.models.card import Card, ModelError, file_hash, find_card
+from nextview.models.card import Card, ModelError, find_card
 from nextview.models.cloud_input import cloud_input
 from nextview.models.geometry_input import geometry_input
 from nextview.models.image_input import image_input
 from nextview.observation import Observation
 from nextview.policies.base import Evidence
 from nextview.recognition import Calibration
+from nextview.weights import WeightsError, open_onnx
 
 RECOGNISER = "resnet18-modelnet10"
 MAPS = {"lem": "lem-modelnet10", "lcm": "lcm-modelnet10"}
@@ -33,15 +34,10 @@ def open_weights(card: Card, threads: int = 0) -> ort.InferenceSession:
     Raises:
         ModelError: the file is not the one that the card describes, or ONNX Runtime refuses it.
     """
-    if file_hash(card.path) != card.sha256:
-        raise ModelError(f"{card.path}: is not the file that its card describes (the SHA-256 differs)")
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.log_severity_level = 3
     try:
-        return ort.InferenceSession(str(card.path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # the runtime has a class of exception for every reason
-        raise ModelError(f"{card.path}: not a usable ONNX model ({str(error).splitlines()[0]})") from None
+        return open_onnx(card.path, card.sha256, threads)
+    except WeightsError as error:
+        raise ModelError(str(error)) from None
 
 
 def sight(card: Card) -> tuple[str, int]:

@@ -34,6 +34,10 @@ class PolicyCardError(ValueError):
     """A policy's card that cannot be used; the message is one sentence."""
 
 
+class OtherUseError(PolicyCardError):
+    """A sound card of a policy for other viewpoints or classes; the message is one sentence."""
+
+
 def bundled_policies() -> dict[str, Path]:
     """Cards of the learned policies that ship with the package, by name."""
     return {path.stem: path for path in sorted(BUNDLED.glob("*.json"))}
@@ -55,7 +59,8 @@ def read_policy(path: Path, sphere: ViewSphere, classes: Sequence[str] | None = 
         classes: of the recogniser, which have to be those too; not compared by default.
 
     Raises:
-        PolicyCardError: there is no such card, it or its weights are damaged, or it is for other viewpoints or classes.
+        OtherUseError: it is for other viewpoints or classes.
+        PolicyCardError: there is no such card, or it or its weights are damaged.
     """
     try:
         facts = json.loads(path.read_text())
@@ -70,7 +75,7 @@ def read_policy(path: Path, sphere: ViewSphere, classes: Sequence[str] | None = 
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise PolicyCardError(f"{path}: not a policy card ({type(error).__name__}: {error})") from None
     if made is None:
-        raise PolicyCardError(f"{path}: was learned for {len(place[0])} rings of {place[1]} views, not for this sphere")
+        raise OtherUseError(f"{path}: was learned for {len(place[0])} rings of {place[1]} views, not for this sphere")
     if classes is not None and known != tuple(classes):
-        raise PolicyCardError(f"{path}: was learned for other classes ({', '.join(known)})")
+        raise OtherUseError(f"{path}: was learned for other classes ({', '.join(known)})")
     return made
