@@ -22,6 +22,7 @@ from nextview.mesh import load_mesh
 from nextview.models.card import read_card
 from nextview.models.networks import MapNetwork, Models, Recogniser
 from nextview.policies.base import Evidence
+from nextview.policies.card import PolicyCardError
 from nextview.policies.registry import make_policy
 from nextview.recognition import Calibration, Stopping
 from nextview.session import recognise
@@ -244,6 +245,15 @@ def test_a_policy_that_fails_is_named_with_the_object_and_the_others_are_kept(tr
 def test_a_contestant_that_cannot_take_part_is_refused(trials, name, sentence):
     with pytest.raises(ValueError, match=sentence):
         replay(name, trials, 5, 0)
+
+
+def test_a_damaged_policy_is_named_and_not_left_out(trials, tmp_path, monkeypatch):
+    broken = tmp_path / "broken.json"
+    broken.write_text("{}")
+    monkeypatch.setattr("nextview.benchmark.contestants.bundled_policies", lambda: {"broken": broken})
+    monkeypatch.setattr("nextview.policies.registry.bundled_policies", lambda: {"broken": broken})
+    with pytest.raises(PolicyCardError, match="not a policy card"):
+        default_contestants(trials)
 
 
 def test_the_contestants_are_those_that_the_predictions_allow(trials):
