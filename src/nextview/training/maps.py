@@ -96,10 +96,14 @@ class MapModule(L.LightningModule):
     def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
         predicted, *transforms = self(batch[0])
         predicted, true = predicted.float(), batch[1]
-        error = F.mse_loss(predicted[..., self.window], true[..., self.window])
+        near, goal = predicted[..., self.window], true[..., self.window]
+        error = F.mse_loss(near, goal)
         self.log("mse", error, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True)
         if self.recipe.around == "sphere":
             error = (error + F.mse_loss(predicted, true)) / 2
+        if self.recipe.peak:
+            highest = goal.flatten(1).argmax(1)
+            error = error + self.recipe.peak * F.cross_entropy(near.flatten(1) / self.recipe.sharpness, highest)
         return error + self.recipe.regular * sum(orthogonality(t.float()) for t in transforms)
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:

@@ -90,6 +90,9 @@ class MapRecipe:
         rate: peak learning rate of Adam.
         decay: weight decay of AdamW.
         regular: weight of the orthogonality terms of the PointNet's transforms.
+        peak: weight of the cross-entropy of which cell of the window is the highest, beside the squared error, which
+            cares for all cells alike; values are taken over ``sharpness`` for log-odds.
+        sharpness: see ``peak``.
         mirror: exchange left and right in half of the views, in the map too.
         schedule: of the learning rate: up and down once, or a tenth every fifth epoch from the peak.
         validation: part of the training split held out for validation.
@@ -108,6 +111,8 @@ class MapRecipe:
     rate: float = 2e-3
     decay: float = 0.05
     regular: float = 1e-4
+    peak: float = 0.0
+    sharpness: float = 0.05
     mirror: bool = True
     schedule: Literal["one-cycle", "tenth"] = "one-cycle"
     validation: float = 0.1
