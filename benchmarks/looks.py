@@ -1,0 +1,309 @@
+"""Compare policies at a fixed number of looks: nobody stops early, and each look and each cell of travel is counted.
+
+    python benchmarks/looks.py test.npz --out looks [--policies gain@0.01 my:Policy ...] [--looks 2 3 5]
+
+Writes looks.md (the table), looks.csv (every number in a row of its own) and front.png (accuracy against travel) into
+the folder, and prints the table. A policy chooses without knowing how many looks there will be, so it is run once and
+its path cut after each number of looks; the numbers are those of
+
+    nextview benchmark test.npz --thresholds 1 --max-views 2
+
+and so on. Intervals are 95 % bootstrap intervals over objects; p is McNemar's test over objects, for each comparison by
+itself (not corrected for how many there are). The gap is that between random and oracle-gain, which sees what every
+view of the window would say.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Literal
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import tyro
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+from matplotlib.transforms import Bbox
+
+from nextview.benchmark.contestants import Trials, contestant_policy
+from nextview.benchmark.replay import Ends, Paths, cut, make_trials
+from nextview.benchmark.run import Grid, run_grid
+from nextview.benchmark.statistics import interval, mcnemar, ratio, resample
+from nextview.cli.progress import track
+from nextview.data.predictions import Predictions
+from nextview.report.curves import COLOURS, OWN, is_oracle
+from nextview.report.style import STYLE, to_png
+from nextview.report.tables import KNOWING
+
+POLICIES = (
+    "random",
+    "random-all",
+    "lem",
+    "lcm-peak",
+    "furthest",
+    "spread",
+    "fixed-sequence",
+    "fixed-sequence-near",
+    "class-table",
+    "gain@0",
+    "gain@0.002",
+    "gain@0.005",
+    "gain",
+    "gain@0.02",
+    "gain@0.05",
+    "oracle-gain",
+)
+REFERENCES = ("random", "random-all")
+CEILING = "oracle-gain"
+
+
+def after(paths: Paths, looks: int) -> Ends:
+    """How the episodes stand after so many looks."""
+    fields = ("views", "answers", "confidences", "travel", "arc")
+    return cut(replace(paths, **{name: getattr(paths, name)[:, :looks] for name in fields}), None)
+
+
+def measured(grid: Grid, looks: Sequence[int], samples: int) -> pd.DataFrame:
+    """Every number: policy, looks, measure, value, low, high, p.
+
+    The measures: ``accuracy``; ``travel``, grid cells; ``to_random`` and ``to_random-all``, differences of accuracy;
+    ``share_of_gap``, how much of what ``oracle-gain`` has over ``random`` the policy has too. The bootstrap samples are
+    those of the benchmark, the same for all policies, which pairs the differences.
+    """
+    names = list(grid.paths)
+    weights = resample(len(grid.trials.predictions), samples, np.random.default_rng([grid.seed, 1]))
+    rows: list[tuple] = []
+    for k in looks:
+        ends = [after(grid.paths[name], k) for name in names]
+        right = dict(zip(names, (grid.right(e.answer) for e in ends), strict=True))
+        columns = {(name, "accuracy"): r.mean(0) for name, r in right.items()}
+        columns |= {
+            (name, "travel"): e.travel.reshape(grid.runs, -1).mean(0) for name, e in zip(names, ends, strict=True)
+        }
+        for name, reference in product(names, REFERENCES):
+            columns[name, f"to_{reference}"] = columns[name, "accuracy"] - columns[reference, "accuracy"]
+        top = np.stack(list(columns.values()), 1)
+        low, high = interval(ratio(top, np.ones_like(top), weights))
+        value = dict(zip(columns, top.mean(0), strict=True))
+        for i, (name, measure) in enumerate(columns):
+            reference = measure.removeprefix("to_")
+            p = mcnemar(right[name], right[reference]) if reference in REFERENCES and name != reference else np.nan
+            rows.append((name, k, measure, value[name, measure], low[i], high[i], p))
+        gap = value[CEILING, "to_random"]
+        for name in names:
+            share = value[name, "to_random"] / gap if gap > 0 else np.nan
+            rows.append((name, k, "share_of_gap", share, np.nan, np.nan, np.nan))
+    return pd.DataFrame(rows, columns=["policy", "looks", "measure", "value", "low", "high", "p"])
+
+
+Numbers = dict[tuple[str, int, str], tuple[float, float, float, float]]
+"""Value, low, high and p by policy, looks and measure."""
+
+
+def by_key(table: pd.DataFrame) -> Numbers:
+    return {(policy, k, measure): tuple(rest) for policy, k, measure, *rest in table.itertuples(index=False)}
+
+
+def markdown(table: pd.DataFrame, left_out: Sequence[str]) -> str:
+    """The table as text."""
+    found, looks = by_key(table), table["looks"].unique().tolist()
+    at = " at " + ", ".join(map(str, looks))
+
+    def difference(name: str, k: int, reference: str) -> str:
+        value, *_, p = found[name, k, f"to_{reference}"]
+        # rounded first: no minus before a zero
+        return f"{round(100 * value, 1) + 0.0:+.1f} (p {'< 0.0001' if p < 1e-4 else f'{p:.2g}'})"
+
+    head = ["policy", *(f"{k} look{'s' * (k > 1)}" for k in looks), f"travel{at}"]
+    head += [f"points over {reference}{at}" for reference in REFERENCES] + [f"of the gap{at}"]
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for name in table["policy"].unique():
+        cells = ["{:.3f} ({:.3f}-{:.3f})".format(*found[name, k, "accuracy"][:3]) for k in looks]
+        cells.append(", ".join(f"{found[name, k, 'travel'][0]:.2f}" for k in looks))
+        for reference in REFERENCES:
+            cells.append("" if name == reference else ", ".join(difference(name, k, reference) for k in looks))
+        shares = [found[name, k, "share_of_gap"][0] for k in looks]
+        cells.append(", ".join("-" if np.isnan(s) else f"{100 * s:.0f} %" for s in shares))
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join([*lines, *(f"\nLeft out: {sentence}" for sentence in left_out)]) + "\n"
+
+
+def knows(policy: str) -> bool:
+    """Whether a policy or fixed views are chosen by what no robot can know."""
+    return is_oracle(policy) or policy.split("-")[0] in KNOWING
+
+
+def families(names: Sequence[str], trials: Trials) -> dict[str, list[tuple[float, str]]]:
+    """The policies that were run at two prices or more: price and full name of each, ascending."""
+    found: dict[str, list[tuple[float, str]]] = {}
+    for name in names:
+        price = getattr(contestant_policy(name, trials), "price", None)
+        if price is not None:
+            found.setdefault(name.partition("@")[0], []).append((price, name))
+    return {family: sorted(members) for family, members in found.items() if len(members) > 1}
+
+
+def front(table: pd.DataFrame, prices: dict[str, list[tuple[float, str]]]) -> Figure:
+    """Accuracy against travel, a panel for each number of looks; what is told the truth is only named above it.
+
+    A line joins the prices of one policy. Dots are filled where McNemar's p against random is under 0.05.
+    """
+    found, looks = by_key(table), table["looks"].unique().tolist()
+    names = [name for name in table["policy"].unique() if not knows(name)]
+    colour = {name: COLOURS.get(name, "#4a5560") for name in names}
+    said = {name: Path(name).name for name in names}
+    for own, (family, members) in zip(OWN * len(prices), prices.items(), strict=False):
+        for price, name in members:
+            colour[name], said[name] = own, f"{Path(family).name}@{price:g}" if name == family else f"@{price:g}"
+        if family not in said:
+            said[members[0][1]] = Path(members[0][1]).name
+    with matplotlib.rc_context(STYLE):
+        figure = Figure((3.7 * len(looks), 4.4), dpi=160, layout="constrained")
+        FigureCanvasAgg(figure)  # measures text
+        panels = figure.subplots(1, len(looks), sharey=True, squeeze=False)[0]
+        lines = []
+        for axes, k in zip(panels, looks, strict=True):
+            place = {name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0]) for name in names}
+            for members in prices.values():
+                line = [place[name] for _, name in members]
+                axes.plot(*zip(*line, strict=True), color=colour[members[0][1]], linewidth=1.2, zorder=2)
+                lines.append((axes, line))
+            for name, (x, y) in place.items():
+                clear = found[name, k, "to_random"][3] < 0.05
+                axes.plot(x, y, "o", color=colour[name], markersize=5, zorder=3,
+                          markerfacecolor=colour[name] if clear else "white")  # fmt: skip
+            axes.margins(0.16, 0.1)
+            axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=1))
+            axes.set_xlabel("mean travel, grid cells")
+            above = [
+                f"{name}: {100 * found[name, k, 'accuracy'][0]:.1f} % for {found[name, k, 'travel'][0]:.1f} cells"
+                for name in table["policy"].unique()
+                if knows(name)
+            ]
+            axes.set_title(f"{k} look{'s' * (k > 1)}", loc="left", fontweight="bold", fontsize=10, y=1.0,
+                           pad=8 + 11 * len(above))  # fmt: skip
+            axes.annotate("\n".join(above), (0, 1), xytext=(0, 5), xycoords="axes fraction",
+                          textcoords="offset points", fontsize=8, va="bottom")  # fmt: skip
+        panels[0].set_ylabel("accuracy")
+        figure.supxlabel("filled: differs from random by McNemar's test (p < 0.05)", fontsize=8, x=0.99, ha="right")
+        figure.canvas.draw()  # settles where the points are
+        figure.set_layout_engine("none")
+        for axes, k in zip(panels, looks, strict=True):
+            points = {name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0]) for name in names}
+            label(axes, points, said, colour, [line for of, line in lines if of is axes])
+    return figure
+
+
+def label(
+    axes: Axes,
+    points: dict[str, tuple[float, float]],
+    said: dict[str, str],
+    colour: dict[str, str],
+    lines: Sequence[Sequence[tuple[float, float]]],
+) -> None:
+    """Write the name of each point beside it, where it covers no other name, no point and as little line as may be.
+
+    Each takes the best of the places round its point in turn, the most crowded point first; a name that has to stand
+    off is tied to its point by a thin line.
+    """
+    point = axes.figure.dpi / 72  # in pixels
+    dots = {name: axes.transData.transform(at) for name, at in points.items()}
+    along = [np.linspace(a, b, 60) for line in lines for a, b in pairwise(axes.transData.transform(line))]
+    taken = [Bbox.from_extents(*(at - 3.5 * point), *(at + 3.5 * point)) for at in dots.values()]
+    inside, tied = axes.get_window_extent(), []
+    everyone = np.array(list(dots.values()))
+    crowd = {name: np.sort(np.hypot(*(everyone - at).T))[:4].sum() for name, at in dots.items()}
+    for name in sorted(dots, key=crowd.__getitem__):
+        at = dots[name]
+        text = axes.annotate(said[name], points[name], xytext=(0, 0), textcoords="offset points", va="bottom",
+                             fontsize=7.5, color=colour[name], zorder=4)  # fmt: skip
+        size = np.array(text.get_window_extent().size)
+        tries = []
+        for far, angle in product((6, 11, 17, 25, 35, 47), np.radians(np.arange(0, 360, 15))):
+            way = np.array([np.cos(angle), np.sin(angle)])
+            tie = np.linspace(at, at + way * far * point, 20)
+            centre = tie[-1] + way * size / 2
+            box = Bbox([centre - size / 2, centre + size / 2])
+            bad = 40 * sum(_overlap(box, other) for other in taken)
+            bad += 40 * (box.width * box.height - _overlap(box, inside))
+            bad += 300 * sum(map(box.count_contains, tied)) + 30 * sum(map(box.count_contains, along))
+            if far > 11:
+                bad += 60 * sum(other.count_contains(tie[6:]) for other in taken)
+            tries.append((bad + far * far + 20 * abs(np.sin(angle)), far, box, tie))
+        _, far, box, tie = min(tries, key=lambda tried: tried[0])
+        text.set_position((box.p0 - at) / point)
+        taken.append(box)
+        if far > 11:
+            tied.append(tie)
+            ends = axes.transData.inverted().transform(tie[[0, -1]])
+            axes.plot(*ends.T, color="#8a949e", linewidth=0.6, zorder=1, scalex=False, scaley=False)
+
+
+def _overlap(a: Bbox, b: Bbox) -> float:
+    shared = Bbox.intersection(a, b)
+    return 0.0 if shared is None else float(shared.width * shared.height)
+
+
+def main(
+    predictions: tyro.conf.Positional[Path],
+    out: Path = Path("looks"),
+    policies: tuple[str, ...] = (),
+    looks: tuple[int, ...] = (2, 3, 5),
+    split: Literal["train", "test"] | None = None,
+    runs: int = 10,
+    samples: int = 2000,
+    seed: int = 0,
+) -> None:
+    """Write the table and the figure.
+
+    Args:
+        predictions: made by nextview predict.
+        out: folder for looks.md, looks.csv and front.png.
+        policies: names, or MODULE:CLASS for your own, beside random, random-all and oracle-gain; by default a choice of
+            those that the predictions allow.
+        looks: after how many the policies are compared.
+        split: take only the objects of this one; needed where the predictions hold several.
+        runs: random first views of each object.
+        samples: of the bootstrap.
+        seed: decides first views, random policies and the bootstrap.
+    """
+    table = Predictions.load(predictions)
+    if split:
+        table = table.of_split(split)
+    elif len(set(table.splits)) > 1:
+        raise ValueError(f"{predictions}: holds training and test objects; choose with --split which are compared")
+    if not looks or not 1 <= min(looks) <= max(looks) <= len(table.sphere):
+        raise ValueError(f"policies are compared after 1 to {len(table.sphere)} looks, not {looks}")
+    trials = make_trials(table, runs, seed)
+    sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
+    names = list(dict.fromkeys([*REFERENCES, *(policies or POLICIES), CEILING]))
+    grid = Grid(trials, runs, (), max(looks), seed)
+    track(run_grid(grid, names), len(names), "replaying policies")
+    for name in [name for name, paths in grid.paths.items() if paths.views.shape[1] < max(looks) and paths.fixed]:
+        grid.failures[name] = f"{name} is over before look {max(looks)}"
+        del grid.paths[name]
+    found = measured(grid, sorted(set(looks)), samples)
+    text = markdown(found, list(grid.failures.values()))
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "looks.md").write_text(text, encoding="utf-8")
+    found.to_csv(out / "looks.csv", index=False)
+    choosing = [name for name, paths in grid.paths.items() if not paths.fixed]
+    to_png(front(found, families(choosing, trials)), out / "front.png")
+    print(text, end="")
+    if policies and grid.failures:
+        raise ValueError("not all that was asked for could be run")
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(main)
+    except ValueError as error:
+        print(f"looks.py: {error}", file=sys.stderr)
+        sys.exit(2)

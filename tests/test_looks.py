@@ -1,0 +1,100 @@
+"""The comparison at fixed numbers of looks against the benchmark itself, one number of looks at a time."""
+
+import runpy
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.text import Text
+from test_predictions import some_predictions
+
+from nextview.benchmark import results
+from nextview.cli.benchmark import benchmark
+
+LOOKS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "looks.py"))
+NAMES = ("lem", "furthest", "spread", "orbit-4", "best-4")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("looks")
+    some_predictions(24, seed=2).save(folder / "p.npz")
+    LOOKS["main"](folder / "p.npz", folder / "out", NAMES, (4, 2), runs=3, samples=200)
+    return folder
+
+
+@pytest.mark.parametrize("looks", [2, 4])
+def test_the_numbers_are_those_of_a_benchmark_with_so_many_looks(made, looks):
+    names = ("random", "random-all", "lem", "furthest", "spread", "oracle-gain")
+    out = made / f"benchmark{looks}"
+    benchmark(made / "p.npz", out=out, policies=names, thresholds=(1.0,), runs=3, max_views=looks, samples=200)
+    tables = results.load(out).tables
+    found = pd.read_csv(made / "out" / "looks.csv").set_index(["policy", "looks", "measure"]).sort_index()
+    for ours, theirs in (("accuracy", "accuracy"), ("travel", "travel_all")):
+        summary = tables.summary[tables.summary["measure"] == theirs].set_index("policy")
+        for name in names:
+            for column in ("value", "low", "high"):
+                assert found.loc[name, looks, ours][column] == pytest.approx(summary.loc[name, column], abs=1e-9)
+    tests = tables.tests.query("measure == 'accuracy'").set_index("policy")
+    for name in names[1:]:
+        for ours, theirs in (("value", "difference"), ("low", "low"), ("high", "high"), ("p", "mcnemar")):
+            assert found.loc[name, looks, "to_random"][ours] == pytest.approx(tests.loc[name, theirs], abs=1e-9)
+
+
+def test_the_gap_is_that_between_random_and_one_step_of_foresight(made):
+    found = pd.read_csv(made / "out" / "looks.csv").set_index(["measure", "looks", "policy"])["value"].sort_index()
+    for looks in (2, 4):
+        accuracy, share = found["accuracy", looks], found["share_of_gap", looks]
+        assert (share["random"], share["oracle-gain"]) == (0, pytest.approx(1))
+        floor, top = accuracy["random"], accuracy["oracle-gain"]
+        assert share["spread"] == pytest.approx((accuracy["spread"] - floor) / (top - floor))
+
+
+def test_the_table_has_a_row_for_every_policy_and_a_column_for_every_number_of_looks(made):
+    text = (made / "out" / "looks.md").read_text().splitlines()
+    assert [line.split(" | ")[0] for line in text[2:]] == [f"| {name}" for name in ("random", "random-all", *NAMES,
+                                                                                  "oracle-gain")]  # fmt: skip
+    assert text[0].startswith("| policy | 2 looks | 4 looks | travel at 2, 4 |")
+    assert {line.count("|") for line in text} == {text[0].count("|")}
+
+
+def test_views_that_end_before_the_last_look_are_left_out_with_a_sentence(made):
+    with pytest.raises(ValueError, match="not all"):
+        LOOKS["main"](made / "p.npz", made / "short", ("orbit-3", "lem"), (2, 4), runs=1, samples=20)
+    text = (made / "short" / "looks.md").read_text()
+    assert "Left out: orbit-3 is over before look 4" in text
+    assert "| orbit-3" not in text
+    assert "| lem |" in text
+
+
+@pytest.mark.parametrize("looks", [(), (0, 2), (41,)])
+def test_a_number_of_looks_that_nobody_can_take_is_refused(made, looks):
+    with pytest.raises(ValueError, match="1 to 40 looks"):
+        LOOKS["main"](made / "p.npz", made / "bad", looks=looks)
+
+
+def test_no_name_in_the_figure_covers_another_and_only_robots_have_a_dot():
+    rng = np.random.default_rng(0)
+    family = [(0.0, "gain@0"), (0.01, "gain"), (0.05, "gain@0.05")]
+    names = ["random", "random-all", "lem", "furthest", "spread", "class-table", *(name for _, name in family)]
+    rows = []
+    for name in (*names, "oracle-gain"):
+        x, y = (2, 0.97) if name == "oracle-gain" else (rng.uniform(2, 2.6), rng.uniform(0.91, 0.914))
+        rows += [(name, 2, "accuracy", y, y, y, np.nan), (name, 2, "travel", x, x, x, np.nan)]
+        rows += [(name, 2, "to_random", 0.0, 0.0, 0.0, 0.01)]
+    table = pd.DataFrame(rows, columns=["policy", "looks", "measure", "value", "low", "high", "p"])
+    figure = LOOKS["front"](table, {"gain": family})
+    (axes,) = figure.axes
+    texts = [t for t in axes.findobj(Text) if t in axes.texts and t.get_text()]
+    assert {t.get_text() for t in texts} >= {"spread", "@0", "gain@0.01", "@0.05"}
+    boxes = [t.get_window_extent() for t in texts]
+    for a, b in combinations(boxes, 2):
+        assert not a.padded(-0.5).overlaps(b.padded(-0.5))
+    dots = [line for line in axes.lines if line.get_marker() == "o"]
+    assert len(dots) == len(names)
+    assert axes.get_ylim()[1] < 0.95  # the oracle does not squeeze the rest
+    joined = next(line for line in axes.lines if len(line.get_xdata()) == 3)
+    by = table.set_index(["policy", "measure"])["value"]
+    assert [*joined.get_xdata()] == [by[name, "travel"] for _, name in family]
