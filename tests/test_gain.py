@@ -135,7 +135,7 @@ def some_table(n=30, sphere=SMALL, seed=0) -> ReplayTable:
     rng = np.random.default_rng(seed)
     data = telling(sphere, [[0], [1], [2]], n, seed)
     noisy = data.logits + rng.normal(size=data.logits.shape)
-    maps = {"lem": rng.random((n, len(sphere), sphere.rings, 3), dtype=np.float32)}
+    maps = {"lem-sphere": rng.random((n, len(sphere), sphere.rings, sphere.azimuths), dtype=np.float32)}
     return ReplayTable(replace(data, logits=noisy.astype(np.float32)), maps, Calibration(0.8, 0.5))
 
 
@@ -320,7 +320,7 @@ from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.registry import make_policy
 from nextview.viewsphere import ViewSphere
 sphere = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
-evidence = Evidence(np.zeros((1, 10)), {"lem": np.zeros((1, 5, 3))})
+evidence = Evidence(np.zeros((1, 10)), {"lem": np.zeros((1, 5, 3)), "lem-sphere": np.zeros((1, 5, 8))})
 state = EpisodeState(np.array([3]), np.arange(40)[None] == 3, np.full((1, 10), 0.1), evidence, 1)
 print(*make_policy("gain", sphere).next_views(state, np.random.default_rng(0)))
 """
@@ -394,7 +394,8 @@ def test_the_same_seed_gives_the_same_policy():
 def unseen(tmp_path):
     path = tmp_path / "unseen.npz"
     p = some_predictions(90)
-    replace(p, splits=np.array(["train"] * 90)).save(path)
+    sphere = np.random.default_rng(0).random((90, len(p.sphere), p.sphere.rings, p.sphere.azimuths)).astype(np.float32)
+    replace(p, splits=np.array(["train"] * 90), maps=p.maps | {"lem-sphere": sphere}).save(path)
     return path
 
 
@@ -419,7 +420,7 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
     assert "its answers differ from the networks' by" in " ".join(capsys.readouterr().err.split())
     main(["train", "gain", str(unseen), str(card), "--epochs", "1", "--local", "--price", "0.2"])
     policy = make_policy(str(card), SPHERE)
-    assert (policy.anywhere, policy.price, policy.needs) == (False, 0.2, ("lem",))
+    assert (policy.anywhere, policy.price, policy.needs) == (False, 0.2, ("lem-sphere",))
 
 
 def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsys):
@@ -437,6 +438,7 @@ def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsy
     for arguments, sentence in [
         ([str(unseen), str(tmp_path / "mine")], "NAME.json"),
         ([str(tmp_path / "none.npz"), str(card)], "no such file"),
+        ([str(unseen), str(card), "--inputs", "belief", "lcm"], "holds no map 'lcm'"),
     ]:
         with pytest.raises(SystemExit) as end:
             main(["train", "gain", *arguments])

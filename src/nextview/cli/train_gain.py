@@ -42,7 +42,7 @@ def train_gain(
     from nextview.data.split import divide
     from nextview.fitting.choices import ReplayTable, Worth, travel_price
     from nextview.models.card import file_hash
-    from nextview.policies.gain import Gain
+    from nextview.policies.gain import MAPS, Gain
     from nextview.training.gain import best_epoch, train, walk
     from nextview.training.gain_export import write_gain
 
@@ -52,6 +52,10 @@ def train_gain(
     other = table if validation is None else Predictions.load(validation)
     if (other.classes, other.sphere) != (table.classes, table.sphere):
         raise PredictionsError(f"{validation}: is of other classes or viewpoints than {predictions}")
+    for path, source in ((predictions, table), (validation, other)):
+        lacking = [name for name in recipe.inputs if name in MAPS and name not in source.maps]
+        if lacking:
+            raise PredictionsError(f"{path}: holds no map {lacking[0]!r}; predict it, or choose other --inputs")
     if validation is None:
         learning, checking = divide(table.labels, table.depth_entropy, 0.2, recipe.seed)
     else:

@@ -158,7 +158,7 @@ class GainRecipe:
         "belief",
         "look",
         "place",
-        "lem",
+        "lem-sphere",
     )
     outcome: Literal["belief", "log-belief", "right"] = "log-belief"
     looks: int = 5
