@@ -18,6 +18,7 @@ from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
 from nextview.data.seen import seen_views
 from nextview.data.store import ViewStore
+from nextview.fitting.valleys import valley_gains
 from nextview.models.networks import MapNetwork, Recogniser
 from nextview.observation import Observation
 from nextview.viewsphere import ViewSphere
@@ -30,7 +31,6 @@ from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.maps import Windows  # noqa: E402
 from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
-from nextview.training.valleys import valley_gains  # noqa: E402
 
 
 def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
@@ -126,8 +126,7 @@ def trained(tmp_path_factory):
     main(["train", "recogniser", str(store), str(runs / "recogniser"), *small])
     main(["export", "recogniser", str(runs / "recogniser"), str(store), str(models), "--name", "tiny"])
     main(["train", "lem", str(store), str(runs / "lem"), *small])
-    card = str(models / "tiny.json")
-    main(["export", "lem", str(runs / "lem"), str(store), str(models), "--name", "tiny-lem", "--recogniser", card])
+    main(["export", "lem", str(runs / "lem"), str(store), str(models), "--name", "tiny-lem"])
     return root
 
 
@@ -159,7 +158,7 @@ def test_trained_models_have_cards_and_run(trained):
 
 def test_a_mirrored_view_has_the_mirrored_map(trained):
     run, store = trained / "runs/lem", trained / "views.zarr"
-    options = ["--mirror", "--bits", "8", "--name", "both", "--recogniser", str(trained / "models/tiny.json")]
+    options = ["--mirror", "--bits", "8", "--name", "both"]
     main(["export", "lem", str(run), str(store), str(trained / "models"), *options])
     network = MapNetwork(trained / "models/both.json")
     seen = seen_views(ViewStore.open(store), 0, "geometry", 56)
@@ -174,8 +173,7 @@ def test_the_published_map_network_trains_on_clouds_and_predicts_the_window(trai
     main(["train", "lem", store, str(run), "--preset", "thesis", "--epochs", "1", "--views", "2", "--points", "64"])
     recipe = json.loads((run / "recipe.json").read_text())
     assert (recipe["input"], recipe["batch"], recipe["schedule"]) == ("cloud", 16, "tenth")
-    name = ["--name", "published", "--recogniser", str(trained / "models/tiny.json")]
-    main(["export", "lem", str(run), store, str(trained / "models"), *name])
+    main(["export", "lem", str(run), store, str(trained / "models"), "--name", "published"])
     cloud = seen_views(ViewStore.open(trained / "views.zarr"), 0, "cloud", 0)[:2]
     assert {k: v.shape for k, v in MapNetwork(trained / "models/published.json").from_inputs(cloud).items()} == {
         "lem": (2, 5, 3)
@@ -238,9 +236,28 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
             Recogniser(card).from_inputs(np.array(inputs))[0], abs=1e-4
         )
     main(["train", "lcm", str(store), str(out), str(runs / "lcm"), *small])
-    card = ["--name", "tiny-lcm", "--recogniser", str(models / "tiny.json")]
-    main(["export", "lcm", str(runs / "lcm"), str(store), str(out), str(models), *card])
+    main(["export", "lcm", str(runs / "lcm"), str(store), str(out), str(models), "--name", "tiny-lcm"])
     assert MapNetwork(models / "tiny-lcm.json").card.kind == "lcm"
+
+
+def test_valley_classes_are_fitted_to_objects_that_neither_network_has_seen(trained, capsys):
+    store, models, out = str(trained / "views.zarr"), trained / "models", trained / "validation.npz"
+    card = models / "tiny-lem.json"
+    cards = ["--maps", f"lem={card}", "--recogniser", str(models / "tiny.json"), "--workers", "1"]
+    main(["predict", store, str(out), "--unseen", *cards])
+    main(["fit", "valleys", str(out), str(card)])
+    facts, p = json.loads(card.read_text()), Predictions.load(out)
+    gains = valley_gains(p.sphere, p.logits, p.maps["lem"], p.labels)
+    assert facts["valley_classes"] == [p.classes[c] for c, gain in gains.items() if gain > 0]
+    assert facts["valley_gain"] == {p.classes[c]: round(gain, 4) for c, gain in gains.items()}
+    assert f"{len(p)} objects" in facts["valley_fitted_to"]
+    main(["predict", store, str(out), "--unseen", *cards])  # takes up what the card says now
+    assert Predictions.load(out).valley_classes == {"lem": tuple(facts["valley_classes"])}
+    for wrong, sentence in ((models / "tiny.json", "holds no maps by"), (models / "none.json", "no such model card")):
+        with pytest.raises(SystemExit) as end:
+            main(["fit", "valleys", str(out), str(wrong)])
+        assert end.value.code == 2
+        assert sentence in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_recogniser_of_images_sees_images_live_and_in_predictions(trained):

@@ -133,12 +133,11 @@ def export_lem(
     /,
     mirror: bool = False,
     bits: Literal[8, 16] = 16,
-    recogniser: str = "resnet18-modelnet10",
     name: str = "lem-modelnet10",
     commands: tuple[str, ...] = (),
     note: str = "",
 ) -> None:
-    """Export a trained LEM: ONNX, with a card of scores and the classes that prefer the valley, chosen on validation.
+    """Export a trained LEM: ONNX, with a card of its validation scores.
 
     Args:
         run: folder made by nextview train lem.
@@ -146,7 +145,6 @@ def export_lem(
         out: folder for NAME.onnx and NAME.json.
         mirror: average what a ResNet says of a view and of its mirror image.
         bits: that a weight takes in the file.
-        recogniser: the model, or its card, whose beliefs decide which classes prefer the valley.
         name: what to call the model.
         commands: the commands that made the run, for the card.
         note: what else the card should say.
@@ -156,7 +154,7 @@ def export_lem(
 
     target = entropy_target(ViewStore.open(store))
     what = "depth-entropy, 0 .. 1 over the object's views"
-    _export_map("lem", what, target, run, store, out, mirror, bits, recogniser, name, commands, note)
+    _export_map("lem", what, target, run, store, out, mirror, bits, name, commands, note)
 
 
 def export_lcm(
@@ -167,12 +165,11 @@ def export_lcm(
     /,
     mirror: bool = False,
     bits: Literal[8, 16] = 16,
-    recogniser: str = "resnet18-modelnet10",
     name: str = "lcm-modelnet10",
     commands: tuple[str, ...] = (),
     note: str = "",
 ) -> None:
-    """Export a trained LCM: ONNX, with a card of scores and the classes that prefer the valley, chosen on validation.
+    """Export a trained LCM: ONNX, with a card of its validation scores.
 
     Args:
         run: folder made by nextview train lcm.
@@ -181,7 +178,6 @@ def export_lcm(
         out: folder for NAME.onnx and NAME.json.
         mirror: average what a ResNet says of a view and of its mirror image.
         bits: that a weight takes in the file.
-        recogniser: the model, or its card, whose beliefs decide which classes prefer the valley.
         name: what to call the model.
         commands: the commands that made the run, for the card.
         note: what else the card should say.
@@ -192,7 +188,7 @@ def export_lcm(
 
     target = confidence_target(ViewStore.open(store), Predictions.load(predictions))
     what = "the recogniser's confidence where it is right, else 0"
-    _export_map("lcm", what, target, run, store, out, mirror, bits, recogniser, name, commands, note)
+    _export_map("lcm", what, target, run, store, out, mirror, bits, name, commands, note)
 
 
 def _export_map(
@@ -204,7 +200,6 @@ def _export_map(
     out: Path,
     mirror: bool,
     bits: int,
-    recogniser: str,
     name: str,
     commands: tuple[str, ...],
     note: str,
@@ -219,11 +214,10 @@ def _export_map(
     from nextview.data.split import split_training
     from nextview.data.store import ViewStore
     from nextview.models.card import ModelError, write_card
-    from nextview.models.networks import MapNetwork, Recogniser
+    from nextview.models.networks import MapNetwork
     from nextview.training.export import ShippedMap, answer, export_onnx, load_weights
     from nextview.training.networks import map_network
     from nextview.training.recipes import MapRecipe
-    from nextview.training.valleys import valley_gains
 
     recipe = MapRecipe(**json.loads((run / "recipe.json").read_text()))
     views = ViewStore.open(store)
@@ -259,13 +253,6 @@ def _export_map(
         return predictor.from_inputs(seen_views(views, i, *predictor.sees))[kind]
 
     maps = _tracked(one, validation, "validation maps")
-    judge = Recogniser(recogniser)
-
-    def judged(i: int) -> NDArray:
-        return judge.from_inputs(seen_views(views, i, *judge.sees))[0]
-
-    logits = _tracked(judged, validation, "validation views")
-    gains = valley_gains(sphere, logits, maps, views.labels[validation])
     shape = (-1, sphere.rings, 3)
     true = target.values[validation][:, sphere.windows]
     facts |= {
@@ -279,10 +266,9 @@ def _export_map(
                 maps.reshape(shape), true.reshape(shape)
             ),
         },
-        "valley_gain_on_validation": {views.classes[c]: round(gain, 4) for c, gain in gains.items()},
-        "valley_classes": [views.classes[c] for c, gain in gains.items() if gain > 0],
         "largest_difference_to_torch": round(difference, 4),
         "note": note,
+        "unseen": [views.names[i] for i in validation],
     }
     write_card(card, facts)
 

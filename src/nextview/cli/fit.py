@@ -58,6 +58,46 @@ def fit_calibration(
     )
 
 
+def fit_valleys(
+    predictions: tyro.conf.Positional[Path],
+    card: tyro.conf.Positional[Path],
+    /,
+) -> None:
+    """Choose the classes for which the valley of a predicted map is the better view than its peak.
+
+    They go into the map network's card; nextview predict takes them into predictions made before, without predicting
+    again.
+
+    Args:
+        predictions: of the training split; those of objects are taken that the map network was not trained on. Let
+            neither be the recogniser (nextview predict --unseen).
+        card: of the map network; "valley_classes" is written into it.
+    """
+    import numpy as np
+
+    from nextview.cli.progress import console
+    from nextview.data.predictions import Predictions, PredictionsError
+    from nextview.fitting.evidence import fitting_set
+    from nextview.fitting.valleys import valley_gains
+    from nextview.models.card import read_card, write_card
+
+    model, table = read_card(card), Predictions.load(predictions)
+    if model.kind not in table.maps or table.models[model.kind] != (model.name, model.sha256):
+        raise PredictionsError(f"{predictions}: holds no maps by {card}")
+    data = fitting_set(table, 1.0, 0)
+    kept = np.flatnonzero(np.isin(table.names, model.facts.get("unseen", [])))
+    if len(kept) == 0:
+        raise PredictionsError(f"{predictions}: holds no object of which {card} says that it was not trained on it")
+    gains = valley_gains(table.sphere, data.logits[kept], table.maps[model.kind][kept], data.labels[kept])
+    told = {
+        "valley_classes": [table.classes[c] for c, gain in gains.items() if gain > 0],
+        "valley_gain": {table.classes[c]: round(gain, 4) for c, gain in gains.items()},
+        "valley_fitted_to": f"{len(kept)} objects of the training split, judged by {table.models['recogniser'][0]}",
+    }
+    write_card(card, model.facts | told)
+    console.print(f"{len(kept)} objects: the valley is better for {', '.join(told['valley_classes']) or 'no class'}")
+
+
 def fit_policies(
     predictions: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],

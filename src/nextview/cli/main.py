@@ -15,7 +15,7 @@ from nextview.cli.demo import demo
 from nextview.cli.download import download
 from nextview.cli.evaluate import evaluate
 from nextview.cli.export import export_lcm, export_lem, export_recogniser
-from nextview.cli.fit import fit_calibration, fit_policies
+from nextview.cli.fit import fit_calibration, fit_policies, fit_valleys
 from nextview.cli.grid import train_grid
 from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
@@ -47,7 +47,7 @@ COMMANDS: dict[str, Any] = {
     },
     "export": {"recogniser": export_recogniser, "lem": export_lem, "lcm": export_lcm},
     "predict": predict,
-    "fit": {"calibration": fit_calibration, "policies": fit_policies},
+    "fit": {"calibration": fit_calibration, "valleys": fit_valleys, "policies": fit_policies},
     "evaluate": evaluate,
     "benchmark": benchmark,
     "report": report,
@@ -55,7 +55,7 @@ COMMANDS: dict[str, Any] = {
 GROUPS = {
     "train": "Train a network on a view store.",
     "export": "Turn a training run into an ONNX model with a card.",
-    "fit": "Fit a recogniser's calibration or simple policies to predictions.",
+    "fit": "Fit a recogniser's calibration, a map's valleys or simple policies to predictions.",
 }
 
 
