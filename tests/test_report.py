@@ -16,6 +16,8 @@ from nextview.cli.benchmark import benchmark
 from nextview.cli.report import report
 from nextview.data.folders import Entry
 from nextview.data.store import DONE, ViewStore
+from nextview.report import curves
+from nextview.report.html import headline_policy
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -34,6 +36,49 @@ def made(tmp_path_factory):
     store.group["status"][:] = DONE
     report(folder / "out", store=folder / "views.zarr")
     return folder
+
+
+class Ahead:
+    """Takes the first unvisited view that is so many places or more ahead."""
+
+    needs = ()
+    places = 1
+
+    def __init__(self, sphere):
+        self.views = len(sphere)
+
+    def next_views(self, state, rng):
+        ahead = (np.arange(self.views) - state.current[:, None] - self.places) % self.views
+        return np.where(state.visited, self.views, ahead).argmin(1)
+
+
+class Ahead2(Ahead):
+    places = 2
+
+
+class Ahead7(Ahead):
+    places = 7
+
+
+class Ahead13(Ahead):
+    places = 13
+
+
+class Ahead19(Ahead):
+    places = 19
+
+
+OWN = tuple(f"test_report:{made.__name__}" for made in (Ahead, Ahead2, Ahead7, Ahead13, Ahead19))
+ROBOTS = ("random", "random-all", "furthest", "unidirectional", "spread", "spread-local", "lem", "lem-peak", *OWN)
+
+
+@pytest.fixture(scope="module")
+def crowd(made):
+    """Results of thirteen policies that a robot could follow and four oracles."""
+    policies = (*ROBOTS, "true-lem", "oracle-valley", "oracle-gain", "oracle-gain-all")
+    benchmark(made / "p.npz", out=made / "crowd", policies=policies, thresholds=(0.8, 0.97), runs=2, samples=50)
+    report(made / "crowd")
+    return results.load(made / "crowd")
 
 
 class Page(HTMLParser):
@@ -86,6 +131,46 @@ def test_the_tables_show_the_numbers_of_the_results(made):
         assert cells[:4] == [f"{of[m]:.3f}" for m in ("accuracy", "clean_accuracy", "class_accuracy")] + [
             f"{of['looks']:.2f}"
         ]
+
+
+def drawn(figure):
+    """The policies in the legend of a figure, whatever number stands behind each."""
+    return [text.get_text().split("  ")[0] for text in figure.axes[0].get_legend().get_texts()]
+
+
+def test_of_a_crowd_the_curves_show_the_reference_the_best_eight_and_two_oracles(crowd):
+    of = crowd.tables.summary.query("measure == 'accuracy' and threshold == 0.97").set_index("policy")["value"]
+    shown = curves.compared(crowd)
+    assert shown[-2:] == ["oracle-valley", "oracle-gain"]
+    best, left = set(shown[:-2]) - {"random"}, set(ROBOTS) - set(shown)
+    assert "random" in shown
+    assert (len(shown), len(best), len(left)) == (11, 8, 4)
+    assert min(of[list(best)]) >= max(of[list(left)])
+    assert headline_policy(crowd, 0.97) in best
+    assert drawn(curves.threshold_curve(crowd)) == drawn(curves.budget_curve(crowd, "looks")) == shown
+    looks = [curves.look_of(name, crowd) for name in shown]
+    assert len({(look["color"], look["linestyle"]) for look in looks}) == len(shown)
+    rows = [label.get_text() for label in curves.class_differences(crowd, 0.97).axes[0].get_yticklabels()]
+    assert rows == [name for name in shown if name not in ("random", "oracle-gain")]
+
+
+def test_a_reference_that_is_the_worst_of_a_crowd_is_drawn_all_the_same(crowd):
+    of = crowd.tables.summary.query("measure == 'accuracy' and threshold == 0.97").set_index("policy")["value"]
+    worst = min(ROBOTS, key=of.__getitem__)
+    shown = curves.compared(replace(crowd, settings={**crowd.settings, "reference": worst}))
+    assert worst in shown
+    assert len(shown) == 11
+
+
+def test_captions_tell_where_the_rest_of_a_crowd_is(crowd, made):
+    text = (crowd.folder / "report.html").read_text()
+    assert text.count("4 more are in the tables") == 4
+    assert text.count("4 more are in per_class.csv") == 1
+    for name in ROBOTS:
+        assert len(re.findall(rf'<tr><th scope="row">{name}\b(?!-)', text)) == 2  # of results, and of calibration
+    few = (made / "out" / "report.html").read_text()
+    assert "more are in" not in few
+    assert curves.compared(results.load(made / "out")) == [*ROBOTS[:8], "oracle-valley", "oracle-gain"]
 
 
 @pytest.mark.parametrize("policies", [("random",), ("lem", "best-3"), ("test_replay:Raises", "unidirectional")])

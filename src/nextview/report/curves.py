@@ -31,8 +31,10 @@ COLOURS = {
     "oracle-gain": "#111111",
     "oracle-gain-all": "#777777",
 }
-OWN = ("#b5179e", "#7b2d00", "#3a7d00", "#7209b7")
-"""For the policies of others."""
+OWN = ("#b5179e", "#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff7043", "#5c6bc0")
+"""For all others: as many as there are at most in a figure of a crowded benchmark."""
+CROWD, BEST = 12, 8
+"""With more curves than the first, only so many of the most accurate are drawn."""
 
 
 def is_oracle(policy: str) -> bool:
@@ -40,15 +42,38 @@ def is_oracle(policy: str) -> bool:
     return policy in ORACLES
 
 
-def compared(results: Results) -> list[str]:
-    """The policies of the curves: those that a robot could follow, then the published one and the ceiling."""
+def headline_threshold(results: Results) -> float:
+    """The threshold that the report speaks of: 0.97, the library's default, or the one next to it."""
+    return min(results.settings["thresholds"], key=lambda t: abs(t - 0.97))
+
+
+def followed(results: Results) -> list[str]:
+    """The policies that a robot could follow, then the published one and the ceiling."""
     names = list(results.tables.sweep["policy"].unique())
     return [n for n in names if not is_oracle(n)] + [n for n in ("oracle-valley", "oracle-gain") if n in names]
 
 
+def compared(results: Results) -> list[str]:
+    """The policies of the curves: those ``followed``.
+
+    Of more than ``CROWD``: the reference, the ``BEST`` others that a robot could follow and that are the most accurate
+    at the headline threshold, the published one and the ceiling.
+    """
+    names = followed(results)
+    if len(names) <= CROWD:
+        return names
+    reference, summary = results.settings["reference"], results.tables.summary
+    at = (summary["measure"] == "accuracy") & (summary["threshold"] == headline_threshold(results))
+    accuracy = summary[at].set_index("policy")["value"]
+    rivals = sorted((n for n in names if not is_oracle(n) and n != reference), key=lambda n: -accuracy[n])
+    drawn = {reference, *rivals[:BEST]}
+    return [n for n in names if n in drawn or is_oracle(n)]
+
+
 def look_of(policy: str, results: Results) -> dict:
-    """Colour and line of a policy, the same in all figures."""
-    own = [name for name in results.tables.sweep["policy"].unique() if name not in COLOURS]
+    """Colour and line of a policy, the same in all figures; no two of those ``compared`` in a crowd share both."""
+    names = dict.fromkeys([*compared(results), *results.tables.sweep["policy"].unique()])
+    own = [name for name in names if name not in COLOURS]
     colour = COLOURS.get(policy) or OWN[own.index(policy) % len(OWN)]
     style = {"oracle-gain": ":", "oracle-gain-all": ":"}.get(policy, "--" if is_oracle(policy) else "-")
     return {"color": colour, "linestyle": style}

@@ -15,11 +15,6 @@ from nextview.report.elements import asset, card, description, document, numbers
 from nextview.report.trajectories import Pictures, gains, trajectories, worst_failures
 
 
-def headline_threshold(results: Results) -> float:
-    """The threshold that the report speaks of: 0.97, the library's default, or the one next to it."""
-    return min(results.settings["thresholds"], key=lambda t: abs(t - 0.97))
-
-
 def headline_policy(results: Results, threshold: float) -> str:
     """The most accurate policy that a robot could follow, other than the reference; the reference if it is alone."""
     found = numbers(results.tables.summary, "policy", "threshold", "measure")
@@ -46,7 +41,7 @@ def write_report(results: Results, path: Path, pictures: Pictures) -> None:
 
 def page(results: Results, pictures: Pictures) -> str:
     """The whole page as text."""
-    at = headline_threshold(results)
+    at = curves.headline_threshold(results)
     best, reference = headline_policy(results, at), results.settings["reference"]
     failures = worst_failures(results.episodes(best, at))
     sections = [
@@ -116,6 +111,13 @@ def _spoken(results: Results, policies: Sequence[str], at: float, measure: str) 
     return f"At threshold {at:g}: " + ", ".join(said) + "."
 
 
+def _others(results: Results, where: str = "the tables") -> str:
+    """What a figure's caption says of the policies that are left out of it in a crowd; nothing if none are."""
+    left = len(curves.followed(results)) - len(curves.compared(results))
+    drawn = f"the reference, the {curves.BEST} most accurate others and oracles"
+    return f" Drawn are {drawn}; {left} more are in {where}." if left else ""
+
+
 def _results(results: Results, at: float) -> str:
     text = (
         "<p>Policies marked <em>oracle</em> are told something that no robot knows: the true class, the true map, or "
@@ -153,7 +155,7 @@ def _curves(results: Results, at: float) -> str:
         picture(
             curves.threshold_curve(results, measure),
             f"{what} against threshold. " + _spoken(results, names, at, measure),
-            f"{what} against threshold, as figures 15 and 18.",
+            f"{what} against threshold, as figures 15 and 18.{_others(results)}",
         )
         for measure, what in (("class_accuracy", "Mean class accuracy"), ("accuracy", "Accuracy over objects"))
     ]
@@ -163,7 +165,7 @@ def _curves(results: Results, at: float) -> str:
                 picture(
                     curves.budget_curve(results, budget),
                     f"Accuracy against mean {what}. " + _spoken(results, names, at, budget),
-                    f"Accuracy against mean {what}; oracles broken.",
+                    f"Accuracy against mean {what}; oracles broken.{_others(results)}",
                 )
             )
     return text + side_by_side(*figures)
@@ -177,7 +179,7 @@ def _calibration(results: Results, best: str, at: float) -> str:
         "Share of right answers against confidence. " + _spoken(results, policies, at, "calibration_error"),
         f"Reliability at threshold {at:g}: on the diagonal, 90&nbsp;% sure is right nine times in ten.",
     )
-    return tables.calibration(results, curves.compared(results)) + side_by_side(figure)
+    return tables.calibration(results, curves.followed(results)) + side_by_side(figure)
 
 
 def _classes(results: Results, best: str, at: float) -> str:
@@ -194,7 +196,8 @@ def _classes(results: Results, best: str, at: float) -> str:
         difference = picture(
             curves.class_differences(results, at),
             "Accuracy of each class against the reference, in percentage points; the table below has the numbers.",
-            f"Accuracy by class against {reference} at threshold {at:g}, percentage points.",
+            f"Accuracy by class against {reference} at threshold {at:g}, percentage points."
+            + _others(results, "per_class.csv"),
         )
     return (
         side_by_side(*figures, difference)
