@@ -151,7 +151,7 @@ def test_predictions_are_what_the_networks_say_of_each_look(shop):
     )
     logits, _ = Recogniser(shop / "tiny.json")([look])
     np.testing.assert_allclose(found.logits[i, v], logits[0], atol=1e-5)
-    np.testing.assert_allclose(found.maps["lem"][i, v], MapNetwork(shop / "tiny-lem.json")([look])[0], atol=1e-5)
+    np.testing.assert_allclose(found.maps["lem"][i, v], MapNetwork(shop / "tiny-lem.json")([look])["lem"][0], atol=1e-5)
 
 
 def test_the_same_mesh_under_two_labels_is_marked_across_splits(shop):
