@@ -151,7 +151,7 @@ def judge(
     return Worth(*reached)
 
 
-PRICES = (0.0, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
+PRICES = (0.0, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.012, 0.015, 0.02, 0.03, 0.05, 0.1)
 """Of a grid cell of travel, in the unit of the outcome."""
 
 
