@@ -28,7 +28,7 @@ torch = pytest.importorskip("torch")
 from nextview.benchmark.scores import map_scores, recogniser_scores  # noqa: E402
 from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
-from nextview.training.maps import Windows  # noqa: E402
+from nextview.training.maps import MapModule, Windows  # noqa: E402
 from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
 
@@ -199,6 +199,19 @@ def test_map_batches_hold_each_view_with_its_own_map():
     assert len(set(drawn)) == 16  # no view comes twice before all have come
     assert {o for o, _ in drawn} == {1, 2, 5}
     assert 0 < sum(flips) < 16
+
+
+def test_the_peak_weighs_in_which_cell_of_the_window_is_highest(monkeypatch):
+    rng, sphere = np.random.default_rng(0), ViewSphere.named("40")
+    said, true = rng.random((2, 4, 5, 8)).astype(np.float32)
+    module = MapModule(MapRecipe(peak=0.3, sharpness=0.1), sphere, 1)
+    monkeypatch.setattr(module, "forward", lambda seen: (torch.from_numpy(said),))
+    monkeypatch.setattr(module, "log", lambda *args, **options: None)
+    loss = module.training_step((torch.zeros(4), torch.from_numpy(true)), 0)
+    near, goal = (values[:, :, [-1, 0, 1]].reshape(4, 15) for values in (said, true))
+    chance = softmax(near / 0.1, 1)[np.arange(4), goal.argmax(1)]
+    squared = (((near - goal) ** 2).mean() + ((said - true) ** 2).mean()) / 2
+    assert loss.item() == pytest.approx(squared - 0.3 * np.log(chance).mean(), rel=1e-5)
 
 
 def test_a_finished_run_is_not_trained_again(trained):
