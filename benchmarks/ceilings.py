@@ -4,7 +4,8 @@
 
 prints a section in Markdown. TRAINING.npz are predictions of the training split; what is learned is learned from its
 validation objects (VALIDATION_SHARE as for nextview fit). All numbers are shares of right answers over the objects of
-TEST.npz and all first views, in brackets 95 % bootstrap intervals over objects; looks are fused by summing logits.
+TEST.npz and all first views, in brackets 95 % bootstrap intervals over objects; looks are fused by summing
+logits, without what the recogniser says of the sides.
 """
 
 from __future__ import annotations
@@ -114,8 +115,8 @@ def learned_paths(data: FittingSet, p: Predictions, by_class: bool, by_pose: boo
 
 
 def section(test: Path, training: Path, validation: float = 0.1, samples: int = 2000) -> str:
-    p = Predictions.load(test)
-    data = fitting_set(Predictions.load(training), validation, 0)
+    p = replace(Predictions.load(test), sides=None)
+    data = replace(fitting_set(Predictions.load(training), validation, 0), sides=None)
     weights = resample(len(p), samples, np.random.default_rng(0)) / len(p)
 
     def number(of_objects: NDArray) -> str:

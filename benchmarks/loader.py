@@ -27,7 +27,7 @@ from nextview.data.store import ViewStore
 from nextview.training.ahead import Ahead
 from nextview.training.inputs import load_inputs
 from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe
-from nextview.training.recogniser import RecogniserModule, Views
+from nextview.training.recogniser import RecogniserModule, Source, Views
 
 RECIPES = {"default": RecogniserRecipe(), "thesis": THESIS_RECOGNISER}
 
@@ -83,7 +83,7 @@ def main(
     views = ViewStore.open(store)
     training, _ = split_training(views, recipe.validation, recipe.seed)
     inputs = load_inputs(store, recipe.size, recipe.input)
-    real = Views([(inputs, np.arange(len(views)))], training, views.labels, recipe)
+    real = Views([Source(inputs, np.arange(len(views)))], training, views.labels, recipe)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     module = RecogniserModule(recipe, len(views.classes), recipe.epochs * len(real)).to(device).train()
     module.log = lambda *_, **__: None  # there is no trainer to log to

@@ -21,6 +21,7 @@ from nextview.benchmark.replay import make_trials
 from nextview.benchmark.run import THRESHOLDS, Grid, run_grid
 from nextview.benchmark.summary import summarise
 from nextview.data.predictions import Predictions
+from nextview.recognition import Calibration
 from nextview.viewsphere import ViewSphere
 
 TEN = ["random", "random-all", "furthest", "unidirectional", "lem", "lem-peak"]
@@ -44,6 +45,8 @@ def made_up(objects: int, azimuths: int = 8, classes: int = 10) -> Predictions:
         sphere,
         {},
         {"lem": ("class_0",)},
+        Calibration(1.0, 0.8, side_correlation=0.1),
+        rng.normal(size=(objects, v, classes, 8)).astype(np.float32),
     )
 
 

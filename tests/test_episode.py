@@ -1,6 +1,6 @@
 """Episodes against a plain loop over one object, and policies that misbehave."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.special import softmax
 
 from nextview.episode import Episodes, PolicyError, run_episodes, select
 from nextview.policies.base import EpisodeState, Evidence
-from nextview.policies.baselines import Random, Unidirectional
+from nextview.policies.baselines import Random, RandomAll, Unidirectional
 from nextview.policies.maps import MapPeak
 from nextview.recognition import PLAIN_SUM, Calibration, Stopping
 from nextview.viewsphere import ViewSphere
@@ -125,6 +125,44 @@ def test_confidence_counts_at_the_threshold_itself():
     assert end.confident
 
 
+class Turning:
+    """Remembers what it was told of the sides; goes where the rng says."""
+
+    needs = ("sides",)
+
+    def __init__(self):
+        self.told = []
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator):
+        self.told.append((state.episodes, state.current, state.sides))
+        return RandomAll(SPHERE).next_views(state, rng)
+
+
+def test_the_belief_in_the_side_is_that_of_an_object_that_stands_still():
+    """Each look says something of the side seen from it; together they speak of where the object's own zero points."""
+    table, policy, calibration = Table.random(20), Turning(), Calibration(0.7, 0.4)
+    said = np.random.default_rng(1).normal(size=(20, len(SPHERE), CLASSES, 8))
+
+    def observe(episodes, views):
+        return replace(table.observe(episodes, views), sides=said[episodes, views])
+
+    starts = np.random.default_rng(2).integers(0, 40, 20)
+    rng = np.random.default_rng(0)
+    done = run_episodes(observe, SPHERE, policy, starts, Stopping(0.995, 6), rng, calibration)
+    assert len({len(episodes) for episodes, _, _ in policy.told}) > 1  # some end earlier
+    for looks, (episodes, current, sides) in enumerate(policy.told, 1):
+        for e, now, found in zip(episodes, current, sides, strict=True):
+            at = done.outcome.views[e, :looks]
+            assert at[-1] == now
+            zero = np.zeros((CLASSES, 8))  # summed by the azimuth that the object's zero has, a steps from the view's
+            for view in at:
+                for side in range(8):
+                    zero[:, (SPHERE.azimuth_index[view] - side) % 8] += said[e, view, :, side]
+            expected = softmax(zero / (1 + 0.4 * (looks - 1)), axis=1)
+            seen = expected[:, (SPHERE.azimuth_index[now] - np.arange(8)) % 8]
+            np.testing.assert_allclose(found, seen, atol=1e-9)
+
+
 def test_the_same_seed_gives_the_same_episodes():
     runs = [run(Table.random(40), Random(SPHERE), np.arange(40), Stopping(), seed=s).outcome.views for s in (1, 1, 2)]
     np.testing.assert_array_equal(runs[0], runs[1])
@@ -216,7 +254,7 @@ def test_a_map_that_is_missing_or_of_another_sphere():
 def test_a_logit_that_is_not_finite_is_refused(bad):
     table = Table.random(5)
     table.logits[3, :, 1] = bad
-    with pytest.raises(ValueError, match="a logit that is not a finite number"):
+    with pytest.raises(ValueError, match="something that is not a finite number"):
         run(table, MapPeak(SPHERE), np.arange(5), Stopping())
 
 

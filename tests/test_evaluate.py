@@ -104,7 +104,7 @@ def test_confusion_and_calibration_by_hand():
 def test_fusing_random_views_against_every_combination():
     rng = np.random.default_rng(2)
     logits, labels = rng.normal(size=(30, 3, 4)), rng.integers(4, size=30)
-    right, confidence = fused_views(logits, labels, Calibration(1.5, 0.4), rng)
+    right, confidence = fused_views(logits, labels, Calibration(1.5, 0.4), rng, 4)
     for k, temperature in ((1, 1.5), (2, 1.5 * 1.4), (3, 1.5 * 1.8)):
         # of three views, the rotations of any order hold every pair once
         sums = np.stack([logits[:, list(views)].sum(1) for views in combinations(range(3), k)])

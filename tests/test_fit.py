@@ -28,13 +28,13 @@ def data(classes=3, objects=12, views=5, size=32):
     rng = np.random.default_rng(0)
     labels = np.arange(objects) % classes
     inputs = rng.integers(1, 200, (objects, views, 4, size, size)) + 20 * labels[:, None, None, None, None]
-    return [(inputs.astype(np.uint8), np.arange(objects))], labels
+    return [recogniser.Source(inputs.astype(np.uint8), np.arange(objects))], labels
 
 
 class SmallNet(torch.nn.Module):
     """In place of a ResNet, whose checkpoints are 130 MB: convolution, batch norm and what is needed around them."""
 
-    def __init__(self, depth, classes, channels):
+    def __init__(self, depth, classes, channels, azimuths=0):
         super().__init__()
         self.features = torch.nn.Sequential(
             torch.nn.Conv2d(channels, 8, 5, 4), torch.nn.BatchNorm2d(8), torch.nn.ReLU(), torch.nn.AdaptiveAvgPool2d(1)

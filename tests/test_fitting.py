@@ -49,6 +49,27 @@ def test_the_correlation_and_temperature_of_generated_looks_are_found(correlatio
         assert losses[0] < loss(data, PLAIN_SUM, np.random.default_rng(2), walks=1)
 
 
+@pytest.mark.parametrize("right", [0.8, 0.5])
+def test_sides_count_as_far_as_looks_are_right_about_them(right):
+    """Both classes look alike; seen as the true one, a look claims to be right about the side 8 times in 10."""
+    rng, n, v, s = np.random.default_rng(0), 2000, len(SMALL), SMALL.azimuths
+    labels, zero = rng.integers(0, 2, n), rng.integers(0, s, n)
+    claimed = rng.integers(0, s, (n, v, 2))  # seen as the other class: anything
+    true = (SMALL.azimuth_index - zero[:, None]) % s
+    wrong = (true + rng.integers(1, s, (n, v))) % s
+    claimed[np.arange(n)[:, None], np.arange(v), labels[:, None]] = np.where(rng.random((n, v)) < right, true, wrong)
+    sides = np.log(np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))).astype(np.float32)
+    data = FittingSet(rng.normal(size=(n, v, 2)).astype(np.float32) / 100, labels, SMALL, ("a", "b"), sides)
+    found = fit_temperature(data, np.random.default_rng(1), walks=1)
+    if right == 0.8:  # as good as they claim, and each by itself
+        assert found.side_correlation == pytest.approx(0, abs=0.05)
+    else:
+        assert found.side_correlation > 0.1
+    blind = Calibration(found.temperature_of_one, found.correlation)
+    of_found, of_blind = (loss(data, c, np.random.default_rng(2), walks=1) for c in (found, blind))
+    assert of_found < of_blind
+
+
 def test_the_bound_of_single_episodes_is_that_of_clopper_and_pearson():
     rng = np.random.default_rng(0)
     for n, wrong in [(50, 0), (50, 3), (300, 30), (7, 7)]:

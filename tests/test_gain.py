@@ -21,22 +21,23 @@ from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.card import PolicyCardError, bundled_policies
 from nextview.policies.gain import INPUTS, MAPS, Gain, mirrored, told, told_mirrored
 from nextview.policies.registry import make_policy
-from nextview.recognition import PLAIN_SUM, Calibration
+from nextview.recognition import PLAIN_SUM, Calibration, reorient
 from nextview.training.perceptrons import Perceptrons
 from nextview.training.recipes import GainRecipe
 
 CLASSES = 4
 
 
-def some_gain(sphere=SPHERE, inputs=INPUTS, networks=2, seed=0, **rest) -> Gain:
+def some_gain(sphere=SPHERE, inputs=INPUTS, networks=2, seed=0, frame="camera", **rest) -> Gain:
     """With weights at random: whatever it was trained to, these promises hold."""
     rng = np.random.default_rng(seed)
-    widths = [len(told_mirrored(sphere, CLASSES, inputs)), 8, 8, len(sphere)]
+    widths = [len(told_mirrored(sphere, CLASSES, inputs, frame)), 8, 8, len(sphere)]
     layers = [
         tuple((rng.normal(size=(a, b)) / a**0.5, rng.normal(size=b)) for a, b in pairwise(widths))
         for _ in range(networks)
     ]
-    return Gain(sphere, CLASSES, Perceptrons.of(sphere, CLASSES, inputs, tuple(layers)), inputs, **rest)
+    score = Perceptrons.of(sphere, CLASSES, inputs, tuple(layers), frame)
+    return Gain(sphere, CLASSES, score, inputs, frame=frame, **rest)
 
 
 def some_state(sphere=SPHERE, episodes=60, seed=0):
@@ -45,16 +46,20 @@ def some_state(sphere=SPHERE, episodes=60, seed=0):
     state.visited[:] |= rng.random(state.visited.shape) < rng.random((episodes, 1))
     columns = {name: sphere.azimuths if name.endswith("-sphere") else 3 for name in MAPS}
     maps = {name: rng.random((episodes, sphere.rings, wide)) for name, wide in columns.items()}
-    return replace(state, evidence=Evidence(rng.normal(size=(episodes, CLASSES)), maps))
+    sides = rng.dirichlet([1] * sphere.azimuths, (episodes, CLASSES))
+    return replace(state, evidence=Evidence(rng.normal(size=(episodes, CLASSES)), maps), sides=sides)
 
 
 # The contract
 
 
 @pytest.mark.parametrize("anywhere", [True, False])
-@pytest.mark.parametrize("inputs", [INPUTS, ("belief",), ("look", "place")])
-def test_an_unvisited_view_is_chosen_in_each_episode_by_itself(anywhere, inputs):
-    state, policy = some_state(), some_gain(inputs=inputs, anywhere=anywhere)
+@pytest.mark.parametrize(
+    ("inputs", "frame"),
+    [(INPUTS, "camera"), (INPUTS, "object"), (("belief",), "camera"), (("look", "place"), "object")],
+)
+def test_an_unvisited_view_is_chosen_in_each_episode_by_itself(anywhere, inputs, frame):
+    state, policy = some_state(), some_gain(inputs=inputs, frame=frame, anywhere=anywhere)
     chosen = policy.next_views(state, np.random.default_rng(0))
     free = ~state.visited.all(1)
     assert free.sum() > 40
@@ -65,6 +70,7 @@ def test_an_unvisited_view_is_chosen_in_each_episode_by_itself(anywhere, inputs)
             current=state.current[[i]],
             visited=state.visited[[i]],
             belief=state.belief[[i]],
+            sides=state.sides[[i]],
             evidence=Evidence(state.evidence.logits[[i]], {n: m[[i]] for n, m in state.evidence.maps.items()}),
         )
         assert policy.next_views(alone, np.random.default_rng(1)) == chosen[i]
@@ -78,15 +84,45 @@ def turned(state, sphere, steps: int):
     return replace(state, current=views[state.current], visited=visited), views
 
 
+@pytest.mark.parametrize("frame", ["camera", "object"])
 @pytest.mark.parametrize("price", [0.0, 0.3])
-def test_absolute_azimuth_means_nothing(price):
-    state, policy = some_state(), some_gain(price=price)
+def test_absolute_azimuth_means_nothing(price, frame):
+    state, policy = some_state(), some_gain(price=price, frame=frame)
     gains, chosen = policy.gains(state), policy.next_views(state, np.random.default_rng(0))
     for steps in (1, 3, 4):
         other, views = turned(state, SPHERE, steps)
         np.testing.assert_allclose(policy.gains(other)[:, views], gains, atol=1e-9)
         going = ~state.visited.all(1)
         np.testing.assert_array_equal(policy.next_views(other, np.random.default_rng(0))[going], views[chosen][going])
+
+
+def test_in_the_objects_frame_it_does_not_matter_from_which_azimuth_the_object_is_seen():
+    """The same views of it are visited, and the camera stands at one of them or another of the same ring."""
+    zero, ring = 3, 2  # azimuth at which the object shows its side 0, and the ring of the camera
+    states = []
+    for azimuth in (1, 6):
+        state = some_state(episodes=1)
+        side = (azimuth - zero) % 8
+        state.sides[:] = 0.02
+        state.sides[:, :, side] = 0.86
+        around = np.random.default_rng(1).random((1, 5, 8))  # of the sphere, by the object's own azimuth
+        state.evidence.maps["lem-sphere"] = around[:, :, (np.arange(8) + side) % 8]
+        state.visited[:] = np.arange(40) % 3 == 0
+        states.append(replace(state, current=np.array([ring * 8 + azimuth])))
+    inputs = ("belief", "place", "lem-sphere")
+    np.testing.assert_allclose(*(told(SPHERE, state, inputs, "object") for state in states))
+    assert not np.allclose(*(told(SPHERE, state, inputs, "camera") for state in states))
+    for state in states:  # and the networks are told on which side the camera is
+        assert told(SPHERE, state, ("side",), "object")[0, :8].argmax() == (state.current[0] % 8 - zero) % 8
+
+
+@pytest.mark.parametrize("frame", ["camera", "object"])
+def test_a_recogniser_that_does_not_know_the_sides_is_refused(frame):
+    state, policy = some_state(), some_gain(inputs=("side",), frame=frame)
+    assert policy.needs == ("sides",)
+    for sides in (None, np.ones((60, CLASSES, 4)) / 4):
+        with pytest.raises(ValueError, match="tells 8 sides of an object apart"):
+            policy.next_views(replace(state, sides=sides), np.random.default_rng(0))
 
 
 def reflected(state):
@@ -98,15 +134,19 @@ def reflected(state):
         for name, m in state.evidence.maps.items()
     }
     evidence = Evidence(state.evidence.logits, maps)
-    return replace(state, current=flip[state.current], visited=state.visited[:, flip], evidence=evidence), flip
+    sides = state.sides[..., -np.arange(8) % 8]
+    moved = {"current": flip[state.current], "visited": state.visited[:, flip], "evidence": evidence, "sides": sides}
+    return replace(state, **moved), flip
 
 
-def test_an_object_and_its_mirror_image_are_alike():
-    state, policy = some_state(), some_gain()
+@pytest.mark.parametrize("frame", ["camera", "object"])
+def test_an_object_and_its_mirror_image_are_alike(frame):
+    state, policy = some_state(), some_gain(frame=frame)
     other, flip = reflected(state)
     np.testing.assert_allclose(policy.gains(other)[:, flip], policy.gains(state), atol=1e-7)
     np.testing.assert_array_equal(
-        told(SPHERE, other, INPUTS), told(SPHERE, state, INPUTS)[:, told_mirrored(SPHERE, CLASSES, INPUTS)]
+        told(SPHERE, other, INPUTS, frame),
+        told(SPHERE, state, INPUTS, frame)[:, told_mirrored(SPHERE, CLASSES, INPUTS, frame)],
     )
 
 
@@ -131,16 +171,20 @@ def test_a_decision_takes_less_than_three_milliseconds():
 # What every choice leads to
 
 
-def some_table(n=30, sphere=SMALL, seed=0) -> ReplayTable:
+def some_table(n=30, sphere=SMALL, seed=0, sides=False) -> ReplayTable:
     rng = np.random.default_rng(seed)
     data = telling(sphere, [[0], [1], [2]], n, seed)
     noisy = data.logits + rng.normal(size=data.logits.shape)
     maps = {"lem-sphere": rng.random((n, len(sphere), sphere.rings, sphere.azimuths), dtype=np.float32)}
-    return ReplayTable(replace(data, logits=noisy.astype(np.float32)), maps, Calibration(0.8, 0.5))
+    shape = (n, len(sphere), len(data.classes), sphere.azimuths)
+    likely = log_softmax(rng.normal(size=shape), axis=3).astype(np.float32) if sides else None
+    data = replace(data, logits=noisy.astype(np.float32), sides=likely)
+    return ReplayTable(data, maps, Calibration(0.8, 0.5, side_correlation=0.1 if sides else None))
 
 
-def test_what_a_choice_leads_to_is_what_is_there_after_it():
-    table, seen = some_table(), []
+@pytest.mark.parametrize("sides", [False, True])
+def test_what_a_choice_leads_to_is_what_is_there_after_it(sides):
+    table, seen = some_table(sides=sides), []
     for moment in follow(table, RandomAll(SMALL), 4, np.random.default_rng(0)):
         state = moment.state
         if seen:
@@ -148,18 +192,25 @@ def test_what_a_choice_leads_to_is_what_is_there_after_it():
             moved = SMALL.travel[before.state.current, state.current]
             np.testing.assert_allclose(moment.travel - before.travel, moved)
             for kind in OUTCOMES:
-                reached = outcome(moment.total, table.data.labels, table.calibration.temperature(state.step), kind)
+                reached = outcome(table, moment.total, state.step, kind)
                 np.testing.assert_allclose(reached, said[kind][np.arange(30), state.current], atol=1e-9)
         seen.append((moment, {kind: choices(table, moment, kind) for kind in OUTCOMES}))
     moment = seen[-1][0]
     logits = np.stack([table.data.logits[np.arange(30), m.state.current] for m, _ in seen], 1).astype(float)
-    logs = log_softmax(logits.sum(1) / (0.8 * 2.5), axis=1)
+    logs = logits.sum(1) / (0.8 * 2.5)
+    if sides:
+        at = [m.state.current for m, _ in seen]
+        said = [table.data.sides[np.arange(30), view].astype(float) for view in at]
+        azimuths = [SMALL.azimuth_index[view] / SMALL.azimuths for view in at]
+        pointing = sum(map(reorient, said, azimuths)) / 1.3
+        logs += np.log(np.exp(pointing).sum(2))
+    logs = log_softmax(logs, axis=1)
     np.testing.assert_allclose(np.log(moment.state.belief), logs, atol=1e-9)
     assert (moment.state.visited.sum(1) == 4).all()
     of_truth = logs[np.arange(30), table.data.labels]
-    np.testing.assert_allclose(outcome(moment.total, table.data.labels, 2.0, "log-belief"), of_truth, atol=1e-9)
-    right = (logits.sum(1).argmax(1) == table.data.labels).astype(float)
-    np.testing.assert_array_equal(outcome(moment.total, table.data.labels, 2.0, "right"), right)
+    np.testing.assert_allclose(outcome(table, moment.total, 4, "log-belief"), of_truth, atol=1e-9)
+    right = (logs.argmax(1) == table.data.labels).astype(float)
+    np.testing.assert_array_equal(outcome(table, moment.total, 4, "right"), right)
 
 
 def test_objects_that_the_recogniser_knows_or_of_the_test_split_are_refused():
@@ -321,7 +372,8 @@ from nextview.policies.registry import make_policy
 from nextview.viewsphere import ViewSphere
 sphere = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
 evidence = Evidence(np.zeros((1, 10)), {"lem": np.zeros((1, 5, 3)), "lem-sphere": np.zeros((1, 5, 8))})
-state = EpisodeState(np.array([3]), np.arange(40)[None] == 3, np.full((1, 10), 0.1), evidence, 1)
+visited, belief, sides = np.arange(40)[None] == 3, np.full((1, 10), 0.1), np.full((1, 10, 8), 0.125)
+state = EpisodeState(np.array([3]), visited, belief, evidence, 1, sides=sides)
 print(*make_policy("gain", sphere).next_views(state, np.random.default_rng(0)))
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
@@ -360,7 +412,7 @@ def test_training_finds_the_views_that_tell_the_class_believed():
     """Every class is told on one ring alone, and each look hints at the class: go to the ring of the class believed."""
     learned = ReplayTable(telling(SMALL, [[0], [1], [2]], 240), {}, PLAIN_SUM)
     fresh = ReplayTable(telling(SMALL, [[0], [1], [2]], 90, seed=1), {}, PLAIN_SUM)
-    recipe = replace(QUICK, inputs=("belief", "look", "place"), epochs=20)
+    recipe = replace(QUICK, inputs=("belief", "look", "place"), frame="camera", epochs=20)
     *_, (policy, worth) = best_epoch(train(learned, recipe), fresh, recipe)
     first, second = (SMALL.ring[m.state.current] for m in follow(fresh, policy, 2, np.random.default_rng(5)))
     not_told_yet = first != fresh.data.labels
@@ -379,7 +431,7 @@ def test_training_finds_the_views_that_tell_the_class_believed():
 
 
 def test_the_same_seed_gives_the_same_policy():
-    table = some_table()
+    table = some_table(sides=True)
     recipe = replace(QUICK, epochs=2)
 
     def weights(seed):
@@ -395,13 +447,14 @@ def unseen(tmp_path):
     path = tmp_path / "unseen.npz"
     p = some_predictions(90)
     sphere = np.random.default_rng(0).random((90, len(p.sphere), p.sphere.rings, p.sphere.azimuths)).astype(np.float32)
-    replace(p, splits=np.array(["train"] * 90), maps=p.maps | {"lem-sphere": sphere}).save(path)
+    sides = np.random.default_rng(1).normal(size=(90, len(p.sphere), 3, p.sphere.azimuths)).astype(np.float32)
+    replace(p, splits=np.array(["train"] * 90), maps=p.maps | {"lem-sphere": sphere}, sides=sides).save(path)
     return path
 
 
 def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, capsys):
     card = tmp_path / "mine.json"
-    main(["train", "gain", str(unseen), str(card), "--epochs", "2", "--inputs", "belief", "place"])
+    main(["train", "gain", str(unseen), str(card), "--epochs", "2", "--inputs", "belief", "place", "--frame", "camera"])
     facts = json.loads(card.read_text())
     assert "72 objects" in facts["learned_from"]
     policy = make_policy(str(card), SPHERE, classes=("ball", "box", "pillar"))
@@ -420,7 +473,8 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
     assert "its answers differ from the networks' by" in " ".join(capsys.readouterr().err.split())
     main(["train", "gain", str(unseen), str(card), "--epochs", "1", "--local", "--price", "0.2"])
     policy = make_policy(str(card), SPHERE)
-    assert (policy.anywhere, policy.price, policy.needs) == (False, 0.2, ("lem-sphere",))
+    assert (policy.anywhere, policy.price, policy.needs) == (False, 0.2, ("lem-sphere", "sides"))
+    assert policy.frame == "object"
 
 
 def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsys):
@@ -430,15 +484,18 @@ def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsy
     some = replace(
         p, logits=p.logits[:20], maps={n: m[:20] for n, m in p.maps.items()}, depth_entropy=p.depth_entropy[:20],
         names=p.names[:20], labels=p.labels[:20], splits=p.splits[:20], conflicting=p.conflicting[:20],
+        sides=p.sides[:20],
     )  # fmt: skip
     some.save(tmp_path / "validation.npz")
     card = tmp_path / "mine.json"
     main(["train", "gain", str(unseen), str(card), "--epochs", "1", "--validation", str(tmp_path / "validation.npz")])
     assert "70 objects" in json.loads(card.read_text())["learned_from"]
+    replace(Predictions.load(unseen), sides=None).save(tmp_path / "sideless.npz")
     for arguments, sentence in [
         ([str(unseen), str(tmp_path / "mine")], "NAME.json"),
         ([str(tmp_path / "none.npz"), str(card)], "no such file"),
         ([str(unseen), str(card), "--inputs", "belief", "lcm"], "holds no map 'lcm'"),
+        ([str(tmp_path / "sideless.npz"), str(card)], "says nothing of sides"),
     ]:
         with pytest.raises(SystemExit) as end:
             main(["train", "gain", *arguments])

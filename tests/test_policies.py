@@ -18,6 +18,7 @@ from nextview.policies.oracle import OracleGain, OracleValley
 from nextview.policies.registry import POLICIES, make_policy
 from nextview.policies.spread import Spread
 from nextview.policies.tables import ClassTable, FixedRing, FixedSequence, cells_from, cells_to
+from nextview.recognition import Calibration
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("40")
@@ -85,9 +86,9 @@ def policies(sphere, rng):
     yield from (make_policy(name, sphere, (1,)) for name in POLICIES)
     labels, objects = rng.integers(0, 2, 50), np.arange(50)
     yield OracleValley(sphere, labels, (1,))
-    logits = rng.normal(size=(50, len(sphere), 2))
-    yield OracleGain(sphere, logits, labels, objects)
-    yield OracleGain(sphere, logits, labels, objects, anywhere=True)
+    said = rng.normal(size=(50, len(sphere), 2 * 9))
+    yield OracleGain(sphere, said, 2, labels, objects)
+    yield OracleGain(sphere, said, 2, labels, objects, anywhere=True, calibration=Calibration(side_correlation=0.1))
     for anywhere in (True, False):
         yield FixedSequence(sphere, rng.integers(len(sphere), size=(sphere.rings, 4)), anywhere)
         yield ClassTable(sphere, rng.random((2, sphere.rings, len(sphere))), anywhere)

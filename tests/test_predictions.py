@@ -56,7 +56,7 @@ def shop(tmp_path_factory):
     same.parent.mkdir()
     same.write_bytes((folder / "meshes/pillar/test/pillar_test.off").read_bytes())
     list(render(folder / "meshes", folder / "views.zarr", ViewSphere.named("40"), 32, workers=1))
-    make_recogniser(folder, CLASSES)
+    make_recogniser(folder, CLASSES, sides=8)
     make_map_network(folder, valleys=("box",))
     return folder
 
@@ -87,6 +87,7 @@ def test_what_is_saved_is_what_is_loaded(tmp_path):
         ({"labels": np.full(6, 3)}, "not one of the 3 classes"),
         ({"names": ("a",) * 6}, "the same name"),
         ({"maps": {"lem": np.zeros((6, 40, 5, 2), np.float32)}}, "map lem"),
+        ({"sides": np.zeros((6, 40, 2, 8), np.float32)}, "sides"),
         ({"sphere": ViewSphere.named("12")}, "logits"),
     ],
 )
@@ -127,6 +128,8 @@ def test_a_split_is_its_objects_and_nothing_else():
     assert test.names == ("thing_1", "thing_3", "thing_5")
     np.testing.assert_array_equal(test.logits, some.logits[1::2])
     np.testing.assert_array_equal(test.maps["lem"], some.maps["lem"][1::2])
+    sides = np.random.default_rng(0).normal(size=(6, 40, 3, 8)).astype(np.float32)
+    np.testing.assert_array_equal(replace(some, sides=sides).of_split("test").sides, sides[1::2])
     with pytest.raises(PredictionsError, match="no objects of the split 'train', only of 'test'"):
         test.of_split("train")
 
@@ -149,8 +152,9 @@ def test_predictions_are_what_the_networks_say_of_each_look(shop):
     look = Observation(
         store.image(i)[v], store.depth(i)[v], store.points(i)[v], store.sphere.poses[v], store.intrinsics
     )
-    logits, _ = Recogniser(shop / "tiny.json")([look])
-    np.testing.assert_allclose(found.logits[i, v], logits[0], atol=1e-5)
+    said = Recogniser(shop / "tiny.json")([look])
+    np.testing.assert_allclose(found.logits[i, v], said.logits[0], atol=1e-5)
+    np.testing.assert_allclose(found.sides[i, v], said.sides[0], atol=1e-5)
     np.testing.assert_allclose(found.maps["lem"][i, v], MapNetwork(shop / "tiny-lem.json")([look])["lem"][0], atol=1e-5)
 
 

@@ -38,6 +38,8 @@ def test_json_holds_the_whole_episode(chair, capsys):
     assert [look["next_view"] for look in looks] == [look["view"] for look in looks[1:]] + [None]
     for look in looks:
         assert sum(look["belief"].values()) == pytest.approx(1, abs=1e-4)
+        assert look["side"]["belief"] > 0.5
+    assert len({(look["azimuth"] - look["side"]["degrees"]) % 360 for look in looks}) == 1  # the chair stands still
     assert looks[0]["belief"] == looks[0]["image_says"]
     sphere = ViewSphere.named("40")
     legs = [sphere.travel[a["view"], b["view"]] for a, b in itertools.pairwise(looks)]
@@ -132,7 +134,9 @@ def test_bundled_models_are_what_their_cards_say():
     assert {path.suffix for path in BUNDLED.iterdir()} <= {".onnx", ".json"}
     assert sum(card.path.stat().st_size for card in cards.values()) < 60e6
     for card in cards.values():
-        assert {"data", "recipe", "commands"} <= set(card.facts["training"])
+        training = set(card.facts["training"])
+        assert {"data", "commands"} <= training
+        assert training & {"recipe", "recipes"}
         assert len(card.facts["scores"]) == 2
 
 

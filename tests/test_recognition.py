@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as npst
 from scipy.special import log_softmax, softmax
 from scipy.stats import multivariate_normal
 
-from nextview.recognition import Calibration, RiskBounds, RiskError, Stopping, fuse
+from nextview.recognition import Calibration, RiskBounds, RiskError, Stopping, additive, fuse, reorient
 
 logits = npst.arrays(
     st.sampled_from([np.float32, np.float64]),
@@ -142,3 +142,69 @@ def test_a_threshold_that_is_certain_or_nothing_stays_so():
 def test_at_least_one_view(views):
     with pytest.raises(ValueError, match="at least one view"):
         Stopping(0.9, views)
+
+
+def test_what_is_said_of_sides_is_said_of_where_side_0_points():
+    sides = np.random.default_rng(0).normal(size=(3, 2, 8))
+    azimuth = np.array([0.0, 0.25, -0.5])
+    pointing = reorient(sides, azimuth)
+    for look, step in enumerate((0, 2, -4)):
+        for side in range(8):  # from azimuth a side s is seen if side 0 points to a - s
+            np.testing.assert_array_equal(pointing[look, :, (step - side) % 8], sides[look, :, side])
+    np.testing.assert_array_equal(reorient(pointing, azimuth), sides)
+
+
+def test_between_two_steps_what_is_said_of_sides_is_interpolated():
+    sides = np.random.default_rng(0).normal(size=(1, 3, 4))
+    between = reorient(sides, np.array([0.375]))  # one and a half of four steps
+    np.testing.assert_allclose(between, (reorient(sides, np.array([0.25])) + reorient(sides, np.array([0.5]))) / 2)
+
+
+def some_looks(looks, classes=3, sides=8):
+    rng = np.random.default_rng(looks)
+    likely = log_softmax(2 * rng.normal(size=(looks, classes, sides)), axis=2)
+    return rng.normal(size=(looks, classes)), likely, rng.integers(0, 8, looks)
+
+
+@pytest.mark.parametrize("looks", [1, 2, 5])
+def test_looks_that_agree_on_the_side_are_believed_as_bayes_would(looks):
+    """Independent looks at an object of which neither class nor azimuth is known, each as likely as any other."""
+    logits, sides, azimuth = some_looks(looks)
+    belief = Calibration(0.7, 0.0, side_correlation=0.0).belief(additive(logits, sides, azimuth / 8).sum(0), looks, 3)
+    joint = np.zeros((3, 8))
+    for c in range(3):
+        for zero in range(8):
+            seen = [sides[k, c, (azimuth[k] - zero) % 8] for k in range(looks)]
+            joint[c, zero] = np.exp((logits[:, c] / 0.7).sum() + np.sum(seen))
+    np.testing.assert_allclose(belief, joint.sum(1) / joint.sum())
+    if looks == 1:  # one look has nothing to agree with
+        np.testing.assert_allclose(belief, softmax(logits[0] / 0.7))
+
+
+def test_correlated_looks_agree_less_and_the_world_may_be_turned():
+    logits, sides, azimuth = some_looks(4)
+    calibration = Calibration(0.7, 0.5, side_correlation=0.2)
+    turned = [calibration.belief(additive(logits, sides, (azimuth + by) % 8 / 8).sum(0), 4, 3) for by in (0, 3)]
+    np.testing.assert_allclose(*turned)
+    pointing = reorient(sides, azimuth / 8).sum(0) / 1.6
+    expected = softmax(logits.sum(0) / (0.7 * 2.5) + np.log(np.exp(pointing).sum(1)))
+    np.testing.assert_allclose(turned[0], expected)
+    both = np.stack([additive(logits, sides, azimuth / 8)[:k].sum(0) for k in (2, 4)])
+    np.testing.assert_allclose(calibration.belief(both, np.array([2, 4]), 3)[1], expected)
+
+
+def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
+    logits, sides, azimuth = some_looks(3)
+    total = additive(logits, sides, azimuth / 8).sum(0)
+    for calibration in (Calibration(), Calibration(0.7, 0.5)):
+        np.testing.assert_allclose(calibration.belief(total, 3, 3), fuse(logits, calibration.temperature(3)))
+    np.testing.assert_array_equal(additive(logits, None, azimuth / 8), logits)
+    with pytest.raises(ValueError, match="not a finite number"):
+        Calibration().belief(total + np.nan, 3, 3)
+
+
+def test_the_correlation_of_sides_is_kept_with_the_calibration():
+    calibration = Calibration(0.7, 0.5, side_correlation=0.2)
+    assert Calibration.of_facts(json.loads(json.dumps(calibration.facts()))) == calibration
+    with pytest.raises(ValueError, match="no calibration"):
+        Calibration(side_correlation=-0.1)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from scipy.special import softmax
+from scipy.special import log_softmax, softmax
 from test_predictions import some_predictions
 from tiny_models import make_map_network, make_recogniser
 
@@ -88,9 +88,13 @@ def test_the_policy_is_asked_once_for_all_episodes_of_a_look(trials, monkeypatch
     assert calls == [len(trials.objects)] * 4
 
 
-def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(trials):
-    calibration = Calibration(0.8, 0.5)
-    trials = replace(trials, predictions=replace(trials.predictions, calibration=calibration))
+@pytest.mark.parametrize("knows_sides", [False, True])
+def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(trials, knows_sides):
+    calibration, likely = Calibration(0.8, 0.5), None
+    if knows_sides:
+        calibration = replace(calibration, side_correlation=0.1)
+        likely = log_softmax(np.random.default_rng(3).normal(size=(30, 40, 3, 8)), axis=3).astype(np.float32)
+    trials = replace(trials, predictions=replace(trials.predictions, calibration=calibration, sides=likely))
     p = trials.predictions
     for name, everywhere in [("oracle-gain", False), ("oracle-gain-all", True)]:
         views = replay(name, trials, 3, seed=0).views
@@ -98,7 +102,7 @@ def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(trials):
             i, seen = trials.objects[e], list(views[e, :2])
             around = range(40) if everywhere else p.sphere.windows[seen[-1]].ravel()
             belief = {
-                v: softmax(p.logits[i, [*seen, v]].astype(float).sum(0) / calibration.temperature(3))[p.labels[i]]
+                v: calibration.belief(p.said[i, [*seen, v]].astype(float).sum(0), 3, 3)[p.labels[i]]
                 for v in around
                 if v not in seen
             }
@@ -295,13 +299,29 @@ def real_meshes(folder: Path) -> None:
             target.symlink_to(source.resolve())
 
 
+class ToItsBack:
+    """Goes round the ring to where the side opposite to that which the recogniser calls 0 is likely to be seen."""
+
+    needs = ("sides",)
+
+    def __init__(self, sphere):
+        self.sphere = sphere
+
+    def next_views(self, state, rng):
+        n, rows = self.sphere.azimuths, np.arange(len(state.current))
+        seen = (state.belief[:, :, None] * state.sides).sum(1)  # (B, sides)
+        to = (self.sphere.azimuth_index[state.current][:, None] + n // 2 - np.arange(n)) % n
+        views = self.sphere.ring[state.current][:, None] * n + to
+        return views[rows, np.where(state.visited[rows[:, None], views], -1.0, seen).argmax(1)]
+
+
 @pytest.mark.parametrize("meshes", [sample_meshes, real_meshes])
 def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(meshes, tmp_path):
     meshes(tmp_path / "meshes")
     sphere = ViewSphere.named("40")
     list(render(tmp_path / "meshes", tmp_path / "views.zarr", sphere, 64, workers=1))
     classes = sorted(path.name for path in (tmp_path / "meshes").iterdir())
-    recogniser = make_recogniser(tmp_path, classes, size=32)
+    recogniser = make_recogniser(tmp_path, classes, size=32, sides=8)
     calibrated = json.loads(recogniser.read_text()) | {"calibration": Calibration(0.6, 0.7).facts()}
     recogniser.write_text(json.dumps(calibrated))
     lem = make_map_network(tmp_path, valleys=(classes[0],))
@@ -312,7 +332,7 @@ def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(meshes, 
     models = Models(Recogniser(recogniser, 1), {"lem": MapNetwork(lem, 1)})
     # A threshold that some reach: the middle of all confidences after two looks.
     threshold = float(np.median(replay("lem", trials, 2, 0).confidences[:, 1]))
-    for name in ("lem", "lem-peak", "unidirectional"):
+    for name in ("lem", "lem-peak", "unidirectional", "test_replay:ToItsBack"):
         policy = make_policy(name, sphere, trials.valley_classes)
         paths = replay(name, trials, 5, 0)
         ends = cut(paths, threshold)

@@ -28,7 +28,7 @@ from nextview.training.grid import published_cells  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.networks import ResNet  # noqa: E402
 from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe  # noqa: E402
-from nextview.training.recogniser import RecogniserModule, ValidationViews, Views, augment  # noqa: E402
+from nextview.training.recogniser import RecogniserModule, Source, ValidationViews, Views, augment  # noqa: E402
 from nextview.training.runs import begin  # noqa: E402
 from nextview.viewsphere import ViewSphere  # noqa: E402
 
@@ -56,9 +56,8 @@ def views_of(recipe, objects=6, views=V):
     """Inputs whose pixels say which object and view they are."""
     which = np.arange(objects * views, dtype=np.uint8).reshape(objects, views, 1, 1, 1)
     labels = np.arange(objects) % 2
-    return Views(
-        [(np.broadcast_to(which, (objects, views, 4, 2, 2)), np.arange(objects))], np.arange(objects), labels, recipe
-    )
+    source = Source(np.broadcast_to(which, (objects, views, 4, 2, 2)), np.arange(objects))
+    return Views([source], np.arange(objects), labels, recipe)
 
 
 def drawn(views):
@@ -80,7 +79,7 @@ def test_balanced_draws_even_out_the_classes():
     labels = np.repeat([0, 1], [90, 10])
     inputs = np.zeros((100, V, 1, 1, 1), np.uint8)
     recipe = RecogniserRecipe(views=100, batch=100)
-    views = Views([(inputs, np.arange(100))], np.arange(100), labels, recipe)
+    views = Views([Source(inputs, np.arange(100))], np.arange(100), labels, recipe)
     seen = np.concatenate([label for _, label in views])
     share = 10**0.5 / (10**0.5 + 90**0.5)  # a class of n objects is drawn with weight n / sqrt(n)
     assert (seen == 1).mean() == pytest.approx(share, abs=4 * (share * (1 - share) / len(seen)) ** 0.5)
@@ -91,7 +90,8 @@ def test_deformed_twins_may_have_fewer_views_and_each_gets_its_share():
     twins = [np.full((3, 20, 1, 1, 1), k, np.uint8) for k in (1, 2)]
     row = np.array([0, 1, 2, -1, -1, -1])
     recipe = RecogniserRecipe(views=2000, batch=50, deformed_share=0.5)
-    views = Views([(own, np.arange(6)), *((twin, row) for twin in twins)], np.arange(3), np.zeros(6, int), recipe)
+    sources = [Source(own, np.arange(6)), *(Source(twin, row) for twin in twins)]
+    views = Views(sources, np.arange(3), np.zeros(6, int), recipe)
     found = np.concatenate([images.numpy().ravel() for images, _ in views])
     assert np.bincount(found) / len(found) == pytest.approx([0.5, 0.25, 0.25], abs=0.03)
 
@@ -158,11 +158,21 @@ def test_the_published_recipe_is_what_the_thesis_says():
 def test_augmented_background_stays_empty():
     torch.manual_seed(0)
     x = torch.zeros(8, 1, 32, 32)
-    assert augment(x, 32).abs().max() == 0
+    assert augment(x, 32)[0].abs().max() == 0
     x[:, :, 8:24, 8:24] = 0.5
-    y = augment(x, 16)
+    y, _ = augment(x, 16)
     assert y.shape == (8, 1, 16, 16)
     assert (y[:, :, 8, 8] > 0).float().mean() > 0.5
+
+
+def test_augment_says_which_views_it_mirrored():
+    torch.manual_seed(0)
+    x = torch.zeros(64, 1, 32, 32)
+    x[:, :, :, 4:12] = 0.5  # something on the left
+    y, mirrored = augment(x, 32)
+    on_the_right = y[..., 16:].sum((1, 2, 3)) > y[..., :16].sum((1, 2, 3))
+    assert torch.equal(on_the_right, mirrored)
+    assert 16 < mirrored.sum() < 48
 
 
 def test_image_input_is_the_mean_of_squares():

@@ -123,7 +123,7 @@ def trained(tmp_path_factory):
     store, runs, models = root / "views.zarr", root / "runs", root / "models"
     small = ["--epochs", "2", "--views", "4", "--batch", "8", "--validation", "0.25"]
     main(["render", str(root / "meshes"), str(store), "--workers", "1"])
-    main(["train", "recogniser", str(store), str(runs / "recogniser"), *small])
+    main(["train", "recogniser", str(store), str(runs / "recogniser"), *small, "--side", "0.3"])
     main(["export", "recogniser", str(runs / "recogniser"), str(store), str(models), "--name", "tiny"])
     main(["train", "lem", str(store), str(runs / "lem"), *small])
     main(["export", "lem", str(runs / "lem"), str(store), str(models), "--name", "tiny-lem"])
@@ -147,9 +147,11 @@ def test_trained_models_have_cards_and_run(trained):
     assert card["classes"] == ["monitor", "table"]
     assert {part.split()[0] for part in card["scores"]} == {"validation"}  # training leaves the test split alone
     recogniser = Recogniser(trained / "models/tiny.json")
-    logits, features = recogniser.from_inputs(np.zeros((3, 4, 112, 112), np.uint8))
-    assert logits.shape == (3, 2)
-    assert features.shape == (3, 512)
+    said = recogniser.from_inputs(np.zeros((3, 4, 112, 112), np.uint8))
+    assert said.logits.shape == (3, 2)
+    assert said.features.shape == (3, 512)
+    assert card["sides"] == recogniser.sides == 8
+    assert np.exp(said.sides).sum(2) == pytest.approx(np.ones((3, 2)), abs=1e-4)
     lem = MapNetwork(trained / "models/tiny-lem.json").from_inputs(np.zeros((2, 4, 56, 56), np.uint8))
     assert lem["lem"].shape == (2, 5, 3)
     assert lem["lem-sphere"].shape == (2, 5, 8)
@@ -201,15 +203,21 @@ def test_map_batches_hold_each_view_with_its_own_map():
     assert 0 < sum(flips) < 16
 
 
-def test_the_peak_weighs_in_which_cell_of_the_window_is_highest(monkeypatch):
+def within_one_cell(at, other):
+    return abs(at // 3 - other // 3) + abs(at % 3 - other % 3) <= 1
+
+
+@pytest.mark.parametrize("reach", [0, 1])
+def test_the_peak_weighs_in_which_cell_of_the_window_is_highest(monkeypatch, reach):
     rng, sphere = np.random.default_rng(0), ViewSphere.named("40")
     said, true = rng.random((2, 4, 5, 8)).astype(np.float32)
-    module = MapModule(MapRecipe(peak=0.3, sharpness=0.1), sphere, 1)
+    module = MapModule(MapRecipe(peak=0.3, sharpness=0.1, reach=reach), sphere, 1)
     monkeypatch.setattr(module, "forward", lambda seen: (torch.from_numpy(said),))
     monkeypatch.setattr(module, "log", lambda *args, **options: None)
     loss = module.training_step((torch.zeros(4), torch.from_numpy(true)), 0)
     near, goal = (values[:, :, [-1, 0, 1]].reshape(4, 15) for values in (said, true))
-    chance = softmax(near / 0.1, 1)[np.arange(4), goal.argmax(1)]
+    counts = [[k == best or (reach and within_one_cell(k, best)) for k in range(15)] for best in goal.argmax(1)]
+    chance = (softmax(near / 0.1, 1) * counts).sum(1)
     squared = (((near - goal) ** 2).mean() + ((said - true) ** 2).mean()) / 2
     assert loss.item() == pytest.approx(squared - 0.3 * np.log(chance).mean(), rel=1e-5)
 
@@ -246,7 +254,7 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
         name = sorted(unseen[k] - unseen[1 - k])[0]
         inputs = np.load(trained / "views.zarr.inputs112.npy", mmap_mode="r")[views.names.index(name)]
         assert predictions.logits[predictions.names.index(name)] == pytest.approx(
-            Recogniser(card).from_inputs(np.array(inputs))[0], abs=1e-4
+            Recogniser(card).from_inputs(np.array(inputs)).logits, abs=1e-4
         )
     main(["train", "lcm", str(store), str(out), str(runs / "lcm"), *small])
     main(["export", "lcm", str(runs / "lcm"), str(store), str(out), str(models), "--name", "tiny-lcm"])
@@ -285,9 +293,9 @@ def test_a_recogniser_of_images_sees_images_live_and_in_predictions(trained):
         views.image(3)[7], views.depth(3)[7], views.points(3)[7], views.sphere.poses[7], views.intrinsics
     )
     at = predictions.names.index(views.names[3])
-    live = Recogniser(models / "of-images.json")([look])[0]
+    live = Recogniser(models / "of-images.json")([look]).logits
     assert predictions.logits[at, 7] == pytest.approx(live[0], abs=1e-4)
-    dark = Recogniser(models / "of-images.json")([replace(look, image=look.image // 4)])[0]
+    dark = Recogniser(models / "of-images.json")([replace(look, image=look.image // 4)]).logits
     assert np.abs(live - dark).max() > 1e-3  # it does look at the image
     mixture = ["export", "recogniser", str(run), str(store), str(models), "--also", str(trained / "runs/recogniser")]
     with pytest.raises(SystemExit) as mixed:
@@ -301,11 +309,13 @@ def test_several_networks_are_exported_as_their_mean(trained):
     main(["export", "recogniser", str(runs / "recogniser"), str(trained / "views.zarr"), str(models), *both])
     alone, jury = Recogniser(models / "tiny.json"), Recogniser(models / "both.json")
     x = np.random.default_rng(0).integers(0, 256, (3, 4, 112, 112), dtype=np.uint8)
-    mean = (alone.from_inputs(x)[0] + alone.from_inputs(x[..., ::-1].copy())[0]) / 2
+    mean = (alone.from_inputs(x).logits + alone.from_inputs(x[..., ::-1].copy()).logits) / 2
     scale = alone.card.facts["temperature"] / jury.card.facts["temperature"]
-    logits, features = jury.from_inputs(x)
-    assert logits == pytest.approx(mean * scale, abs=2e-2)
-    assert features.shape == (3, 1024)
+    together = jury.from_inputs(x)
+    assert together.logits == pytest.approx(mean * scale, abs=2e-2)
+    assert together.features.shape == (3, 1024)
+    mirrored = jury.from_inputs(x[..., ::-1].copy())  # what was side 1 is side -1 in the mirror
+    assert together.sides == pytest.approx(mirrored.sides[..., -np.arange(8) % 8], abs=1e-3)
 
 
 def test_folds_divide_every_class_evenly_and_keep_twins_together(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.policies.base import EpisodeState, Evidence, Policy
-from nextview.recognition import PLAIN_SUM, Calibration, Stopping, fuse
+from nextview.recognition import PLAIN_SUM, Calibration, Stopping, additive
 from nextview.viewsphere import ViewSphere
 
 
@@ -32,6 +32,7 @@ class Step:
         belief: fused after it, (A, classes).
         stopped: whether the episode ended here, (A,) bool.
         next_views: where it goes next, (A,) int64; -1 where it ended.
+        total: sum of what was said in it and before, (A, D), see ``recognition.additive``.
     """
 
     episodes: NDArray[np.int64]
@@ -40,6 +41,7 @@ class Step:
     belief: NDArray[np.float64]
     stopped: NDArray[np.bool_]
     next_views: NDArray[np.int64]
+    total: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -109,9 +111,10 @@ class Episodes:
         if len(evidence.logits) != len(now):
             raise ValueError(f"evidence of {len(evidence.logits)} looks for {len(now)} running episodes")
         before = self._total[now] if self.steps else 0.0
-        total = before + np.asarray(evidence.logits, np.float64)
-        looks = len(self.steps) + 1
-        belief = fuse(total[:, None], self.calibration.temperature(looks))
+        azimuth = self.sphere.turn[views]
+        total = before + np.asarray(additive(evidence.logits, evidence.sides, azimuth), np.float64)
+        looks, classes = len(self.steps) + 1, evidence.logits.shape[1]
+        belief = self.calibration.belief(total, looks, classes)
         visited = self._visited[now]
         visited[np.arange(len(now)), views] = True
         stopped = belief.max(1) >= self.stopping.bar(looks)
@@ -120,10 +123,20 @@ class Episodes:
         going = ~stopped
         next_views = np.full(len(now), -1)
         if going.any():
-            left = now[going]
-            state = EpisodeState(views[going], visited[going], belief[going], select(evidence, going), looks, left)
+            left, sides = now[going], None
+            if "sides" in self.policy.needs:
+                sides = self.calibration.sides(total[going], looks, classes, azimuth[going])
+            state = EpisodeState(
+                views[going],
+                visited[going],
+                belief[going],
+                select(evidence, going),
+                looks,
+                left,
+                sides,
+            )
             next_views[going] = self._choose(state)
-        step = Step(now, views, evidence, belief, stopped, next_views)
+        step = Step(now, views, evidence, belief, stopped, next_views, total)
         if not self.steps:
             self._total = np.zeros((len(self.current), total.shape[1]))
         self._total[now], self._visited[now] = total, visited
@@ -162,6 +175,7 @@ class Episodes:
                 select(state.evidence, here),
                 state.step,
                 state.episodes[here],
+                None if state.sides is None else state.sides[here],
             )
             try:
                 self.policy.next_views(alone, self.rng)
@@ -202,7 +216,8 @@ class Episodes:
 def select(evidence: Evidence, keep: NDArray[np.bool_]) -> Evidence:
     """The evidence of some of the episodes."""
     features = None if evidence.features is None else evidence.features[keep]
-    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, features)
+    sides = None if evidence.sides is None else evidence.sides[keep]
+    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, features, sides)
 
 
 def run_episodes(

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+Float = NDArray[np.float64]
+
 
 def fuse(logits: NDArray[np.floating], temperature: float = 1.0) -> NDArray[np.float64]:
     """Belief after several looks: softmax of the sum of their logits (thesis, section 4.4), over a temperature.
@@ -26,9 +28,76 @@ def fuse(logits: NDArray[np.floating], temperature: float = 1.0) -> NDArray[np.f
     logits = np.asarray(logits, np.float64)
     if not np.isfinite(logits).all():
         raise ValueError("the recogniser gave a logit that is not a finite number")
-    total = logits.sum(-2)
-    total = np.exp((total - total.max(-1, keepdims=True)) / temperature)
-    return total / total.sum(-1, keepdims=True)
+    return _softmax(logits.sum(-2) / temperature)
+
+
+def _softmax(logs: NDArray[np.floating]) -> Float:
+    values = np.exp(logs - logs.max(-1, keepdims=True))
+    return values / values.sum(-1, keepdims=True)
+
+
+def _pointing(total: NDArray[np.floating], classes: int) -> NDArray[np.floating]:
+    """What sums say of the azimuths to which side 0 points, (..., sides, classes)."""
+    return total[..., classes:].reshape(*total.shape[:-1], -1, classes)
+
+
+def reorient(sides: NDArray[np.floating], azimuth: NDArray[np.floating]) -> NDArray[np.floating]:
+    """What is said of the sides seen from an azimuth, said of the azimuths to which side 0 points; or the way back.
+
+    From azimuth a side s is seen if side 0 points to a - s: the same sum turns either into the other.
+
+    Args:
+        sides: (..., classes, sides), in even steps of azimuth.
+        azimuth: of the looks, parts of a full turn, (...). Between two steps it is interpolated.
+
+    Returns:
+        The same shape.
+    """
+    n = sides.shape[-1]
+    steps = np.asarray(azimuth, np.float64)[..., None, None] * n
+    low = np.floor(steps + 1e-9)
+    share = np.maximum(steps - low, 0)
+
+    def turned(by: NDArray[np.float64]) -> NDArray[np.floating]:
+        source = (by.astype(np.int64) - np.arange(n)) % n
+        return np.take_along_axis(sides, np.broadcast_to(source, sides.shape), -1)
+
+    return turned(low) if not (share > 1e-9).any() else (1 - share) * turned(low) + share * turned(low + 1)
+
+
+def additive(
+    logits: NDArray[np.floating], sides: NDArray[np.floating] | None, azimuth: NDArray[np.floating]
+) -> NDArray[np.floating]:
+    """What looks say of their object, written so that the looks can be summed: see ``Calibration.belief``.
+
+    Args:
+        logits: (..., classes).
+        sides: log-likelihoods of the sides that are seen, (..., classes, sides); None if they are not told.
+        azimuth: of the looks, parts of a full turn, (...).
+
+    Returns:
+        The logits, then for each azimuth how likely it is that side 0 points there, for each class: (..., (1 + sides) *
+        classes). The logits alone if no sides are told.
+    """
+    if sides is None:
+        return logits
+    pointing = reorient(sides, np.broadcast_to(azimuth, logits.shape[:-1])).swapaxes(-1, -2)
+    return np.concatenate([logits, pointing.reshape(*logits.shape[:-1], -1)], -1)
+
+
+def of_true_class(logs: Float, labels: NDArray[np.int64]) -> Float:
+    """Logarithm of the belief in the true class.
+
+    Args:
+        logs: of the belief in each class, up to a constant, (N, ..., C).
+        labels: (N,).
+
+    Returns:
+        (N, ...) float64.
+    """
+    top = logs.max(-1)
+    of_truth = logs[np.arange(len(labels)), ..., labels]
+    return of_truth - top - np.log(np.exp(logs - top[..., None]).sum(-1))
 
 
 class RiskError(ValueError):
@@ -74,10 +143,16 @@ class Calibration:
     The sum over k looks is divided by ``temperature * (1 + correlation * (k - 1))``: what the variance of a sum of k
     equally correlated terms grows by, beyond k. Correlation 0 trusts the sum, 1 the mean.
 
+    What looks say of the sides counts too, if the recogniser tells: an object stands still, so looks from different
+    azimuths that are to be of one class have to agree on where its side 0 points. The belief in a class is multiplied
+    by how likely it is that they would say what they say, over all azimuths to which it may point. Looks err together
+    about this as well, though less.
+
     Attributes:
         temperature_of_one: temperature of a single look.
         correlation: of the evidence of two looks, 0 .. 1.
         risk: for stopping with a promise; None if not known.
+        side_correlation: of what two looks say of the side, 0 .. 1; None where that shall not count for the class.
 
     Raises:
         ValueError: a temperature that is not positive, or a negative correlation.
@@ -86,14 +161,69 @@ class Calibration:
     temperature_of_one: float = 1.0
     correlation: float = 0.0
     risk: RiskBounds | None = None
+    side_correlation: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.temperature_of_one < np.inf or not 0 <= self.correlation < np.inf:
-            raise ValueError(f"no calibration: temperature {self.temperature_of_one}, correlation {self.correlation}")
+        numbers = (self.correlation, self.side_correlation or 0.0)
+        if not 0 < self.temperature_of_one < np.inf or not all(0 <= x < np.inf for x in numbers):
+            raise ValueError(
+                f"no calibration: temperature {self.temperature_of_one}, correlation {self.correlation}, of sides "
+                f"{self.side_correlation}"
+            )
 
     def temperature(self, looks: int) -> float:
         """What the sum of the logits of so many looks is divided by."""
         return self.temperature_of_one * (1 + self.correlation * (looks - 1))
+
+    def log_belief(self, total: NDArray[np.floating], looks: NDArray[np.int64] | int, classes: int) -> Float:
+        """Logarithm of the belief in each class, up to a constant for all classes.
+
+        Args:
+            total: sum over looks of what they say, see ``additive``, (..., classes) or (..., (1 + sides) * classes).
+            looks: how many, one number or (...).
+            classes: how many.
+
+        Returns:
+            (..., classes) float64.
+
+        Raises:
+            ValueError: something that was said is not finite.
+        """
+        if not np.isfinite(total).all():
+            raise ValueError("the recogniser said something that is not a finite number")
+        more = np.asarray(looks)[..., None] - 1
+        total = np.asarray(total, np.float64)
+        logs = total[..., :classes] / (self.temperature_of_one * (1 + self.correlation * more))
+        if self.side_correlation is None or total.shape[-1] == classes:
+            return logs
+        pointing = _pointing(total, classes) / (1 + self.side_correlation * more)[..., None]
+        top = pointing.max(-2)
+        pointing -= top[..., None, :]
+        return logs + top + np.log(np.exp(pointing, out=pointing).sum(-2))
+
+    def belief(self, total: NDArray[np.floating], looks: NDArray[np.int64] | int, classes: int) -> Float:
+        """Belief in each class, (..., classes) float64, sums to 1; arguments as for ``log_belief``."""
+        return _softmax(self.log_belief(total, looks, classes))
+
+    def sides(
+        self, total: NDArray[np.floating], looks: int, classes: int, azimuth: NDArray[np.floating]
+    ) -> Float | None:
+        """Belief in the side that is seen from an azimuth, if the object is of each class.
+
+        Args:
+            total: sum over looks of what they say, see ``additive``, (..., (1 + sides) * classes).
+            looks: how many.
+            classes: how many.
+            azimuth: parts of a full turn, (...).
+
+        Returns:
+            (..., classes, sides) float64, sums to 1 over the sides; None if no sides were told.
+        """
+        if total.shape[-1] == classes:
+            return None
+        correlation = self.correlation if self.side_correlation is None else self.side_correlation
+        pointing = _pointing(np.asarray(total, np.float64), classes) / (1 + correlation * (looks - 1))
+        return _softmax(reorient(pointing.swapaxes(-1, -2), azimuth))
 
     def threshold(self, risk: float, max_views: int) -> float:
         """The lowest threshold of the belief that promises an error rate, see ``RiskBounds``.
@@ -117,7 +247,7 @@ class Calibration:
         try:
             risk = facts.get("risk")
             bounds = risk and RiskBounds(tuple(risk["thresholds"]), tuple(map(tuple, risk["bounds"])), risk["delta"])
-            return cls(facts["temperature_of_one"], facts["correlation"], bounds)
+            return cls(facts["temperature_of_one"], facts["correlation"], bounds, facts.get("side_correlation"))
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"a calibration that cannot be read ({type(error).__name__}: {error})") from None
 
@@ -127,6 +257,8 @@ class Calibration:
             "temperature_of_one": self.temperature_of_one,
             "correlation": self.correlation,
         }
+        if self.side_correlation is not None:
+            facts["side_correlation"] = self.side_correlation
         if self.risk is not None:
             r = self.risk
             facts["risk"] = {"delta": r.delta, "thresholds": list(r.thresholds), "bounds": [*map(list, r.bounds)]}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nextview.episode import Episodes
 from nextview.models.networks import Models
 from nextview.observation import Camera, Observation
-from nextview.policies.base import Policy
+from nextview.policies.base import Policy, maps_among
 from nextview.recognition import Stopping, fuse
 from nextview.viewsphere import ViewSphere
 
@@ -28,6 +28,8 @@ class Look:
         next_view: where to look next; None where the episode ends.
         travel: so far, in grid cells.
         arc: so far, in radians.
+        sides: belief, over all looks, in the side of the object that is seen from here, for each class, (classes,
+            sides), in even steps of azimuth; None if the recogniser was not taught them.
     """
 
     view: int
@@ -38,6 +40,7 @@ class Look:
     next_view: int | None
     travel: float
     arc: float
+    sides: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,9 @@ class Session:
         stopping: Stopping = Stopping(),
         rng: np.random.Generator | None = None,
     ) -> None:
-        missing = [name for name in policy.needs if name.removesuffix("-sphere") not in models.maps]
+        if "sides" in policy.needs and not models.recogniser.sides:
+            raise ValueError("this policy wants to know the side that is seen, and the recogniser was not taught it")
+        missing = [name for name in maps_among(policy.needs) if name.removesuffix("-sphere") not in models.maps]
         if missing:
             raise ValueError(f"this policy needs the map {missing[0]!r}; load it with the models")
         self.models, self.sphere = models, sphere
@@ -133,6 +138,8 @@ class Session:
         if self.looks:
             travel += float(self.sphere.travel[self.looks[-1].view, view])
             arc += float(self.sphere.arc[self.looks[-1].view, view])
+        calibration, azimuth = self._episodes.calibration, self.sphere.turn[step.views]
+        sides = calibration.sides(step.total, len(self.looks) + 1, len(self.models.classes), azimuth)
         look = Look(
             view,
             observation,
@@ -142,6 +149,7 @@ class Session:
             None if to < 0 else to,
             travel,
             arc,
+            None if sides is None else sides[0],
         )
         self.looks.append(look)
         return look

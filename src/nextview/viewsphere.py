@@ -101,6 +101,11 @@ class ViewSphere:
         """Position of each view on its ring, shape (V,), int64."""
         return _fixed(np.tile(np.arange(self.azimuths), self.rings))
 
+    @cached_property
+    def turn(self) -> Float:
+        """Azimuth of each view as a part of a full turn, shape (V,), float64."""
+        return _fixed(self.azimuth_index / self.azimuths)
+
     def angles(self, view: int) -> tuple[float, float]:
         """(elevation, azimuth) of a view, degrees."""
         return self.elevations[self.ring[view]], 360.0 * int(self.azimuth_index[view]) / self.azimuths

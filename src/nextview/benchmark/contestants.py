@@ -70,7 +70,7 @@ FIXED = {
 
 def _gain(t: Trials, anywhere: bool) -> Policy:
     p = t.predictions
-    return OracleGain(p.sphere, p.logits, p.labels, t.objects, anywhere, p.calibration)
+    return OracleGain(p.sphere, p.said, len(p.classes), p.labels, t.objects, anywhere, p.calibration)
 
 
 def default_contestants(trials: Trials) -> list[str]:
@@ -92,7 +92,8 @@ def contestant_policy(name: str, trials: Trials) -> Policy:
     policy = _make(name, trials)
     lacking = _lacking(policy, trials)
     if lacking:
-        raise ValueError(f"policy {name} needs the map {lacking[0]!r}, which these predictions lack")
+        what = "what the recogniser says of the sides" if lacking[0] == "sides" else f"the map {lacking[0]!r}"
+        raise ValueError(f"policy {name} needs {what}, which these predictions lack")
     return policy
 
 
@@ -118,7 +119,9 @@ def _fits(name: str, trials: Trials) -> bool:
 
 
 def _lacking(policy: Policy, trials: Trials) -> list[str]:
-    return [wanted for wanted in policy.needs if wanted not in {*trials.predictions.maps, *TRUE_MAPS}]
+    p = trials.predictions
+    there = {*p.maps, *TRUE_MAPS, *(["sides"] if p.sides is not None else [])}
+    return [wanted for wanted in policy.needs if wanted not in there]
 
 
 def fixed_views(name: str, trials: Trials, rng: np.random.Generator) -> NDArray[np.int64] | None:

@@ -78,8 +78,8 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
     if samples < 1:
         raise EvaluationError(f"at least one sample of the bootstrap is needed, not {samples}")
     weights = st.resample(len(p), samples, rng)
-    right, confidence = fused_views(p.logits, p.labels, p.calibration, rng)
-    judged = {1: p.logits, len(p.sphere): p.logits.astype(np.float64).sum(1, keepdims=True)}
+    right, confidence = fused_views(p.said, p.labels, p.calibration, rng, len(p.classes))
+    judged: dict[int, NDArray] = {1: p.logits, len(p.sphere): all_fused(p)[:, None]}
     maps, left_out = _maps(p, weights)
     return Evaluation(
         _accuracy(p, judged, weights),
@@ -91,32 +91,41 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
     )
 
 
+def all_fused(p: Predictions) -> Float:
+    """Logarithm of the belief from all views of each object, up to a constant, (N, C)."""
+    return p.calibration.log_belief(p.said.astype(np.float64).sum(1), len(p.sphere), len(p.classes))
+
+
 def fused_views(
-    logits: NDArray[np.floating], labels: NDArray[np.int64], calibration: Calibration, rng: np.random.Generator
+    said: NDArray[np.floating],
+    labels: NDArray[np.int64],
+    calibration: Calibration,
+    rng: np.random.Generator,
+    classes: int,
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations.
 
     Every view comes first once, second once, and so on: with one view this is the single-view accuracy exactly.
 
     Args:
-        logits: (N, V, classes).
+        said: by the recogniser, so that it adds up, (N, V, D); see ``additive``.
         labels: (N,).
-        calibration: how far a sum of logits is to be trusted.
+        calibration: how far a sum of it is to be trusted.
         rng: draws one order for each object.
+        classes: how many.
 
     Returns:
         Whether the answer is right, and its confidence, each (V looks, N, V rotations).
     """
-    n, v, _ = logits.shape
+    n, v, _ = said.shape
     order = rng.permuted(np.tile(np.arange(v), (n, 1)), axis=1)
-    shuffled = np.take_along_axis(logits.astype(np.float64), order[:, :, None], axis=1)
-    temperature = np.array([calibration.temperature(k + 1) for k in range(v)])[:, None]
+    shuffled = np.take_along_axis(said.astype(np.float64), order[:, :, None], axis=1)
     right, confidence = np.empty((v, n, v), bool), np.empty((v, n, v), np.float32)
     for turn in range(v):
         total = np.roll(shuffled, -turn, axis=1).cumsum(1)
-        right[:, :, turn] = (total.argmax(2) == labels[:, None]).T
-        below_peak = (total - total.max(2, keepdims=True)) / temperature
-        confidence[:, :, turn] = (1 / np.exp(below_peak).sum(2)).T
+        belief = calibration.belief(total, np.arange(1, v + 1), classes)
+        right[:, :, turn] = (belief.argmax(2) == labels[:, None]).T
+        confidence[:, :, turn] = belief.max(2).T
     return right, confidence
 
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from nextview.benchmark.contestants import TRUE_MAPS, Trials, contestant_policy, fixed_views
 from nextview.data.predictions import Predictions
 from nextview.episode import PolicyError, run_episodes
-from nextview.policies.base import Evidence
-from nextview.recognition import Stopping, fuse
+from nextview.policies.base import Evidence, maps_among
+from nextview.recognition import Stopping
 from nextview.viewsphere import ViewSphere
 
 
@@ -101,11 +101,16 @@ def replay(name: str, trials: Trials, max_views: int, seed: int) -> Paths:
     if views is not None:
         return _look_at(views, trials)
     policy = contestant_policy(name, trials)
-    maps = {wanted: TRUE_MAPS[wanted](p) if wanted in TRUE_MAPS else p.maps[wanted] for wanted in policy.needs}
+    wanted = maps_among(policy.needs)
+    maps = {name: TRUE_MAPS[name](p) if name in TRUE_MAPS else p.maps[name] for name in wanted}
 
     def observe(which: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
         rows = objects[which]
-        return Evidence(p.logits[rows, views], {name: values[rows, views] for name, values in maps.items()})
+        return Evidence(
+            p.logits[rows, views],
+            {name: values[rows, views] for name, values in maps.items()},
+            sides=None if p.sides is None else p.sides[rows, views],
+        )
 
     try:
         done = run_episodes(observe, p.sphere, policy, trials.starts, Stopping(1.0, max_views), rng, p.calibration)
@@ -124,12 +129,12 @@ def replay(name: str, trials: Trials, max_views: int, seed: int) -> Paths:
 def _look_at(views: NDArray[np.int64], trials: Trials) -> Paths:
     """Take fixed views one after the other."""
     p = trials.predictions
-    total = np.zeros((len(views), len(p.classes)))
+    total = np.zeros((len(views), p.said.shape[2]))
     answers, confidences = np.zeros(views.shape, np.int64), np.zeros(views.shape)
     for k, now in enumerate(views.T):
-        total += p.logits[trials.objects, now]
-        answers[:, k] = total.argmax(1)
-        confidences[:, k] = fuse(total[:, None], p.calibration.temperature(k + 1)).max(1)
+        total += p.said[trials.objects, now]
+        belief = p.calibration.belief(total, k + 1, len(p.classes))
+        answers[:, k], confidences[:, k] = belief.argmax(1), belief.max(1)
     return Paths(views, answers, confidences, *_moved(p.sphere, views), fixed=True)
 
 

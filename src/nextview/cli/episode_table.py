@@ -71,6 +71,7 @@ def as_json(result: Recognition, sphere: ViewSphere) -> str:
     looks = []
     for look in result.looks:
         peak = _peak(sphere, look)
+        side = None if look.sides is None else look.sides[look.belief.argmax()]
         looks.append(
             {
                 "view": look.view,
@@ -78,6 +79,9 @@ def as_json(result: Recognition, sphere: ViewSphere) -> str:
                 "azimuth": sphere.angles(look.view)[1],
                 "image_says": dict(zip(result.classes, rounded(look.guess), strict=True)),
                 "belief": dict(zip(result.classes, rounded(look.belief), strict=True)),
+                "side": None
+                if side is None
+                else {"degrees": 360 * int(side.argmax()) / len(side), "belief": round(float(side.max()), 6)},
                 "maps": {name: rounded(values) for name, values in look.maps.items()},
                 "map_peak": None if peak is None else peak[0],
                 "next_view": look.next_view,

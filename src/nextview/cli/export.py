@@ -78,8 +78,9 @@ def export_recogniser(
     if len(validation) == 0:
         raise ModelError(f"{run} and the other runs have no validation object in common")
     unseen = set.intersection(*held) | {views.names[i] for i in validation}
+    c, channels, azimuths = len(views.classes), CHANNELS_OF[sees], views.sphere.azimuths
     networks = [
-        load_weights(ResNet(recipe.depth, len(views.classes), CHANNELS_OF[sees]), r)
+        load_weights(ResNet(recipe.depth, c, channels, azimuths if recipe.side else 0), r)
         for r, recipe in zip(runs, recipes, strict=True)
     ]
 
@@ -96,18 +97,21 @@ def export_recogniser(
         "temperature": 1.0,
     }
     example = np.array(inputs[validation[0], :2])
-    export_onnx(CalibratedRecogniser(networks, 1.0, mirror), example, "input", ["logits", "features"], weights, bits)
+    uncalibrated = CalibratedRecogniser(networks, 1.0, mirror)
+    if uncalibrated.sides:
+        facts["sides"] = uncalibrated.sides
+    export_onnx(uncalibrated, example, "input", uncalibrated.outputs, weights, bits)
     write_card(card, facts)
     plain = Recogniser(card)
-    raw = _tracked(lambda i: plain.from_inputs(np.array(inputs[i]))[0], validation, "validation views")
+    raw = _tracked(lambda i: plain.from_inputs(np.array(inputs[i])).logits, validation, "validation views")
     labels = views.labels[validation]
     temperature = fit_temperature(raw.reshape(-1, raw.shape[2]), np.repeat(labels, raw.shape[1]))
 
     shipped = CalibratedRecogniser(networks, temperature, mirror).eval()
-    export_onnx(shipped, example, "input", ["logits", "features"], weights, bits)
+    export_onnx(shipped, example, "input", shipped.outputs, weights, bits)
     write_card(card, facts)
     sample = np.array(inputs[validation[:: max(1, len(validation) // 8)][:8], 5])
-    difference = float(np.abs(answer(shipped, sample) - Recogniser(card).from_inputs(sample)[0]).max())
+    difference = float(np.abs(answer(shipped, sample) - Recogniser(card).from_inputs(sample).logits).max())
     console.print(f"largest difference between torch and ONNX logits on real views: {difference:.2g}")
     if not difference < 0.1:
         raise ModelError(f"{weights}: its logits differ from the network's by up to {difference:.2g}")

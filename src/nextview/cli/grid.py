@@ -95,7 +95,8 @@ def _scores(run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe) 
     kept = run / "scores.json"
     if kept.exists():
         return json.loads(kept.read_text())
-    network = load_weights(ResNet(recipe.depth, len(views.classes), CHANNELS_OF[recipe.input]), run)
+    azimuths = views.sphere.azimuths if recipe.side else 0
+    network = load_weights(ResNet(recipe.depth, len(views.classes), CHANNELS_OF[recipe.input], azimuths), run)
     objects, labels = test_objects(views), views.labels
     right: list[int] = []
 

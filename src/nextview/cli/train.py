@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from nextview.data.store import ViewStore
+    from nextview.training.recogniser import Source
     from nextview.training.targets import Target
 
 
@@ -36,7 +37,8 @@ def train_recogniser(
         out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the best class mean.
         deformed: stores of the same objects, stretched and turned (nextview render --stretch .25 --turn --seed 1 and so
             on); their views may be others.
-        weights: a torchvision checkpoint of the same depth to start from.
+        weights: start from a torchvision checkpoint of the same depth, or go on from an exported recogniser (its card,
+            NAME.json) on other data or for longer.
         folds: train so many recognisers instead, OUT/fold0 and so on, each without its share of the training objects,
             for evidence from networks that have not seen the object.
         fold: train only this one of them, 0 the first.
@@ -52,12 +54,15 @@ def train_recogniser(
     from nextview.training import recogniser
     from nextview.training.folds import hold_out
     from nextview.training.runs import begin, finish, is_done
+    from nextview.training.sides import mirror_planes
 
     if fold is not None and not 0 <= fold < folds:
         raise ModelError(f"there is no fold {fold} of {folds}: they are counted from 0")
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation, recipe.seed)
-    sources = [_source(path, views, training, recipe) for path in (store, *deformed)]
+    azimuths = views.sphere.azimuths if recipe.side else 0
+    planes = mirror_planes(views, training) if recipe.side else None
+    sources = [_source(path, views, training, recipe, planes) for path in (store, *deformed)]
     runs = {out: training[:0]}
     if folds:
         runs = {out / f"fold{k}": held for k, held in enumerate(hold_out(views, training, folds, recipe.seed))}
@@ -70,19 +75,27 @@ def train_recogniser(
                 continue
             (run / "held_out.json").write_text(json.dumps([views.names[i] for i in held]) + "\n")
             seen = np.setdiff1d(training, held)
-            network = recogniser.train(sources, views.labels, seen, validation, recipe, run, weights, hardware)
+            network = recogniser.train(
+                sources, views.labels, seen, validation, recipe, run, weights, hardware, azimuths
+            )
             _draw_curves(run)
             finish(network, run)
 
 
 def _source(
-    path: Path, views: ViewStore, needed: NDArray[np.int64], recipe: RecogniserRecipe
-) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    path: Path,
+    views: ViewStore,
+    needed: NDArray[np.int64],
+    recipe: RecogniserRecipe,
+    planes: NDArray[np.float64] | None,
+) -> Source:
     """Inputs of a store, prepared if they are not yet, and the row of each object of ``views`` in them, -1 for none."""
     import numpy as np
 
     from nextview.data.folders import DatasetError
     from nextview.data.store import ViewStore
+    from nextview.training.recogniser import Source
+    from nextview.training.sides import sides
 
     store = ViewStore.open(path)
     row = {name: i for i, name in enumerate(store.names)}
@@ -90,7 +103,8 @@ def _source(
     missing = [views.names[i] for i in needed if rows[i] < 0]
     if missing:
         raise DatasetError(f"{path}: lacks {len(missing)} of the training objects, {missing[0]} among them")
-    return _prepared(path, store, recipe.size, recipe.input), rows
+    inputs = _prepared(path, store, recipe.size, recipe.input)
+    return Source(inputs, rows, None if planes is None else sides(store, views.sphere.azimuths, planes))
 
 
 def _prepared(path: Path, store: ViewStore, size: int, kind: str) -> NDArray[np.uint8]:
@@ -124,6 +138,7 @@ def _draw_curves(run: Path) -> None:
 def train_lem(
     store: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
+    weights: Path | None = None,
     recipe: tyro.conf.OmitArgPrefixes[MapRecipe] = MapRecipe(),
     hardware: tyro.conf.OmitArgPrefixes[Hardware] = Hardware(),
 ) -> None:
@@ -132,19 +147,22 @@ def train_lem(
     Args:
         store: view store made by nextview render, with the 40 views.
         out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the lowest squared error.
+        weights: card of a recogniser (NAME.json) of the same depth and input, from which a ResNet starts: what it knows
+            of shapes and of the side that is seen is of use.
         recipe: how to train.
         hardware: on what.
     """
     from nextview.data.store import ViewStore
     from nextview.training.targets import entropy_target
 
-    _train_map(store, entropy_target(ViewStore.open(store)), out, recipe, hardware)
+    _train_map(store, entropy_target(ViewStore.open(store)), out, weights, recipe, hardware)
 
 
 def train_lcm(
     store: tyro.conf.Positional[Path],
     predictions: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
+    weights: Path | None = None,
     recipe: tyro.conf.OmitArgPrefixes[MapRecipe] = MapRecipe(),
     hardware: tyro.conf.OmitArgPrefixes[Hardware] = Hardware(),
 ) -> None:
@@ -155,6 +173,8 @@ def train_lcm(
         predictions: of its training split, from recognisers that have not seen the objects (nextview train recogniser
             --folds, export each, nextview predict --unseen --recogniser CARD CARD).
         out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the lowest squared error.
+        weights: card of a recogniser (NAME.json) of the same depth and input, from which a ResNet starts: what it knows
+            of shapes and of the side that is seen is of use.
         recipe: how to train.
         hardware: on what.
     """
@@ -162,10 +182,13 @@ def train_lcm(
     from nextview.data.store import ViewStore
     from nextview.training.targets import confidence_target
 
-    _train_map(store, confidence_target(ViewStore.open(store), Predictions.load(predictions)), out, recipe, hardware)
+    target = confidence_target(ViewStore.open(store), Predictions.load(predictions))
+    _train_map(store, target, out, weights, recipe, hardware)
 
 
-def _train_map(store: Path, target: Target, out: Path, recipe: MapRecipe, hardware: Hardware) -> None:
+def _train_map(
+    store: Path, target: Target, out: Path, weights: Path | None, recipe: MapRecipe, hardware: Hardware
+) -> None:
     from nextview.cli.progress import console
     from nextview.data.split import split_training
     from nextview.data.store import ViewStore
@@ -180,6 +203,6 @@ def _train_map(store: Path, target: Target, out: Path, recipe: MapRecipe, hardwa
             return
         cloud = recipe.input == "cloud"
         seen: NDArray = views.all_points() if cloud else _prepared(store, views, recipe.size, recipe.input)
-        network = maps.train(seen, target.values, views.sphere, training, validation, recipe, out, hardware)
+        network = maps.train(seen, target.values, views.sphere, training, validation, recipe, out, hardware, weights)
         _draw_curves(out)
         finish(network, out)

@@ -56,6 +56,8 @@ def train_gain(
         lacking = [name for name in recipe.inputs if name in MAPS and name not in source.maps]
         if lacking:
             raise PredictionsError(f"{path}: holds no map {lacking[0]!r}; predict it, or choose other --inputs")
+        if source.sides is None and (recipe.frame == "object" or "side" in recipe.inputs):
+            raise PredictionsError(f"{path}: says nothing of sides; teach the recogniser (--side), or do without")
     if validation is None:
         learning, checking = divide(table.labels, table.depth_entropy, 0.2, recipe.seed)
     else:

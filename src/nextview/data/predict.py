@@ -104,7 +104,10 @@ def predict(
     with only_one(out):
         n, v = len(chosen), len(store.sphere)
         windows = {name: shape for kind, card in maps.items() for name, shape in map_shapes(kind, card, store.sphere)}
-        shapes = {"logits": (n, v, len(classes)), **{f"map_{name}": (n, v, *shape) for name, shape in windows.items()}}
+        sides = recogniser.facts.get("sides", 0)
+        told = {"sides": (n, v, len(classes), sides)} if sides else {}
+        maps_of = {f"map_{name}": (n, v, *shape) for name, shape in windows.items()}
+        shapes = {"logits": (n, v, len(classes)), **told, **maps_of}
         arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
         # Logits are written last: an object counts as done when none of its logits is the NaN that the file began with.
         todo = np.flatnonzero(np.isnan(arrays["logits"]).any((1, 2)))
@@ -138,6 +141,7 @@ def predict(
             models,
             valleys,
             calibration,
+            np.array(arrays["sides"]) if sides else None,
         ).save(out)
         shutil.rmtree(out.with_name(out.name + ".part"))
 
@@ -157,8 +161,9 @@ def judges(recognisers: Sequence[Card], names: Sequence[str]) -> NDArray[np.int6
     for card in recognisers:
         if "unseen" not in card.facts:
             raise DatasetError(f"recogniser {card.name} does not say which objects it has not seen in training")
-        if card.facts["classes"] != recognisers[0].facts["classes"]:
-            raise DatasetError(f"recognisers {recognisers[0].name} and {card.name} do not know the same classes")
+        for what in ("classes", "sides"):
+            if card.facts.get(what) != recognisers[0].facts.get(what):
+                raise DatasetError(f"recognisers {recognisers[0].name} and {card.name} do not know the same {what}")
     unseen = np.array([np.isin(names, card.facts["unseen"]) for card in recognisers])
     return np.where(unseen.any(0), unseen.argmax(0), -1)
 
@@ -198,7 +203,7 @@ def _open(
 def _predict_object(
     path: Path, recognisers: tuple[Path, ...], maps: tuple[tuple[str, Path], ...], batch: int, item: tuple[int, int]
 ) -> dict[str, NDArray[np.float32]]:
-    """Maps and logits of all views of one object, by the names of their files; the logits last."""
+    """Maps, sides and logits of all views of one object, by the names of their files; the logits last."""
     i, judge = item
     store, names_it, networks = _open(path, recognisers, maps)
     recogniser = names_it[judge]
@@ -209,5 +214,7 @@ def _predict_object(
         said = [network.from_inputs(seen[network.sees][p]) for p in parts]
         for kind in said[0]:
             found[f"map_{name}{kind.removeprefix(network.card.kind)}"] = np.concatenate([part[kind] for part in said])
-    logits = [recogniser.from_inputs(seen[recogniser.sees][p])[0] for p in parts]
-    return {**found, "logits": np.concatenate(logits)}
+    answers = [recogniser.from_inputs(seen[recogniser.sees][p]) for p in parts]
+    if all(said.sides is not None for said in answers):
+        found["sides"] = np.concatenate([said.sides for said in answers])
+    return {**found, "logits": np.concatenate([said.logits for said in answers])}

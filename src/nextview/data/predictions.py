@@ -6,13 +6,14 @@ import json
 import os
 import zipfile
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.recognition import PLAIN_SUM, Calibration
+from nextview.recognition import PLAIN_SUM, Calibration, additive
 from nextview.viewsphere import ViewSphere
 
 FORMAT = 1
@@ -40,6 +41,8 @@ class Predictions:
         models: name and SHA-256 of the recogniser ("recogniser") and of each map network ("lem").
         valley_classes: for each map, the classes for which its card says that the valley is the better view.
         calibration: how far the recogniser's card says that a sum of its logits is to be trusted.
+        sides: what the recogniser says of the sides of the object, (N, V, C, sides) float32, see ``Evidence``; None if
+            it cannot tell them.
 
     Raises:
         PredictionsError: shapes that do not fit, nothing inside, or a number that is not finite.
@@ -57,6 +60,7 @@ class Predictions:
     models: dict[str, tuple[str, str]]
     valley_classes: dict[str, tuple[str, ...]]
     calibration: Calibration = PLAIN_SUM
+    sides: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         n, v, c = len(self.names), len(self.sphere), len(self.classes)
@@ -69,6 +73,8 @@ class Predictions:
         for name, values in self.maps.items():
             columns = self.sphere.azimuths if name.endswith("-sphere") else 3
             wanted[f"map {name}"], arrays[f"map {name}"] = (n, v, self.sphere.rings, columns), values
+        if self.sides is not None:
+            wanted["sides"], arrays["sides"] = (n, v, c, *self.sides.shape[-1:]), self.sides
         for name, shape in wanted.items():
             if arrays[name].shape != shape:
                 raise PredictionsError(f"{name} of these predictions has the shape {arrays[name].shape}, not {shape}")
@@ -83,6 +89,11 @@ class Predictions:
     def __len__(self) -> int:
         return len(self.names)
 
+    @cached_property
+    def said(self) -> NDArray[np.float32]:
+        """What the recogniser says of each view, so that views can be summed, (N, V, D); see ``additive``."""
+        return additive(self.logits, self.sides, self.sphere.turn)
+
     def of_split(self, split: str) -> Predictions:
         """The objects of one split.
 
@@ -96,7 +107,8 @@ class Predictions:
         arrays = {name: getattr(self, name)[kept] for name in ("logits", "depth_entropy", "labels", "splits")}
         names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
         maps = {name: values[kept] for name, values in self.maps.items()}
-        return replace(self, **arrays, names=names, maps=maps, conflicting=self.conflicting[kept])
+        sides = None if self.sides is None else self.sides[kept]
+        return replace(self, **arrays, names=names, maps=maps, conflicting=self.conflicting[kept], sides=sides)
 
     def save(self, path: Path) -> None:
         """Write one .npz file, aside and then renamed, so that it is whole or not there."""
@@ -117,6 +129,8 @@ class Predictions:
         }
         arrays |= {f"map/{name}": values for name, values in self.maps.items()}
         arrays |= {f"valley/{name}": np.array(classes, np.str_) for name, classes in self.valley_classes.items()}
+        if self.sides is not None:
+            arrays["sides"] = self.sides
         part = path.with_name(path.name + ".part.npz")
         np.savez_compressed(part, **arrays)
         os.replace(part, path)
@@ -155,6 +169,7 @@ class Predictions:
                 {kind: (name, sha) for kind, name, sha in f["models"].tolist()},
                 {name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
                 Calibration.of_facts(json.loads(str(f["calibration"])) if "calibration" in f else None),
+                f.get("sides"),
             )
         except KeyError as error:
             raise PredictionsError(f"{path}: {error.args[0]}") from None

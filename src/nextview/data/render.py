@@ -13,6 +13,7 @@ from uuid import uuid4
 
 import numpy as np
 import zarr
+from numpy.typing import NDArray
 
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.folders import DatasetError, Entry, list_dataset
@@ -37,11 +38,16 @@ class Deform:
     stretch: float = 0.0
     turn: bool = False
 
-    def __call__(self, mesh: Mesh, rng: np.random.Generator) -> Mesh:
-        """The new object, normalised again."""
+    def draw(self, seed: int, name: str) -> tuple[NDArray[np.float64], float]:
+        """The factors of the three axes, (3,), and the angle, radians, of the object of that name."""
+        rng = np.random.default_rng([seed, *name.encode()])
         reach = np.log1p(self.stretch)
         factors = np.exp(rng.uniform(-reach, reach, 3))
-        angle = rng.uniform(0, 2 * np.pi) if self.turn else 0.0
+        return factors, rng.uniform(0, 2 * np.pi) if self.turn else 0.0
+
+    def __call__(self, mesh: Mesh, seed: int, name: str) -> Mesh:
+        """The new object, normalised again."""
+        factors, angle = self.draw(seed, name)
         c, s = np.cos(angle), np.sin(angle)
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         return make_mesh((mesh.vertices * factors) @ turn.T, mesh.faces, mesh.name)
@@ -122,6 +128,13 @@ def render(
             yield entry.name, None if reason is None else f"{reason}"
 
 
+def turns(store: ViewStore) -> NDArray[np.float64]:
+    """By how much each object of a store was turned about z when it was rendered, radians, (N,)."""
+    facts = store.group.attrs
+    deform = Deform(float(facts.get("stretch", 0.0)), bool(facts.get("turn", False)))
+    return np.array([deform.draw(int(facts.get("seed", 0)), name)[1] for name in store.names])
+
+
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Say what happens to a store when it cannot be written."""
@@ -184,7 +197,7 @@ def _render_entry(
     try:
         mesh = load_mesh(entry.path)
         if deform != Deform():
-            mesh = deform(mesh, np.random.default_rng([seed, *entry.name.encode()]))
+            mesh = deform(mesh, seed, entry.name)
         rendered = render_object(mesh, sphere, size)
     except MeshError as error:
         return str(error)

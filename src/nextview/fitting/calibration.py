@@ -11,12 +11,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.special import logsumexp
 from scipy.stats import beta
 
 from nextview.fitting.evidence import FittingSet, blind_walks
 from nextview.policies.baselines import Random, RandomAll
-from nextview.recognition import Calibration, RiskBounds, fuse
+from nextview.recognition import Calibration, RiskBounds, of_true_class
 
 Float = NDArray[np.float64]
 
@@ -25,7 +24,7 @@ THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
 
 
 def fit_temperature(data: FittingSet, rng: np.random.Generator, looks: int = 5, walks: int = 4) -> Calibration:
-    """Temperature of one look and correlation of several, by maximum likelihood over 1 to ``looks`` looks.
+    """Temperature of one look and correlations of several, by maximum likelihood over 1 to ``looks`` looks.
 
     Args:
         data: what the recogniser says.
@@ -35,11 +34,17 @@ def fit_temperature(data: FittingSet, rng: np.random.Generator, looks: int = 5, 
     """
     measure = _loss(data, rng, looks, walks)
 
-    def of(parameters: Float) -> float:
-        return measure(Calibration(float(np.exp(parameters[0])), float(parameters[1])))
+    def made_of(parameters: Float) -> Calibration:
+        temperature, correlation, *of_sides = parameters.tolist()
+        return Calibration(temperature, correlation, side_correlation=of_sides[0] if of_sides else None)
 
-    found = minimize(of, np.array([0.0, 0.5]), method="L-BFGS-B", bounds=[(-5.0, 5.0), (0.0, 5.0)])
-    return Calibration(round(float(np.exp(found.x[0])), 4), round(float(found.x[1]), 4))
+    def of(parameters: Float) -> float:
+        return measure(made_of(parameters))
+
+    begin = np.array([1.0, 0.5] if data.sides is None else [1.0, 0.5, 0.1])
+    bounds = [(0.01, 100.0), (0.0, 5.0), (0.0, 5.0)][: len(begin)]
+    found = minimize(of, begin, method="L-BFGS-B", bounds=bounds)
+    return made_of(np.round(found.x, 4))
 
 
 def loss(data: FittingSet, calibration: Calibration, rng: np.random.Generator, looks: int = 5, walks: int = 4) -> float:
@@ -51,14 +56,13 @@ def _loss(data: FittingSet, rng: np.random.Generator, looks: int, walks: int) ->
     """That loss as a function of the calibration, over the same walks each time."""
     looks = min(looks, len(data.sphere))
     objects, views = _walks(data, looks, walks, rng)
-    totals = np.cumsum(data.logits[objects[:, None], views].astype(np.float64), axis=1)
-    of_truth = np.take_along_axis(totals, data.labels[objects][:, None, None], 2)[..., 0]
+    totals = np.cumsum(data.said[objects[:, None], views].astype(np.float64), axis=1)
+    numbers, labels = np.arange(1, looks + 1), data.labels[objects]
     weights = data.weights[objects] / data.weights[objects].sum() / looks
 
     def measure(calibration: Calibration) -> float:
-        temperature = np.array([calibration.temperature(k) for k in range(1, looks + 1)])
-        missing = logsumexp(totals / temperature[:, None], axis=2) - of_truth / temperature
-        return float(weights @ missing.sum(1))
+        logs = calibration.log_belief(totals, numbers, len(data.classes))
+        return -float(weights @ of_true_class(logs, labels).sum(1))
 
     return measure
 
@@ -87,8 +91,8 @@ def fit_risk(
     """
     looks = min(looks, len(data.sphere))
     objects, views = _walks(data, looks, walks, rng)
-    totals = np.cumsum(data.logits[objects[:, None], views].astype(np.float64), axis=1)
-    belief = np.stack([fuse(totals[:, k, None], calibration.temperature(k + 1)) for k in range(looks)], 1)
+    totals = np.cumsum(data.said[objects[:, None], views].astype(np.float64), axis=1)
+    belief = calibration.belief(totals, np.arange(1, looks + 1), len(data.classes))
     sure, wrong = belief.max(2), belief.argmax(2) != data.labels[objects][:, None]
     promised = np.zeros((looks, len(THRESHOLDS)))
     for k in range(looks):

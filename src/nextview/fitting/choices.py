@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from nextview.data.predictions import Predictions, PredictionsError
 from nextview.fitting.calibration import fit_temperature
 from nextview.fitting.evidence import FittingSet, fitting_set
-from nextview.fitting.tables import log_belief
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.baselines import Random
 from nextview.policies.gain import Gain
-from nextview.recognition import PLAIN_SUM, Calibration, fuse
+from nextview.recognition import PLAIN_SUM, Calibration, of_true_class
 
 Float = NDArray[np.float64]
 
@@ -46,8 +45,7 @@ class ReplayTable:
         """
         if len(kept) == 0:
             raise PredictionsError("no object is left to learn from")
-        whole = fitting_set(predictions, 1.0, 0)
-        data = replace(whole, logits=whole.logits[kept], labels=whole.labels[kept])
+        data = fitting_set(predictions, 1.0, 0).of(kept)
         maps = {name: values[kept] for name, values in predictions.maps.items()}
         known = predictions.calibration != PLAIN_SUM
         return cls(data, maps, predictions.calibration if known else fit_temperature(data, rng))
@@ -59,7 +57,7 @@ class Moment:
 
     Attributes:
         state: what the policy is shown.
-        total: sum of the logits so far, (N, C) float64.
+        total: sum of what was said so far, (N, D) float64, see ``additive``.
         travel: so far, grid cells, (N,) float64.
     """
 
@@ -80,17 +78,21 @@ def follow(table: ReplayTable, policy: Policy, looks: int, rng: np.random.Genera
     Yields:
         The moment after each look.
     """
-    data = table.data
+    data, classes = table.data, len(table.data.classes)
     rows, sphere = np.arange(len(data)), data.sphere
     current = rng.integers(len(sphere), size=len(data))
-    visited, total = np.zeros((len(data), len(sphere)), bool), np.zeros((len(data), len(data.classes)))
+    visited, total = np.zeros((len(data), len(sphere)), bool), np.zeros((len(data), data.said.shape[2]))
     travel = np.zeros(len(data))
     for k in range(1, looks + 1):
         visited[rows, current] = True
-        total = total + data.logits[rows, current]
+        total = total + data.said[rows, current]
         maps = {name: values[rows, current] for name, values in table.maps.items()}
-        belief = fuse(total[:, None], table.calibration.temperature(k))
-        state = EpisodeState(current, visited.copy(), belief, Evidence(data.logits[rows, current], maps), k, rows)
+        belief = table.calibration.belief(total, k, classes)
+        seen = Evidence(
+            data.logits[rows, current], maps, sides=None if data.sides is None else data.sides[rows, current]
+        )
+        sides = table.calibration.sides(total, k, classes, sphere.turn[current])
+        state = EpisodeState(current, visited.copy(), belief, seen, k, rows, sides)
         yield Moment(state, total, travel)
         if k < looks:
             following = policy.next_views(state, rng)
@@ -98,28 +100,28 @@ def follow(table: ReplayTable, policy: Policy, looks: int, rng: np.random.Genera
             current = following
 
 
-def outcome(total: Float, labels: NDArray[np.int64], temperature: float, kind: str) -> Float:
-    """What sums of logits are worth.
+def outcome(table: ReplayTable, total: Float, looks: int, kind: str) -> Float:
+    """What sums of what was said of each object are worth.
 
     Args:
-        total: (N, ..., C).
-        labels: true classes, (N,).
-        temperature: what the sum is divided by.
+        table: holds the truth.
+        total: (N, ..., D), see ``additive``.
+        looks: how many were summed.
         kind: one of OUTCOMES.
 
     Returns:
         (N, ...) float64.
     """
+    logs = table.calibration.log_belief(total, looks, len(table.data.classes))
     if kind == "right":
-        return np.equal(total.argmax(-1).T, labels).T.astype(np.float64)
-    logs = log_belief(total, labels, temperature)
-    return logs if kind == "log-belief" else np.exp(logs)
+        return np.equal(logs.argmax(-1).T, table.data.labels).T.astype(np.float64)
+    of_truth = of_true_class(logs, table.data.labels)
+    return of_truth if kind == "log-belief" else np.exp(of_truth)
 
 
 def choices(table: ReplayTable, moment: Moment, kind: str) -> Float:
     """The outcome of looking from every view next, (N, V) float64."""
-    after = moment.total[:, None] + table.data.logits
-    return outcome(after, table.data.labels, table.calibration.temperature(moment.state.step + 1), kind)
+    return outcome(table, moment.total[:, None] + table.data.said, moment.state.step + 1, kind)
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ def judge(
         for moment in follow(table, policy, looks, rng):
             k = moment.state.step
             if k > 1:
-                worth = outcome(moment.total, data.labels, table.calibration.temperature(k), kind)
+                worth = outcome(table, moment.total, k, kind)
                 reached[:, k - 2] += weights @ worth, weights @ moment.travel
     return Worth(*reached)
 

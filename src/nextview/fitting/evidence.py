@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from nextview.data.predictions import Predictions, PredictionsError
 from nextview.data.split import divide
 from nextview.policies.base import EpisodeState, Evidence, Policy
+from nextview.recognition import additive
 from nextview.viewsphere import ViewSphere
 
 
@@ -22,15 +24,27 @@ class FittingSet:
         labels: (N,) int64.
         sphere: the viewpoints.
         classes: names, in the order of the logits.
+        sides: what it says of the sides, (N, V, C, sides) float32, see ``Evidence``; None if it cannot tell.
     """
 
     logits: NDArray[np.float32]
     labels: NDArray[np.int64]
     sphere: ViewSphere
     classes: tuple[str, ...]
+    sides: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    @cached_property
+    def said(self) -> NDArray[np.float32]:
+        """All of it, so that views can be summed, (N, V, D); see ``additive``."""
+        return additive(self.logits, self.sides, self.sphere.turn)
+
+    def of(self, kept: NDArray) -> FittingSet:
+        """Some of the objects."""
+        sides = None if self.sides is None else self.sides[kept]
+        return replace(self, logits=self.logits[kept], labels=self.labels[kept], sides=sides)
 
     @property
     def weights(self) -> NDArray[np.float64]:
@@ -59,7 +73,7 @@ def fitting_set(predictions: Predictions, validation: float, seed: int) -> Fitti
     if len(kept) == 0:
         raise PredictionsError("no object is left to fit to")
     p = predictions
-    return FittingSet(p.logits[kept], p.labels[kept], p.sphere, p.classes)
+    return FittingSet(p.logits, p.labels, p.sphere, p.classes, p.sides).of(kept)
 
 
 def blind_walks(

@@ -11,26 +11,14 @@ from numpy.typing import NDArray
 
 from nextview.fitting.evidence import FittingSet, blind_walks
 from nextview.policies.tables import FixedRing, cells_from, cells_to
-from nextview.recognition import Calibration
+from nextview.recognition import Calibration, of_true_class
 
 Float = NDArray[np.float64]
 
 
-def log_belief(total: NDArray[np.floating], labels: NDArray[np.int64], temperature: float) -> Float:
-    """Logarithm of the belief in the true class.
-
-    Args:
-        total: sum of logits, (N, ..., C).
-        labels: (N,).
-        temperature: what the sum is divided by.
-
-    Returns:
-        (N, ...) float64.
-    """
-    total = np.asarray(total, np.float64) / temperature
-    top = total.max(-1)
-    of_truth = total[np.arange(len(labels)), ..., labels]
-    return of_truth - top - np.log(np.exp(total - top[..., None]).sum(-1))
+def log_belief(data: FittingSet, calibration: Calibration, total: NDArray[np.floating], looks: int) -> Float:
+    """Logarithm of the belief in the true class, (N, ...), after so many looks with that sum, (N, ..., D)."""
+    return of_true_class(calibration.log_belief(total, looks, len(data.classes)), data.labels)
 
 
 def fit_sequence(
@@ -78,18 +66,18 @@ def greedy_path(
     sphere = data.sphere
     path = [int(sphere.ring[starts[0]]) * sphere.azimuths]
 
-    def logits(place: int) -> Float:
-        return data.logits[:, cells_from(sphere)[starts, place]].astype(np.float64)
+    def said(place: int) -> Float:
+        return data.said[:, cells_from(sphere)[starts, place]].astype(np.float64)
 
-    total = logits(path[0])
+    total = said(path[0])
     for k in range(2, min(length, len(sphere) - 1) + 2):
         reachable = np.arange(len(sphere)) if anywhere else sphere.window(path[-1]).ravel()
         free = np.setdiff1d(reachable, path)
         free = free if len(free) else np.setdiff1d(np.arange(len(sphere)), path)
-        beliefs = [log_belief(total + logits(v), data.labels, calibration.temperature(k)).mean(1) for v in free]
+        beliefs = [log_belief(data, calibration, total + said(v), k).mean(1) for v in free]
         worth = np.array(beliefs) @ data.weights / len(data) - price * sphere.travel[path[-1], free]
         path.append(int(free[np.argmax(worth)]))
-        total += logits(path[-1])
+        total += said(path[-1])
     return np.array(path)
 
 
@@ -112,11 +100,11 @@ def fit_ring(data: FittingSet, anywhere: bool, looks: int, calibration: Calibrat
         return blind_walks(data.sphere, policy, everywhere, min(looks, len(data.sphere)), nothing_drawn)
 
     def worth(walk: tuple[int, int]) -> float:
-        total, sum_over_looks = np.zeros(data.logits.shape), 0.0
+        total, sum_over_looks = np.zeros(data.said.shape), 0.0
         for k, views in enumerate(walks_from_everywhere(walk).T, 1):
-            total += data.logits[:, views]
+            total += data.said[:, views]
             if k > 1:
-                belief = log_belief(total, data.labels, calibration.temperature(k))
+                belief = log_belief(data, calibration, total, k)
                 sum_over_looks += float(data.weights @ belief.mean(1))
         return sum_over_looks
 
@@ -148,15 +136,16 @@ def fit_class_table(
     cell = cells_to(sphere)
     for _ in range(walks):
         walk = rng.permuted(np.tile(np.arange(len(sphere)), (n, 1)), axis=1)
-        total = np.zeros((n, c))
+        total = np.zeros((n, data.said.shape[2]))
         for k in range(1, min(looks, len(sphere))):
             current = walk[:, k - 1]
-            total += data.logits[np.arange(n), current]
-            now = log_belief(total, data.labels, calibration.temperature(k))
-            after = log_belief(total[:, None] + data.logits, data.labels, calibration.temperature(k + 1))
+            total += data.said[np.arange(n), current]
+            now = log_belief(data, calibration, total, k)
+            after = log_belief(data, calibration, total[:, None] + data.said, k + 1)
             free = np.ones((n, len(sphere)), bool)
             free[np.arange(n)[:, None], walk[:, :k]] = False
-            at = (total.argmax(1)[:, None], sphere.ring[current][:, None], cell[current])
+            believed = calibration.log_belief(total, k, c).argmax(1)
+            at = (believed[:, None], sphere.ring[current][:, None], cell[current])
             each = free * data.weights[:, None]
             np.add.at(gains, at, each * (after - now[:, None]))
             np.add.at(weight, at, each)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from nextview.models.cloud_input import cloud_input
 from nextview.models.geometry_input import geometry_input
 from nextview.models.image_input import image_input
 from nextview.observation import Observation
-from nextview.policies.base import Evidence
+from nextview.policies.base import Evidence, maps_among
 from nextview.recognition import Calibration
 from nextview.weights import WeightsError, open_onnx
 
@@ -75,6 +75,8 @@ def see(observations: Sequence[Observation], sees: str, size: int) -> NDArray[An
 class Recogniser:
     """Names the object in each view.
 
+    ``sides`` is how many sides of the object it tells apart, 0 if it was not taught to.
+
     Args:
         model: name of a bundled model, or path of a card.
         threads: of ONNX Runtime, 0 for one on each core.
@@ -86,20 +88,23 @@ class Recogniser:
             raise ModelError(f"model {self.card.name} is a {self.card.kind}, not a recogniser")
         self.classes: tuple[str, ...] = tuple(self.card.facts["classes"])
         self.sees = sight(self.card)
+        self.sides: int = self.card.facts.get("sides", 0)
         try:
             self.calibration = Calibration.of_facts(self.card.facts.get("calibration"))
         except ValueError as error:
             raise ModelError(f"{self.card.path.with_suffix('.json')}: {error}") from None
         self._session = open_weights(self.card, threads)
 
-    def __call__(self, observations: Sequence[Observation]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Calibrated logits (B, classes) and pooled features (B, D) of looks from one camera."""
+    def __call__(self, observations: Sequence[Observation]) -> Evidence:
+        """What it says of B looks from one camera: calibrated logits, pooled features, and sides if it knows them."""
         return self.from_inputs(see(observations, *self.sees))
 
-    def from_inputs(self, inputs: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def from_inputs(self, inputs: NDArray[Any]) -> Evidence:
         """The same from what is seen, see ``see``."""
-        logits, features = self._session.run(["logits", "features"], {"input": inputs})
-        return logits, features
+        logits, features, *sides = self._session.run(
+            ["logits", "features", *(["sides"] if self.sides else [])], {"input": inputs}
+        )
+        return Evidence(logits, features=features, sides=sides[0] if sides else None)
 
 
 class MapNetwork:
@@ -152,18 +157,19 @@ class Models:
 
     def evidence(self, observations: Sequence[Observation]) -> Evidence:
         """What the models say of looks from one camera."""
-        logits, features = self.recogniser(observations)
         maps = {name: values for network in self.maps.values() for name, values in network(observations).items()}
-        return Evidence(logits, maps, features)
+        return replace(self.recogniser(observations), maps=maps)
 
 
 def load_models(maps: Sequence[str] = ("lem",), recogniser: str | Path = RECOGNISER, threads: int = 0) -> Models:
     """The bundled recogniser, or the one whose card is given, and the bundled map networks of the given names.
 
+    The names may be a policy's needs: "sides" takes no network beside the recogniser.
+
     Raises:
         ModelError: a model is missing, damaged or of the wrong kind.
     """
-    names = list(dict.fromkeys(name.removesuffix("-sphere") for name in maps))
+    names = list(dict.fromkeys(name.removesuffix("-sphere") for name in maps_among(maps)))
     unknown = [name for name in names if name not in MAPS]
     if unknown:
         raise ModelError(f"no map is called {unknown[0]!r}; there are {', '.join(MAPS)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -20,11 +21,15 @@ class Evidence:
         maps: those that the policy needs, by name: predicted local maps ("lem"), each (B, rings, 3) float, and maps of
             the whole sphere ("lem-sphere"), (B, rings, azimuths), columns once round from the view.
         features: pooled image features, (B, D) float.
+        sides: logarithms of how likely each side of the object is the one that is seen, if it is of each class,
+            (B, classes, sides) float: sides in even steps of azimuth from one that the recogniser has settled on for
+            the class. None if the recogniser cannot tell.
     """
 
     logits: NDArray[np.floating]
     maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
     features: NDArray[np.floating] | None = None
+    sides: NDArray[np.floating] | None = None
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,9 @@ class EpisodeState:
         evidence: of the current look.
         step: looks taken so far, 1 or more.
         episodes: which episodes these are, (B,) int64: where an oracle looks up its truth. Live there is one, 0.
+        sides: belief, over all looks, in the side that is seen from the current view, if the object is of each class,
+            (B, classes, sides) float64, sums to 1 over the sides. None if the recogniser cannot tell, or "sides" is not
+            among the policy's needs.
     """
 
     current: NDArray[np.int64]
@@ -46,6 +54,7 @@ class EpisodeState:
     evidence: Evidence
     step: int
     episodes: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
+    sides: NDArray[np.float64] | None = None
 
 
 class Policy(Protocol):
@@ -53,12 +62,17 @@ class Policy(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the maps it wants in the evidence."""
+        """Names of the maps it wants in the evidence; "sides" for what the recogniser says of them."""
         ...
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """The next view of each episode, (B,) int64: one not visited yet, as long as there is any."""
         ...
+
+
+def maps_among(needs: Sequence[str]) -> list[str]:
+    """Those of a policy's needs that are maps."""
+    return [name for name in needs if name != "sides"]
 
 
 def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]) -> NDArray[np.int64]:

@@ -1,14 +1,15 @@
 """A policy that has learned what a look at each view is worth, and pays a price for travel.
 
-It knows the ring (from gravity), never the object's azimuth: all views are written as cells (see ``policies.tables``)
-seen from where the camera stands. An object and its mirror image are taken to be alike.
+It knows the ring (from gravity), never where the object's azimuth zero is: all views are written as cells (see
+``policies.tables``) seen from where the camera stands, or from where the recogniser believes the object's own zero to
+be. An object and its mirror image are taken to be alike.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +23,14 @@ Float = NDArray[np.float64]
 MAPS = ("lem", "lcm", "lem-sphere", "lcm-sphere")
 """Predicted maps that a network may be told, of the local window or of the whole sphere."""
 
-INPUTS = ("belief", "look", "place", *MAPS)
+INPUTS = ("belief", "look", "place", *MAPS, "side")
 """What a network may be told: the belief over all looks; what the last look alone says; the ring and the views that are
-visited; the maps that were predicted from the last look."""
+visited; the maps that were predicted from the last look; and which side of the object is seen, if it is of the class
+that is believed most, and over all classes."""
+
+Frame = Literal["camera", "object"]
+"""From where the azimuths of cells are counted: from the camera's, or from that at which the object, if it is of the
+class that is believed most, in all likelihood shows its side 0."""
 
 FLOOR = np.log(1e-4)
 """Beliefs below this are taken for it: nobody knows such small ones."""
@@ -36,17 +42,48 @@ def mirrored(sphere: ViewSphere) -> NDArray[np.int64]:
     return sphere.ring * n + (-sphere.azimuth_index) % n
 
 
-def told(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str]) -> Float:
+def origin(sphere: ViewSphere, state: EpisodeState, frame: Frame) -> NDArray[np.int64]:
+    """The view from which the cells of each episode are counted, (B,) int64.
+
+    Raises:
+        ValueError: the frame is the object's, and the recogniser does not tell its sides apart.
+    """
+    if frame == "camera":
+        return state.current
+    side = _own(state.belief, _sides(sphere, state)).argmax(1)
+    n = sphere.azimuths
+    return sphere.ring[state.current] * n + (sphere.azimuth_index[state.current] - side) % n
+
+
+def _sides(sphere: ViewSphere, state: EpisodeState) -> Float:
+    """Belief in the side that is seen from the current view, for each class, (B, C, azimuths)."""
+    if state.sides is None or state.sides.shape[2] != sphere.azimuths:
+        raise ValueError(f"this policy needs a recogniser that tells {sphere.azimuths} sides of an object apart")
+    return state.sides
+
+
+def _own(belief: Float, sides: Float) -> Float:
+    """The sides of the class that is believed most, (B, azimuths)."""
+    return sides[np.arange(len(belief)), belief.argmax(1)]
+
+
+def told(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], frame: Frame = "camera") -> Float:
     """What a network is told of B episodes, none of it depending on the absolute azimuth.
 
     Args:
         sphere: the viewpoints.
         state: the episodes.
         inputs: some of INPUTS.
+        frame: in which cells are counted.
 
     Returns:
         (B, D) float64.
+
+    Raises:
+        ValueError: the sides matter, and the recogniser does not tell as many apart as the sphere has azimuths.
     """
+    n, start = sphere.azimuths, origin(sphere, state, frame)
+    ahead = (sphere.azimuth_index[state.current] - sphere.azimuth_index[start]) % n
     rows = np.arange(len(state.current))
     parts: list[NDArray] = []
     if "belief" in inputs:
@@ -57,8 +94,19 @@ def told(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str]) -> Floa
         parts += _facets(alone / alone.sum(1, keepdims=True))
     if "place" in inputs:
         parts.append(np.eye(sphere.rings)[sphere.ring[state.current]])
-        parts.append(state.visited[rows[:, None], cells_from(sphere)[state.current]])
-    parts += [np.asarray(state.evidence.maps[name]) for name in MAPS if name in inputs]
+        parts.append(state.visited[rows[:, None], cells_from(sphere)[start]])
+    for name in MAPS:
+        if name in inputs:
+            values = np.asarray(state.evidence.maps[name])
+            if name.endswith("-sphere"):  # its columns are counted from the camera
+                columns = (np.arange(n) - ahead[:, None]) % n
+                values = np.take_along_axis(values, columns[:, None], 2)
+            parts.append(values)
+    if "side" in inputs:
+        parts += [np.eye(n)[ahead]] if frame == "object" else []
+        sides = _sides(sphere, state)
+        for believed in (_own(state.belief, sides), (state.belief[:, :, None] * sides).sum(1)):
+            parts.append(np.take_along_axis(believed, (np.arange(n) + ahead[:, None]) % n, 1))
     return np.concatenate([np.asarray(part, np.float64).reshape(len(rows), -1) for part in parts], 1)
 
 
@@ -68,7 +116,9 @@ def _facets(belief: Float) -> list[Float]:
     return [belief, logs, -np.sort(-logs, 1)[:, :3]]
 
 
-def told_mirrored(sphere: ViewSphere, classes: int, inputs: Sequence[str]) -> NDArray[np.int64]:
+def told_mirrored(
+    sphere: ViewSphere, classes: int, inputs: Sequence[str], frame: Frame = "camera"
+) -> NDArray[np.int64]:
     """Which of the numbers of ``told`` stands in each place for the mirror image of an object, (D,) int64."""
     facets = 2 * classes + min(3, classes)
     blocks = {
@@ -78,6 +128,8 @@ def told_mirrored(sphere: ViewSphere, classes: int, inputs: Sequence[str]) -> ND
     }
     window = np.arange(sphere.rings * 3).reshape(-1, 3)[:, ::-1].ravel()
     blocks |= {name: mirrored(sphere) if name.endswith("-sphere") else window for name in MAPS}
+    n = sphere.azimuths
+    blocks["side"] = np.concatenate([k * n + -np.arange(n) % n for k in range(2 if frame == "camera" else 3)])
     found, begin = [], 0
     for name in [name for name in INPUTS if name in inputs]:
         found.append(begin + blocks[name])
@@ -97,6 +149,7 @@ class Gain:
         inputs: what the score is told, some of INPUTS.
         price: of a grid cell of travel, in what the networks were trained to predict.
         anywhere: among all views; otherwise among those of the local window.
+        frame: in which cells are counted.
     """
 
     sphere: ViewSphere
@@ -105,27 +158,32 @@ class Gain:
     inputs: tuple[str, ...] = INPUTS
     price: float = 0.0
     anywhere: bool = True
+    frame: Frame = "camera"
 
     def __post_init__(self) -> None:
         if unknown := set(self.inputs) - set(INPUTS):
             raise ValueError(f"a gain policy is told some of {', '.join(INPUTS)}, not {', '.join(sorted(unknown))}")
         if not np.isfinite(self.price) or self.price < 0:
             raise ValueError(f"needs a price that is not negative, not {self.price}")
+        if self.frame not in get_args(Frame):
+            raise ValueError(f"cells are counted from one of {', '.join(get_args(Frame))}, not {self.frame!r}")
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The maps that the score is told."""
-        return tuple(name for name in MAPS if name in self.inputs)
+        """The maps that the score is told, and the sides."""
+        sides = "side" in self.inputs or self.frame == "object"
+        return (*(name for name in MAPS if name in self.inputs), *(["sides"] if sides else []))
 
     def facts(self) -> dict[str, Any]:
         """What a card says of it beside the sphere, for JSON."""
-        return {"classes": self.classes, "inputs": self.inputs, "price": self.price}
+        return {"classes": self.classes, "inputs": self.inputs, "price": self.price, "frame": self.frame}
 
     def gains(self, state: EpisodeState) -> Float:
         """What each view is predicted to be worth, (B, V); only differences between views mean anything."""
-        cells = self.score(told(self.sphere, state, self.inputs).astype(np.float32)).astype(np.float64)
+        seen = told(self.sphere, state, self.inputs, self.frame).astype(np.float32)
+        cells = self.score(seen).astype(np.float64)
         cells -= 1e-9 * np.arange(len(self.sphere))  # cells that are mirror images may tie; the first of them is taken
-        return np.take_along_axis(cells, cells_to(self.sphere)[state.current], 1)
+        return np.take_along_axis(cells, cells_to(self.sphere)[origin(self.sphere, state, self.frame)], 1)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""

@@ -31,8 +31,16 @@ def read_gain(sphere: ViewSphere, facts: dict[str, Any], weights: Path) -> Gain:
     def score(told: NDArray[np.float32]) -> NDArray[np.float32]:
         return session.run(["cells"], {"told": told})[0]
 
-    policy = Gain(sphere, table["classes"], score, tuple(table["inputs"]), table["price"], facts["anywhere"])
-    width = len(told_mirrored(sphere, policy.classes, policy.inputs))
+    policy = Gain(
+        sphere,
+        table["classes"],
+        score,
+        tuple(table["inputs"]),
+        table["price"],
+        facts["anywhere"],
+        table.get("frame", "camera"),
+    )
+    width = len(told_mirrored(sphere, policy.classes, policy.inputs, policy.frame))
     wanted = [("told", "tensor(float)", [width]), ("cells", "tensor(float)", [len(sphere)])]
     ends = [*session.get_inputs(), *session.get_outputs()]
     found = [(end.name, end.type, list(end.shape[1:])) for end in ends]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nextview.policies.base import EpisodeState, best_in_window
 from nextview.policies.maps import peaks_first
-from nextview.recognition import PLAIN_SUM, Calibration
+from nextview.recognition import PLAIN_SUM, Calibration, of_true_class
 from nextview.viewsphere import ViewSphere
 
 
@@ -47,7 +47,8 @@ class OracleGain:
 
     Attributes:
         sphere: the viewpoints.
-        logits: of every view of every object, (N, V, classes).
+        said: by the recogniser of every view of every object, so that it adds up, (N, V, D); see ``additive``.
+        classes: how many.
         labels: true class of each object, (N,) int64.
         objects: the object of each episode, (E,) int64.
         anywhere: choose among all unvisited views instead of the local window.
@@ -55,7 +56,8 @@ class OracleGain:
     """
 
     sphere: ViewSphere
-    logits: NDArray[np.floating]
+    said: NDArray[np.floating]
+    classes: int
     labels: NDArray[np.int64]
     objects: NDArray[np.int64]
     anywhere: bool = False
@@ -65,17 +67,18 @@ class OracleGain:
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
         b = len(state.current)
-        objects = self.objects[state.episodes]
-        # Belief is the softmax of the sum so far over its temperature: its logarithm is that sum up to a constant.
-        now, then = self.calibration.temperature(state.step), self.calibration.temperature(state.step + 1)
-        so_far = now * np.log(np.maximum(state.belief, np.finfo(np.float64).tiny))[:, None]
-        views = (
-            np.arange(len(self.sphere))[None] if self.anywhere else self.sphere.windows[state.current].reshape(b, -1)
-        )
-        total = (so_far + self.logits[objects[:, None], views]) / then
-        of_truth = np.take_along_axis(total, self.labels[objects][:, None, None], 2)[..., 0]
-        top = total.max(2)
-        gain = of_truth - top - np.log(np.exp(total - top[..., None]).sum(2))
+        parts = np.split(np.arange(b), range(500, b, 500))  # all at once would fill the memory
+        gain = np.concatenate([self._gains(state, rows) for rows in parts])
         if self.anywhere:
             return np.where(state.visited, -np.inf, gain).argmax(1)
         return best_in_window(self.sphere, state, gain.reshape(b, -1, 3))
+
+    def _gains(self, state: EpisodeState, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Logarithm of the belief in the truth after a look at each view, or each of the window, in some episodes."""
+        objects, current = self.objects[state.episodes[rows]], state.current[rows]
+        said = self.said[objects].astype(np.float64)
+        so_far = np.matmul(state.visited[rows, None].astype(np.float64), said)[:, 0]
+        if not self.anywhere:
+            said = said[np.arange(len(rows))[:, None], self.sphere.windows[current].reshape(len(rows), -1)]
+        logs = self.calibration.log_belief(so_far[:, None] + said, state.step + 1, self.classes)
+        return of_true_class(logs, self.labels[objects])

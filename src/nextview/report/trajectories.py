@@ -18,7 +18,6 @@ from nextview.benchmark.replay import cut, replay
 from nextview.benchmark.results import Results
 from nextview.data.store import ViewStore
 from nextview.measures.depth_entropy import normalise_per_object
-from nextview.recognition import fuse
 
 CLOUD = 1500
 """Points of an object in the viewer."""
@@ -155,7 +154,8 @@ def _scene(
 
 def _episode(results: Results, i: int, policy: str, views: list[int]) -> dict[str, Any]:
     p = results.predictions
-    beliefs = [fuse(p.logits[i, views[:k]], p.calibration.temperature(k)) for k in range(1, len(views) + 1)]
+    said = p.said[i, views].astype(np.float64).cumsum(0)
+    beliefs = p.calibration.belief(said, np.arange(1, len(views) + 1), len(p.classes))
     top = [np.argsort(-belief, kind="stable")[:3] for belief in beliefs]
     travel = [0.0, *np.cumsum(p.sphere.travel[views[:-1], views[1:]])]
     return {

@@ -19,8 +19,10 @@ OPSET = 18
 class CalibratedRecogniser(nn.Module):
     """The recogniser as it ships: raw input bytes in, logits over a temperature and pooled features out.
 
+    Where all networks know the sides of objects, a third output is what they say of them, see ``networks.ResNet``.
+
     Args:
-        networks: their logits are averaged and their features set side by side.
+        networks: their logits are averaged, and what they say of the sides; their features are set side by side.
         temperature: what the logits are divided by.
         mirror: whether every network also sees the mirrored view, and what it says of either is averaged.
     """
@@ -28,15 +30,26 @@ class CalibratedRecogniser(nn.Module):
     def __init__(self, networks: Sequence[nn.Module], temperature: float, mirror: bool = False) -> None:
         super().__init__()
         self.networks, self.temperature, self.mirror = nn.ModuleList(networks), temperature, mirror
+        told = {getattr(network, "azimuths", 0) for network in networks}
+        self.sides = told.pop() if len(told) == 1 else 0
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    @property
+    def outputs(self) -> list[str]:
+        """Names of what it gives."""
+        return ["logits", "features", *(["sides"] if self.sides else [])]
+
+    def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         x = x.float() / 255
-        logits, features = [], []
+        logits, features, sides = [], [], []
         for network in self.networks:
             said = [network(x), network(x.flip(3))] if self.mirror else [network(x)]
             logits += [each[0] for each in said]
             features.append(torch.stack([each[1] for each in said]).mean(0))
-        return torch.stack(logits).mean(0) / self.temperature, torch.cat(features, 1)
+            if self.sides:
+                back = [-side % self.sides for side in range(self.sides)]
+                sides += [each[2][..., back] if k else each[2] for k, each in enumerate(said)]
+        found = torch.stack(logits).mean(0) / self.temperature, torch.cat(features, 1)
+        return (*found, torch.stack(sides).mean(0).log_softmax(2)) if self.sides else found
 
 
 class ShippedMap(nn.Module):

@@ -19,7 +19,7 @@ from torch import nn
 from nextview.fitting.choices import ReplayTable, Worth, choices, follow, judge
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Random, RandomAll
-from nextview.policies.gain import Gain, mirrored, told, told_mirrored
+from nextview.policies.gain import Gain, mirrored, origin, told, told_mirrored
 from nextview.policies.tables import cells_from
 from nextview.training.perceptrons import Layers, Perceptrons
 from nextview.training.recipes import GainRecipe
@@ -50,11 +50,11 @@ def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np
     for policy in policies:
         for moment in follow(table, policy, recipe.looks - 1, rng):
             state = moment.state
-            view = cells_from(sphere)[state.current]
+            view = cells_from(sphere)[origin(sphere, state, recipe.frame)]
             worth = np.take_along_axis(choices(table, moment, recipe.outcome), view, 1)
             free = ~np.take_along_axis(state.visited, view, 1)
             mean = (worth * free).sum(1, keepdims=True) / free.sum(1, keepdims=True)
-            seen = told(sphere, state, recipe.inputs)
+            seen = told(sphere, state, recipe.inputs, recipe.frame)
             parts.append((seen.astype(np.float32), (worth - mean).astype(np.float32), free, state.episodes))
     return States(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
@@ -98,7 +98,7 @@ def train(table: ReplayTable, recipe: GainRecipe) -> Iterator[Gain]:
     rng, data = np.random.default_rng([recipe.seed]), table.data
     generator = torch.Generator().manual_seed(recipe.seed)
     sphere, c = data.sphere, len(data.classes)
-    flip = torch.from_numpy(told_mirrored(sphere, c, recipe.inputs))
+    flip = torch.from_numpy(told_mirrored(sphere, c, recipe.inputs, recipe.frame))
     cells_flip = torch.from_numpy(mirrored(sphere))
     widths = [len(flip), recipe.hidden, recipe.hidden, len(sphere)]
     networks = Networks(widths, recipe.networks, generator)
@@ -127,8 +127,8 @@ def train(table: ReplayTable, recipe: GainRecipe) -> Iterator[Gain]:
             loss.backward()
             optimiser.step()
             schedule.step()
-        score = Perceptrons.of(sphere, c, recipe.inputs, networks.layers())
-        policy = Gain(sphere, c, score, recipe.inputs)
+        score = Perceptrons.of(sphere, c, recipe.inputs, networks.layers(), recipe.frame)
+        policy = Gain(sphere, c, score, recipe.inputs, frame=recipe.frame)
         yield policy
 
 

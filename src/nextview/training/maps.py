@@ -14,11 +14,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.data import IterableDataset
 
+from nextview.models.card import ModelError
 from nextview.models.cloud_input import cloud_input
 from nextview.training.fit import fit
 from nextview.training.hardware import Hardware
 from nextview.training.networks import map_columns, map_network, orthogonality
 from nextview.training.recipes import MapRecipe
+from nextview.training.weights import load_exported
 from nextview.viewsphere import ViewSphere
 
 
@@ -75,6 +77,23 @@ class Windows(IterableDataset):
             yield torch.from_numpy(seen), torch.from_numpy(target)
 
 
+def peak_loss(logits: Tensor, goal: Tensor, reach: int) -> Tensor:
+    """Mean negative log-likelihood that a cell drawn by its logit lies within ``reach`` cells of the highest.
+
+    Args:
+        logits: (B, rings, columns).
+        goal: the map whose highest cell is meant, the same shape.
+        reach: 0 for that cell alone.
+    """
+    _, rings, columns = goal.shape
+    ring, column = torch.meshgrid(torch.arange(rings), torch.arange(columns), indexing="ij")
+    ring, column = ring.flatten().to(goal.device), column.flatten().to(goal.device)
+    highest = goal.flatten(1).argmax(1)
+    away = torch.hypot((ring - ring[highest, None]).float(), (column - column[highest, None]).float())
+    likely = logits.flatten(1).log_softmax(1)
+    return -likely.masked_fill(away > reach, -torch.inf).logsumexp(1).mean()
+
+
 class MapModule(L.LightningModule):
     """AdamW on the squared error, plus the regulariser of the PointNet's transforms (thesis, section 2.2.3).
 
@@ -102,8 +121,8 @@ class MapModule(L.LightningModule):
         if self.recipe.around == "sphere":
             error = (error + F.mse_loss(predicted, true)) / 2
         if self.recipe.peak:
-            highest = goal.flatten(1).argmax(1)
-            error = error + self.recipe.peak * F.cross_entropy(near.flatten(1) / self.recipe.sharpness, highest)
+            lost = peak_loss(near / self.recipe.sharpness, goal, self.recipe.reach)
+            error = error + self.recipe.peak * lost
         return error + self.recipe.regular * sum(orthogonality(t.float()) for t in transforms)
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
@@ -129,6 +148,7 @@ def train(
     recipe: MapRecipe,
     out: Path,
     hardware: Hardware = Hardware(),
+    weights: Path | None = None,
 ) -> nn.Module:
     """Train and return the network of the best epoch; checkpoints in ``out``, from which a second call resumes.
 
@@ -144,14 +164,19 @@ def train(
         recipe: how.
         out: folder for checkpoints and logs.
         hardware: on what.
+        weights: card of an exported recogniser from which a ResNet starts; its last layer is new.
 
     Raises:
-        ModelError: a checkpoint in ``out`` cannot be used.
+        ModelError: a checkpoint in ``out`` cannot be used, or the weights are not of this network.
     """
     windows = Windows(seen, values, sphere, training, recipe, training=True)
     validation_windows = Windows(seen, values, sphere, validation, recipe, training=False)
     L.seed_everything(recipe.seed, verbose=False)
     module = MapModule(recipe, sphere, recipe.epochs * len(windows))
+    if weights:
+        if recipe.input == "cloud":
+            raise ModelError(f"{weights}: a PointNet cannot start from a ResNet")
+        load_exported(module.net.resnet, weights, next(iter(windows))[0].float() / 255, last=False)
     score = "validation_mse"
     return fit(
         module, windows, validation_windows, recipe.epochs, out, score, "min", recipe.patience, hardware

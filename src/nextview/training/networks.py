@@ -67,15 +67,18 @@ class Bottleneck(nn.Module):
 class ResNet(nn.Module):
     """A ResNet; ``forward`` returns (logits (B, classes), pooled features (B, 512), or (B, 2048) from depth 50 on).
 
-    Parameters carry torchvision's names, so that its checkpoints fit; see ``weights.load_torchvision``.
+    With ``azimuths``, it returns a third: the logarithms of how likely each of so many sides of the object is the one
+    that is seen, if it is of each class, (B, classes, azimuths). Parameters carry torchvision's names, so that its
+    checkpoints fit; see ``weights.load_torchvision``.
 
     Args:
         depth: 18, 34, 50, 101 or 152.
         classes: outputs.
         channels: of the input image (B, channels, H, W), values in 0 .. 1.
+        azimuths: sides that are told apart; 0 for none.
     """
 
-    def __init__(self, depth: int, classes: int, channels: int) -> None:
+    def __init__(self, depth: int, classes: int, channels: int, azimuths: int = 0) -> None:
         super().__init__()
         block = BasicBlock if depth < 50 else Bottleneck
         self.conv1 = nn.Conv2d(channels, 64, 7, 2, 3, bias=False)
@@ -91,6 +94,8 @@ class ResNet(nn.Module):
             setattr(self, f"layer{stage + 1}", nn.Sequential(*layer))
         self.avgpool = nn.AdaptiveAvgPool2d(1)
         self.fc = nn.Linear(inputs, classes)
+        self.azimuths = azimuths
+        self.side = nn.Linear(inputs, classes * azimuths) if azimuths else None
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
@@ -100,12 +105,15 @@ class ResNet(nn.Module):
             elif isinstance(module, Bottleneck):
                 nn.init.zeros_(module.bn3.weight)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         x = self.maxpool(self.relu(self.bn1(self.conv1(x))))
         for stage in (self.layer1, self.layer2, self.layer3, self.layer4):
             x = stage(x)
         features = self.avgpool(x).flatten(1)
-        return self.fc(features), features
+        logits = self.fc(features)
+        if self.side is None:
+            return logits, features
+        return logits, features, self.side(features).unflatten(1, (-1, self.azimuths)).log_softmax(2)
 
 
 class PointLayer(nn.Module):

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.policies.gain import mirrored, told_mirrored
+from nextview.policies.gain import Frame, mirrored, told_mirrored
 from nextview.viewsphere import ViewSphere
 
 Layers = tuple[tuple[NDArray[np.floating], NDArray[np.floating]], ...]
@@ -40,9 +40,16 @@ class Perceptrons:
                 raise ValueError("a weight is not a finite number")
 
     @classmethod
-    def of(cls, sphere: ViewSphere, classes: int, inputs: tuple[str, ...], networks: tuple[Layers, ...]) -> Perceptrons:
+    def of(
+        cls,
+        sphere: ViewSphere,
+        classes: int,
+        inputs: tuple[str, ...],
+        networks: tuple[Layers, ...],
+        frame: Frame = "camera",
+    ) -> Perceptrons:
         """With the mirror of a sphere; the other arguments as those of ``Gain``."""
-        return cls(networks, told_mirrored(sphere, classes, inputs), mirrored(sphere))
+        return cls(networks, told_mirrored(sphere, classes, inputs, frame), mirrored(sphere))
 
     def __call__(self, told: NDArray[np.floating]) -> NDArray[np.floating]:
         """What each cell is worth, (B, V), from what is told, (B, D); as precise as the numbers that are given."""

@@ -21,6 +21,8 @@ class RecogniserRecipe:
         rate: peak learning rate of AdamW under a one-cycle schedule.
         decay: weight decay.
         smoothing: label smoothing.
+        side: weight of the cross-entropy of the side from which the object is seen, beside that of its class; 0 does
+            without. The objects of a class have to stand alike in their files, as ModelNet10's do.
         validation: part of the training split held out for validation.
         deformed_share: chance that a view is drawn from the deformed objects, where such a store is given.
         seed: decides everything random.
@@ -41,6 +43,7 @@ class RecogniserRecipe:
     rate: float = 2e-3
     decay: float = 0.05
     smoothing: float = 0.1
+    side: float = 0.0
     validation: float = 0.1
     deformed_share: float = 0.5
     seed: int = 0
@@ -93,6 +96,8 @@ class MapRecipe:
         peak: weight of the cross-entropy of which cell of the window is the highest, beside the squared error, which
             cares for all cells alike; values are taken over ``sharpness`` for log-odds.
         sharpness: see ``peak``.
+        reach: 0 if only the highest cell itself counts for ``peak``, 1 if its neighbours above, below, left and right
+            do as well: what is within one cell.
         mirror: exchange left and right in half of the views, in the map too.
         schedule: of the learning rate: up and down once, or a tenth every fifth epoch from the peak.
         validation: part of the training split held out for validation.
@@ -113,6 +118,7 @@ class MapRecipe:
     regular: float = 1e-4
     peak: float = 0.0
     sharpness: float = 0.05
+    reach: int = 0
     mirror: bool = True
     schedule: Literal["one-cycle", "tenth"] = "one-cycle"
     validation: float = 0.1
@@ -142,6 +148,8 @@ class GainRecipe:
 
     Attributes:
         inputs: what the networks are told; see ``policies.gain.INPUTS``.
+        frame: from where azimuths are counted: from the camera's, or from the one at which the object is believed to
+            show its side 0, which takes a recogniser that was taught the sides.
         outcome: of a look: belief in the true class after it, its logarithm, or whether the answer is right.
         looks: the outcome of looks 2 to this one is learned.
         hidden: width of the two hidden layers.
@@ -154,12 +162,14 @@ class GainRecipe:
         seed: of everything random.
     """
 
-    inputs: tuple[Literal["belief", "look", "place", "lem", "lcm", "lem-sphere", "lcm-sphere"], ...] = (
+    inputs: tuple[Literal["belief", "look", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "side"], ...] = (
         "belief",
         "look",
         "place",
         "lem-sphere",
+        "side",
     )
+    frame: Literal["camera", "object"] = "object"
     outcome: Literal["belief", "log-belief", "right"] = "log-belief"
     looks: int = 5
     hidden: int = 32

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,27 @@ from nextview.training.hardware import Hardware
 from nextview.training.inputs import CHANNELS_OF
 from nextview.training.networks import ResNet
 from nextview.training.recipes import RecogniserRecipe
-from nextview.training.weights import load_torchvision
+from nextview.training.sides import side_loss
+from nextview.training.weights import load_exported, load_torchvision
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where views of the training objects come from: their own store or one of deformed twins.
+
+    Attributes:
+        inputs: (rows, V, C, S, S) uint8.
+        row: of each object in them, (N,).
+        sides: that each view sees of its object, (rows, V), see ``sides.sides``; None if they are not to be learned.
+    """
+
+    inputs: NDArray[np.uint8]
+    row: NDArray[np.int64]
+    sides: NDArray[np.float32] | None = None
 
 
 class Views(IterableDataset):
-    """Batches of (input (B, C, S, S) uint8, label (B,)), new draws each epoch.
+    """Batches of (input (B, C, S, S) uint8, label (B,), and side (B,) where sources have it), new draws each epoch.
 
     Balanced, objects are drawn with weight 1/sqrt(objects of their class), so that rare classes are seen more often,
     and views at random. Otherwise every view comes at most once an epoch, and once exactly if ``recipe.views`` takes
@@ -33,7 +50,7 @@ class Views(IterableDataset):
 
     def __init__(
         self,
-        sources: list[tuple[NDArray[np.uint8], NDArray[np.int64]]],
+        sources: list[Source],
         objects: NDArray[np.int64],
         labels: NDArray[np.int64],
         recipe: RecogniserRecipe,
@@ -44,12 +61,12 @@ class Views(IterableDataset):
         self.epoch, self.share = 0, slice(None)
 
     def __len__(self) -> int:
-        views = self.recipe.views if self.recipe.balanced else min(self.recipe.views, self.sources[0][0].shape[1])
+        views = self.recipe.views if self.recipe.balanced else min(self.recipe.views, self.sources[0].inputs.shape[1])
         return len(self.objects) * views // self.recipe.batch
 
-    def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
+    def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
         rng = np.random.default_rng([self.recipe.seed, self.epoch])
-        n, v = len(self) * self.recipe.batch, self.sources[0][0].shape[1]
+        n, v = len(self) * self.recipe.batch, self.sources[0].inputs.shape[1]
         if self.recipe.balanced:
             objects = rng.choice(self.objects, n, p=self.weights)
             turn = rng.random(n)  # of the view, as a part of all views
@@ -60,22 +77,27 @@ class Views(IterableDataset):
         source = np.where(deformed, rng.integers(1, max(2, len(self.sources)), n), 0)
         for start in range(0, n, self.recipe.batch):
             batch = np.arange(start, start + self.recipe.batch)[self.share]
-            images = []
+            images, sides = [], []
             for k in batch:
-                inputs, row = self.sources[source[k]]
-                images.append(inputs[row[objects[k]], int(turn[k] * inputs.shape[1])])
-            yield torch.from_numpy(np.stack(images)), torch.from_numpy(self.labels[objects[batch]])
+                own = self.sources[source[k]]
+                row, view = own.row[objects[k]], int(turn[k] * own.inputs.shape[1])
+                images.append(own.inputs[row, view])
+                if own.sides is not None:
+                    sides.append(own.sides[row, view])
+            drawn = [np.stack(images), self.labels[objects[batch]], *([np.array(sides)] if sides else [])]
+            yield tuple(map(torch.from_numpy, drawn))
 
 
-def augment(x: Tensor, s: int) -> Tensor:
+def augment(x: Tensor, s: int) -> tuple[Tensor, Tensor]:
     """Vary inputs (B, C, S, S) in 0 .. 1: mirror, shift, scale and stretch, roll a little, hide a rectangle, add noise.
 
     A mirrored object is of the same class, and none of the channels changes its sign under the mirror. The result is
-    (B, C, s, s).
+    (B, C, s, s) and which of them are mirrored, (B,) bool.
     """
     (b, channels), on = x.shape[:2], {"device": x.device}
     scale = torch.empty(b, 2, **on).uniform_(0.8, 1.25)
-    scale[:, 0] *= torch.randint(0, 2, (b,), **on) * 2 - 1
+    mirrored = torch.randint(0, 2, (b,), **on) == 0
+    scale[:, 0] *= torch.where(mirrored, -1.0, 1.0)
     roll = torch.empty(b, **on).normal_(0, 0.05)
     theta = torch.zeros(b, 2, 3, **on)
     theta[:, 0, 0], theta[:, 0, 1] = scale[:, 0] * roll.cos(), -scale[:, 0] * roll.sin()
@@ -90,7 +112,7 @@ def augment(x: Tensor, s: int) -> Tensor:
     columns = (grid > corner[:, 1:]) & (grid < corner[:, 1:] + side[:, 1:])
     hidden = (rows[:, :, None] & columns[:, None, :] & (torch.rand(b, 1, 1, **on) < 0.5))[:, None]
     seen = (x > 0) & ~hidden
-    return torch.where(seen, x + 0.02 * torch.randn_like(x), 0.0)
+    return torch.where(seen, x + 0.02 * torch.randn_like(x), 0.0), mirrored
 
 
 class RecogniserModule(L.LightningModule):
@@ -99,22 +121,30 @@ class RecogniserModule(L.LightningModule):
     Without weight decay AdamW is Adam, the published optimiser.
     """
 
-    def __init__(self, recipe: RecogniserRecipe, classes: int, steps: int) -> None:
+    def __init__(self, recipe: RecogniserRecipe, classes: int, steps: int, azimuths: int = 0) -> None:
         super().__init__()
         self.recipe, self.steps = recipe, steps
-        self.net = ResNet(recipe.depth, classes, CHANNELS_OF[recipe.input]).to(memory_format=torch.channels_last)
+        network = ResNet(recipe.depth, classes, CHANNELS_OF[recipe.input], azimuths)
+        self.net = network.to(memory_format=torch.channels_last)
         for name in ("hits", "seen", "lost"):  # of each class in validation
             self.register_buffer(name, torch.zeros(classes), persistent=False)
 
-    def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
+    def training_step(self, batch: tuple[Tensor, ...], _: int) -> Tensor:
         size = self.recipe.small if self.current_epoch < self.recipe.small_epochs else self.recipe.size
-        x = batch[0].float() / 255
+        x, label = batch[0].float() / 255, batch[1]
+        mirrored = torch.zeros_like(label, dtype=torch.bool)
         if self.recipe.augment:
-            x = augment(x, size)
+            x, mirrored = augment(x, size)
         elif size < x.shape[2]:
             x = F.interpolate(x, size=(size, size), mode="area")
         x = x.to(memory_format=torch.channels_last)
-        loss = F.cross_entropy(self.net(x)[0].float(), batch[1], label_smoothing=self.recipe.smoothing)
+        logits, _features, *likely = self.net(x)
+        loss = F.cross_entropy(logits.float(), label, label_smoothing=self.recipe.smoothing)
+        if likely:
+            side = torch.where(mirrored, -batch[2] % likely[0].shape[2], batch[2])
+            lost = side_loss(likely[0].float(), label, side)
+            self.log("side_loss", lost, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))
+            loss = loss + self.recipe.side * lost
         self.log("loss", loss, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))
         return loss
 
@@ -161,7 +191,7 @@ class ValidationViews(IterableDataset):
 
 
 def train(
-    sources: list[tuple[NDArray[np.uint8], NDArray[np.int64]]],
+    sources: list[Source],
     labels: NDArray[np.int64],
     training: NDArray[np.int64],
     validation: NDArray[np.int64],
@@ -169,28 +199,32 @@ def train(
     out: Path,
     weights: Path | None = None,
     hardware: Hardware = Hardware(),
+    azimuths: int = 0,
 ) -> nn.Module:
     """Train and return the network of the best epoch; checkpoints in ``out``, from which a second call resumes.
 
     Args:
-        sources: inputs (rows, V, C, S, S) uint8 and each object's row in them (N,); the store's own, whose rows are the
-            objects, and maybe those of deformed twins.
+        sources: the store's own, whose rows are the objects, and maybe those of deformed twins.
         labels: class of each object, (N,).
         training: objects that train.
         validation: objects that validate.
         recipe: how.
         out: folder for checkpoints and logs.
-        weights: a torchvision checkpoint to start from.
+        weights: a torchvision checkpoint, or the card of an exported recogniser, to start from.
         hardware: on what.
+        azimuths: sides of the object that the network learns to tell apart, 0 for none.
 
     Raises:
         ModelError: the weights or a checkpoint in ``out`` cannot be used.
     """
     L.seed_everything(recipe.seed, verbose=False)
     views = Views(sources, training, labels, recipe)
-    module = RecogniserModule(recipe, int(labels.max()) + 1, recipe.epochs * len(views))
-    if weights:
+    module = RecogniserModule(recipe, int(labels.max()) + 1, recipe.epochs * len(views), azimuths)
+    if weights and weights.suffix == ".json":
+        sample = next(iter(views))[0].float() / 255
+        load_exported(module.net, weights, augment(sample, recipe.size)[0] if recipe.augment else sample)
+    elif weights:
         load_torchvision(module.net, weights)
-    validation_views = ValidationViews(sources[0][0], validation, labels)
+    validation_views = ValidationViews(sources[0].inputs, validation, labels)
     best = fit(module, views, validation_views, recipe.epochs, out, "class_accuracy", "max", recipe.patience, hardware)
     return best.net.eval()

@@ -1,14 +1,19 @@
-"""Start a ResNet from a checkpoint of torchvision's."""
+"""Start a ResNet from a checkpoint of torchvision's, or from a recogniser that was exported."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import onnx
 import torch
-from torch import Tensor
+from onnx import numpy_helper
+from torch import Tensor, nn
 
-from nextview.models.card import ModelError
+from nextview.models.card import ModelError, find_card
+from nextview.models.networks import open_weights
 from nextview.training.networks import ResNet
 
 
@@ -46,6 +51,80 @@ def load_torchvision(network: ResNet, path: Path) -> None:
         if not torch.isfinite(state[name]).all():
             raise ModelError(f"{path}: {name} holds numbers that are not finite; download the checkpoint again")
     network.load_state_dict(state)
+
+
+def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True) -> None:
+    """Give a network the parameters of an exported recogniser of the same depth and input, so that it can learn on.
+
+    The export merges every batch norm into the convolution before it. Here each gets the mean and the variance that its
+    input has over ``views``, and a scale and a shift that undo them: the network answers as the exported one, save for
+    the temperature. A last layer that is not there, or has other classes, is left as it is.
+
+    Args:
+        network: is changed in place.
+        card: the recogniser, of one network and not of several averaged.
+        views: what it will see in training, (B, C, S, S) in 0 .. 1, B some dozens.
+        last: take the last layers too; otherwise those of the network stay as they are.
+
+    Raises:
+        ModelError: it is no recogniser, or not one network of this depth and input.
+    """
+    model = find_card(card)
+    if model.kind != "recogniser":
+        raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
+    open_weights(model)  # refuses a file that is not the card's
+    graph = onnx.load(model.path).graph
+    arrays = {re.sub(r"^networks?\.(0\.)?", "", i.name): numpy_helper.to_array(i) for i in graph.initializer}
+
+    several = any(name.startswith("networks.1.") for name in arrays)
+
+    def exported(name: str, shape: torch.Size) -> Tensor:
+        kept = [arrays[name + end] for end in ("", "_half", "_small") if name + end in arrays]
+        if several or not kept or kept[0].shape != shape:
+            raise ModelError(f"{card}: is not one network of this depth and input (see {name})")
+        return torch.from_numpy(kept[0].astype(np.float32) * arrays.get(f"{name}_scale", np.float32(1)))
+
+    norms: list[nn.BatchNorm2d] = []
+    with torch.no_grad():
+        for name, module in network.named_modules():
+            if not isinstance(module, nn.Conv2d):
+                continue
+            weight = exported(f"{name}.weight", module.weight.shape)
+            # A norm forgets the scale of what it is given: bring it to where training begins, as the rate expects.
+            scale = float((2 / (weight.shape[0] * weight[0, 0].numel())) ** 0.5 / weight.std())
+            module.weight.copy_(weight * scale)
+            norm = network.get_submodule(re.sub(r"conv(\d)$", r"bn\1", name.replace("downsample.0", "downsample.1")))
+            assert isinstance(norm, nn.BatchNorm2d)
+            norm.weight.fill_(1 / scale)
+            norm.bias.copy_(exported(f"{name}.weight_bias", norm.bias.shape))
+            norms.append(norm)
+        for name in ("fc", "side"):
+            layer = getattr(network, name)
+            if last and layer is not None and arrays.get(f"{name}.bias", np.zeros(0)).shape == layer.bias.shape:
+                layer.weight.copy_(exported(f"{name}.weight", layer.weight.shape))
+                layer.bias.copy_(torch.from_numpy(arrays[f"{name}.bias"].copy()))
+        _make_norms(network, norms, views)
+
+
+def _make_norms(network: nn.Module, norms: list[nn.BatchNorm2d], views: Tensor) -> None:
+    """Turn norms that only scale and shift into ones with the moments of what they are given, to the same effect."""
+
+    def measure(norm: nn.Module, inputs: tuple[Tensor]) -> None:
+        assert isinstance(norm, nn.BatchNorm2d)
+        assert norm.running_mean is not None
+        assert norm.running_var is not None
+        variance, mean = torch.var_mean(inputs[0], (0, 2, 3))
+        norm.bias += norm.weight * mean
+        norm.weight *= (variance + norm.eps).sqrt()
+        norm.running_mean.copy_(mean)
+        norm.running_var.copy_(variance)
+
+    hooks = [norm.register_forward_pre_hook(measure) for norm in norms]  # the layers before are done by then
+    was = network.training
+    network.eval()(views)
+    network.train(was)
+    for hook in hooks:
+        hook.remove()
 
 
 def _read(path: Path) -> dict[str, Tensor]:
