@@ -20,7 +20,7 @@ from nextview.training.hardware import Hardware  # noqa: E402
 from nextview.training.networks import ResNet  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
 from nextview.training.sides import mirror_planes, side_loss, sides  # noqa: E402
-from nextview.training.weights import load_exported  # noqa: E402
+from nextview.training.weights import load_exported, refuse_seen  # noqa: E402
 from nextview.viewsphere import ViewSphere  # noqa: E402
 
 SPHERE = ViewSphere((0.0, 30.0), 8, 3.0)
@@ -166,3 +166,11 @@ def test_a_map_network_is_refused():
     card = Path(find_card("lem-modelnet10").path).with_suffix(".json")
     with pytest.raises(ModelError, match="is a lem, not a recogniser"):
         load_exported(ResNet(18, 10, 4), card, torch.zeros(2, 4, 64, 64))
+
+
+def test_a_network_that_has_seen_what_is_to_be_kept_is_refused():
+    unseen = find_card(bundled()).facts["unseen"]
+    refuse_seen(bundled(), unseen[:50])
+    refuse_seen(bundled(), ["another", "dataset"])
+    with pytest.raises(ModelError, match=r"was trained on 1 of the 3 objects .* mug_0001 among them; take the --seed"):
+        refuse_seen(bundled(), [*unseen[:2], "mug_0001"])

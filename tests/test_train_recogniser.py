@@ -21,8 +21,9 @@ from nextview.cli.presets import with_preset  # noqa: E402
 from nextview.cli.train import train_recogniser  # noqa: E402
 from nextview.data.folders import DatasetError, Entry  # noqa: E402
 from nextview.data.lock import only_one  # noqa: E402
+from nextview.data.split import split_training  # noqa: E402
 from nextview.data.store import DONE, ViewStore  # noqa: E402
-from nextview.models.card import ModelError  # noqa: E402
+from nextview.models.card import ModelError, find_card  # noqa: E402
 from nextview.models.image_input import image_input  # noqa: E402
 from nextview.training.grid import published_cells  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
@@ -216,6 +217,22 @@ def test_published_recipe_on_images_by_the_command(store, tmp_path, capsys):
         main(["train", "recogniser", str(store), str(run), "--preset", "thesis", *FAST])
     assert stopped.value.code == 2
     assert "holds a run of another recipe (depth was 18, not 34)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("what", [["recogniser", "--folds", "2"], ["recogniser"], ["lem"]], ids=" ".join)
+def test_going_on_from_a_network_that_has_seen_the_validation_objects_is_refused(store, what, tmp_path, capsys):
+    views = ViewStore.open(store)
+    kept = [views.names[i] for i in split_training(views, 0.25, 0)[1]]
+    unseen = kept if "--folds" in what else kept[:1]  # every object is held out for some fold
+    bundled = Path(find_card("resnet18-modelnet10").path)
+    facts = json.loads(bundled.with_suffix(".json").read_text())
+    (tmp_path / "mine.onnx").write_bytes(bundled.read_bytes())
+    (tmp_path / "mine.json").write_text(json.dumps(facts | {"name": "mine", "unseen": unseen}))
+    command = ["train", what[0], str(store), str(tmp_path / "out"), *what[1:], "--weights", str(tmp_path / "mine.json")]
+    with pytest.raises(SystemExit):
+        main([*command, *FAST])
+    assert re.search(r"mine.json: was trained on \d of the \d objects", capsys.readouterr().err)
+    assert not (tmp_path / "out").exists()
 
 
 def test_one_fold_alone_starts_from_weights(store, tmp_path, capsys):

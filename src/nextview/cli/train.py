@@ -55,6 +55,7 @@ def train_recogniser(
     from nextview.training.folds import hold_out
     from nextview.training.runs import begin, finish, is_done
     from nextview.training.sides import mirror_planes
+    from nextview.training.weights import refuse_seen
 
     if fold is not None and not 0 <= fold < folds:
         raise ModelError(f"there is no fold {fold} of {folds}: they are counted from 0")
@@ -68,6 +69,9 @@ def train_recogniser(
         runs = {out / f"fold{k}": held for k, held in enumerate(hold_out(views, training, folds, recipe.seed))}
     if fold is not None:
         runs = dict([list(runs.items())[fold]])
+    if weights and weights.suffix == ".json":
+        for held in runs.values():
+            refuse_seen(weights, [views.names[i] for i in [*validation, *held]])
     for run, held in runs.items():
         with begin(run, recipe):
             if is_done(run):
@@ -194,9 +198,12 @@ def _train_map(
     from nextview.data.store import ViewStore
     from nextview.training import maps
     from nextview.training.runs import begin, finish, is_done
+    from nextview.training.weights import refuse_seen
 
     views = ViewStore.open(store)
     training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
+    if weights:
+        refuse_seen(weights, [views.names[i] for i in validation])
     with begin(out, recipe):
         if is_done(out):
             console.print(f"{out}: is trained already", soft_wrap=True)

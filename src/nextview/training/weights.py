@@ -75,7 +75,6 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True)
     open_weights(model)  # refuses a file that is not the card's
     graph = onnx.load(model.path).graph
     arrays = {re.sub(r"^networks?\.(0\.)?", "", i.name): numpy_helper.to_array(i) for i in graph.initializer}
-
     several = any(name.startswith("networks.1.") for name in arrays)
 
     def exported(name: str, shape: torch.Size) -> Tensor:
@@ -104,6 +103,27 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True)
                 layer.weight.copy_(exported(f"{name}.weight", layer.weight.shape))
                 layer.bias.copy_(torch.from_numpy(arrays[f"{name}.bias"].copy()))
         _make_norms(network, norms, views)
+
+
+def refuse_seen(card: Path, kept: list[str]) -> None:
+    """Refuse to go on from a recogniser that was trained on objects which are to be kept from the network now.
+
+    A card names the objects of its split that it has not seen. Where none of them is among ``kept``, it was trained on
+    another dataset.
+
+    Args:
+        card: of the recogniser.
+        kept: names of the objects that validate, and of those held out for a fold.
+
+    Raises:
+        ModelError: it has seen some of them.
+    """
+    seen = sorted(set(kept) - set(find_card(card).facts.get("unseen", [])))
+    if 0 < len(seen) < len(set(kept)):
+        raise ModelError(
+            f"{card}: was trained on {len(seen)} of the {len(set(kept))} objects that this network must not have seen, "
+            f"{seen[0]} among them; take the --seed and --validation of its recipe, and no folds but its own"
+        )
 
 
 def _make_norms(network: nn.Module, norms: list[nn.BatchNorm2d], views: Tensor) -> None:
