@@ -386,7 +386,7 @@ print(*make_policy("gain", sphere).next_views(state, np.random.default_rng(0)))
 
 torch = pytest.importorskip("torch")
 
-from nextview.training.gain import Networks, best_epoch, train  # noqa: E402
+from nextview.training.gain import Networks, averaged, best_epoch, train  # noqa: E402
 
 
 def test_what_ships_says_what_torch_says(tmp_path):
@@ -413,7 +413,7 @@ def test_training_finds_the_views_that_tell_the_class_believed():
     learned = ReplayTable(telling(SMALL, [[0], [1], [2]], 240), {}, PLAIN_SUM)
     fresh = ReplayTable(telling(SMALL, [[0], [1], [2]], 90, seed=1), {}, PLAIN_SUM)
     recipe = replace(QUICK, inputs=("belief", "look", "place"), frame="camera", epochs=20)
-    *_, (policy, worth) = best_epoch(train(learned, recipe), fresh, recipe)
+    *_, ((policy,), worth) = best_epoch([train(learned, recipe)], [fresh], recipe)
     first, second = (SMALL.ring[m.state.current] for m in follow(fresh, policy, 2, np.random.default_rng(5)))
     not_told_yet = first != fresh.data.labels
     assert np.mean((second == fresh.data.labels)[not_told_yet]) > 0.9
@@ -425,7 +425,7 @@ def test_training_finds_the_views_that_tell_the_class_believed():
         for p in (0.0, 0.05, 10.0)
     ]
     assert travel[0] > travel[1] > travel[2]
-    price = travel_price(fresh, policy, 3, "log-belief", 0)
+    price = travel_price([(fresh, policy)], 3, "log-belief", 0)
     limit = judge(fresh, Random(SMALL), 3, "log-belief", np.random.default_rng(0)).travel
     assert (judge(fresh, replace(policy, price=price), 3, "log-belief", np.random.default_rng(0)).travel <= limit).all()
 
@@ -442,6 +442,29 @@ def test_the_same_seed_gives_the_same_policy():
     assert np.abs(weights(0) - weights(1)).max() > 0.01
 
 
+def test_folds_judge_policies_that_have_not_seen_them_and_are_averaged(monkeypatch):
+    parts = [some_table(30, seed=k) for k in range(3)]
+    recipe = replace(QUICK, epochs=2, inputs=("belief", "place"), frame="camera")
+    asked = []
+
+    def listen(table, policy, *rest, **options):
+        asked.append((table, policy))
+        return judge(table, policy, *rest, **options)
+
+    monkeypatch.setattr("nextview.training.gain.judge", listen)
+    trainings = [train(parts[0], recipe, k) for k in range(2)]
+    *_, (policies, worth) = best_epoch(trainings, parts[1:], recipe)
+    assert [table is parts[1 + k % 2] for k, (table, _) in enumerate(asked)] == [True] * 4
+    worths = [
+        judge(t, p, 3, "log-belief", np.random.default_rng([0, 2]), 4) for t, p in zip(parts[1:], policies, strict=True)
+    ]
+    np.testing.assert_allclose(worth.outcome, np.mean([w.outcome for w in worths], 0))
+    told_some = np.random.default_rng(0).random((7, len(policies[0].score.told_flip))).astype(np.float32)
+    one, other = (policy.score(told_some) for policy in policies)
+    assert np.abs(one - other).max() > 1e-3
+    np.testing.assert_allclose(averaged(policies).score(told_some), (one + other) / 2, atol=1e-6)
+
+
 @pytest.fixture
 def unseen(tmp_path):
     path = tmp_path / "unseen.npz"
@@ -456,7 +479,8 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
     card = tmp_path / "mine.json"
     main(["train", "gain", str(unseen), str(card), "--epochs", "2", "--inputs", "belief", "place", "--frame", "camera"])
     facts = json.loads(card.read_text())
-    assert "72 objects" in facts["learned_from"]
+    assert "90 objects" in facts["learned_from"]
+    assert "each judged by networks of 4 other folds" in facts["learned_from"]
     policy = make_policy(str(card), SPHERE, classes=("ball", "box", "pillar"))
     assert isinstance(policy, Gain)
     assert policy.price == facts["table"]["price"]

@@ -66,7 +66,8 @@ def train_recogniser(
     sources = [_source(path, views, training, recipe, planes) for path in (store, *deformed)]
     runs = {out: training[:0]}
     if folds:
-        runs = {out / f"fold{k}": held for k, held in enumerate(hold_out(views, training, folds, recipe.seed))}
+        parts = hold_out(views.labels[training], views.measure()[training], folds, recipe.seed)
+        runs = {out / f"fold{k}": training[part] for k, part in enumerate(parts)}
     if fold is not None:
         runs = dict([list(runs.items())[fold]])
     if weights and weights.suffix == ".json":

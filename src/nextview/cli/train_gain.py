@@ -14,6 +14,7 @@ def train_gain(
     out: tyro.conf.Positional[Path],
     /,
     validation: Path | None = None,
+    folds: int = 5,
     price: float | None = None,
     local: bool = False,
     recipe: tyro.conf.OmitArgPrefixes[GainRecipe] = GainRecipe(),
@@ -26,7 +27,9 @@ def train_gain(
         out: card of the policy (.json), the weights beside it (.onnx); run it with --policy OUT, or OUT@PRICE for
             another price.
         validation: predictions of other objects of the training split, which choose the epoch and the price; those
-            among them are left out of the training. A fifth of PREDICTIONS by default.
+            among them are left out of the training. By default PREDICTIONS choose them, in folds.
+        folds: without VALIDATION, so many policies are trained, each without its share of the objects, which judge it;
+            the result is the mean of all.
         price: of a grid cell of travel; by default the lowest at which the policy travels no farther than a random walk
             in the local window.
         local: let it choose in the local window only.
@@ -39,11 +42,11 @@ def train_gain(
 
     from nextview.cli.progress import console, track
     from nextview.data.predictions import Predictions, PredictionsError
-    from nextview.data.split import divide
     from nextview.fitting.choices import ReplayTable, Worth, travel_price
     from nextview.models.card import file_hash
     from nextview.policies.gain import MAPS, Gain
-    from nextview.training.gain import best_epoch, train, walk
+    from nextview.training.folds import hold_out
+    from nextview.training.gain import averaged, best_epoch, train, walk
     from nextview.training.gain_export import write_gain
 
     if out.suffix != ".json":
@@ -58,24 +61,32 @@ def train_gain(
             raise PredictionsError(f"{path}: holds no map {lacking[0]!r}; predict it, or choose other --inputs")
         if source.sides is None and (recipe.frame == "object" or "side" in recipe.inputs):
             raise PredictionsError(f"{path}: says nothing of sides; teach the recogniser (--side), or do without")
+    everything = np.arange(len(table))
     if validation is None:
-        learning, checking = divide(table.labels, table.depth_entropy, 0.2, recipe.seed)
+        checking = hold_out(table.labels, table.depth_entropy, folds, recipe.seed)
+        learning = [np.setdiff1d(everything, part) for part in checking]
     else:
-        learning, checking = np.flatnonzero(~np.isin(table.names, other.names)), np.arange(len(other))
+        checking, learning = [np.arange(len(other))], [everything[~np.isin(table.names, other.names)]]
     rng = np.random.default_rng([recipe.seed, 1])
-    learned, checked = ReplayTable.of(table, learning, rng), ReplayTable.of(other, checking, rng)
-    found: list[tuple[Gain, Worth]] = []
+    learned = [ReplayTable.of(table, part, rng) for part in learning]
+    checked = [ReplayTable.of(other, part, rng) for part in checking]
+    found: list[tuple[tuple[Gain, ...], Worth]] = []
 
     def epochs() -> Iterator[int]:
-        for best in best_epoch(train(learned, recipe), checked, recipe):
+        trainings = [train(part, recipe, k) for k, part in enumerate(learned)]
+        for best in best_epoch(trainings, checked, recipe):
             found.append(best)
             yield len(found)
 
     track(epochs(), recipe.epochs, "training")
     best, worth = found[-1]
-    policy = replace(best, anywhere=not local)
+    policies = [replace(policy, anywhere=not local) for policy in best]
     if price is None:
-        price = travel_price(checked, policy, recipe.looks, recipe.outcome, recipe.seed)
+        judged = list(zip(checked, policies, strict=True))
+        price = travel_price(judged, recipe.looks, recipe.outcome, recipe.seed)
+    policy = averaged(policies)
+    learners = len(np.unique(np.concatenate(learning)))
+    chosen = f"{len(other)} others" if validation else f"the same, each judged by networks of {folds - 1} other folds"
     out.parent.mkdir(parents=True, exist_ok=True)
     sources = [(path, source) for path, source in ((predictions, table), (validation, other)) if path is not None]
     facts = {
@@ -84,17 +95,17 @@ def train_gain(
         "elevations": table.sphere.elevations,
         "azimuths": table.sphere.azimuths,
         "classes": table.classes,
-        "learned_from": f"{len(learned.data)} objects of the training split, classes weighted evenly; epoch and price "
-        f"chosen on {len(checked.data)} others",
+        "learned_from": f"{learners} objects of the training split, classes weighted evenly; epoch and price chosen on "
+        f"{chosen}",
         "predictions": [{"sha256": file_hash(path), "models": source.models} for path, source in sources],
-        "calibration": [learned.calibration.temperature_of_one, learned.calibration.correlation],
+        "calibration": [[c.temperature_of_one, c.correlation] for c in (part.calibration for part in learned)],
         "settings": asdict(recipe),
     }
-    seen = walk(checked, [policy], recipe, rng).told
+    seen = np.concatenate([walk(part, [policy], recipe, rng).told for part in checked])
     difference = write_gain(out, replace(policy, price=price), facts, seen)
     console.print(
-        f"learned from {len(learned.data)} objects; on {len(checked.data)} others the {recipe.outcome} after 2, 3, ... "
-        f"looks is {', '.join(f'{x:.4f}' for x in worth.outcome)} at price 0; price {price:g}: {out}"
+        f"learned from {learners} objects; on {chosen} the {recipe.outcome} after 2, 3, ... looks is "
+        f"{', '.join(f'{x:.4f}' for x in worth.outcome)} at price 0; price {price:g}: {out}"
     )
     console.print(
         f"weights: {out.with_suffix('.onnx')}; in {len(seen)} states its answers differ from the networks' by "

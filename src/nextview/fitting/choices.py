@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -157,19 +157,31 @@ PRICES = (0.0, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.012, 0.015, 0.
 """Of a grid cell of travel, in the unit of the outcome."""
 
 
-def travel_price(table: ReplayTable, policy: Gain, looks: int, kind: str, seed: int) -> float:
-    """The lowest of PRICES at which a policy travels no farther than a random walk in the local window, at any look.
+def mean_worth(parts: Sequence[Worth], sizes: Sequence[int]) -> Worth:
+    """What policies reach on average, each on objects of its own."""
+    return Worth(*(np.average([getattr(p, name) for p in parts], 0, sizes) for name in ("outcome", "travel")))
+
+
+def travel_price(judged: Sequence[tuple[ReplayTable, Gain]], looks: int, kind: str, seed: int) -> float:
+    """The lowest of PRICES at which policies travel no farther than a random walk in the local window, at any look.
 
     Args:
-        table: what is seen.
-        policy: whose price is set.
+        judged: the policies whose price is set, each with what is seen of the objects that judge it.
         looks: at most.
         kind: one of OUTCOMES.
         seed: of the first views.
     """
-    limit = judge(table, Random(table.data.sphere), looks, kind, np.random.default_rng(seed)).travel
+
+    def travel(policies: Iterable[Policy]) -> Float:
+        tables = [table for table, _ in judged]
+        worths = [
+            judge(table, policy, looks, kind, np.random.default_rng(seed))
+            for table, policy in zip(tables, policies, strict=True)
+        ]
+        return mean_worth(worths, [len(table.data) for table in tables]).travel
+
+    limit = travel(Random(table.data.sphere) for table, _ in judged)
     for price in PRICES:
-        reached = judge(table, replace(policy, price=price), looks, kind, np.random.default_rng(seed))
-        if (reached.travel <= limit).all():
+        if (travel(replace(policy, price=price) for _, policy in judged) <= limit).all():
             return price
     return PRICES[-1]

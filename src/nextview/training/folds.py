@@ -5,34 +5,34 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.store import ViewStore
 
-
-def hold_out(store: ViewStore, objects: NDArray[np.int64], folds: int, seed: int) -> list[NDArray[np.int64]]:
+def hold_out(
+    labels: NDArray[np.int64], measured: NDArray[np.floating], folds: int, seed: int
+) -> list[NDArray[np.int64]]:
     """Divide objects into parts, each to be kept from one network; every class is spread evenly.
 
     Meshes that are byte-identical, which equal depth-entropy from all views tells, are kept together.
 
     Args:
-        store: the views.
-        objects: indices of those that may train, (M,).
+        labels: class of each object, (N,).
+        measured: depth-entropy from every view, (N, V).
         folds: how many parts, at least 2.
         seed: decides which object goes where.
 
     Returns:
-        ``folds`` sorted arrays of indices that together are ``objects``.
+        ``folds`` sorted arrays of indices that together are all objects.
 
     Raises:
         ValueError: fewer than two folds, or fewer objects than folds.
     """
-    if not 2 <= folds <= len(objects):
-        raise ValueError(f"{len(objects)} objects cannot be divided into {folds} folds")
+    if not 2 <= folds <= len(labels):
+        raise ValueError(f"{len(labels)} objects cannot be divided into {folds} folds")
     rng = np.random.default_rng([seed, folds])
-    _, twin = np.unique(store.measure()[objects], axis=0, return_inverse=True)
+    _, twin = np.unique(measured, axis=0, return_inverse=True)
     _, first = np.unique(twin, return_index=True)  # one object stands for all that look the same
     first = rng.permutation(first)
-    first = first[np.argsort(store.labels[objects][first], kind="stable")]  # dealt out class by class
+    first = first[np.argsort(labels[first], kind="stable")]  # dealt out class by class
     fold_of_twin = np.empty(len(first), np.int64)
     fold_of_twin[twin[first]] = np.arange(len(first)) % folds
     fold = fold_of_twin[twin]
-    return [objects[fold == k] for k in range(folds)]
+    return [np.flatnonzero(fold == k) for k in range(folds)]

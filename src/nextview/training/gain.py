@@ -7,8 +7,8 @@ is a mean.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from nextview.fitting.choices import ReplayTable, Worth, choices, follow, judge
+from nextview.fitting.choices import ReplayTable, Worth, choices, follow, judge, mean_worth
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.gain import Gain, mirrored, origin, told, told_mirrored
@@ -85,18 +85,19 @@ class Networks(nn.Module):
         return tuple(tuple((w[e], b[e, 0]) for w, b in zip(weights, biases, strict=True)) for e in chains)
 
 
-def train(table: ReplayTable, recipe: GainRecipe) -> Iterator[Gain]:
+def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
     """Train the networks.
 
     Args:
         table: what is learned from.
         recipe: how.
+        fold: makes for other draws than those of other folds.
 
     Yields:
         After every epoch, the policy as it then is, at price 0 and over all views.
     """
-    rng, data = np.random.default_rng([recipe.seed]), table.data
-    generator = torch.Generator().manual_seed(recipe.seed)
+    rng, data = np.random.default_rng([recipe.seed, fold]), table.data
+    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     sphere, c = data.sphere, len(data.classes)
     flip = torch.from_numpy(told_mirrored(sphere, c, recipe.inputs, recipe.frame))
     cells_flip = torch.from_numpy(mirrored(sphere))
@@ -132,11 +133,34 @@ def train(table: ReplayTable, recipe: GainRecipe) -> Iterator[Gain]:
         yield policy
 
 
-def best_epoch(policies: Iterable[Gain], table: ReplayTable, recipe: GainRecipe) -> Iterator[tuple[Gain, Worth]]:
-    """After every epoch, the best policy so far by its outcome over 2 to ``recipe.looks`` looks, and its worth."""
+def best_epoch(
+    folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], recipe: GainRecipe
+) -> Iterator[tuple[tuple[Gain, ...], Worth]]:
+    """After every epoch, the policies of the best epoch so far by their outcome over 2 to ``recipe.looks`` looks.
+
+    Args:
+        folds: trainings side by side, each a policy an epoch.
+        tables: by which they are judged, one each: of objects that it was not trained on.
+        recipe: how.
+
+    Yields:
+        The policies of the same epoch, and their worth, a mean over all objects.
+    """
     best = None
-    for policy in policies:
-        worth = judge(table, policy, recipe.looks, recipe.outcome, np.random.default_rng([recipe.seed, 2]), rounds=4)
+    for policies in zip(*folds, strict=True):
+        worths = [
+            judge(table, policy, recipe.looks, recipe.outcome, np.random.default_rng([recipe.seed, 2]), rounds=4)
+            for table, policy in zip(tables, policies, strict=True)
+        ]
+        worth = mean_worth(worths, [len(table.data) for table in tables])
         if best is None or worth.outcome.mean() > best[1].outcome.mean():
-            best = policy, worth
+            best = policies, worth
         yield best
+
+
+def averaged(policies: Sequence[Gain]) -> Gain:
+    """One policy whose networks are those of all."""
+    scores = [policy.score for policy in policies if isinstance(policy.score, Perceptrons)]
+    return replace(
+        policies[0], score=replace(scores[0], networks=tuple(net for score in scores for net in score.networks))
+    )
