@@ -202,7 +202,7 @@ def test_published_recipe_on_images_by_the_command(store, tmp_path, capsys):
     noted = json.loads((run / "recipe.json").read_text())
     assert noted == asdict(replace(THESIS_RECOGNISER, depth=18, epochs=1, size=32, views=2, batch=4, validation=0.25))
     assert {path.name for path in run.iterdir()} == {
-        "recipe.json", "held_out.json", "network.pt", "best.ckpt", "last.ckpt", "log", "curves.png",
+        "recipe.json", "weights.json", "held_out.json", "network.pt", "best.ckpt", "last.ckpt", "log", "curves.png",
     }  # fmt: skip
     assert torch.load(run / "network.pt", weights_only=True)["conv1.weight"].shape == (64, 1, 7, 7)
     images = load_inputs(store, 32, "image")
@@ -246,7 +246,9 @@ def test_one_fold_alone_starts_from_weights(store, tmp_path, capsys):
     assert [path.name for path in (tmp_path / "out").iterdir() if path.is_dir()] == ["fold1"]
     trained = torch.load(tmp_path / "out/fold1/network.pt", weights_only=True)
     assert not trained["layer4.1.conv2.weight"].any()  # a rate of 0 leaves the weights that it was given
+    (tmp_path / "others.pth").write_bytes((tmp_path / "zeros.pth").read_bytes() + b" ")
     for options, message in (
+        ([str(tmp_path / "others.pth"), "--fold", "1", "--rate", "0"], "started from other weights"),
         ([str(tmp_path / "missing.pth"), "--fold", "0"], "there is no such checkpoint"),
         ([str(tmp_path / "zeros.pth"), "--fold", "2"], "there is no fold 2 of 2"),
     ):

@@ -74,7 +74,7 @@ def train_recogniser(
         for held in runs.values():
             refuse_seen(weights, [views.names[i] for i in [*validation, *held]])
     for run, held in runs.items():
-        with begin(run, recipe):
+        with begin(run, recipe, weights):
             if is_done(run):
                 console.print(f"{run}: is trained already", soft_wrap=True)
                 continue
@@ -205,7 +205,7 @@ def _train_map(
     training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
     if weights:
         refuse_seen(weights, [views.names[i] for i in validation])
-    with begin(out, recipe):
+    with begin(out, recipe, weights):
         if is_done(out):
             console.print(f"{out}: is trained already", soft_wrap=True)
             return

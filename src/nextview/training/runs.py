@@ -14,24 +14,31 @@ import torch
 from torch import nn
 
 from nextview.data.lock import only_one
-from nextview.models.card import ModelError
+from nextview.models.card import ModelError, file_hash, find_card
 from nextview.training.fit import is_first
 
 
 @contextmanager
-def begin(run: Path, recipe: Any) -> Iterator[None]:
-    """Open a run's folder to this process alone, or that of its devices, and keep its recipe there.
+def begin(run: Path, recipe: Any, weights: Path | None = None) -> Iterator[None]:
+    """Open a run's folder to this process alone, or that of its devices; keep its recipe there and what it starts from.
+
+    Args:
+        run: the folder.
+        recipe: a dataclass.
+        weights: a checkpoint, or the card of an exported network.
 
     Raises:
-        ModelError: it holds a run of another recipe.
+        ModelError: it holds a run of another recipe, or one that started from other weights; there are none.
         DatasetError: another process trains there, or it cannot be written.
     """
     with only_one(run) if is_first() else nullcontext():
-        noted = run / "recipe.json"
+        noted, start = run / "recipe.json", {"sha256": _hash(weights)}
         if noted.exists():
             _compare(noted, recipe)
+            _compare_start(run / "weights.json", start)
         elif is_first():
             run.mkdir(parents=True, exist_ok=True)
+            (run / "weights.json").write_text(json.dumps(start) + "\n")
             part = noted.with_suffix(".part")
             part.write_text(json.dumps(asdict(recipe), indent=1) + "\n")
             part.rename(noted)
@@ -48,6 +55,30 @@ def finish(network: nn.Module, run: Path) -> None:
     part = run / f"network.part{os.getpid()}"
     torch.save(network.state_dict(), part)
     part.rename(run / "network.pt")
+
+
+def _hash(weights: Path | None) -> str | None:
+    if weights is None:
+        return None
+    if weights.suffix == ".json":
+        return find_card(weights).sha256
+    if not weights.is_file():
+        raise ModelError(f"{weights}: there is no such checkpoint")
+    return file_hash(weights)
+
+
+def _compare_start(noted: Path, start: dict[str, str | None]) -> None:
+    if not noted.exists():
+        return  # begun before this was noted
+    try:
+        same = json.loads(noted.read_text()) == start
+    except (OSError, ValueError) as error:
+        raise ModelError(f"{noted}: cannot be read ({type(error).__name__}); give another folder") from None
+    if not same:
+        raise ModelError(
+            f"{noted.parent}: holds a run that started from other weights; give the same --weights to resume it, or "
+            "another folder"
+        )
 
 
 def _compare(noted: Path, recipe: Any) -> None:
