@@ -184,3 +184,15 @@ def test_real_meshes_are_mostly_recognised():
     ]
     assert len(right) >= 5
     assert np.mean(right) >= 0.6  # the published single-view recogniser is right on 0.87
+
+
+@pytest.mark.parametrize("arguments", [["models"], ["recognise", "--help"]], ids=" ".join)
+def test_a_reader_that_goes_away_is_no_fault(arguments):
+    """As ``nextview models | head`` does."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-m", "nextview.cli.main", *arguments], stdout=writer, stderr=subprocess.PIPE, text=True
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, "")

@@ -235,6 +235,16 @@ def test_going_on_from_a_network_that_has_seen_the_validation_objects_is_refused
     assert not (tmp_path / "out").exists()
 
 
+def test_a_size_that_the_views_do_not_have_is_refused_before_anything_is_made(store, tmp_path, capsys):
+    before = sorted(store.parent.iterdir())
+    with pytest.raises(SystemExit):
+        main(["train", "recogniser", str(store), str(tmp_path / "out"), *FAST, "--size", "48"])
+    assert "cannot be thinned to 48x48: use a multiple of 48" in capsys.readouterr().err
+    assert [path for path in sorted(store.parent.iterdir()) if path.suffix != ".lock"] == [
+        path for path in before if path.suffix != ".lock"
+    ]
+
+
 def test_one_fold_alone_starts_from_weights(store, tmp_path, capsys):
     with torch.device("meta"):
         shapes = RecogniserModule(RecogniserRecipe(), 1000, 10).net.state_dict()

@@ -29,18 +29,24 @@ def prepare_inputs(path: Path, size: int, kind: str = "geometry", workers: int |
 
     Yields:
         Objects done so far. The file appears under its name only when it is whole.
+
+    Raises:
+        ValueError: the views cannot be brought to this size.
     """
     target = inputs_path(path, size, kind)
     if target.exists():
         return
     store = ViewStore.open(path)
+    chosen = np.flatnonzero(store.done)
+    for first in chosen[:1]:  # a size that the views do not have is refused before anything is made
+        seen_views(store, int(first), kind, size)
     shape = (len(store), len(store.sphere), CHANNELS_OF[kind], size, size)
     part = target.with_suffix(".part")
     np.lib.format.open_memmap(part, "w+", np.uint8, shape).flush()
     with ProcessPoolExecutor(workers or os.cpu_count(), get_context("spawn")) as pool:
         jobs = [
             pool.submit(_prepare, path, part, objects, size, kind)
-            for objects in np.array_split(np.flatnonzero(store.done), max(1, len(store) // 25))
+            for objects in np.array_split(chosen, max(1, len(store) // 25))
         ]
         total = 0
         for job in as_completed(jobs):
