@@ -25,9 +25,11 @@ from nextview.viewsphere import ViewSphere
 torch = pytest.importorskip("torch")
 
 from nextview.benchmark.scores import map_scores, recogniser_scores  # noqa: E402
+from nextview.models.card import ModelError  # noqa: E402
 from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.maps import MapModule, Windows  # noqa: E402
+from nextview.training.merge import merge  # noqa: E402
 from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
 
@@ -348,3 +350,19 @@ def test_eight_bits_a_weight_are_enough_for_the_answers_and_halve_the_file_again
     assert np.abs(said[8] - true).max() < 0.02 * np.abs(true).max()
     assert np.abs(said[8] - true).max() > np.abs(said[16] - true).max()  # so they do have fewer
     assert (tmp_path / "8.onnx").stat().st_size < 0.52 * (tmp_path / "16.onnx").stat().st_size
+
+
+def test_merged_networks_have_the_mean_weights_and_norms_that_know_what_they_see():
+    torch.manual_seed(0)
+    networks = [ResNet(18, 3, 4) for _ in range(2)]
+    views = [torch.rand(8, 4, 32, 32) for _ in range(3)]
+    one = merge(networks, views)
+    for name, value in one.named_parameters():
+        expected = sum(dict(network.named_parameters())[name] for network in networks) / 2
+        assert torch.equal(value, expected)
+    with torch.no_grad():
+        before = torch.cat([one.conv1(x) for x in views])
+    assert torch.allclose(one.bn1.running_mean, before.mean((0, 2, 3)), atol=1e-5)
+    assert not one.training
+    with pytest.raises(ModelError, match="cannot be merged"):
+        merge([networks[0], ResNet(34, 3, 4)], views)

@@ -28,6 +28,7 @@ def export_recogniser(
     out: tyro.conf.Positional[Path],
     /,
     also: tuple[Path, ...] = (),
+    merged: bool = False,
     mirror: bool = False,
     bits: Literal[8, 16] = 16,
     name: str = "resnet18-modelnet10",
@@ -41,6 +42,7 @@ def export_recogniser(
         store: the store that it was trained on.
         out: folder for NAME.onnx and NAME.json.
         also: further runs on the same store, with the same input; the logits of all are averaged.
+        merged: average their weights instead, into one network; for runs that went on from one another (--weights).
         mirror: average what the networks say of a view and of its mirror image.
         bits: that a weight takes in the file.
         name: what to call the model.
@@ -59,8 +61,10 @@ def export_recogniser(
     from nextview.models.networks import Recogniser
     from nextview.training.export import CalibratedRecogniser, answer, export_onnx, fit_temperature, load_weights
     from nextview.training.inputs import CHANNELS_OF, load_inputs
+    from nextview.training.merge import merge
     from nextview.training.networks import ResNet
     from nextview.training.recipes import RecogniserRecipe
+    from nextview.training.recogniser import drawn_views
 
     runs = (run, *also)
     recipes = [RecogniserRecipe(**json.loads((r / "recipe.json").read_text())) for r in runs]
@@ -83,13 +87,17 @@ def export_recogniser(
         load_weights(ResNet(recipe.depth, c, channels, azimuths if recipe.side else 0), r)
         for r, recipe in zip(runs, recipes, strict=True)
     ]
+    names = [f"ResNet-{recipe.depth}" for recipe in recipes]
+    if merged:
+        networks = [merge(networks, drawn_views(inputs, training, views.labels, recipes[0], 32))]
+        names = [f"{names[0]}, the mean of {len(runs)} runs"]
 
     out.mkdir(parents=True, exist_ok=True)
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
     facts: dict[str, Any] = {
         "name": name,
         "kind": "recogniser",
-        "network": " + ".join(f"ResNet-{recipe.depth}" for recipe in recipes) + (", mirrored too" if mirror else ""),
+        "network": " + ".join(names) + (", mirrored too" if mirror else ""),
         "input": SEEN[sees],
         "sees": sees,
         "input_size": size,

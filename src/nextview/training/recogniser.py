@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,27 @@ def augment(x: Tensor, s: int) -> tuple[Tensor, Tensor]:
     return torch.where(seen, x + 0.02 * torch.randn_like(x), 0.0), mirrored
 
 
+def drawn_views(
+    inputs: NDArray[np.uint8],
+    objects: NDArray[np.int64],
+    labels: NDArray[np.int64],
+    recipe: RecogniserRecipe,
+    most: int,
+) -> Iterator[Tensor]:
+    """At most so many batches of views as they are trained on, (B, C, S, S) in 0 .. 1, from the store itself.
+
+    Args:
+        inputs: (N, V, C, S, S).
+        objects: from which is drawn.
+        labels: class of each object, (N,).
+        recipe: how.
+        most: batches.
+    """
+    for batch in islice(Views([Source(inputs, np.arange(len(inputs)))], objects, labels, recipe), most):
+        x = batch[0].float() / 255
+        yield augment(x, recipe.size)[0] if recipe.augment else x
+
+
 class RecogniserModule(L.LightningModule):
     """AdamW on cross-entropy; validates on the class mean of single-view accuracy.
 
@@ -221,8 +243,8 @@ def train(
     views = Views(sources, training, labels, recipe)
     module = RecogniserModule(recipe, int(labels.max()) + 1, recipe.epochs * len(views), azimuths)
     if weights and weights.suffix == ".json":
-        sample = next(iter(views))[0].float() / 255
-        load_exported(module.net, weights, augment(sample, recipe.size)[0] if recipe.augment else sample)
+        sample = next(drawn_views(sources[0].inputs, training, labels, recipe, 1))
+        load_exported(module.net, weights, sample)
     elif weights:
         load_torchvision(module.net, weights)
     validation_views = ValidationViews(sources[0].inputs, validation, labels)
