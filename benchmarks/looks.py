@@ -54,7 +54,6 @@ POLICIES = (
     "class-table",
     "gain@0",
     "gain@0.002",
-    "gain@0.005",
     "gain",
     "gain@0.02",
     "gain@0.05",
