@@ -480,7 +480,7 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
     main(["train", "gain", str(unseen), str(card), "--epochs", "2", "--inputs", "belief", "place", "--frame", "camera"])
     facts = json.loads(card.read_text())
     assert "90 objects" in facts["learned_from"]
-    assert "each judged by networks of 4 other folds" in facts["learned_from"]
+    assert "each judged by networks of 19 other folds" in facts["learned_from"]
     policy = make_policy(str(card), SPHERE, classes=("ball", "box", "pillar"))
     assert isinstance(policy, Gain)
     assert policy.price == facts["table"]["price"]

@@ -14,7 +14,7 @@ def train_gain(
     out: tyro.conf.Positional[Path],
     /,
     validation: Path | None = None,
-    folds: int = 5,
+    folds: int = 20,
     price: float | None = None,
     local: bool = False,
     recipe: tyro.conf.OmitArgPrefixes[GainRecipe] = GainRecipe(),

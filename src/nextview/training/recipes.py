@@ -153,7 +153,7 @@ class GainRecipe:
         outcome: of a look: belief in the true class after it, its logarithm, or whether the answer is right.
         looks: the outcome of looks 2 to this one is learned.
         hidden: width of the two hidden layers.
-        networks: that are averaged; each weighs the objects by a bootstrap draw of its own.
+        networks: that are averaged, of each fold; each weighs the objects by a bootstrap draw of its own.
         epochs: each over new walks of all objects.
         walks: of each object in an epoch.
         batch: states in a step.
@@ -173,9 +173,9 @@ class GainRecipe:
     outcome: Literal["belief", "log-belief", "right"] = "log-belief"
     looks: int = 5
     hidden: int = 32
-    networks: int = 5
+    networks: int = 2
     epochs: int = 15
-    walks: int = 2
+    walks: int = 8
     batch: int = 1024
     rate: float = 3e-3
     decay: float = 0.1
