@@ -1,6 +1,6 @@
 """Compare policies at a fixed number of looks: nobody stops early, and each look and each cell of travel is counted.
 
-    python benchmarks/looks.py test.npz --out looks [--policies gain@0.01 my:Policy ...] [--looks 2 3 5]
+    python benchmarks/looks.py test.npz --out looks [--policies gain@0.01 my:Policy ...] [--looks 2 3 5] [--against lem lcm ...]
 
 Writes looks.md (the table), looks.csv (every number in a row of its own) and front.png (accuracy against travel) into
 the folder, and prints the table. A policy chooses without knowing how many looks there will be, so it is run once and
@@ -69,10 +69,10 @@ def after(paths: Paths, looks: int) -> Ends:
     return cut(replace(paths, **{name: getattr(paths, name)[:, :looks] for name in fields}), None)
 
 
-def measured(grid: Grid, looks: Sequence[int], samples: int) -> pd.DataFrame:
+def measured(grid: Grid, looks: Sequence[int], samples: int, references: Sequence[str] = REFERENCES) -> pd.DataFrame:
     """Every number: policy, looks, measure, value, low, high, p.
 
-    The measures: ``accuracy``; ``travel``, grid cells; ``to_random`` and ``to_random-all``, differences of accuracy;
+    The measures: ``accuracy``; ``travel``, grid cells; ``to_random`` and so on, differences of accuracy to references;
     ``share_of_gap``, how much of what ``oracle-gain`` has over ``random`` the policy has too. The bootstrap samples are
     those of the benchmark, the same for all policies, which pairs the differences.
     """
@@ -86,14 +86,14 @@ def measured(grid: Grid, looks: Sequence[int], samples: int) -> pd.DataFrame:
         columns |= {
             (name, "travel"): e.travel.reshape(grid.runs, -1).mean(0) for name, e in zip(names, ends, strict=True)
         }
-        for name, reference in product(names, REFERENCES):
+        for name, reference in product(names, references):
             columns[name, f"to_{reference}"] = columns[name, "accuracy"] - columns[reference, "accuracy"]
         top = np.stack(list(columns.values()), 1)
         low, high = interval(ratio(top, np.ones_like(top), weights))
         value = dict(zip(columns, top.mean(0), strict=True))
         for i, (name, measure) in enumerate(columns):
             reference = measure.removeprefix("to_")
-            p = mcnemar(right[name], right[reference]) if reference in REFERENCES and name != reference else np.nan
+            p = mcnemar(right[name], right[reference]) if reference in references and name != reference else np.nan
             rows.append((name, k, measure, value[name, measure], low[i], high[i], p))
         gap = value[CEILING, "to_random"]
         for name in names:
@@ -110,7 +110,7 @@ def by_key(table: pd.DataFrame) -> Numbers:
     return {(policy, k, measure): tuple(rest) for policy, k, measure, *rest in table.itertuples(index=False)}
 
 
-def markdown(table: pd.DataFrame, left_out: Sequence[str]) -> str:
+def markdown(table: pd.DataFrame, left_out: Sequence[str], references: Sequence[str] = REFERENCES) -> str:
     """The table as text."""
     found, looks = by_key(table), table["looks"].unique().tolist()
     at = " at " + ", ".join(map(str, looks))
@@ -121,12 +121,12 @@ def markdown(table: pd.DataFrame, left_out: Sequence[str]) -> str:
         return f"{round(100 * value, 1) + 0.0:+.1f} (p {'< 0.0001' if p < 1e-4 else f'{p:.2g}'})"
 
     head = ["policy", *(f"{k} look{'s' * (k > 1)}" for k in looks), f"travel{at}"]
-    head += [f"points over {reference}{at}" for reference in REFERENCES] + [f"of the gap{at}"]
+    head += [f"points over {reference}{at}" for reference in references] + [f"of the gap{at}"]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for name in table["policy"].unique():
         cells = ["{:.3f} ({:.3f}-{:.3f})".format(*found[name, k, "accuracy"][:3]) for k in looks]
         cells.append(", ".join(f"{found[name, k, 'travel'][0]:.2f}" for k in looks))
-        for reference in REFERENCES:
+        for reference in references:
             cells.append("" if name == reference else ", ".join(difference(name, k, reference) for k in looks))
         shares = [found[name, k, "share_of_gap"][0] for k in looks]
         cells.append(", ".join("-" if np.isnan(s) else f"{100 * s:.0f} %" for s in shares))
@@ -259,6 +259,7 @@ def main(
     runs: int = 10,
     samples: int = 2000,
     seed: int = 0,
+    against: tuple[str, ...] = REFERENCES,
 ) -> None:
     """Write the table and the figure.
 
@@ -272,6 +273,7 @@ def main(
         runs: random first views of each object.
         samples: of the bootstrap.
         seed: decides first views, random policies and the bootstrap.
+        against: names of policies with which, beside random, all are compared.
     """
     table = Predictions.load(predictions)
     if split:
@@ -282,21 +284,22 @@ def main(
         raise ValueError(f"policies are compared after 1 to {len(table.sphere)} looks, not {looks}")
     trials = make_trials(table, runs, seed)
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
-    names = list(dict.fromkeys([*REFERENCES, *(policies or POLICIES), CEILING]))
+    names = list(dict.fromkeys([*REFERENCES, *against, *(policies or POLICIES), CEILING]))
     grid = Grid(trials, runs, (), max(looks), seed)
     track(run_grid(grid, names), len(names), "replaying policies")
     for name in [name for name, paths in grid.paths.items() if paths.views.shape[1] < max(looks) and paths.fixed]:
         grid.failures[name] = f"{name} is over before look {max(looks)}"
         del grid.paths[name]
-    found = measured(grid, sorted(set(looks)), samples)
-    text = markdown(found, list(grid.failures.values()))
+    compared = [name for name in dict.fromkeys((REFERENCES[0], *against)) if name in grid.paths]
+    found = measured(grid, sorted(set(looks)), samples, compared)
+    text = markdown(found, list(grid.failures.values()), compared)
     out.mkdir(parents=True, exist_ok=True)
     (out / "looks.md").write_text(text, encoding="utf-8")
     found.to_csv(out / "looks.csv", index=False)
     choosing = [name for name, paths in grid.paths.items() if not paths.fixed]
     to_png(front(found, families(choosing, trials)), out / "front.png")
     print(text, end="")
-    if policies and grid.failures:
+    if (policies or against != REFERENCES) and grid.failures:
         raise ValueError("not all that was asked for could be run")
 
 

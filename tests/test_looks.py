@@ -60,6 +60,19 @@ def test_the_table_has_a_row_for_every_policy_and_a_column_for_every_number_of_l
     assert {line.count("|") for line in text} == {text[0].count("|")}
 
 
+def test_policies_may_be_compared_with_others_than_the_random_ones(made):
+    LOOKS["main"](made / "p.npz", made / "against", ("furthest",), (2,), runs=3, samples=50, against=("lem",))
+    found = pd.read_csv(made / "against" / "looks.csv").set_index(["policy", "measure"]).sort_index()
+    for reference in ("random", "lem"):
+        difference = found.loc[("furthest", "accuracy"), "value"] - found.loc[(reference, "accuracy"), "value"]
+        assert found.loc[("furthest", f"to_{reference}"), "value"] == pytest.approx(difference)
+    assert np.isnan(found.loc[("lem", "to_lem"), "p"])
+    head = (made / "against" / "looks.md").read_text().splitlines()[0]
+    assert "points over random at 2 | points over lem at 2 |" in head
+    with pytest.raises(ValueError, match="not all"):
+        LOOKS["main"](made / "p.npz", made / "against", (), (2,), runs=1, samples=20, against=("lcm",))
+
+
 def test_views_that_end_before_the_last_look_are_left_out_with_a_sentence(made):
     with pytest.raises(ValueError, match="not all"):
         LOOKS["main"](made / "p.npz", made / "short", ("orbit-3", "lem"), (2, 4), runs=1, samples=20)

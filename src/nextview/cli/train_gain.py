@@ -22,8 +22,8 @@ def train_gain(
     """Train the gain policy on what a recogniser says of objects that it has not seen. Takes a few minutes.
 
     Args:
-        predictions: of objects of the training split that the recogniser was not trained on (nextview predict --unseen):
-            those that validated it, or those that were kept from it in folds.
+        predictions: of objects of the training split that the recogniser was not trained on, those that validated it or
+            those that were kept from it in folds (nextview predict --unseen).
         out: card of the policy (.json), the weights beside it (.onnx); run it with --policy OUT, or OUT@PRICE for
             another price.
         validation: predictions of other objects of the training split, which choose the epoch and the price; those
