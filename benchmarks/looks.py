@@ -1,6 +1,6 @@
 """Compare policies at a fixed number of looks: nobody stops early, and each look and each cell of travel is counted.
 
-    python benchmarks/looks.py test.npz --out looks [--policies gain@0.01 my:Policy ...] [--looks 2 3 5] [--against lem lcm ...]
+    python benchmarks/looks.py test.npz --out looks [--policies gain@0.01 ...] [--looks 2 3 5] [--against lem ...]
 
 Writes looks.md (the table), looks.csv (every number in a row of its own) and front.png (accuracy against travel) into
 the folder, and prints the table. A policy chooses without knowing how many looks there will be, so it is run once and
