@@ -26,6 +26,7 @@ from nextview.benchmark.statistics import interval, ratio, resample
 from nextview.cli.progress import track
 from nextview.data.folders import Entry, list_dataset
 from nextview.data.predictions import Predictions
+from nextview.fitting.evidence import fitting_set
 from nextview.mesh import load_mesh
 from nextview.recognition import of_true_class
 
@@ -95,7 +96,7 @@ def main(meshes: Path, validation: Path, test: Path) -> None:
         log_densities(taught_sizes, labels, c, np.array([size[name] for name in p.names])) for p in (known, other)
     ]
     single = log_beliefs(known, 1, np.random.default_rng(0))
-    even = 1 / np.bincount(known.labels, minlength=c)[known.labels]
+    even = fitting_set(known, 1.0, 0).weights
 
     def loss(weight: float) -> float:
         of_truth = of_true_class(single + weight * density[0][:, None], known.labels)

@@ -32,6 +32,7 @@ from nextview.training.maps import MapModule, Windows  # noqa: E402
 from nextview.training.merge import merge  # noqa: E402
 from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
+from nextview.training.weights import load_exported  # noqa: E402
 
 
 def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
@@ -333,6 +334,28 @@ def test_folds_divide_every_class_evenly_and_keep_twins_together(tmp_path):
     assert any((a != b).any() for a, b in zip(folds, hold_out(labels, measured, 3, 2), strict=True) if len(a) == len(b))
     with pytest.raises(ValueError, match="cannot be divided"):
         hold_out(labels, measured, 1, seed=0)
+
+
+def test_merged_runs_ship_as_one_network_that_training_goes_on_from(trained, capsys):
+    runs, store, models = trained / "runs", trained / "views.zarr", trained / "models"
+    command = [
+        "export",
+        "recogniser",
+        str(runs / "recogniser"),
+        str(store),
+        str(models),
+        "--name",
+        "merged",
+        "--merged",
+    ]
+    with pytest.raises(SystemExit):
+        main(command)
+    assert "name the others with --also" in capsys.readouterr().err
+    main([*command, "--also", str(runs / "recogniser")])
+    assert json.loads((models / "merged.json").read_text())["network"] == "ResNet-18, the mean of 2 runs"
+    views = seen_views(ViewStore.open(store), 0, "geometry", 112)
+    assert np.isfinite(Recogniser(models / "merged.json").from_inputs(views).logits).all()
+    load_exported(ResNet(18, 2, 4, 8), models / "merged.json", torch.from_numpy(views).float() / 255)
 
 
 def test_eight_bits_a_weight_are_enough_for_the_answers_and_halve_the_file_again(tmp_path):

@@ -66,6 +66,8 @@ def export_recogniser(
     from nextview.training.recipes import RecogniserRecipe
     from nextview.training.recogniser import drawn_views
 
+    if merged and not also:
+        raise ModelError("--merged averages the weights of several runs: name the others with --also")
     runs = (run, *also)
     recipes = [RecogniserRecipe(**json.loads((r / "recipe.json").read_text())) for r in runs]
     views = ViewStore.open(store)
