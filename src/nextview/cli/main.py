@@ -72,17 +72,19 @@ def main(arguments: list[str] | None = None) -> None:
     else:
         commands = {name: _group(name) if isinstance(c, dict) else c for name, c in commands.items()}
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            commands,
-            prog=prog,
-            description=description,
-            args=arguments,
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-        )
-        sys.stdout.flush()
-    except ValueError as error:
-        print(f"nextview: {error}", file=sys.stderr)
-        sys.exit(2)
+        try:
+            tyro.extras.subcommand_cli_from_dict(
+                commands,
+                prog=prog,
+                description=description,
+                args=arguments,
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+            )
+        except ValueError as error:
+            print(f"nextview: {error}", file=sys.stderr)
+            sys.exit(2)
+        finally:
+            sys.stdout.flush()  # here and not at the interpreter's end, also after --help, which exits by itself
     except BrokenPipeError:  # whoever read this has gone, as head does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still to be flushed goes nowhere
         sys.exit(1)
