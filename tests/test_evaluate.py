@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ from scipy.special import softmax
 from scipy.stats import bootstrap
 from test_predictions import some_predictions
 
-from nextview.benchmark.evaluate import EvaluationError, evaluate, fused_views, yardsticks
+from nextview.benchmark.evaluate import EvaluationError, evaluate, fused_views, scores_for_card, yardsticks
 from nextview.benchmark.published import published_map, published_recognisers, read_table
+from nextview.models.card import Card
 from nextview.recognition import Calibration
 from nextview.viewsphere import ViewSphere
 
@@ -85,6 +87,23 @@ def test_accuracy_by_hand():
     assert of[3, "", "accuracy"] == (3 / 4, 4)
     assert of[3, "", "class_clean_accuracy"] == (1 / 2, 3)
     assert table["published"].isna().all()
+
+
+def test_what_is_right_without_knowing_the_size_stands_beside():
+    p = by_hand()
+    of_size = np.where(np.eye(2)[p.labels] > 0, 0, -99).astype(np.float32)
+    sized = replace(p, logits=p.logits + of_size[:, None], of_size=of_size)
+    known, shape = (evaluate(x, 50, np.random.default_rng(0)).accuracy for x in (sized, p))
+    for row in shape.query("measure == 'accuracy' or measure == 'class_accuracy'").itertuples():
+        before = row.measure.removesuffix("accuracy")
+        here = {"looks": row.looks, "label": row.label}
+        assert score(known, **here, measure=f"{before}shape_accuracy").value == row.value
+        assert score(known, **here, measure=row.measure).value == 1
+    assert "shape_accuracy" not in set(shape["measure"])
+    card = Card("r", "recogniser", Path("r.onnx"), "0" * 64, {})
+    of_shape = scores_for_card(card, p)
+    assert scores_for_card(card, sized)["by_shape"] == of_shape
+    assert of_shape["single_view"]["instance"] == 0.5
 
 
 def test_confusion_and_calibration_by_hand():

@@ -1,44 +1,182 @@
-"""benchmarks/size.py: what is known of how large objects are is weighed in, and chosen without the test split."""
+"""How large an object is counts for its class where it is known, and nowhere else."""
 
+import json
 import runpy
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.stats import norm
 from tests.test_predictions import some_predictions
+from tiny_models import make_recogniser
 
-from nextview.recognition import Calibration
+from nextview.cameras.simulated import SimulatedCamera
+from nextview.cli.main import main
+from nextview.data.folders import DatasetError
+from nextview.data.predict import predict
+from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.render import Deform, render
+from nextview.data.store import ViewStore
+from nextview.fitting.evidence import FittingSet
+from nextview.fitting.size import ANY_SIZE, RADII, densities, fit_weight
+from nextview.mesh import MeshError, load_mesh
+from nextview.models.card import ModelError, read_card
+from nextview.models.networks import Recogniser
+from nextview.models.size import SizeEvidence
+from nextview.viewsphere import ViewSphere
 
-SIZE = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "size.py"))
+SPHERE = ViewSphere.named("40")
+BENCHMARK = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "size.py"))
+CLASSES = ["big", "small"]
 
 
-def test_the_density_of_a_size_is_that_of_its_class():
+@pytest.fixture(scope="module")
+def shop(tmp_path_factory):
+    """Balls of two classes that differ in nothing but their size, in centimetres, and a recogniser."""
+    folder, rng = tmp_path_factory.mktemp("shop"), np.random.default_rng(0)
+    for label, radius in (("big", 80), ("small", 20)):
+        for i in range(8):
+            path = folder / f"meshes/{label}/{'train' if i < 6 else 'test'}/{label}_{i}.off"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            trimesh.creation.icosphere(2, radius * rng.uniform(0.8, 1.25)).export(path)
+    list(render(folder / "meshes", folder / "views.zarr", SPHERE, 32, workers=1))
+    make_recogniser(folder, CLASSES)
+    facts = json.loads((folder / "tiny.json").read_text())
+    (folder / "tiny.json").write_text(json.dumps(facts | {"unseen": ["big_0", "big_1", "small_0", "small_1"]}))
+    return folder
+
+
+def test_a_density_is_that_of_its_class_and_a_share_of_anything():
     rng = np.random.default_rng(0)
-    sizes, labels = np.concatenate([rng.normal(0, 0.1, 200), rng.normal(2, 0.1, 200)]), np.repeat([0, 1], 200)
-    found = SIZE["log_densities"](sizes, labels, 2, np.array([0.0, 2.0, 50.0]))
-    normal = -np.log(0.1 * np.sqrt(2 * np.pi))
-    assert found[[0, 1], [0, 1]] == pytest.approx([normal, normal], abs=0.3)
-    assert (found[[0, 1, 2, 2], [1, 0, 0, 1]] == -10).all()
+    radii = np.exp(np.concatenate([rng.normal(np.log(0.1), 0.1, 500), rng.normal(np.log(2), 0.1, 500)]))
+    found = densities(radii, np.repeat([0, 1], 500), 2)
+    span = np.log(RADII[-1] / RADII[0])
+    share = np.exp(found).mean(1) * span  # under the curve
+    assert share == pytest.approx([1, 1], rel=0.03)
+    near = np.abs(RADII - 0.1).argmin()
+    wanted = 0.95 * norm.pdf(np.log(RADII[near]), np.log(0.1), np.hypot(0.1, 0.1 * 500**-0.2))
+    assert np.exp(found[0, near]) == pytest.approx(wanted, rel=0.15)
+    assert np.exp(found[1, near]) == pytest.approx(ANY_SIZE / span)
+    with pytest.raises(ValueError, match="objects of several sizes"):
+        densities(radii[:3], np.array([0, 0, 1]), 2)
 
 
-def test_looks_are_fused_in_order_and_a_telling_size_repairs_what_they_get_wrong():
-    p = replace(some_predictions(40), calibration=Calibration(0.7, 0.5))
-    single = SIZE["log_beliefs"](p, 1, np.random.default_rng(3))
-    assert np.sort(single.ravel()) == pytest.approx(np.sort(p.logits.ravel() / 0.7), rel=1e-5)
-    everything = SIZE["log_beliefs"](p, len(p.sphere), np.random.default_rng(3))
-    wanted = p.logits.sum(1) / (0.7 * (1 + 0.5 * (len(p.sphere) - 1)))
-    np.testing.assert_allclose(everything, np.broadcast_to(wanted[:, None], everything.shape), rtol=1e-4, atol=1e-5)
-    rows = list(SIZE["lines"](p, 100.0 * np.eye(len(p.classes))[p.labels], 1.0, samples=50))
-    assert all("| 1.000 (1.000) |" in row for row in rows)
-    assert rows[0].startswith("| 1 |")
-    none = list(SIZE["lines"](p, np.zeros((len(p), len(p.classes))), 1.0, samples=50))
-    assert all("+0.0 (+0.0 to +0.0)" in row for row in none)
+def test_sizes_between_two_radii_are_interpolated_and_unknown_ones_say_nothing():
+    evidence = SizeEvidence(np.array([1.0, 4.0]), np.array([[0.0, 2.0], [1.0, 1.0]]), 0.5)
+    found = evidence.logits(np.array([1.0, 2.0, 4.0, 100.0, 0.001, np.nan]))
+    np.testing.assert_allclose(found, [[0, 0.5], [0.5, 0.5], [1, 0.5], [1, 0.5], [0, 0.5], [0, 0]], atol=1e-6)
 
 
-def test_test_objects_may_not_choose(tmp_path):
-    p = some_predictions(10)
-    path = tmp_path / "test.npz"
-    replace(p, splits=np.array(["test"] * 10)).save(path)
-    with pytest.raises(ValueError, match="holds test objects, which choose nothing"):
-        SIZE["main"](tmp_path, path, path)
+def test_the_weight_is_the_most_likely_one():
+    """Log-odds of the shape and of the size that are both calibrated add up as they are."""
+    rng = np.random.default_rng(0)
+    n = 4000
+    labels = rng.integers(0, 2, n)
+    logs = rng.normal(np.log([0.3, 0.6])[labels], 0.5)
+    density = norm.logpdf(np.log(RADII)[None], np.log([[0.3], [0.6]]), 0.5)
+    shape = rng.normal(np.where(labels == 0, 1, -1), np.sqrt(2))  # log-odds of the first class
+    logits = np.stack([shape, np.zeros(n)], 1)[:, None].astype(np.float32)
+    data = FittingSet(logits, labels, SPHERE, ("a", "b"))
+    assert fit_weight(data, np.exp(logs), density).weight == pytest.approx(1, abs=0.15)
+    assert fit_weight(data, np.exp(rng.permutation(logs)), density).weight == pytest.approx(0, abs=0.1)
+
+
+def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
+    views, card, honest = str(shop / "views.zarr"), str(shop / "tiny.json"), str(tmp_path / "honest.npz")
+    assert np.isnan(ViewStore.open(views).radii).all()
+    main(["predict", views, honest, "--unseen", "--recogniser", card, "--maps"])
+    with pytest.raises(SystemExit):
+        main(["fit", "size", views, honest, card])
+    assert "--unit" in capsys.readouterr().err
+    main(["render", str(shop / "meshes"), views, "--size", "32", "--unit", "cm"])
+    radii = dict(zip(ViewStore.open(views).names, ViewStore.open(views).radii, strict=True))
+    assert radii["small_3"] == pytest.approx(load_mesh(shop / "meshes/small/train/small_3.off", unit="cm").metres)
+    assert 0.15 < radii["small_3"] < 0.26
+    with pytest.raises(DatasetError, match="measured in cm, not m"):
+        list(render(shop / "meshes", Path(views), SPHERE, 32, unit="m", workers=1))
+
+    test = shop / "test.npz"
+    list(predict(Path(views), test, [read_card(Path(card))], {}, "test", workers=1))
+    by_shape = Predictions.load(test)
+    assert by_shape.of_size is None
+    main(["fit", "size", views, honest, card])
+    assert read_card(Path(card)).facts["size"]["learned_from"] == "8 objects of the training split"
+    list(predict(Path(views), test, [read_card(Path(card))], {}, "test", workers=1))  # nothing is predicted again
+    known = Predictions.load(test)
+    assert (known.logits.argmax(2) == known.labels[:, None]).all()
+    np.testing.assert_allclose(known.by_shape().logits, by_shape.logits, atol=1e-5)
+    list(predict(Path(views), test, [read_card(Path(card))], {}, "test", size=False, workers=1))
+    np.testing.assert_allclose(Predictions.load(test).logits, by_shape.logits, atol=1e-5)
+    list(predict(Path(views), tmp_path / "new.npz", [read_card(Path(card))], {}, "test", workers=1))
+    np.testing.assert_allclose(Predictions.load(tmp_path / "new.npz").logits, known.logits, atol=1e-5)
+
+    recogniser = Recogniser(card)
+    path = shop / "meshes/small/test/small_7.off"
+    looks = [SimulatedCamera(load_mesh(path, unit=unit), 32).observe(SPHERE.poses[9]) for unit in ("cm", None)]
+    assert [look.radius for look in looks] == [pytest.approx(radii["small_7"]), None]
+    row = known.names.index("small_7")
+    said = recogniser(looks).logits
+    np.testing.assert_allclose(said, [known.logits[row, 9], by_shape.logits[row, 9]], atol=2e-3)  # depth is rounded
+    strange = tmp_path / "strange.npz"
+    replace(Predictions.load(honest), names=("a", "b", "c", "d")).save(strange)
+    with pytest.raises(SystemExit):
+        main(["fit", "size", views, str(strange), card])
+    assert "holds 'a'" in capsys.readouterr().err
+
+
+def test_a_stretched_mesh_keeps_its_size(shop, tmp_path):
+    path = shop / "meshes/big/test/big_7.off"
+    mesh = load_mesh(path)
+    assert Deform(turn=True)(mesh, 0, "big_7").radius == pytest.approx(mesh.radius)
+    assert mesh.radius / 1.5 < Deform(0.5)(mesh, 0, "big_7").radius < mesh.radius * 1.5
+
+
+def test_a_unit_is_one_of_a_few(shop):
+    with pytest.raises(MeshError, match="the unit is one of mm, cm, inch, foot, m, not 'mile'"):
+        load_mesh(shop / "meshes/big/test/big_7.off", unit="mile")
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"weight": None}, "sizes that cannot be read"),
+        ({"weight": -1}, "not a finite number"),
+        ({"radii_m": [1, 0.5]}, "do not fit together"),
+        ({"log_density": [[0, 0]]}, "sizes of 1 classes, not 2"),
+        ({"log_density": [[0], [0]]}, "do not fit together"),
+        ({"log_density": [[0, float("nan")], [0, 0]]}, "not a finite number"),
+    ],
+)
+def test_sizes_that_make_no_sense_are_refused_in_one_sentence(tmp_path, change, sentence):
+    card = make_recogniser(tmp_path, CLASSES)
+    size = {"weight": 1, "radii_m": [1, 2], "log_density": [[0, 0], [0, 0]]} | change
+    card.write_text(json.dumps(json.loads(card.read_text()) | {"size": size}))
+    with pytest.raises(ModelError, match=rf"tiny\.json: .*{sentence}"):
+        Recogniser(card)
+
+
+def test_predictions_keep_what_the_size_said(tmp_path):
+    of_size = np.arange(18, dtype=np.float32).reshape(6, 3)
+    p = replace(some_predictions(), of_size=of_size, splits=np.array(["train", "test"] * 3))
+    p.save(tmp_path / "p.npz")
+    np.testing.assert_array_equal(Predictions.load(tmp_path / "p.npz").of_size, of_size)
+    np.testing.assert_array_equal(p.of_split("test").of_size, of_size[1::2])
+    np.testing.assert_allclose(p.by_shape().logits, p.logits - of_size[:, None])
+    with pytest.raises(PredictionsError, match="of_size"):
+        replace(p, of_size=of_size[:5])
+
+
+def test_the_benchmark_compares_with_and_without(tmp_path, capsys):
+    p = some_predictions(40)
+    of_size = (100.0 * np.eye(3)[p.labels]).astype(np.float32)
+    rows = list(BENCHMARK["lines"](replace(p, logits=p.logits + of_size[:, None], of_size=of_size), samples=50))
+    assert all("| 1.000 (1.000) |" in row for row in rows[2:9])
+    share = (p.logits.argmax(2) == p.labels[:, None]).mean()
+    assert rows[2].startswith(f"| 1 | {share:.3f} (")
+    assert f"| {100 * (1 - share):+.1f} (" in rows[2]
+    assert rows[-1].startswith("| pillar | ")
+    p.save(tmp_path / "p.npz")
+    with pytest.raises(ValueError, match="nothing is said of sizes"):
+        BENCHMARK["main"](tmp_path / "p.npz")

@@ -13,6 +13,8 @@ from nextview.obj import read_obj
 from nextview.off import read_off
 
 FORMATS = (".off", ".obj", ".ply", ".stl", ".glb")
+UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}
+"""What a file's unit of length may be, and how many metres it is."""
 
 
 class MeshError(ValueError):
@@ -29,6 +31,7 @@ class Mesh:
         centre: bounding-box centre in the file's frame, (3,) float64, the file's units.
         radius: object radius in the file's units; ``vertices * radius + centre`` are the file's positions.
         name: what to call it in messages.
+        unit: the file's unit, one of UNITS; None if it is not known.
     """
 
     vertices: NDArray[np.float64]
@@ -36,15 +39,24 @@ class Mesh:
     centre: NDArray[np.float64]
     radius: float
     name: str = "mesh"
+    unit: str | None = None
+
+    @property
+    def metres(self) -> float | None:
+        """Object radius in metres; None if the unit is not known."""
+        return None if self.unit is None else self.radius * UNITS[self.unit]
 
 
-def make_mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], name: str = "mesh") -> Mesh:
+def make_mesh(
+    vertices: NDArray[np.floating], faces: NDArray[np.integer], name: str = "mesh", unit: str | None = None
+) -> Mesh:
     """Check raw arrays and normalise them.
 
     Args:
         vertices: (V, 3), any unit.
         faces: (F, 3), indices into the vertices.
         name: used in messages.
+        unit: of the positions, one of UNITS; None if it is not known.
 
     Returns:
         The mesh in the object frame, without the vertices that no face uses.
@@ -79,15 +91,16 @@ def make_mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], name: 
     radius = np.sqrt((vertices**2).sum(1).max())
     if reach > np.finfo(float).max / radius:
         raise MeshError(f"{name}: the mesh is too large, its radius is not a finite number")
-    return Mesh(vertices / radius, faces.astype(np.int32), centre, float(radius * reach), name)
+    return Mesh(vertices / radius, faces.astype(np.int32), centre, float(radius * reach), name, unit)
 
 
-def load_mesh(path: str | Path, up: str | None = None) -> Mesh:
+def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None) -> Mesh:
     """Read an OFF, OBJ, PLY, STL or GLB file; the parts of a scene are joined.
 
     Args:
         path: the file; its suffix tells the format.
         up: the file's up axis, "y" or "z". By default z, but y for GLB, whose standard says so.
+        unit: the file's unit of length, one of UNITS; None if it is not known.
 
     Returns:
         The mesh in the object frame.
@@ -99,6 +112,8 @@ def load_mesh(path: str | Path, up: str | None = None) -> Mesh:
     suffix = path.suffix.lower()
     if up not in (None, "y", "z"):
         raise MeshError(f"{path}: the up axis is y or z, not {up!r}")
+    if unit is not None and unit not in UNITS:
+        raise MeshError(f"{path}: the unit is one of {', '.join(UNITS)}, not {unit!r}")
     if path.is_dir():
         raise MeshError(f"{path}: is a folder, not a mesh file")
     if not path.exists():
@@ -118,7 +133,7 @@ def load_mesh(path: str | Path, up: str | None = None) -> Mesh:
         raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({reason})") from None
     if (up or ("y" if suffix == ".glb" else "z")) == "y":
         vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)
-    return make_mesh(vertices, faces, str(path))
+    return make_mesh(vertices, faces, str(path), unit)
 
 
 def _read_with_trimesh(data: bytes, suffix: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -26,6 +26,7 @@ class Observation:
         pose: camera-to-world, (4, 4) float64, OpenCV axes (x right, y down, z forward).
         intrinsics: pinhole matrix, (3, 3) float64, pixels; pixel (row, column) has its centre at
             (column + 0.5, row + 0.5).
+        radius: the object radius, metres: what positions were divided by. None if the camera does not know its scale.
     """
 
     image: NDArray[np.uint8]
@@ -33,6 +34,7 @@ class Observation:
     points: NDArray[np.float32]
     pose: NDArray[np.float64]
     intrinsics: NDArray[np.float64]
+    radius: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "depth", object_depth(self.depth))

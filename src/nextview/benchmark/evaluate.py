@@ -38,7 +38,8 @@ class Evaluation:
     Attributes:
         accuracy: looks (1, or V: the logits of all views summed), label (empty: all classes), measure, objects, value,
             low, high, published. The measures: ``accuracy``; ``clean_accuracy``, without the objects whose very mesh
-            also has another label; with ``class_`` before it the mean over classes.
+            also has another label; ``shape_accuracy``, where the recogniser is told how large the objects are, when it
+            is not; with ``class_`` before it the mean over classes.
         fusion: looks, accuracy, low, high, class_accuracy, confidence (its mean), calibration_error: that many random
             views fused, calibrated as the recogniser's card says.
         confusion: looks, label, answer, answers: how many; a view is an answer, or a whole object.
@@ -79,7 +80,7 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
         raise EvaluationError(f"at least one sample of the bootstrap is needed, not {samples}")
     weights = st.resample(len(p), samples, rng)
     right, confidence = fused_views(p.said, p.labels, p.calibration, rng, len(p.classes))
-    judged: dict[int, NDArray] = {1: p.logits, len(p.sphere): all_fused(p)[:, None]}
+    judged = _judged(p)
     maps, left_out = _maps(p, weights)
     return Evaluation(
         _accuracy(p, judged, weights),
@@ -89,6 +90,11 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
         maps,
         left_out,
     )
+
+
+def _judged(p: Predictions) -> dict[int, NDArray]:
+    """What single views say and all of them together, by the number of looks, each (N, answers, C)."""
+    return {1: p.logits, len(p.sphere): all_fused(p)[:, None]}
 
 
 def all_fused(p: Predictions) -> Float:
@@ -153,17 +159,19 @@ def _means(
 
 
 def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.DataFrame:
-    clean = np.where(p.conflicting, 0.0, 1.0)
-    bottom = np.stack([np.ones(len(p)), clean], 1)
+    one, clean = np.ones(len(p)), np.where(p.conflicting, 0.0, 1.0)
+    by_shape = {} if p.of_size is None else _judged(p.by_shape())
     best = published_recognisers(p.classes, len(p.sphere))
     rows = []
     for looks, logits in judged.items():
-        right = (logits.argmax(2) == p.labels[:, None]).mean(1)
-        for label, over, value, low, high in _means(right[:, None] * bottom, bottom, p.labels, p.classes, weights):
+        said = {"accuracy": logits, "clean_accuracy": logits}
+        if by_shape:
+            said["shape_accuracy"] = by_shape[looks]
+        right = np.stack([(x.argmax(2) == p.labels[:, None]).mean(1) for x in said.values()], 1)
+        bottom = np.stack([clean if measure == "clean_accuracy" else one for measure in said], 1)
+        for label, over, value, low, high in _means(right * bottom, bottom, p.labels, p.classes, weights):
             here = p.labels == p.classes.index(label) if label else slice(None)
-            for i, (measure, objects) in enumerate(
-                zip(("accuracy", "clean_accuracy"), bottom[here].sum(0), strict=True)
-            ):
+            for i, (measure, objects) in enumerate(zip(said, bottom[here].sum(0), strict=True)):
                 beside = best[0][2] if best and (looks, label, over, i) == (1, "", "", 0) else np.nan
                 rows.append((looks, label, over + measure, int(objects), value[i], low[i], high[i], beside))
     return pd.DataFrame(rows, columns=["looks", "label", "measure", "objects", "value", "low", "high", "published"])
@@ -267,7 +275,8 @@ def scores_for_card(card: Card, p: Predictions) -> dict[str, Any]:
     if p.models.get(card.kind) != (card.name, card.sha256):
         raise EvaluationError(f"these predictions were not made by model {card.name}")
     if card.kind == "recogniser":
-        return recogniser_scores(p.logits, p.labels)
+        scores = recogniser_scores(p.logits, p.labels)
+        return scores if p.of_size is None else scores | {"by_shape": recogniser_scores(p.by_shape().logits, p.labels)}
     kept = judged_objects(p, card.kind)
     if card.kind not in TRUTHS or len(kept) == 0:
         raise EvaluationError(f"these predictions hold no object by which model {card.name} can be judged")

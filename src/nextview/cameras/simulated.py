@@ -38,6 +38,7 @@ class SimulatedCamera:
         self.size = size
         self.seed = seed
         self.intrinsics = pinhole(size, distance)
+        self.radius = mesh.metres
         vertices = mesh.vertices.astype(np.float32)
         self._corners = np.ascontiguousarray(vertices.T)
         self._scene = EmbreeScene()
@@ -66,7 +67,7 @@ class SimulatedCamera:
             image[bound] = shade.reshape(height, width)
             depth[bound] = np.where(hit, hits["tfar"], 0).reshape(height, width)
         points = visible_points(depth, pose, self.intrinsics, self.seed)
-        return Observation(image, depth, points, pose, self.intrinsics)
+        return Observation(image, depth, points, pose, self.intrinsics, self.radius)
 
     def _bound(self, rotation: NDArray[np.float32], origin: NDArray[np.float32]) -> tuple[slice, slice]:
         """Rows and columns that hold the projection of every vertex; the whole image if one is behind the camera."""

@@ -96,6 +96,8 @@ def _recogniser(found: Evaluation, views: int) -> Table:
     lines = [(label.replace("_", " "), label, "accuracy") for label in labels]
     lines += [("mean of classes", "", "class_accuracy"), ("mean of objects", "", "accuracy")]
     lines += [("  without duplicates", "", "clean_accuracy")]
+    if "shape_accuracy" in set(found.accuracy["measure"]):
+        lines += [("  size not known", "", "shape_accuracy")]
     for heading, label, measure in lines:
         cells = (_cell(right[looks, label, measure], 3) for looks in (1, views))
         shown.add_row(escape(heading), str(objects[label, measure]), *cells, end_section=label == labels[-1])

@@ -58,6 +58,55 @@ def fit_calibration(
     )
 
 
+def fit_size(
+    store: tyro.conf.Positional[Path],
+    predictions: tyro.conf.Positional[Path],
+    card: tyro.conf.Positional[Path],
+    /,
+) -> None:
+    """Tell a recogniser how large the objects of each class are, for stores and cameras that know it.
+
+    It goes into its card; nextview predict takes it into predictions made before, without predicting again. Calibrate
+    afterwards.
+
+    Args:
+        store: view store that knows the unit of its meshes (nextview render --unit); its training objects teach, except
+            those in the predictions.
+        predictions: of training objects that the recogniser has not seen (nextview predict --unseen); they decide how
+            much the size counts beside the shape.
+        card: of the recogniser; "size" is written into it.
+    """
+    import numpy as np
+
+    from nextview.cli.progress import console
+    from nextview.data.folders import DatasetError
+    from nextview.data.predictions import Predictions, PredictionsError
+    from nextview.data.store import ViewStore
+    from nextview.fitting.evidence import fitting_set
+    from nextview.fitting.size import densities, fit_weight
+    from nextview.models.card import read_card, write_card
+
+    model, views, table = read_card(card), ViewStore.open(store), Predictions.load(predictions).by_shape()
+    radii, labels = views.radii, views.labels
+    if np.isnan(radii[views.done]).any():
+        raise DatasetError(f"{store}: does not know the unit of its meshes; tell it with nextview render --unit")
+    row = {name: i for i, name in enumerate(views.names)}
+    strangers = [name for name in table.names if name not in row]
+    if strangers:
+        raise PredictionsError(f"{predictions}: holds {strangers[0]!r}, which {store} does not")
+    if table.models["recogniser"][1] != model.sha256:
+        raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
+    data, judged = fitting_set(table, 1.0, 0), [row[name] for name in table.names]
+    of_training = views.done & (views.splits == "train") & np.isin(views.group.attrs["labels"], table.classes)
+    taught = np.setdiff1d(np.flatnonzero(of_training), judged)
+    classes = np.array([table.classes.index(name) if name in table.classes else -1 for name in views.classes])
+    log_density = densities(radii[taught], classes[labels[taught]], len(table.classes))
+    found = fit_weight(data, radii[judged], log_density)
+    told = {"learned_from": f"{len(taught)} objects of the training split", "weighed_on": f"{len(data)} others"}
+    write_card(card, model.facts | {"size": found.facts() | told})
+    console.print(f"sizes of {len(taught)} objects; weight by {len(data)} others: {found.weight:.2f}")
+
+
 def fit_valleys(
     predictions: tyro.conf.Positional[Path],
     card: tyro.conf.Positional[Path],

@@ -16,7 +16,7 @@ from nextview.cli.demo import demo
 from nextview.cli.download import download
 from nextview.cli.evaluate import evaluate
 from nextview.cli.export import export_lcm, export_lem, export_recogniser
-from nextview.cli.fit import fit_calibration, fit_policies, fit_valleys
+from nextview.cli.fit import fit_calibration, fit_policies, fit_size, fit_valleys
 from nextview.cli.grid import train_grid
 from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
@@ -48,7 +48,7 @@ COMMANDS: dict[str, Any] = {
     },
     "export": {"recogniser": export_recogniser, "lem": export_lem, "lcm": export_lcm},
     "predict": predict,
-    "fit": {"calibration": fit_calibration, "valleys": fit_valleys, "policies": fit_policies},
+    "fit": {"size": fit_size, "calibration": fit_calibration, "valleys": fit_valleys, "policies": fit_policies},
     "evaluate": evaluate,
     "benchmark": benchmark,
     "report": report,

@@ -22,6 +22,7 @@ def recognise(
     max_views: int = 5,
     start: int | None = None,
     up: Literal["y", "z"] | None = None,
+    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None,
     seed: int = 0,
     figure: Path | None = None,
     json: bool = False,
@@ -39,6 +40,7 @@ def recognise(
         max_views: stop after so many views.
         start: first view, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
         up: the file's up axis; z if not given, but y for GLB.
+        unit: the file's unit of length, if it is known: how large an object is says something of its class.
         seed: decides the first view and whatever the policy draws.
         figure: write a picture of the episode to this file (PNG, PDF or SVG).
         json: print JSON instead of a table.
@@ -50,7 +52,7 @@ def recognise(
     from nextview.mesh import load_mesh
 
     def load() -> Mesh:
-        return load_mesh(mesh, up)
+        return load_mesh(mesh, up, unit)
 
     show(load, mesh.name, watch, policy, threshold, max_views, start, seed, figure, json, timing, risk)
 

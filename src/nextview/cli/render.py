@@ -18,6 +18,7 @@ def render(
     split: Literal["train", "test"] | None = None,
     stretch: float = 0.0,
     turn: bool = False,
+    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None,
     seed: int = 0,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -33,6 +34,8 @@ def render(
         split: only this split.
         stretch: scale each axis of each mesh by a random factor between 1/(1 + STRETCH) and 1 + STRETCH.
         turn: turn each mesh about the vertical by a random angle.
+        unit: of length in the mesh files, so that the store knows how large the objects are (ModelNet: inch). Not
+            known by default; a store that was made without can be told later.
         seed: decides the stretch and the turn of each mesh.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler to use instead, as tcp://HOST:8786.
@@ -51,7 +54,7 @@ def render(
         views = replace(views, azimuths=azimuths)
     total = sum(split in (None, entry.split) for entry in list_dataset(dataset))
     before = int(ViewStore.open(store).done.sum()) if store.exists() else 0
-    jobs = render_dataset(dataset, store, views, size, seed, Deform(stretch, turn), split, workers, scheduler)
+    jobs = render_dataset(dataset, store, views, size, seed, Deform(stretch, turn), split, unit, workers, scheduler)
     track((before + n for n, _ in enumerate(jobs, 1)), total, f"rendering {store.name}", before, len(views))
 
     made = ViewStore.open(store)

@@ -56,7 +56,7 @@ def _check_object(path: Path, i: int) -> str | None:
     arrays = {}
     measures = [name for name in MEASURES if name in store.measures]
     computed = [ARRAY] if ARRAY in store.group else []
-    for name in ("image", "depth", "points", *(f"measures/{name}" for name in measures), *computed):
+    for name in ("image", "depth", "points", "radius", *(f"measures/{name}" for name in measures), *computed):
         try:
             arrays[name] = store.array(name)[i]
         except Exception as error:  # a damaged chunk raises whatever its codec makes of it
@@ -64,6 +64,8 @@ def _check_object(path: Path, i: int) -> str | None:
     image, depth = arrays["image"], arrays["depth"]
     if ((image > 0) != (depth > 0)).any():
         return "image and depth do not show the same silhouette"
+    if not 0 < arrays["radius"] < np.inf:
+        return "radius is not a positive number"
     for name in measures:
         stored = arrays[f"measures/{name}"]
         true = np.array([MEASURES[name](d * DEPTH_UNIT) for d in depth], np.float32)

@@ -20,7 +20,7 @@ from nextview.data.predictions import Predictions, PredictionsError
 from nextview.data.seen import seen_views
 from nextview.data.store import ViewStore
 from nextview.models.card import Card
-from nextview.models.networks import MapNetwork, Recogniser, knows_sphere
+from nextview.models.networks import MapNetwork, Recogniser, knows_sphere, size_evidence
 from nextview.recognition import Calibration
 from nextview.viewsphere import ViewSphere
 
@@ -43,6 +43,7 @@ def predict(
     maps: dict[str, Card],
     split: str | None = None,
     unseen: bool = False,
+    size: bool = True,
     batch: int = 8,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -59,6 +60,7 @@ def predict(
         split: only this split.
         unseen: let each object be judged by a recogniser that has not seen it in training, and leave out those that
             all have seen.
+        size: let the recogniser know how large the objects are, where store and card tell.
         batch: views a call of the networks.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
@@ -70,8 +72,8 @@ def predict(
         DatasetError: the store holds no such objects, or a class that the recogniser does not know, or another run is
             writing ``out``.
         PredictionsError: ``out`` is there and comes from another store or other models, or an object kills its process.
-            Where it comes from the same, only what the cards say beside the networks (valley classes, calibration) is
-            brought up to date.
+            Where it comes from the same, only what the cards say beside the networks (valley classes, sizes,
+            calibration) is brought up to date.
     """
     store = ViewStore.open(path)
     chosen = np.flatnonzero(store.done & (True if split is None else store.splits == split))
@@ -91,12 +93,17 @@ def predict(
     valleys = {name: tuple(card.facts.get("valley_classes", ())) for name, card in maps.items()}
     calibration = Calibration.of_facts(recogniser.facts.get("calibration"))
     entropy = store.measure()[chosen]  # differs where the views do
+    of_size = sizes_say(store, chosen, recognisers, judge) if size else None
     if out.exists():
         there = Predictions.load(out)
         if (there.names, there.models) != (names, models) or not np.array_equal(there.depth_entropy, entropy):
             raise PredictionsError(f"{out}: was made from other objects or models; give another name or remove it")
-        if (there.valley_classes, there.calibration) != (valleys, calibration):
-            replace(there, valley_classes=valleys, calibration=calibration).save(out)
+        renewed = (valleys, calibration, None if of_size is None else of_size.tobytes())
+        known = (there.valley_classes, there.calibration, None if there.of_size is None else there.of_size.tobytes())
+        if renewed != known:
+            seen = there.by_shape()
+            logits = seen.logits if of_size is None else seen.logits + of_size[:, None]
+            replace(seen, logits=logits, of_size=of_size, valley_classes=valleys, calibration=calibration).save(out)
         yield len(names), len(names)
         return
 
@@ -128,8 +135,9 @@ def predict(
             total += 1
             yield total, n
 
+        seen_logits = np.array(arrays["logits"])
         Predictions(
-            np.array(arrays["logits"]),
+            seen_logits if of_size is None else seen_logits + of_size[:, None],
             {name: np.array(arrays[f"map_{name}"]) for name in windows},
             entropy,
             names,
@@ -142,8 +150,27 @@ def predict(
             valleys,
             calibration,
             np.array(arrays["sides"]) if sides else None,
+            of_size,
         ).save(out)
         shutil.rmtree(out.with_name(out.name + ".part"))
+
+
+def sizes_say(
+    store: ViewStore, chosen: NDArray[np.int64], recognisers: Sequence[Card], judge: NDArray[np.int64]
+) -> NDArray[np.float32] | None:
+    """What the sizes of the chosen objects say of their class to the recognisers that judge them, (N, C) float32.
+
+    None if no recogniser knows of sizes, or the store of none.
+    """
+    radii = store.radii[chosen]
+    found = [size_evidence(card) for card in recognisers]
+    if np.isnan(radii).all() or all(evidence is None for evidence in found):
+        return None
+    said = np.zeros((len(chosen), len(recognisers[0].facts["classes"])), np.float32)
+    for j, evidence in enumerate(found):
+        if evidence is not None:
+            said[judge == j] = evidence.logits(radii[judge == j])
+    return said
 
 
 def map_shapes(name: str, card: Card, sphere: ViewSphere) -> list[tuple[str, tuple[int, int]]]:

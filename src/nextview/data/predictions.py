@@ -43,6 +43,8 @@ class Predictions:
         calibration: how far the recogniser's card says that a sum of its logits is to be trusted.
         sides: what the recogniser says of the sides of the object, (N, V, C, sides) float32, see ``Evidence``; None if
             it cannot tell them.
+        of_size: what the size of the object has added to the logits of each of its views, (N, C) float32; None if the
+            recogniser knows nothing of sizes.
 
     Raises:
         PredictionsError: shapes that do not fit, nothing inside, or a number that is not finite.
@@ -61,6 +63,7 @@ class Predictions:
     valley_classes: dict[str, tuple[str, ...]]
     calibration: Calibration = PLAIN_SUM
     sides: NDArray[np.float32] | None = None
+    of_size: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         n, v, c = len(self.names), len(self.sphere), len(self.classes)
@@ -75,6 +78,8 @@ class Predictions:
             wanted[f"map {name}"], arrays[f"map {name}"] = (n, v, self.sphere.rings, columns), values
         if self.sides is not None:
             wanted["sides"], arrays["sides"] = (n, v, c, *self.sides.shape[-1:]), self.sides
+        if self.of_size is not None:
+            wanted["of_size"], arrays["of_size"] = (n, c), self.of_size
         for name, shape in wanted.items():
             if arrays[name].shape != shape:
                 raise PredictionsError(f"{name} of these predictions has the shape {arrays[name].shape}, not {shape}")
@@ -107,8 +112,14 @@ class Predictions:
         arrays = {name: getattr(self, name)[kept] for name in ("logits", "depth_entropy", "labels", "splits")}
         names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
         maps = {name: values[kept] for name, values in self.maps.items()}
-        sides = None if self.sides is None else self.sides[kept]
-        return replace(self, **arrays, names=names, maps=maps, conflicting=self.conflicting[kept], sides=sides)
+        said = {name: values[kept] for name in ("sides", "of_size") if (values := getattr(self, name)) is not None}
+        return replace(self, **arrays, **said, names=names, maps=maps, conflicting=self.conflicting[kept])
+
+    def by_shape(self) -> Predictions:
+        """What the recogniser says to those who do not know how large the objects are."""
+        if self.of_size is None:
+            return self
+        return replace(self, logits=self.logits - self.of_size[:, None], of_size=None)
 
     def save(self, path: Path) -> None:
         """Write one .npz file, aside and then renamed, so that it is whole or not there."""
@@ -131,6 +142,8 @@ class Predictions:
         arrays |= {f"valley/{name}": np.array(classes, np.str_) for name, classes in self.valley_classes.items()}
         if self.sides is not None:
             arrays["sides"] = self.sides
+        if self.of_size is not None:
+            arrays["of_size"] = self.of_size
         part = path.with_name(path.name + ".part.npz")
         np.savez_compressed(part, **arrays)
         os.replace(part, path)
@@ -170,6 +183,7 @@ class Predictions:
                 {name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
                 Calibration.of_facts(json.loads(str(f["calibration"])) if "calibration" in f else None),
                 f.get("sides"),
+                f.get("of_size"),
             )
         except KeyError as error:
             raise PredictionsError(f"{path}: {error.args[0]}") from None

@@ -50,7 +50,7 @@ class Deform:
         factors, angle = self.draw(seed, name)
         c, s = np.cos(angle), np.sin(angle)
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        return make_mesh((mesh.vertices * factors) @ turn.T, mesh.faces, mesh.name)
+        return make_mesh((mesh.vertices * mesh.radius * factors) @ turn.T, mesh.faces, mesh.name)
 
 
 def render_object(mesh: Mesh, sphere: ViewSphere, size: int) -> dict[str, np.ndarray]:
@@ -79,6 +79,7 @@ def render(
     seed: int = 0,
     deform: Deform | None = None,
     split: str | None = None,
+    unit: str | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[str, str | None]]:
@@ -94,6 +95,8 @@ def render(
         seed: decides the deformations.
         deform: how to make a new object of each mesh; not at all by default.
         split: only this split of the dataset.
+        unit: of length in the mesh files, one of ``mesh.UNITS``; None if it is not known. A store that was made without
+            one can be told later.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
 
@@ -113,7 +116,7 @@ def render(
             f"{farthest - 1:.2f} at most, not {sphere.distance:g}"
         )
     with only_one(path), writing(path):
-        store = _begin(path.absolute(), entries, sphere, size, seed, deform)
+        store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit)
         todo = [int(i) for i in np.flatnonzero(~store.done)]
         # Largest files first, so that no worker is left with a long one at the end.
         todo.sort(key=lambda i: -entries[i].path.stat().st_size)
@@ -145,13 +148,15 @@ def writing(path: Path) -> Iterator[None]:
         raise DatasetError(f"{path}: cannot be written ({reason}); what is done is kept, run again to go on") from None
 
 
-def _begin(path: Path, entries: list[Entry], sphere: ViewSphere, size: int, seed: int, deform: Deform) -> ViewStore:
+def _begin(
+    path: Path, entries: list[Entry], sphere: ViewSphere, size: int, seed: int, deform: Deform, unit: str | None
+) -> ViewStore:
     """The store as an earlier run left it, if that had the same meshes and settings, or a new one."""
     with ThreadPoolExecutor() as pool:
         hashes = list(pool.map(_file_hash, [e.path for e in entries]))
     recipe = {"seed": seed, "stretch": deform.stretch, "turn": deform.turn, "sha256": hashes}
     if not path.exists():
-        return ViewStore.create(path, entries, sphere, size, recipe)
+        return ViewStore.create(path, entries, sphere, size, recipe | {"unit": unit})
     store = ViewStore.open(path)
     wanted = {
         "names": [e.name for e in entries],
@@ -164,6 +169,11 @@ def _begin(path: Path, entries: list[Entry], sphere: ViewSphere, size: int, seed
     for key, value in wanted.items():
         if store.group.attrs.get(key, value) != value:
             raise DatasetError(f"{path}: was begun with other {key}; give another store or the same settings")
+    known = store.group.attrs.get("unit")
+    if unit not in (None, known):
+        if known is not None:
+            raise DatasetError(f"{path}: its meshes are measured in {known}, not {unit}")
+        store.group.attrs["unit"] = unit
     for name in RENDERED:
         store.array(name)  # says what is missing
     for leftover in path.rglob("*.partial"):  # what was being written when a run was killed
@@ -205,5 +215,6 @@ def _render_entry(
         return f"{entry.path}: too large for this machine's memory"
     for name, values in rendered.items():
         arrays[name][i] = values
+    arrays["radius"][i] = mesh.radius
     arrays["status"][i] = DONE  # last, so that an object counts only when it is whole
     return None

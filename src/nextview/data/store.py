@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from nextview.data.folders import DatasetError, Entry
+from nextview.mesh import UNITS
 from nextview.observation import POINTS, pinhole
 from nextview.viewsphere import ViewSphere
 
-FORMAT = 1
+FORMAT = 2
 DEPTH_UNIT = 1e-4
 """Depth is stored as uint16 in steps of this many object radii."""
 POINT_UNIT = 1 / 32767
 """Points are stored as int16 in steps of this many object radii."""
 PENDING, DONE, FAILED = 0, 1, 2
-RENDERED = ("image", "depth", "points", "measures/depth_entropy", "status")
+RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
 """The arrays that rendering makes; others are added later."""
 
 
@@ -31,7 +32,8 @@ class ViewStore:
 
     Arrays of the group, sharded by object (axis 0): ``image`` (N, V, S, S) uint8; ``depth`` (N, V, S, S) uint16 in
     DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object frame; ``measures/depth_entropy``
-    (N, V) float32, bits, and other measures alike; ``status`` (N,) uint8. Names, labels, splits, the SHA-256 of the
+    (N, V) float32, bits, and other measures alike; ``radius`` (N,) float64, of the object in the unit of its mesh file;
+    ``status`` (N,) uint8. Names, labels, splits, the SHA-256 of the
     mesh files, what was rendered how, and why meshes were left out are attributes. Chunks carry a checksum, so that a
     damaged one is noticed when it is read.
     """
@@ -64,6 +66,7 @@ class ViewStore:
         store.add("depth", (v, size, size), "uint16")
         store.add("points", (v, POINTS, 3), "int16")
         store.add("measures/depth_entropy", (v,), "float32")
+        store.add("radius", (), "float64", np.nan)
         store.add("status", (), "uint8")
         part.rename(path)
         return cls.open(path)
@@ -175,6 +178,14 @@ class ViewStore:
     def failures(self) -> dict[str, str]:
         """Why objects were left out, by name."""
         return self.group.attrs.get("failures", {})
+
+    @property
+    def radii(self) -> NDArray[np.float64]:
+        """Of the objects, metres, (N,) float64; NaN where it is not known."""
+        unit = self.group.attrs.get("unit")
+        if unit is None:
+            return np.full(len(self), np.nan)
+        return self.array("radius")[:] * UNITS[unit]
 
     @property
     def twins(self) -> list[list[int]]:

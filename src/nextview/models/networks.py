@@ -15,6 +15,7 @@ from nextview.models.card import Card, ModelError, find_card
 from nextview.models.cloud_input import cloud_input
 from nextview.models.geometry_input import geometry_input
 from nextview.models.image_input import image_input
+from nextview.models.size import SizeEvidence
 from nextview.observation import Observation
 from nextview.policies.base import Evidence, maps_among
 from nextview.recognition import Calibration
@@ -72,8 +73,21 @@ def see(observations: Sequence[Observation], sees: str, size: int) -> NDArray[An
     return geometry_input(np.stack([o.depth for o in observations]), poses, observations[0].intrinsics, size)
 
 
+def size_evidence(card: Card) -> SizeEvidence | None:
+    """What a recogniser's card says of sizes; None if nothing.
+
+    Raises:
+        ModelError: it makes no sense.
+    """
+    facts = card.facts.get("size")
+    try:
+        return None if facts is None else SizeEvidence.of_facts(facts, len(card.facts["classes"]))
+    except ValueError as error:
+        raise ModelError(f"{card.path.with_suffix('.json')}: {error}") from None
+
+
 class Recogniser:
-    """Names the object in each view.
+    """Names the object in each view, by what is seen and, where the camera knows it, by how large the object is.
 
     ``sides`` is how many sides of the object it tells apart, 0 if it was not taught to.
 
@@ -89,6 +103,7 @@ class Recogniser:
         self.classes: tuple[str, ...] = tuple(self.card.facts["classes"])
         self.sees = sight(self.card)
         self.sides: int = self.card.facts.get("sides", 0)
+        self._size = size_evidence(self.card)
         try:
             self.calibration = Calibration.of_facts(self.card.facts.get("calibration"))
         except ValueError as error:
@@ -97,10 +112,14 @@ class Recogniser:
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
         """What it says of B looks from one camera: calibrated logits, pooled features, and sides if it knows them."""
-        return self.from_inputs(see(observations, *self.sees))
+        said = self.from_inputs(see(observations, *self.sees))
+        if self._size is None:
+            return said
+        radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
+        return replace(said, logits=said.logits + self._size.logits(radii))
 
     def from_inputs(self, inputs: NDArray[Any]) -> Evidence:
-        """The same from what is seen, see ``see``."""
+        """The same by what is seen alone, see ``see``."""
         logits, features, *sides = self._session.run(
             ["logits", "features", *(["sides"] if self.sides else [])], {"input": inputs}
         )

@@ -157,6 +157,9 @@ def _recogniser(e: Evaluation, p: Predictions, figures: dict[str, Figure]) -> st
     for heading, before in (("mean of classes", "class_"), ("mean of objects", "")):
         cells = (cell(found[looks, "", before + measure]) for looks, measure in columns)
         rows.append([heading, f"{len(p):,}", *cells])
+        if p.of_size is not None:
+            one, fused = (cell(found[looks, "", f"{before}shape_accuracy"]) for looks in (1, v))
+            rows.append([f"{heading}<small>size of the objects not known</small>", f"{len(p):,}", one, "", fused, ""])
     head = ["class", "objects", "one view", "without duplicates", f"all {v} views fused", "without duplicates"]
     published = published_recognisers(p.classes, v)
     beside = ""
