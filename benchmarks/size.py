@@ -1,10 +1,11 @@
 """What it is worth to know how large the object is: a depth camera tells, a mesh of radius 1 does not.
 
-    python benchmarks/size.py PREDICTIONS.npz
+    python benchmarks/size.py PREDICTIONS.npz [--figure SIZES.png] [--card CARD.json]
 
-prints Markdown. The predictions come from a store that knows the unit of its meshes (nextview render --unit) and a
-recogniser that was told what sizes mean (nextview fit size). Views are fused in a random order and all its rotations,
-the same with the size and without. In brackets: class means, and 95 % bootstrap intervals over objects.
+prints Markdown, and draws what the bundled recogniser, or that of the card, knows of sizes. The predictions come from a
+store that knows the unit of its meshes (nextview render --unit) and a recogniser that was told what sizes mean (fit
+size). Views are fused in a random order and all its rotations, the same with the size and without. In brackets: class
+means, and 95 % bootstrap intervals over objects.
 """
 
 from __future__ import annotations
@@ -13,11 +14,18 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import matplotlib
 import numpy as np
+import tyro
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from nextview.benchmark.statistics import interval, ratio, resample
 from nextview.data.predictions import Predictions
+from nextview.models.card import find_card
+from nextview.models.networks import RECOGNISER, size_evidence
+from nextview.models.size import SizeEvidence
+from nextview.report.style import INK, STYLE, new_figure, to_png
 
 LOOKS = (1, 2, 3, 5, 8, 15, 40)
 
@@ -58,8 +66,39 @@ def lines(p: Predictions, samples: int = 2000) -> Iterator[str]:
         yield f"| {name} | {before.mean():.3f} | {after.mean():.3f} | {difference(before, after, drawn)} |"
 
 
-def main(path: Path) -> None:
-    """Print the tables."""
+def sizes_figure(evidence: SizeEvidence, classes: tuple[str, ...]) -> Figure:
+    """The density of each class over the radius, one above the other, the smaller ones on top."""
+    density = np.exp(evidence.log_density)
+    order = np.argsort((density * np.log(evidence.radii)).sum(1) / density.sum(1))[::-1]
+    with matplotlib.rc_context(STYLE):
+        figure, axes = new_figure(6.4, 3.8)
+        for row, c in enumerate(order):
+            top = row + 1.6 * density[c] / density.max()
+            axes.fill_between(evidence.radii, row, top, color=f"C{c}", alpha=0.75, linewidth=0, zorder=30 - row)
+            axes.plot(evidence.radii, top, color=INK, linewidth=0.8, zorder=30 - row)
+        axes.set_xscale("log")
+        axes.set_xlim(0.08, 8)
+        axes.set_xticks([0.1, 0.2, 0.5, 1, 2, 5], ["0.1", "0.2", "0.5", "1", "2", "5"])
+        axes.minorticks_off()
+        axes.set_yticks(range(len(order)), [classes[c].replace("_", " ") for c in order])
+        axes.set_xlabel("object radius, metres")
+    return figure
+
+
+def main(path: Path, figure: Path | None = None, card: str = RECOGNISER) -> None:
+    """Print the tables.
+
+    Args:
+        path: predictions of a store that knows the unit of its meshes.
+        figure: where to draw what the recogniser knows of sizes.
+        card: of which recogniser, for the figure.
+    """
+    if figure is not None:
+        known = find_card(card)
+        evidence = size_evidence(known)
+        if evidence is None:
+            raise ValueError(f"{card}: knows nothing of sizes; see nextview fit size")
+        to_png(sizes_figure(evidence, tuple(known.facts["classes"])), figure)
     p = Predictions.load(path)
     if p.of_size is None:
         raise ValueError(f"{path}: nothing is said of sizes; see nextview render --unit and nextview fit size")
@@ -69,7 +108,6 @@ def main(path: Path) -> None:
 
 if __name__ == "__main__":
     try:
-        main(*map(Path, sys.argv[1:]))
-    except (ValueError, TypeError) as error:
-        print(f"size.py: {error}", file=sys.stderr)
-        sys.exit(2)
+        tyro.cli(main, config=(tyro.conf.PositionalRequiredArgs,))
+    except ValueError as error:
+        sys.exit(f"size.py: {error}")

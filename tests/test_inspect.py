@@ -5,11 +5,12 @@ import pytest
 import trimesh
 
 from nextview.cli.inspect import inspect
+from nextview.cli.main import main
 from nextview.data.folders import DatasetError
 from nextview.data.measure import measure
 from nextview.data.render import render
 from nextview.data.store import ViewStore
-from nextview.report.store_figures import disk_use, object_figure, store_figure, summary
+from nextview.report.store_figures import disk_use, median_radii, object_figure, store_figure, summary
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("40")
@@ -37,6 +38,17 @@ def test_summary_counts(views):
     assert sum(disk_use(ViewStore.open(views)).values()) == sum(
         p.stat().st_size for p in views.rglob("*") if p.is_file()
     )
+
+
+def test_sizes_are_told_where_the_unit_is_known(views, tmp_path, capsys):
+    store = ViewStore.open(views)
+    assert median_radii(store) == {}
+    store.group.attrs["unit"] = "cm"
+    boxes = [np.sqrt(1 + 4 + (3 + i) ** 2) / 2 / 100 for i in (0, 1, 2)]
+    assert median_radii(store) == {"ball": pytest.approx(0.01), "box": pytest.approx(boxes[1])}
+    main(["inspect", str(views), str(tmp_path / "views.png")])
+    assert "median radius, m       ball 0.01, box 0.02" in capsys.readouterr().err
+    del store.group.attrs["unit"]
 
 
 def test_bars_are_as_long_as_the_classes(views):

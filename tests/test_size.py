@@ -59,6 +59,9 @@ def test_a_density_is_that_of_its_class_and_a_share_of_anything():
     wanted = 0.95 * norm.pdf(np.log(RADII[near]), np.log(0.1), np.hypot(0.1, 0.1 * 500**-0.2))
     assert np.exp(found[0, near]) == pytest.approx(wanted, rel=0.15)
     assert np.exp(found[1, near]) == pytest.approx(ANY_SIZE / span)
+    strays = np.concatenate([radii[:500], np.full(20, 15.0)])  # drawn in another unit
+    blurred = densities(strays, np.repeat(0, 520), 1)[0, near]
+    assert np.exp(blurred) == pytest.approx(wanted * 500 / 520, rel=0.15)
     with pytest.raises(ValueError, match="objects of several sizes"):
         densities(radii[:3], np.array([0, 0, 1]), 2)
 

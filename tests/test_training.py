@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -203,6 +205,44 @@ def test_map_batches_hold_each_view_with_its_own_map():
     assert len(set(drawn)) == 16  # no view comes twice before all have come
     assert {o for o, _ in drawn} == {1, 2, 5}
     assert 0 < sum(flips) < 16
+
+
+@pytest.mark.parametrize("kind", ["geometry", "cloud"])
+@pytest.mark.parametrize("training", [True, False])
+def test_devices_share_every_batch_of_maps(kind, training):
+    sphere, rng = ViewSphere.named("40"), np.random.default_rng(0)
+    shape = (1024, 3) if kind == "cloud" else (4, 2, 2)
+    seen = rng.integers(0, 255, (5, 40, *shape)).astype(np.int16 if kind == "cloud" else np.uint8)
+    values, recipe = rng.random((5, 40)).astype(np.float32), MapRecipe(input=kind, views=8, batch=6)
+
+    def windows(share):
+        made = Windows(seen, values, sphere, np.arange(5), recipe, training)
+        made.share = share
+        return made
+
+    whole, parts = windows(slice(None)), [windows(slice(rank, None, 2)) for rank in range(2)]
+    for found, (a, of_a), (b, of_b) in zip(whole, *parts, strict=True):
+        assert len(a) == len(b) == 3
+        assert torch.equal(torch.stack([a, b], 1).flatten(0, 1), found[0])
+        assert torch.equal(torch.stack([of_a, of_b], 1).flatten(0, 1), found[1])
+
+
+def test_two_devices_train_one_map_network(trained, tmp_path):
+    """As Lightning starts them; each is a process of its own."""
+    run = tmp_path / "run"
+    command = [sys.executable, "-m", "nextview.cli.main", "train", "lem", str(trained / "views.zarr"), str(run)]
+    command += ["--epochs", "2", "--views", "4", "--batch", "8", "--validation", "0.25", "--size", "28"]
+    command += ["--devices", "2", "--accelerator", "cpu", "--precision", "32-true"]
+    done = subprocess.run(
+        command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert "MEMBER: 2/2" in done.stderr
+    assert (run / "network.pt").exists()
+    state = torch.load(run / "last.ckpt", weights_only=True)
+    training, _ = split.split_training(ViewStore.open(trained / "views.zarr"), 0.25, 0)
+    assert state["global_step"] == 2 * (len(training) * 4 // 8)  # the batch is that of both together
+    assert len((run / "log/metrics.csv").read_text().splitlines()) == 3
 
 
 def within_one_cell(at, other):

@@ -20,7 +20,7 @@ def inspect(
     from nextview.cli.progress import console
     from nextview.data.folders import DatasetError
     from nextview.data.store import ViewStore
-    from nextview.report.store_figures import object_figure, save, store_figure, summary
+    from nextview.report.store_figures import median_radii, object_figure, save, store_figure, summary
 
     views = ViewStore.open(store)
     out = out or Path(f"{object or store.resolve().stem}.png")
@@ -37,6 +37,10 @@ def inspect(
     else:
         for what, value in summary(views).items():
             console.print(f"{what:22} {value}", highlight=False)
+        sizes = median_radii(views)
+        if sizes:
+            said = ", ".join(f"{name} {radius:.2f}" for name, radius in sizes.items())
+            console.print(f"{'median radius, m':22} {said}", highlight=False, soft_wrap=True)
         for reason in views.failures.values():
             console.print(f"left out: {reason}", style="yellow", highlight=False)
         save(store_figure(views), out)

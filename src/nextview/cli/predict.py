@@ -16,7 +16,7 @@ def predict(
     recogniser: tuple[str, ...] = (),
     unseen: bool = False,
     maps: tuple[str, ...] = ("lem", "lcm"),
-    size: bool = True,
+    by_shape: bool = False,
     batch: int = 8,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -31,8 +31,8 @@ def predict(
         unseen: let each object be judged by a recogniser that has not seen it in training (nextview train recogniser
             --folds makes such), and leave out those that all have seen.
         maps: maps to predict with the bundled networks, or NAME=CARD for others.
-        size: let the recogniser know how large the objects are, where the store knows it (nextview render --unit) and
-            its card says what that means (nextview fit size).
+        by_shape: keep from the recogniser how large the objects are. Else it is told where the store knows it (nextview
+            render --unit), if its card says what sizes mean (nextview fit size).
         batch: views a call of the networks.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler, to use its workers instead.
@@ -54,6 +54,6 @@ def predict(
             raise ModelError(f"no bundled network predicts the map {name!r}; there are {', '.join(MAPS)}")
         cards[name] = find_card(card or MAPS[name])
     judges = [find_card(r) for r in recogniser or (RECOGNISER,)]
-    steps = job.predict(store, out, judges, cards, split, unseen, size, batch, workers, scheduler)
+    steps = job.predict(store, out, judges, cards, split, unseen, not by_shape, batch, workers, scheduler)
     before, total = next(steps)
     track((done for done, _ in steps), total, f"predicting {store.name}", before, len(ViewStore.open(store).sphere))

@@ -175,8 +175,9 @@ def train_lcm(
 
     Args:
         store: view store made by nextview render, with the 40 views.
-        predictions: of its training split, from recognisers that have not seen the objects (nextview train recogniser
-            --folds, export each, nextview predict --unseen --recogniser CARD CARD).
+        predictions: of its training split, by the recogniser whose confidence is to be predicted; or from recognisers
+            that have not seen the objects (nextview train recogniser --folds, export each, nextview predict --unseen
+            --recogniser CARD CARD).
         out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the lowest squared error.
         weights: card of a recogniser (NAME.json) of the same depth and input, from which a ResNet starts: what it knows
             of shapes and of the side that is seen is of use.

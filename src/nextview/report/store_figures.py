@@ -166,6 +166,13 @@ def summary(store: ViewStore) -> dict[str, str]:
     return facts
 
 
+def median_radii(store: ViewStore) -> dict[str, float]:
+    """Of the objects of each class, metres; empty where the unit of the meshes is not known."""
+    radii, labels = store.radii, store.labels
+    known = store.done & np.isfinite(radii)
+    return {store.classes[c]: float(np.median(radii[known & (labels == c)])) for c in np.unique(labels[known])}
+
+
 def disk_use(store: ViewStore) -> dict[str, int]:
     """Bytes of the files of each array or group of a store, and of its attributes."""
     sizes = {}

@@ -38,9 +38,8 @@ def entropy_target(store: ViewStore) -> Target:
 def confidence_target(store: ViewStore, predictions: Predictions) -> Target:
     """The recogniser's confidence where it is right: the LCM's.
 
-    Let the predictions come from recognisers that have not seen the objects (nextview train recogniser --folds): a
-    network is too sure of what it was trained on. Objects without predictions, and those that are right from no view,
-    have no values.
+    A recogniser is too sure of what it was trained on, and another one prefers other views: validate on objects that
+    the recogniser of use has not seen. Objects without predictions, and those right from no view, have no values.
 
     Raises:
         PredictionsError: the predictions are of none of the store's objects, or of other views.
