@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +9,8 @@ from scipy.special import softmax
 from scipy.stats import bootstrap
 from test_predictions import some_predictions
 
-from nextview.benchmark.evaluate import EvaluationError, evaluate, fused_views, scores_for_card, yardsticks
+from nextview.benchmark.evaluate import EvaluationError, evaluate, fused_views, yardsticks
 from nextview.benchmark.published import published_map, published_recognisers, read_table
-from nextview.models.card import Card
 from nextview.recognition import Calibration
 from nextview.viewsphere import ViewSphere
 
@@ -100,10 +98,6 @@ def test_what_is_right_without_knowing_the_size_stands_beside():
         assert score(known, **here, measure=f"{before}shape_accuracy").value == row.value
         assert score(known, **here, measure=row.measure).value == 1
     assert "shape_accuracy" not in set(shape["measure"])
-    card = Card("r", "recogniser", Path("r.onnx"), "0" * 64, {})
-    of_shape = scores_for_card(card, p)
-    assert scores_for_card(card, sized)["by_shape"] == of_shape
-    assert of_shape["single_view"]["instance"] == 0.5
 
 
 def test_confusion_and_calibration_by_hand():

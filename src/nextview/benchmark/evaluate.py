@@ -275,8 +275,7 @@ def scores_for_card(card: Card, p: Predictions) -> dict[str, Any]:
     if p.models.get(card.kind) != (card.name, card.sha256):
         raise EvaluationError(f"these predictions were not made by model {card.name}")
     if card.kind == "recogniser":
-        scores = recogniser_scores(p.logits, p.labels)
-        return scores if p.of_size is None else scores | {"by_shape": recogniser_scores(p.by_shape().logits, p.labels)}
+        return recogniser_scores(p.logits, p.labels)
     kept = judged_objects(p, card.kind)
     if card.kind not in TRUTHS or len(kept) == 0:
         raise EvaluationError(f"these predictions hold no object by which model {card.name} can be judged")

@@ -55,7 +55,8 @@ def evaluate(
     noted = {}
     for name in cards:
         card = find_card(name)
-        of = f"{split or table.splits[0] or 'all'} ({len(table)} objects)"
+        known = "" if table.of_size is None else ", of known size"
+        of = f"{split or table.splits[0] or 'all'} ({len(table)} objects{known})"
         noted[card.path] = card.facts | {
             "scores": card.facts.get("scores", {}) | {of: judge.scores_for_card(card, table)}
         }

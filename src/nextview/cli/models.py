@@ -26,9 +26,11 @@ def models(name: tyro.conf.Positional[str | None] = None, /) -> None:
     for card in bundled_cards().values():
         tested = []
         for split, scores in card.facts["scores"].items():
+            if split.startswith("test"):
+                tested.append(split)
             for score, value in scores.items() if split.startswith("test") else ():
-                value = f"{value['instance']}\n  class mean {value['class']}" if isinstance(value, dict) else value
-                tested.append(f"{score.replace('_', ' ')} {value}")
+                value = f"{value['instance']}\n    class mean {value['class']}" if isinstance(value, dict) else value
+                tested.append(f"  {score.replace('_', ' ')} {value}")
         intact = "intact" if file_hash(card.path) == card.sha256 else "DAMAGED"
         size = f"{card.path.stat().st_size / 1e6:.1f}"
         table.add_row(card.name, card.kind, size, "\n".join(tested), intact)
