@@ -203,7 +203,9 @@ def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(t
     assert lem["test (30 objects)"].keys() >= {"mse", "regret"}
     sized = replace(p, models=models, splits=np.full(30, "test"), of_size=np.zeros((30, 3), np.float32))
     sized.save(tmp_path / "sized.npz")
-    main(["evaluate", str(tmp_path / "sized.npz"), "--out", str(tmp_path / "o"), "--samples", "50", "--cards", cards[0]])
+    main(
+        ["evaluate", str(tmp_path / "sized.npz"), "--out", str(tmp_path / "o"), "--samples", "50", "--cards", cards[0]]
+    )
     scores = json.loads(Path(cards[0]).read_text())["scores"]
     assert scores["test (30 objects, of known size)"] == scores["test (30 objects)"] == net["test (30 objects)"]
     assert capsys.readouterr().out.count("size not known") == 1

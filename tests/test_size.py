@@ -82,8 +82,12 @@ def test_the_weight_is_the_most_likely_one():
     shape = rng.normal(np.where(labels == 0, 1, -1), np.sqrt(2))  # log-odds of the first class
     logits = np.stack([shape, np.zeros(n)], 1)[:, None].astype(np.float32)
     data = FittingSet(logits, labels, SPHERE, ("a", "b"))
-    assert fit_weight(data, np.exp(logs), density).weight == pytest.approx(1, abs=0.15)
-    assert fit_weight(data, np.exp(rng.permutation(logs)), density).weight == pytest.approx(0, abs=0.1)
+    evidence, before, after = fit_weight(data, np.exp(logs), density)
+    assert evidence.weight == pytest.approx(1, abs=0.15)
+    alone = np.log1p(np.exp(np.where(labels == 0, -shape, shape)))
+    assert before == pytest.approx(np.mean([alone[labels == c].mean() for c in (0, 1)]), rel=1e-4)
+    assert after < before - 0.1
+    assert fit_weight(data, np.exp(rng.permutation(logs)), density)[0].weight == pytest.approx(0, abs=0.1)
 
 
 def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):

@@ -101,10 +101,13 @@ def fit_size(
     taught = np.setdiff1d(np.flatnonzero(of_training), judged)
     classes = np.array([table.classes.index(name) if name in table.classes else -1 for name in views.classes])
     log_density = densities(radii[taught], classes[labels[taught]], len(table.classes))
-    found = fit_weight(data, radii[judged], log_density)
+    found, before, after = fit_weight(data, radii[judged], log_density)
     told = {"learned_from": f"{len(taught)} objects of the training split", "weighed_on": f"{len(data)} others"}
     write_card(card, model.facts | {"size": found.facts() | told})
-    console.print(f"sizes of {len(taught)} objects; weight by {len(data)} others: {found.weight:.2f}")
+    console.print(
+        f"sizes of {len(taught)} objects; by {len(data)} others, weight beside the logits {found.weight:.2f}; negative "
+        f"log-likelihood of single looks {before:.3f} by shape alone, {after:.3f} with the size"
+    )
 
 
 def fit_valleys(

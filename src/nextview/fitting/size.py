@@ -47,13 +47,17 @@ def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
     return found
 
 
-def fit_weight(data: FittingSet, radii: Float, log_density: Float) -> SizeEvidence:
+def fit_weight(data: FittingSet, radii: Float, log_density: Float) -> tuple[SizeEvidence, float, float]:
     """The weight beside the logits that is most likely, over single looks, at the temperature most likely with it.
 
     Args:
         data: what the recogniser says by shape alone.
         radii: of the objects, metres, (N,).
         log_density: see ``densities``.
+
+    Returns:
+        The evidence, and the mean negative log-likelihood of single looks by shape alone and with it, classes weighted
+        evenly.
     """
     of_size = SizeEvidence(RADII, log_density, 1.0).logits(radii)[:, None]
 
@@ -63,4 +67,4 @@ def fit_weight(data: FittingSet, radii: Float, log_density: Float) -> SizeEviden
         return -float(np.average(of_true_class(logs, data.labels).mean(1), weights=data.weights))
 
     found = minimize(loss, np.ones(2), method="L-BFGS-B", bounds=[(0.01, 100.0), (0.0, 10.0)])
-    return SizeEvidence(RADII, log_density, float(found.x[1]))
+    return SizeEvidence(RADII, log_density, float(found.x[1])), loss(np.array([1.0, 0.0])), float(found.fun)
