@@ -56,7 +56,7 @@ COMMANDS: dict[str, Any] = {
 GROUPS = {
     "train": "Train a network on a view store.",
     "export": "Turn a training run into an ONNX model with a card.",
-    "fit": "Fit a recogniser's calibration, a map's valleys or simple policies to predictions.",
+    "fit": "Fit what sizes mean, a recogniser's calibration, a map's valleys or simple policies to predictions.",
 }
 
 
