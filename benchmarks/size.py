@@ -20,6 +20,7 @@ import tyro
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from nextview.benchmark.evaluate import fused_views
 from nextview.benchmark.statistics import interval, ratio, resample
 from nextview.data.predictions import Predictions
 from nextview.models.card import find_card
@@ -28,14 +29,6 @@ from nextview.models.size import SizeEvidence
 from nextview.report.style import INK, STYLE, new_figure, to_png
 
 LOOKS = (1, 2, 3, 5, 8, 15, 40)
-
-
-def right(p: Predictions, looks: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Whether the answer is right after so many looks in a random order from each of its places on, (N, V)."""
-    order = rng.permuted(np.tile(np.arange(len(p.sphere)), (len(p), 1)), axis=1)
-    said = np.take_along_axis(p.said, order[:, :, None], 1).astype(np.float64)
-    total = sum((np.roll(said, -k, 1) for k in range(1, looks)), said)
-    return p.calibration.log_belief(total, looks, len(p.classes)).argmax(2) == p.labels[:, None]
 
 
 def difference(before: NDArray[np.float64], after: NDArray[np.float64], weights: NDArray[np.float64]) -> str:
@@ -51,16 +44,18 @@ def lines(p: Predictions, samples: int = 2000) -> Iterator[str]:
     there = np.unique(p.labels)
     yield "| looks | by shape alone (class mean) | size known | difference, points |"
     yield "|---|---|---|---|"
-    of_one = []
+    fused = [
+        fused_views(x.said, x.labels, x.calibration, np.random.default_rng(0), len(x.classes))[0].mean(2)
+        for x in (p.by_shape(), p)
+    ]
     for k in [k for k in LOOKS if k <= len(p.sphere)]:
-        both = [right(x, k, np.random.default_rng(0)).mean(1) for x in (p.by_shape(), p)]
-        of_one = of_one or both
+        both = [r[k - 1] for r in fused]
         cells = [f"{r.mean():.3f} ({np.mean([r[p.labels == c].mean() for c in there]):.3f})" for r in both]
         yield f"| {k} | {cells[0]} | {cells[1]} | {difference(*both, weights)} |"
     yield "\n| class, one look | by shape alone | size known | difference, points |"
     yield "|---|---|---|---|"
     for c in there:
-        before, after = (r[p.labels == c] for r in of_one)
+        before, after = (r[0, p.labels == c] for r in fused)
         drawn = resample(len(before), samples, np.random.default_rng(1))
         name = p.classes[c].replace("_", " ")
         yield f"| {name} | {before.mean():.3f} | {after.mean():.3f} | {difference(before, after, drawn)} |"
