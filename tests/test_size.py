@@ -140,6 +140,13 @@ def test_a_stretched_mesh_keeps_its_size(shop, tmp_path):
     assert mesh.radius / 1.5 < Deform(0.5)(mesh, 0, "big_7").radius < mesh.radius * 1.5
 
 
+@pytest.mark.parametrize("radius", [0.0, -1.0, np.nan, np.inf])
+def test_a_radius_is_a_positive_number(shop, radius):
+    look = SimulatedCamera(load_mesh(shop / "meshes/big/test/big_7.off"), 32).observe(SPHERE.poses[0])
+    with pytest.raises(ValueError, match="a positive number of metres, or None"):
+        replace(look, radius=radius)
+
+
 def test_a_unit_is_one_of_a_few(shop):
     with pytest.raises(MeshError, match="the unit is one of mm, cm, inch, foot, m, not 'mile'"):
         load_mesh(shop / "meshes/big/test/big_7.off", unit="mile")

@@ -27,6 +27,9 @@ class Observation:
         intrinsics: pinhole matrix, (3, 3) float64, pixels; pixel (row, column) has its centre at
             (column + 0.5, row + 0.5).
         radius: the object radius, metres: what positions were divided by. None if the camera does not know its scale.
+
+    Raises:
+        ValueError: a radius that is not a positive number.
     """
 
     image: NDArray[np.uint8]
@@ -37,6 +40,8 @@ class Observation:
     radius: float | None = None
 
     def __post_init__(self) -> None:
+        if self.radius is not None and not 0 < self.radius < np.inf:
+            raise ValueError(f"the object radius is a positive number of metres, or None, not {self.radius}")
         object.__setattr__(self, "depth", object_depth(self.depth))
 
 
