@@ -66,8 +66,7 @@ def fit_size(
 ) -> None:
     """Tell a recogniser how large the objects of each class are, for stores and cameras that know it.
 
-    It goes into its card; nextview predict takes it into predictions made before, without predicting again. Calibrate
-    afterwards.
+    It goes into its card; nextview predict takes it into predictions made before, without predicting again.
 
     Args:
         store: view store that knows the unit of its meshes (nextview render --unit); its training objects teach, except
