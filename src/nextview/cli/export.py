@@ -31,7 +31,7 @@ def export_recogniser(
     merged: bool = False,
     mirror: bool = False,
     bits: Literal[8, 16] = 16,
-    name: str = "resnet18-modelnet10",
+    name: str | None = None,
     commands: tuple[str, ...] = (),
     note: str = "",
 ) -> None:
@@ -45,7 +45,7 @@ def export_recogniser(
         merged: average their weights instead, into one network; for runs that went on from one another (--weights).
         mirror: average what the networks say of a view and of its mirror image.
         bits: that a weight takes in the file.
-        name: what to call the model.
+        name: what to call the model; resnetDEPTH-modelnet10 by default.
         commands: the commands that made the run, for the card.
         note: what else the card should say.
     """
@@ -95,6 +95,7 @@ def export_recogniser(
         names = [f"{names[0]}, the mean of {len(runs)} runs"]
 
     out.mkdir(parents=True, exist_ok=True)
+    name = name or f"resnet{recipes[0].depth}-modelnet10"
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
     facts: dict[str, Any] = {
         "name": name,
