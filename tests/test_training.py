@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -343,6 +344,21 @@ def test_a_recogniser_of_images_sees_images_live_and_in_predictions(trained):
     with pytest.raises(SystemExit) as mixed:
         main(mixture)
     assert mixed.value.code == 2
+
+
+def test_what_is_no_finished_run_is_not_exported(trained, tmp_path, capsys):
+    def refused(kind, run):
+        with pytest.raises(SystemExit) as stop:
+            main(["export", kind, str(run), str(trained / "views.zarr"), str(tmp_path / "models")])
+        assert stop.value.code == 2
+        return capsys.readouterr().err
+
+    assert "holds no training run" in refused("lem", tmp_path)
+    assert "holds no training run" in refused("recogniser", tmp_path / "nowhere")
+    assert "not a recipe of such a network" in refused("recogniser", trained / "runs/lem")
+    shutil.copy(trained / "runs/lem/recipe.json", tmp_path)
+    assert "the training is not done" in refused("lem", tmp_path)
+    assert not (tmp_path / "models").exists()
 
 
 def test_several_networks_are_exported_as_their_mean(trained):

@@ -65,11 +65,12 @@ def export_recogniser(
     from nextview.training.networks import ResNet
     from nextview.training.recipes import RecogniserRecipe
     from nextview.training.recogniser import drawn_views
+    from nextview.training.runs import read_recipe
 
     if merged and not also:
         raise ModelError("--merged averages the weights of several runs: name the others with --also")
     runs = (run, *also)
-    recipes = [RecogniserRecipe(**json.loads((r / "recipe.json").read_text())) for r in runs]
+    recipes = [read_recipe(r, RecogniserRecipe) for r in runs]
     views = ViewStore.open(store)
     size, sees = recipes[0].size, recipes[0].input
     if {(r.size, r.input) for r in recipes} != {(size, sees)}:
@@ -233,8 +234,9 @@ def _export_map(
     from nextview.training.export import ShippedMap, answer, export_onnx, load_weights
     from nextview.training.networks import map_network
     from nextview.training.recipes import MapRecipe
+    from nextview.training.runs import read_recipe
 
-    recipe = MapRecipe(**json.loads((run / "recipe.json").read_text()))
+    recipe = read_recipe(run, MapRecipe)
     views = ViewStore.open(store)
     sphere = views.sphere
     training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
@@ -16,6 +16,8 @@ from torch import nn
 from nextview.data.lock import only_one
 from nextview.models.card import ModelError, file_hash, find_card
 from nextview.training.fit import is_first
+
+Recipe = TypeVar("Recipe")
 
 
 @contextmanager
@@ -48,6 +50,24 @@ def begin(run: Path, recipe: Any, weights: Path | None = None) -> Iterator[None]
 def is_done(run: Path) -> bool:
     """Whether a run has its network."""
     return (run / "network.pt").exists()
+
+
+def read_recipe(run: Path, kind: type[Recipe]) -> Recipe:
+    """The recipe of a run that is done.
+
+    Raises:
+        ModelError: there is no such run, it is of another kind of network, or not done.
+    """
+    noted = run / "recipe.json"
+    if not noted.exists():
+        raise ModelError(f"{run}: holds no training run")
+    try:
+        recipe = kind(**json.loads(noted.read_text()))
+    except (ValueError, TypeError) as error:
+        raise ModelError(f"{noted}: not a recipe of such a network ({error})") from None
+    if not is_done(run):
+        raise ModelError(f"{run}: the training is not done; give its command again to go on")
+    return recipe
 
 
 def finish(network: nn.Module, run: Path) -> None:
