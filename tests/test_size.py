@@ -4,6 +4,7 @@ import json
 import runpy
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from tiny_models import make_recogniser
 
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.cli.main import main
+from nextview.cli.recognise import Unit
 from nextview.data.folders import DatasetError
 from nextview.data.predict import predict
 from nextview.data.predictions import Predictions, PredictionsError
@@ -21,7 +23,7 @@ from nextview.data.render import Deform, render
 from nextview.data.store import ViewStore
 from nextview.fitting.evidence import FittingSet
 from nextview.fitting.size import ANY_SIZE, RADII, densities, fit_weight
-from nextview.mesh import MeshError, load_mesh
+from nextview.mesh import UNITS, MeshError, load_mesh
 from nextview.models.card import ModelError, read_card
 from nextview.models.networks import Recogniser
 from nextview.models.size import SizeEvidence
@@ -148,6 +150,7 @@ def test_a_radius_is_a_positive_number(shop, radius):
 
 
 def test_a_unit_is_one_of_a_few(shop):
+    assert get_args(Unit) == tuple(UNITS)
     with pytest.raises(MeshError, match="the unit is one of mm, cm, inch, foot, m, not 'mile'"):
         load_mesh(shop / "meshes/big/test/big_7.off", unit="mile")
 

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from nextview.cli.timing import Stopwatch
     from nextview.mesh import Mesh
 
+Unit = Literal["mm", "cm", "inch", "foot", "m"]
+"""The keys of ``mesh.UNITS``, without the time that it takes to import them."""
+
 
 def recognise(
     mesh: tyro.conf.Positional[Path],
@@ -22,7 +25,7 @@ def recognise(
     max_views: int = 5,
     start: int | None = None,
     up: Literal["y", "z"] | None = None,
-    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None,
+    unit: Unit | None = None,
     seed: int = 0,
     figure: Path | None = None,
     json: bool = False,

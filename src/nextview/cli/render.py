@@ -7,6 +7,8 @@ from typing import Literal
 
 import tyro
 
+from nextview.cli.recognise import Unit
+
 
 def render(
     dataset: tyro.conf.Positional[Path],
@@ -18,7 +20,7 @@ def render(
     split: Literal["train", "test"] | None = None,
     stretch: float = 0.0,
     turn: bool = False,
-    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None,
+    unit: Unit | None = None,
     seed: int = 0,
     workers: int | None = None,
     scheduler: str | None = None,

@@ -33,9 +33,9 @@ class ViewStore:
     Arrays of the group, sharded by object (axis 0): ``image`` (N, V, S, S) uint8; ``depth`` (N, V, S, S) uint16 in
     DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object frame; ``measures/depth_entropy``
     (N, V) float32, bits, and other measures alike; ``radius`` (N,) float64, of the object in the unit of its mesh file;
-    ``status`` (N,) uint8. Names, labels, splits, the SHA-256 of the
-    mesh files, what was rendered how, and why meshes were left out are attributes. Chunks carry a checksum, so that a
-    damaged one is noticed when it is read.
+    ``status`` (N,) uint8. Names, labels, splits, the SHA-256 of the mesh files and their unit, what was rendered how,
+    and why meshes were left out are attributes. Chunks carry a checksum, so that a damaged one is noticed when it is
+    read.
     """
 
     path: Path
