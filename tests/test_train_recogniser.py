@@ -76,6 +76,12 @@ def test_the_published_recipe_sees_every_view_once_an_epoch_in_a_new_order():
     assert (labels == np.array(second) // V % 2).all()
 
 
+def test_networks_to_be_averaged_draw_apart():
+    first, again, other = (drawn(views_of(RecogniserRecipe(member=k, batch=5))) for k in (0, 0, 1))
+    assert first == again
+    assert first != other
+
+
 def test_balanced_draws_even_out_the_classes():
     labels = np.repeat([0, 1], [90, 10])
     inputs = np.zeros((100, V, 1, 1, 1), np.uint8)
@@ -106,6 +112,29 @@ def test_devices_share_every_batch(balanced):
     for (images, labels), (a, la), (b, lb) in zip(whole, *parts, strict=True):
         assert torch.equal(torch.stack([a, b], 1).flatten(0, 1), images)
         assert torch.equal(torch.stack([la, lb], 1).flatten(), labels)
+
+
+def test_the_disk_is_asked_for_the_views_that_come(tmp_path, monkeypatch):
+    inputs = np.random.default_rng(0).integers(0, 256, (6, V, 4, 16, 16), dtype=np.uint8)
+    np.save(tmp_path / "inputs.npy", inputs)
+    mapped = np.load(tmp_path / "inputs.npy", mmap_mode="r")
+    file, asked = (tmp_path / "inputs.npy").read_bytes(), []
+
+    def note(_file, start, length, _advice):
+        asked.append(file[start : start + length])
+
+    monkeypatch.setattr(os, "posix_fadvise", note)
+    recipe = RecogniserRecipe(views=V, batch=5)
+    batches = Views([Source(mapped, np.arange(6))], np.arange(6), np.arange(6) % 2, recipe)
+    came = 0
+    for images, _ in batches:
+        came += len(images)
+        assert {image.numpy().tobytes() for image in images} <= set(asked)
+    assert came == len(asked) == 6 * V
+    asked.clear()
+    objects = [images.numpy().tobytes() for images, _ in ValidationViews(mapped, np.arange(6), np.arange(6))]
+    assert len(objects) == 6
+    assert asked == [mapped[i].tobytes() for i in range(1, 6)]
 
 
 def test_devices_share_the_validation():

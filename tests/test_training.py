@@ -358,6 +358,11 @@ def test_what_is_no_finished_run_is_not_exported(trained, tmp_path, capsys):
     assert "not a recipe of such a network" in refused("recogniser", trained / "runs/lem")
     shutil.copy(trained / "runs/lem/recipe.json", tmp_path)
     assert "the training is not done" in refused("lem", tmp_path)
+    whole = (trained / "runs/lem/network.pt").read_bytes()
+    (tmp_path / "network.pt").write_bytes(whole[: len(whole) // 2])
+    assert "damaged" in refused("lem", tmp_path)
+    shutil.copy(trained / "runs/recogniser/network.pt", tmp_path)
+    assert "not the weights of the network" in refused("lem", tmp_path)
     assert not (tmp_path / "models").exists()
 
 
@@ -374,6 +379,28 @@ def test_several_networks_are_exported_as_their_mean(trained):
     assert together.features.shape == (3, 1024)
     mirrored = jury.from_inputs(x[..., ::-1].copy())  # what was side 1 is side -1 in the mirror
     assert together.sides == pytest.approx(mirrored.sides[..., -np.arange(8) % 8], abs=1e-3)
+
+
+def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
+    run, store, models = trained / "runs/recogniser", trained / "views.zarr", trained / "models"
+    command = ["export", "recogniser", str(run), str(store), str(models), "--bits", "8"]
+    main([*command, "--name", "two", "--also", str(models / "tiny.json")])
+    main([*command, "--name", "three", "--also", str(models / "two.json")])
+    x = np.random.default_rng(0).integers(0, 256, (3, 4, 112, 112), dtype=np.uint8)
+    alone = Recogniser(models / "tiny.json")
+    raw = alone.from_inputs(x).logits * alone.card.facts["temperature"]
+    for name, networks in (("two", 2), ("three", 3)):
+        joined = Recogniser(models / f"{name}.json")
+        facts = joined.card.facts
+        assert facts["network"] == " + ".join(["ResNet-18"] * networks)
+        assert facts["unseen"] == alone.card.facts["unseen"]
+        assert len(facts["training"]["recipes"]) == networks
+        said = joined.from_inputs(x)
+        assert said.features.shape == (3, 512 * networks)
+        assert said.logits * facts["temperature"] == pytest.approx(raw, abs=0.03 * np.abs(raw).max())
+    with pytest.raises(SystemExit):
+        main([*command, "--also", str(models / "tiny-lem.json")])
+    assert "not a recogniser" in capsys.readouterr().err
 
 
 def test_folds_divide_every_class_evenly_and_keep_twins_together(tmp_path):

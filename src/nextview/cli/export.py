@@ -38,10 +38,10 @@ def export_recogniser(
     """Export a trained recogniser: ONNX, calibrated on validation views, with a card of its validation scores.
 
     Args:
-        run: folder made by nextview train recogniser.
+        run: folder made by nextview train recogniser; or the card of an exported recogniser (NAME.json).
         store: the store that it was trained on.
         out: folder for NAME.onnx and NAME.json.
-        also: further runs on the same store, with the same input; the logits of all are averaged.
+        also: further runs or cards, of the same store and input; the logits of all are averaged.
         merged: average their weights instead, into one network; for runs that went on from one another (--weights).
         mirror: average what the networks say of a view and of its mirror image.
         bits: that a weight takes in the file.
@@ -49,54 +49,44 @@ def export_recogniser(
         commands: the commands that made the run, for the card.
         note: what else the card should say.
     """
-    import json
+    from dataclasses import asdict
 
     import numpy as np
 
     from nextview.benchmark.scores import recogniser_scores
     from nextview.cli.progress import console
-    from nextview.data.split import split_training
     from nextview.data.store import ViewStore
     from nextview.models.card import ModelError, write_card
     from nextview.models.networks import Recogniser
-    from nextview.training.export import CalibratedRecogniser, answer, export_onnx, fit_temperature, load_weights
-    from nextview.training.inputs import CHANNELS_OF, load_inputs
+    from nextview.training.export import CalibratedRecogniser, answer, export_onnx, fit_temperature
+    from nextview.training.inputs import load_inputs
+    from nextview.training.members import member, member_networks
     from nextview.training.merge import merge
-    from nextview.training.networks import ResNet
-    from nextview.training.recipes import RecogniserRecipe
     from nextview.training.recogniser import drawn_views
-    from nextview.training.runs import read_recipe
 
     if merged and not also:
         raise ModelError("--merged averages the weights of several runs: name the others with --also")
-    runs = (run, *also)
-    recipes = [read_recipe(r, RecogniserRecipe) for r in runs]
     views = ViewStore.open(store)
-    size, sees = recipes[0].size, recipes[0].input
-    if {(r.size, r.input) for r in recipes} != {(size, sees)}:
-        raise ModelError(f"{run} and the other runs do not see the same: geometry or image, of one size")
-    inputs = load_inputs(store, size, sees)
-    validation, held = np.arange(len(views)), []
-    for r, recipe in zip(runs, recipes, strict=True):
-        training, aside = split_training(views, recipe.validation, recipe.seed)
-        validation = np.intersect1d(validation, aside)
-        note_of_held = r / "held_out.json"
-        held.append(set(json.loads(note_of_held.read_text())) if note_of_held.exists() else set())
+    members = [member(source, views) for source in (run, *also)]
+    size, sees = members[0].size, members[0].sees
+    if {(one.size, one.sees) for one in members} != {(size, sees)}:
+        raise ModelError(f"{run} and the others do not see the same: geometry or image, of one size")
+    unseen = frozenset.intersection(*(one.validated | one.held for one in members))
+    validated = frozenset.intersection(*(one.validated for one in members))
+    validation = np.flatnonzero([name in validated for name in views.names])
     if len(validation) == 0:
-        raise ModelError(f"{run} and the other runs have no validation object in common")
-    unseen = set.intersection(*held) | {views.names[i] for i in validation}
-    c, channels, azimuths = len(views.classes), CHANNELS_OF[sees], views.sphere.azimuths
-    networks = [
-        load_weights(ResNet(recipe.depth, c, channels, azimuths if recipe.side else 0), r)
-        for r, recipe in zip(runs, recipes, strict=True)
-    ]
-    names = [f"ResNet-{recipe.depth}" for recipe in recipes]
+        raise ModelError(f"{run} and the others have no validation object in common")
+    training = np.flatnonzero(views.done & (views.splits != "test") & ~np.isin(views.names, list(unseen)))
+    inputs = load_inputs(store, size, sees)
+    sample = np.concatenate([inputs[i] for i in validation[:3]])
+    networks = [network for one in members for network in member_networks(one, views, sample)]
+    names = [f"ResNet-{network.depth}" for network in networks]
     if merged:
-        networks = [merge(networks, drawn_views(inputs, training, views.labels, recipes[0], 32))]
-        names = [f"{names[0]}, the mean of {len(runs)} runs"]
+        drawn = drawn_views(inputs, training, views.labels, members[0].recipes[-1], 32)
+        networks, names = [merge(networks, drawn)], [f"{names[0]}, the mean of {len(networks)} runs"]
 
     out.mkdir(parents=True, exist_ok=True)
-    name = name or f"resnet{recipes[0].depth}-modelnet10"
+    name = name or f"resnet{members[0].recipes[-1].depth}-modelnet10"
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
     facts: dict[str, Any] = {
         "name": name,
@@ -131,8 +121,8 @@ def export_recogniser(
         "temperature": round(temperature, 4),
         "training": {
             "data": f"{len(training)} objects of the training split, {len(views.sphere)} views each",
-            "recipes": [json.loads((r / "recipe.json").read_text()) for r in runs],
-            "commands": list(commands),
+            "recipes": [asdict(recipe) for one in members for recipe in one.recipes],
+            "commands": [*(command for one in members for command in one.commands), *commands],
         },
         "scores": {f"validation ({len(validation)} objects of the training split)": recogniser_scores(raw, labels)},
         "largest_difference_to_torch": round(difference, 4),
@@ -231,16 +221,17 @@ def _export_map(
     from nextview.data.store import ViewStore
     from nextview.models.card import ModelError, write_card
     from nextview.models.networks import MapNetwork
-    from nextview.training.export import ShippedMap, answer, export_onnx, load_weights
+    from nextview.training.export import ShippedMap, answer, export_onnx
     from nextview.training.networks import map_network
     from nextview.training.recipes import MapRecipe
     from nextview.training.runs import read_recipe
+    from nextview.training.weights import load_run
 
     recipe = read_recipe(run, MapRecipe)
     views = ViewStore.open(store)
     sphere = views.sphere
     training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
-    network = load_weights(map_network(recipe, sphere), run)
+    network = load_run(map_network(recipe, sphere), run)
     shipped = ShippedMap(network, mirror).eval()
 
     out.mkdir(parents=True, exist_ok=True)

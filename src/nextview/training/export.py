@@ -76,12 +76,6 @@ class ShippedMap(nn.Module):
         return (said[..., [-1, 0, 1]], said) if self.whole else said
 
 
-def load_weights(network: nn.Module, run: Path) -> nn.Module:
-    """Give a network the parameters of a run; the network, in evaluation mode. Nothing in the file is executed."""
-    network.load_state_dict(torch.load(run / "network.pt", weights_only=True))
-    return network.eval()
-
-
 def answer(network: nn.Module, inputs: NDArray) -> NDArray[np.float32]:
     """What a network, in torch, says of inputs (B, ...): its first output where it has several."""
     with torch.no_grad():

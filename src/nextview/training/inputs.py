@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -17,6 +17,9 @@ from nextview.models.geometry_input import CHANNELS
 
 CHANNELS_OF = {"geometry": len(CHANNELS), "image": 1}
 """Channels of what a recogniser may see."""
+
+AHEAD = 4
+"""So many batches before a view is trained on, the disk is asked for it."""
 
 
 def inputs_path(store: Path, size: int, kind: str = "geometry") -> Path:
@@ -58,6 +61,23 @@ def prepare_inputs(path: Path, size: int, kind: str = "geometry", workers: int |
 def load_inputs(path: Path, size: int, kind: str = "geometry") -> NDArray[np.uint8]:
     """The inputs of a store, memory-mapped, (N, V, C, size, size) uint8."""
     return np.load(inputs_path(path, size, kind), mmap_mode="r")
+
+
+def ask_for(inputs: NDArray[np.uint8], places: Iterable[tuple[int, ...]]) -> None:
+    """Have the disk fetch parts of memory-mapped inputs that are read soon, all at once and nothing else.
+
+    Left to page faults, they come one after the other, each with megabytes around it. Inputs in memory are let be.
+
+    Args:
+        inputs: (N, V, C, S, S), as ``load_inputs`` gives them.
+        places: leading indices: (object, view), or (object,) for all views of it.
+    """
+    if not isinstance(inputs, np.memmap) or inputs.filename is None or not hasattr(os, "posix_fadvise"):
+        return
+    with open(inputs.filename, "rb") as file:
+        for place in places:
+            start = inputs.offset + sum(int(i) * step for i, step in zip(place, inputs.strides, strict=False))
+            os.posix_fadvise(file.fileno(), start, inputs.strides[len(place) - 1], os.POSIX_FADV_WILLNEED)
 
 
 def _prepare(path: Path, part: Path, objects: NDArray[np.int64], size: int, kind: str) -> int:

@@ -18,6 +18,7 @@ from nextview.models.card import ModelError
 from nextview.models.cloud_input import cloud_input
 from nextview.training.fit import fit
 from nextview.training.hardware import Hardware
+from nextview.training.inputs import AHEAD, ask_for
 from nextview.training.networks import map_columns, map_network, orthogonality
 from nextview.training.recipes import MapRecipe
 from nextview.training.weights import load_exported
@@ -60,9 +61,11 @@ class Windows(IterableDataset):
         else:  # the same spread of views every time
             objects, views = np.repeat(self.objects, self.recipe.views)[:n], (np.arange(n) * 7) % v
         mirrored = rng.random(n) < 0.5 * (self.training and self.recipe.mirror)
-        for start in range(0, n, batch):
+        batches = np.arange(n).reshape(-1, batch)[:, self.share]
+        for step, here in enumerate(batches):
+            coming = batches[step + AHEAD if step else 0 : step + AHEAD + 1].flatten()
+            ask_for(self.seen, zip(objects[coming], views[coming], strict=True))
             points = rng.permutation(1024)[: self.recipe.points] if self.training else np.arange(1024)
-            here = np.arange(start, start + batch)[self.share]
             o, w, m = objects[here], views[here], mirrored[here]
             seen: NDArray[Any] = np.stack([self.seen[i, k] for i, k in zip(o, w, strict=True)])
             target = self.values[o[:, None, None], self.around[w]]

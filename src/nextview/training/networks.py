@@ -94,7 +94,7 @@ class ResNet(nn.Module):
             setattr(self, f"layer{stage + 1}", nn.Sequential(*layer))
         self.avgpool = nn.AdaptiveAvgPool2d(1)
         self.fc = nn.Linear(inputs, classes)
-        self.azimuths = azimuths
+        self.depth, self.azimuths = depth, azimuths
         self.side = nn.Linear(inputs, classes * azimuths) if azimuths else None
         for module in self.modules():
             if isinstance(module, nn.Conv2d):

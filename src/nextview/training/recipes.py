@@ -26,6 +26,8 @@ class RecogniserRecipe:
         validation: part of the training split held out for validation.
         deformed_share: chance that a view is drawn from the deformed objects, where such a store is given.
         seed: decides everything random.
+        member: which of several networks to be averaged this is: the seed's objects validate all of them, but each has
+            first weights and draws of its own.
         input: what the network sees: the geometry that a depth camera sees, or the shaded image.
         augment: vary what is seen; see ``recogniser.augment``.
         balanced: draw rare classes more often; otherwise every view comes once before any comes again.
@@ -47,6 +49,7 @@ class RecogniserRecipe:
     validation: float = 0.1
     deformed_share: float = 0.5
     seed: int = 0
+    member: int = 0
     input: Literal["geometry", "image"] = "geometry"
     augment: bool = True
     balanced: bool = True

@@ -18,7 +18,7 @@ from torch.utils.data import IterableDataset
 
 from nextview.training.fit import fit
 from nextview.training.hardware import Hardware
-from nextview.training.inputs import CHANNELS_OF
+from nextview.training.inputs import AHEAD, CHANNELS_OF, ask_for
 from nextview.training.networks import ResNet
 from nextview.training.recipes import RecogniserRecipe
 from nextview.training.sides import side_loss
@@ -66,7 +66,7 @@ class Views(IterableDataset):
         return len(self.objects) * views // self.recipe.batch
 
     def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
-        rng = np.random.default_rng([self.recipe.seed, self.epoch])
+        rng = np.random.default_rng([self.recipe.seed, self.epoch, self.recipe.member])
         n, v = len(self) * self.recipe.batch, self.sources[0].inputs.shape[1]
         if self.recipe.balanced:
             objects = rng.choice(self.objects, n, p=self.weights)
@@ -76,15 +76,17 @@ class Views(IterableDataset):
             objects, turn = self.objects[objects], (views + 0.5) / v
         deformed = (rng.random(n) < self.recipe.deformed_share) & (len(self.sources) > 1)
         source = np.where(deformed, rng.integers(1, max(2, len(self.sources)), n), 0)
-        for start in range(0, n, self.recipe.batch):
-            batch = np.arange(start, start + self.recipe.batch)[self.share]
-            images, sides = [], []
-            for k in batch:
-                own = self.sources[source[k]]
-                row, view = own.row[objects[k]], int(turn[k] * own.inputs.shape[1])
-                images.append(own.inputs[row, view])
-                if own.sides is not None:
-                    sides.append(own.sides[row, view])
+        row = np.stack([own.row for own in self.sources])[source, objects]
+        view = (turn * np.array([own.inputs.shape[1] for own in self.sources])[source]).astype(int)
+        batches = np.arange(n).reshape(-1, self.recipe.batch)[:, self.share]
+        for step, batch in enumerate(batches):
+            coming = batches[step + AHEAD if step else 0 : step + AHEAD + 1]
+            for s, own in enumerate(self.sources):
+                k = coming[source[coming] == s]
+                ask_for(own.inputs, zip(row[k], view[k], strict=True))
+            images = [self.sources[source[k]].inputs[row[k], view[k]] for k in batch]
+            told = [self.sources[source[k]].sides for k in batch]
+            sides = [known[row[k], view[k]] for k, known in zip(batch, told, strict=True) if known is not None]
             drawn = [np.stack(images), self.labels[objects[batch]], *([np.array(sides)] if sides else [])]
             yield tuple(map(torch.from_numpy, drawn))
 
@@ -207,7 +209,9 @@ class ValidationViews(IterableDataset):
         self.inputs, self.objects, self.labels, self.share = inputs, objects, labels, slice(None)
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
-        for k, i in list(enumerate(self.objects))[self.share]:
+        mine = list(enumerate(self.objects))[self.share]
+        for at, (k, i) in enumerate(mine):
+            ask_for(self.inputs, [(later,) for _, later in mine[at + 1 : at + 2]])
             views = self.inputs[i, k % 5 :: 5]
             yield torch.from_numpy(np.array(views)), torch.full((len(views),), int(self.labels[i]))
 
@@ -239,7 +243,8 @@ def train(
     Raises:
         ModelError: the weights or a checkpoint in ``out`` cannot be used.
     """
-    L.seed_everything(recipe.seed, verbose=False)
+    own = np.random.SeedSequence([recipe.seed, recipe.member])
+    L.seed_everything(int(own.generate_state(1)[0]), verbose=False)
     views = Views(sources, training, labels, recipe)
     module = RecogniserModule(recipe, int(labels.max()) + 1, recipe.epochs * len(views), azimuths)
     if weights and weights.suffix == ".json":

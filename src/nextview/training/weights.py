@@ -1,4 +1,4 @@
-"""Start a ResNet from a checkpoint of torchvision's, or from a recogniser that was exported."""
+"""Give a network the parameters of a finished run, of a torchvision checkpoint or of an exported recogniser."""
 
 from __future__ import annotations
 
@@ -14,7 +14,21 @@ from torch import Tensor, nn
 
 from nextview.models.card import ModelError, find_card
 from nextview.models.networks import open_weights
-from nextview.training.networks import ResNet
+from nextview.training.networks import RESNETS, ResNet
+
+
+def load_run(network: nn.Module, run: Path) -> nn.Module:
+    """Give a network the parameters of a finished run: the network, in evaluation mode. Nothing in it is executed.
+
+    Raises:
+        ModelError: its network.pt is missing, damaged or of another network.
+    """
+    path = run / "network.pt"
+    try:
+        network.load_state_dict(_read(path))
+    except RuntimeError:  # names every parameter that is missing, foreign or of another shape
+        raise ModelError(f"{path}: not the weights of the network that {run}/recipe.json describes") from None
+    return network.eval()
 
 
 def load_torchvision(network: ResNet, path: Path) -> None:
@@ -53,7 +67,32 @@ def load_torchvision(network: ResNet, path: Path) -> None:
     network.load_state_dict(state)
 
 
-def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True) -> None:
+def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet]:
+    """The networks of an exported recogniser, one or several that it averages, in evaluation mode.
+
+    Args:
+        card: the recogniser.
+        channels: of its input.
+        views: see ``load_exported``.
+
+    Raises:
+        ModelError: it is no recogniser of such an input.
+    """
+    facts = find_card(card).facts
+    depths = [int(depth) for depth in re.findall(r"ResNet-(\d+)", facts.get("network", ""))]
+    networks = []
+    for which, depth in enumerate(depths):
+        if depth not in RESNETS:
+            raise ModelError(f"{card}: there is no ResNet-{depth}")
+        network = ResNet(depth, len(facts.get("classes", [])), channels, facts.get("sides", 0))
+        load_exported(network, card, views, which=which)
+        networks.append(network.eval())
+    if not networks:
+        raise ModelError(f"{card}: names no ResNet")
+    return networks
+
+
+def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True, which: int = 0) -> None:
     """Give a network the parameters of an exported recogniser of the same depth and input, so that it can learn on.
 
     The export merges every batch norm into the convolution before it. Here each gets the mean and the variance that its
@@ -62,25 +101,26 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True)
 
     Args:
         network: is changed in place.
-        card: the recogniser, of one network and not of several averaged.
+        card: the recogniser.
         views: what it will see in training, (B, C, S, S) in 0 .. 1, B some dozens.
         last: take the last layers too; otherwise those of the network stay as they are.
+        which: of the networks that the recogniser averages.
 
     Raises:
-        ModelError: it is no recogniser, or not one network of this depth and input.
+        ModelError: it is no recogniser, or not of this depth and input.
     """
     model = find_card(card)
     if model.kind != "recogniser":
         raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
     open_weights(model)  # refuses a file that is not the card's
     graph = onnx.load(model.path).graph
-    arrays = {re.sub(r"^networks?\.(0\.)?", "", i.name): numpy_helper.to_array(i) for i in graph.initializer}
-    several = any(name.startswith("networks.1.") for name in arrays)
+    prefix = f"networks.{which}."
+    arrays = {i.name.removeprefix(prefix): numpy_helper.to_array(i) for i in graph.initializer}
 
     def exported(name: str, shape: torch.Size) -> Tensor:
         kept = [arrays[name + end] for end in ("", "_half", "_small") if name + end in arrays]
-        if several or not kept or kept[0].shape != shape:
-            raise ModelError(f"{card}: is not one network of this depth and input (see {name})")
+        if not kept or kept[0].shape != shape:
+            raise ModelError(f"{card}: is no network of this depth and input (see {name})")
         return torch.from_numpy(kept[0].astype(np.float32) * arrays.get(f"{name}_scale", np.float32(1)))
 
     norms: list[nn.BatchNorm2d] = []

@@ -1,0 +1,93 @@
+"""The recognisers that an export averages: training runs, or recognisers that were exported before."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from nextview.data.split import split_training
+from nextview.data.store import ViewStore
+from nextview.models.card import ModelError, find_card
+from nextview.training.inputs import CHANNELS_OF
+from nextview.training.networks import ResNet
+from nextview.training.recipes import RecogniserRecipe
+from nextview.training.runs import read_recipe
+from nextview.training.weights import exported_networks, load_run
+
+
+@dataclass(frozen=True)
+class Member:
+    """One of them.
+
+    Attributes:
+        source: the folder of the run, or the card.
+        size: side of its input, pixels.
+        sees: geometry or image.
+        validated: names of the training split's objects that it was not trained on and that chose its epoch.
+        held: names of those kept from it altogether, as a fold.
+        recipes: of its training, the last one last.
+        commands: of its training, as far as its card names them.
+    """
+
+    source: Path
+    size: int
+    sees: Literal["geometry", "image"]
+    validated: frozenset[str]
+    held: frozenset[str]
+    recipes: list[RecogniserRecipe]
+    commands: list[str]
+
+
+def member(source: Path, views: ViewStore) -> Member:
+    """What is known of a run (a folder), or of an exported recogniser (its card, NAME.json).
+
+    Raises:
+        ModelError: it is neither, or the recogniser was not trained on this store.
+    """
+    if source.suffix == ".json":
+        return _exported(source, views)
+    recipe = read_recipe(source, RecogniserRecipe)
+    _, aside = split_training(views, recipe.validation, recipe.seed)
+    noted = source / "held_out.json"
+    held = json.loads(noted.read_text()) if noted.exists() else []
+    validated = frozenset(views.names[i] for i in aside)
+    return Member(source, recipe.size, recipe.input, validated, frozenset(held), [recipe], [])
+
+
+def _exported(source: Path, views: ViewStore) -> Member:
+    model = find_card(source)
+    if model.kind != "recogniser":
+        raise ModelError(f"{source}: is a {model.kind}, not a recogniser")
+    facts, training = model.facts, model.facts.get("training", {})
+    kept = frozenset(facts.get("unseen", [])) & frozenset(views.names)
+    if facts["classes"] != views.classes or not kept:
+        raise ModelError(f"{source}: is a recogniser of other objects than {views.path} holds")
+    try:
+        recipes = [RecogniserRecipe(**recipe) for recipe in training["recipes"]]
+    except (KeyError, TypeError) as error:
+        raise ModelError(f"{source}: says not, or not as this version does, how it was trained ({error})") from None
+    commands = training.get("commands", [])
+    return Member(source, facts["input_size"], facts["sees"], kept, frozenset(), recipes, commands)
+
+
+def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) -> list[nn.Module]:
+    """Its networks, in evaluation mode: that of a run, or all that an exported recogniser averages.
+
+    Args:
+        one: the member.
+        views: the store that it was trained on.
+        sample: some views' inputs, (B, C, S, S); see ``weights.load_exported``.
+    """
+    channels = CHANNELS_OF[one.sees]
+    if one.source.suffix == ".json":
+        return list(exported_networks(one.source, channels, torch.from_numpy(sample).float() / 255))
+    (recipe,) = one.recipes
+    azimuths = views.sphere.azimuths if recipe.side else 0
+    return [load_run(ResNet(recipe.depth, len(views.classes), channels, azimuths), one.source)]
