@@ -17,33 +17,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.benchmark.evaluate import fused_views
-from nextview.benchmark.statistics import interval, ratio, resample
+from nextview.benchmark.paired import accuracy_after_looks, rows
 from nextview.data.predictions import Predictions
 from nextview.data.split import split_training
 from nextview.data.store import ViewStore
 from nextview.fitting.calibration import fit_temperature, loss
 from nextview.fitting.evidence import fitting_set
-
-LOOKS = (1, 2, 3, 5, 8, 15, 40)
-
-
-def compared(p: Predictions, calibrations: list, samples: int = 2000) -> list[str]:
-    """Rows of a table: accuracy with each calibration, and the difference."""
-    v, classes = len(p.sphere), len(p.classes)
-    right = [fused_views(p.said, p.labels, c, np.random.default_rng(0), classes)[0].mean(2) for c in calibrations]
-    weights = resample(len(p), samples, np.random.default_rng(1))
-    lines = []
-    for k in [k for k in LOOKS if k <= v]:
-        plain, agreeing = (r[k - 1] for r in right)
-        difference = 100 * (agreeing - plain)
-        low, high = interval(ratio(difference[:, None], np.ones((len(p), 1)), weights))
-        gain = "" if k == 1 else f"{difference.mean():+.1f} ({low[0]:+.1f} to {high[0]:+.1f})"
-        by_class = [np.mean([r[p.labels == c].mean() for c in np.unique(p.labels)]) for r in (plain, agreeing)]
-        lines.append(
-            f"| {k} | {plain.mean():.3f} ({by_class[0]:.3f}) | {agreeing.mean():.3f} ({by_class[1]:.3f}) | {gain} |"
-        )
-    return lines
 
 
 def told(p: Predictions, store: ViewStore) -> str:
@@ -77,7 +56,8 @@ def main(validation: Path, test: Path, store: Path | None = None) -> None:
     for p in (known, other):
         print(f"{len(p)} objects, split {p.splits[0]}:\n")
         print("| looks | logits alone (class mean) | agreeing on the side | difference, points |\n|---|---|---|---|")
-        print("\n".join(compared(p, calibrations)) + "\n")
+        plain, agreeing = (accuracy_after_looks(p, c) for c in calibrations)
+        print("\n".join(rows(plain, agreeing, p.labels)) + "\n")
         if store is not None:
             print(told(p, ViewStore.open(store)) + "\n")
 

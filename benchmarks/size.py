@@ -18,47 +18,27 @@ import matplotlib
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from nextview.benchmark.evaluate import fused_views
-from nextview.benchmark.statistics import interval, ratio, resample
+from nextview.benchmark.paired import accuracy_after_looks, in_points, rows
 from nextview.data.predictions import Predictions
 from nextview.models.card import find_card
 from nextview.models.networks import RECOGNISER, size_evidence
 from nextview.models.size import SizeEvidence
 from nextview.report.style import INK, STYLE, new_figure, to_png
 
-LOOKS = (1, 2, 3, 5, 8, 15, 40)
 
-
-def difference(before: NDArray[np.float64], after: NDArray[np.float64], weights: NDArray[np.float64]) -> str:
-    """Of two accuracies of the same objects, each (N,), in points."""
-    points = 100 * (after - before)
-    low, high = interval(ratio(points[:, None], np.ones((len(points), 1)), weights))
-    return f"{points.mean():+.1f} ({low[0]:+.1f} to {high[0]:+.1f})"
-
-
-def lines(p: Predictions, samples: int = 2000) -> Iterator[str]:
+def lines(p: Predictions) -> Iterator[str]:
     """Two tables: accuracy without the size and with it, and the difference; by looks, and of one look by class."""
-    weights = resample(len(p), samples, np.random.default_rng(1))
-    there = np.unique(p.labels)
+    before, after = (accuracy_after_looks(x, x.calibration) for x in (p.by_shape(), p))
     yield "| looks | by shape alone (class mean) | size known | difference, points |"
     yield "|---|---|---|---|"
-    fused = [
-        fused_views(x.said, x.labels, x.calibration, np.random.default_rng(0), len(x.classes))[0].mean(2)
-        for x in (p.by_shape(), p)
-    ]
-    for k in [k for k in LOOKS if k <= len(p.sphere)]:
-        both = [r[k - 1] for r in fused]
-        cells = [f"{r.mean():.3f} ({np.mean([r[p.labels == c].mean() for c in there]):.3f})" for r in both]
-        yield f"| {k} | {cells[0]} | {cells[1]} | {difference(*both, weights)} |"
+    yield from rows(before, after, p.labels)
     yield "\n| class, one look | by shape alone | size known | difference, points |"
     yield "|---|---|---|---|"
-    for c in there:
-        before, after = (r[0, p.labels == c] for r in fused)
-        drawn = resample(len(before), samples, np.random.default_rng(1))
+    for c in np.unique(p.labels):
+        alone, told = before[0, p.labels == c], after[0, p.labels == c]
         name = p.classes[c].replace("_", " ")
-        yield f"| {name} | {before.mean():.3f} | {after.mean():.3f} | {difference(before, after, drawn)} |"
+        yield f"| {name} | {alone.mean():.3f} | {told.mean():.3f} | {in_points(alone, told)} |"
 
 
 def sizes_figure(evidence: SizeEvidence, classes: tuple[str, ...]) -> Figure:

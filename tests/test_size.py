@@ -188,7 +188,7 @@ def test_predictions_keep_what_the_size_said(tmp_path):
 def test_the_benchmark_compares_with_and_without(tmp_path, capsys):
     p = some_predictions(40)
     of_size = (100.0 * np.eye(3)[p.labels]).astype(np.float32)
-    rows = list(BENCHMARK["lines"](replace(p, logits=p.logits + of_size[:, None], of_size=of_size), samples=50))
+    rows = list(BENCHMARK["lines"](replace(p, logits=p.logits + of_size[:, None], of_size=of_size)))
     assert all("| 1.000 (1.000) |" in row for row in rows[2:9])
     share = (p.logits.argmax(2) == p.labels[:, None]).mean()
     assert rows[2].startswith(f"| 1 | {share:.3f} (")
