@@ -61,10 +61,7 @@ def read_recipe(run: Path, kind: type[Recipe]) -> Recipe:
     noted = run / "recipe.json"
     if not noted.exists():
         raise ModelError(f"{run}: holds no training run")
-    try:
-        recipe = kind(**json.loads(noted.read_text()))
-    except (ValueError, TypeError) as error:
-        raise ModelError(f"{noted}: not a recipe of such a network ({error})") from None
+    recipe = _noted(noted, kind)
     if not is_done(run):
         raise ModelError(f"{run}: the training is not done; give its command again to go on")
     return recipe
@@ -101,11 +98,15 @@ def _compare_start(noted: Path, start: dict[str, str | None]) -> None:
         )
 
 
-def _compare(noted: Path, recipe: Any) -> None:
+def _noted(noted: Path, kind: type[Recipe]) -> Recipe:
     try:
-        before = asdict(type(recipe)(**json.loads(noted.read_text())))
+        return kind(**json.loads(noted.read_text()))
     except (ValueError, TypeError) as error:
-        raise ModelError(f"{noted}: not a recipe of this version ({error}); give another folder") from None
+        raise ModelError(f"{noted}: not a recipe of such a network in this version ({error})") from None
+
+
+def _compare(noted: Path, recipe: Any) -> None:
+    before = asdict(_noted(noted, type(recipe)))
     after = json.loads(json.dumps(asdict(recipe)))
     for name, value in after.items():
         if before[name] != value:
