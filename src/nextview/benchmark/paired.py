@@ -1,0 +1,43 @@
+"""Two ways to fuse the same views, side by side: rows of a Markdown table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.benchmark.evaluate import fused_views
+from nextview.benchmark.statistics import interval, ratio, resample
+from nextview.data.predictions import Predictions
+from nextview.recognition import Calibration
+
+Float = NDArray[np.float64]
+LOOKS = (1, 2, 3, 5, 8, 15, 40)
+
+
+def accuracy_after_looks(p: Predictions, calibration: Calibration) -> Float:
+    """How often each object is named right after 1, 2, ... looks, over a random order of views turned round, (V, N)."""
+    return fused_views(p.said, p.labels, calibration, np.random.default_rng(0), len(p.classes))[0].mean(2)
+
+
+def in_points(before: Float, after: Float, samples: int = 2000) -> str:
+    """The difference of two accuracies of the same objects, each (N,), in points, with its 95 % bootstrap interval."""
+    points = 100 * (after - before)
+    weights = resample(len(points), samples, np.random.default_rng(1))
+    low, high = interval(ratio(points[:, None], np.ones((len(points), 1)), weights))
+    return f"{points.mean():+.1f} ({low[0]:+.1f} to {high[0]:+.1f})"
+
+
+def rows(before: Float, after: Float, labels: NDArray[np.int64]) -> Iterator[str]:
+    """Looks, accuracy both ways (class mean in brackets), and the difference where there is one.
+
+    Args:
+        before: of ``accuracy_after_looks``, (V, N).
+        after: the other way, (V, N).
+        labels: of the objects, (N,).
+    """
+    for k in [k for k in LOOKS if k <= len(before)]:
+        both = before[k - 1], after[k - 1]
+        cells = [f"{r.mean():.3f} ({np.mean([r[labels == c].mean() for c in np.unique(labels)]):.3f})" for r in both]
+        yield f"| {k} | {cells[0]} | {cells[1]} | {in_points(*both) if (both[0] != both[1]).any() else ''} |"
