@@ -383,24 +383,31 @@ def test_several_networks_are_exported_as_their_mean(trained):
 
 def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
     run, store, models = trained / "runs/recogniser", trained / "views.zarr", trained / "models"
-    command = ["export", "recogniser", str(run), str(store), str(models), "--bits", "8"]
+    command = ["export", "recogniser", str(run), str(store), str(models)]
     main([*command, "--name", "two", "--also", str(models / "tiny.json")])
-    main([*command, "--name", "three", "--also", str(models / "two.json")])
-    x = np.random.default_rng(0).integers(0, 256, (3, 4, 112, 112), dtype=np.uint8)
-    alone = Recogniser(models / "tiny.json")
-    raw = alone.from_inputs(x).logits * alone.card.facts["temperature"]
-    for name, networks in (("two", 2), ("three", 3)):
-        joined = Recogniser(models / f"{name}.json")
-        facts = joined.card.facts
-        assert facts["network"] == " + ".join(["ResNet-18"] * networks)
-        assert facts["unseen"] == alone.card.facts["unseen"]
-        assert len(facts["training"]["recipes"]) == networks
-        said = joined.from_inputs(x)
-        assert said.features.shape == (3, 512 * networks)
-        assert said.logits * facts["temperature"] == pytest.approx(raw, abs=0.03 * np.abs(raw).max())
+    x = seen_views(ViewStore.open(store), 0, "geometry", 112)[:3]
+    alone, joined = Recogniser(models / "tiny.json"), Recogniser(models / "two.json")
+    facts = joined.card.facts
+    assert facts["network"] == "ResNet-18 + ResNet-18"
+    assert facts["unseen"] == alone.card.facts["unseen"]
+    assert len(facts["training"]["recipes"]) == 2
+    raw, said = alone.from_inputs(x).logits * alone.card.facts["temperature"], joined.from_inputs(x)
+    assert said.features.shape == (3, 1024)
+    assert said.logits * facts["temperature"] == pytest.approx(raw, abs=2e-2)
+    with pytest.raises(SystemExit):
+        main([*command, "--name", "three", "--also", str(models / "two.json")])
+    assert "are two of them the same" in capsys.readouterr().err.replace("\n", " ")
     with pytest.raises(SystemExit):
         main([*command, "--also", str(models / "tiny-lem.json")])
     assert "not a recogniser" in capsys.readouterr().err
+    facts = json.loads((models / "tiny.json").read_text())
+    for name, told in (("foreign", facts | {"unseen": ["chair_9"]}), ("silent", facts | {"training": {}})):
+        (models / f"{name}.json").write_text(json.dumps(told))
+        shutil.copy(models / "tiny.onnx", models / f"{name}.onnx")
+        with pytest.raises(SystemExit):
+            main([*command, "--also", str(models / f"{name}.json")])
+        error = capsys.readouterr().err.replace("\n", " ")
+        assert ("of other objects" if name == "foreign" else "how it was trained") in error
 
 
 def test_folds_divide_every_class_evenly_and_keep_twins_together(tmp_path):

@@ -65,16 +65,16 @@ def _exported(source: Path, views: ViewStore) -> Member:
     model = find_card(source)
     if model.kind != "recogniser":
         raise ModelError(f"{source}: is a {model.kind}, not a recogniser")
-    facts, training = model.facts, model.facts.get("training", {})
+    facts = model.facts
     kept = frozenset(facts.get("unseen", [])) & frozenset(views.names)
-    if facts["classes"] != views.classes or not kept:
+    if facts.get("classes") != views.classes or not kept:
         raise ModelError(f"{source}: is a recogniser of other objects than {views.path} holds")
     try:
+        size, sees, training = facts["input_size"], facts["sees"], facts["training"]
         recipes = [RecogniserRecipe(**recipe) for recipe in training["recipes"]]
     except (KeyError, TypeError) as error:
         raise ModelError(f"{source}: says not, or not as this version does, how it was trained ({error})") from None
-    commands = training.get("commands", [])
-    return Member(source, facts["input_size"], facts["sees"], kept, frozenset(), recipes, commands)
+    return Member(source, size, sees, kept, frozenset(), recipes, training.get("commands", []))
 
 
 def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) -> list[nn.Module]:

@@ -79,13 +79,17 @@ def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet]:
         ModelError: it is no recogniser of such an input.
     """
     facts = find_card(card).facts
-    depths = [int(depth) for depth in re.findall(r"ResNet-(\d+)", facts.get("network", ""))]
     networks = []
-    for which, depth in enumerate(depths):
+    for which, depth in enumerate(_depths(facts)):
         if depth not in RESNETS:
             raise ModelError(f"{card}: there is no ResNet-{depth}")
         network = ResNet(depth, len(facts.get("classes", [])), channels, facts.get("sides", 0))
+        torch.nn.init.constant_(network.fc.bias, torch.nan)
         load_exported(network, card, views, which=which)
+        if network.fc.bias.isnan().any():  # the export keeps what two networks have in common once
+            raise ModelError(
+                f"{card}: the last layer of its network {which + 1} is not there; are two of them the same?"
+            )
         networks.append(network.eval())
     if not networks:
         raise ModelError(f"{card}: names no ResNet")
@@ -112,6 +116,8 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True,
     model = find_card(card)
     if model.kind != "recogniser":
         raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
+    if network.depth not in _depths(model.facts)[which : which + 1]:
+        raise ModelError(f"{card}: is no network of this depth and input (see its network)")
     open_weights(model)  # refuses a file that is not the card's
     graph = onnx.load(model.path).graph
     prefix = f"networks.{which}."
@@ -143,6 +149,11 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True,
                 layer.weight.copy_(exported(f"{name}.weight", layer.weight.shape))
                 layer.bias.copy_(torch.from_numpy(arrays[f"{name}.bias"].copy()))
         _make_norms(network, norms, views)
+
+
+def _depths(facts: dict[str, Any]) -> list[int]:
+    """Of the networks that a card names."""
+    return [int(depth) for depth in re.findall(r"ResNet-(\d+)", facts.get("network", ""))]
 
 
 def refuse_seen(card: Path, kept: list[str]) -> None:
