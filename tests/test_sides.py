@@ -158,7 +158,7 @@ def test_other_classes_keep_a_last_layer_of_their_own(boxes):
 
 @pytest.mark.parametrize(("depth", "channels"), [(34, 4), (18, 1)], ids=["depth", "input"])
 def test_another_network_is_refused(boxes, depth, channels):
-    with pytest.raises(ModelError, match="no network of this depth and input"):
+    with pytest.raises(ModelError, match="not one network of this depth and input"):
         load_exported(ResNet(depth, 10, channels), bundled(), torch.zeros(2, channels, 64, 64))
 
 

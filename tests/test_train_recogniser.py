@@ -307,7 +307,10 @@ def test_a_run_resumes_with_a_recipe_from_before_new_options_and_refuses_what_it
         pass
     for text in ("{", "[]", json.dumps({"flavour": 3})):
         (run / "recipe.json").write_text(text)
-        with pytest.raises(ModelError, match="in this version"), begin(run, RecogniserRecipe()):
+        with (
+            pytest.raises(ModelError, match="not a recipe of such a network in this version"),
+            begin(run, RecogniserRecipe()),
+        ):
             pass
 
 

@@ -396,6 +396,8 @@ def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
     assert said.logits * facts["temperature"] == pytest.approx(raw, abs=2e-2)
     with pytest.raises(SystemExit):
         main([*command, "--name", "three", "--also", str(models / "two.json")])
+    with pytest.raises(ModelError, match="not one network"):
+        load_exported(ResNet(18, 2, 4, 8), models / "two.json", torch.from_numpy(x).float() / 255)
     assert "are two of them the same" in capsys.readouterr().err.replace("\n", " ")
     with pytest.raises(SystemExit):
         main([*command, "--also", str(models / "tiny-lem.json")])

@@ -88,15 +88,13 @@ def _scores(run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe) 
     from nextview.data.split import test_objects
     from nextview.report.training_curves import read_log
     from nextview.training.grid import count_right
-    from nextview.training.inputs import CHANNELS_OF, load_inputs
-    from nextview.training.networks import ResNet
-    from nextview.training.weights import load_run
+    from nextview.training.inputs import load_inputs
+    from nextview.training.members import run_network
 
     kept = run / "scores.json"
     if kept.exists():
         return json.loads(kept.read_text())
-    azimuths = views.sphere.azimuths if recipe.side else 0
-    network = load_run(ResNet(recipe.depth, len(views.classes), CHANNELS_OF[recipe.input], azimuths), run)
+    network = run_network(run, recipe, views)
     objects, labels = test_objects(views), views.labels
     right: list[int] = []
 

@@ -85,9 +85,12 @@ def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) ->
         views: the store that it was trained on.
         sample: some views' inputs, (B, C, S, S); see ``weights.load_exported``.
     """
-    channels = CHANNELS_OF[one.sees]
     if one.source.suffix == ".json":
-        return list(exported_networks(one.source, channels, torch.from_numpy(sample).float() / 255))
-    (recipe,) = one.recipes
+        return list(exported_networks(one.source, CHANNELS_OF[one.sees], torch.from_numpy(sample).float() / 255))
+    return [run_network(one.source, one.recipes[0], views)]
+
+
+def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> nn.Module:
+    """The recogniser of a finished run, in evaluation mode."""
     azimuths = views.sphere.azimuths if recipe.side else 0
-    return [load_run(ResNet(recipe.depth, len(views.classes), channels, azimuths), one.source)]
+    return load_run(ResNet(recipe.depth, len(views.classes), CHANNELS_OF[recipe.input], azimuths), run)

@@ -84,19 +84,14 @@ def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet]:
         if depth not in RESNETS:
             raise ModelError(f"{card}: there is no ResNet-{depth}")
         network = ResNet(depth, len(facts.get("classes", [])), channels, facts.get("sides", 0))
-        torch.nn.init.constant_(network.fc.bias, torch.nan)
         load_exported(network, card, views, which=which)
-        if network.fc.bias.isnan().any():  # the export keeps what two networks have in common once
-            raise ModelError(
-                f"{card}: the last layer of its network {which + 1} is not there; are two of them the same?"
-            )
         networks.append(network.eval())
     if not networks:
         raise ModelError(f"{card}: names no ResNet")
     return networks
 
 
-def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True, which: int = 0) -> None:
+def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True, which: int | None = None) -> None:
     """Give a network the parameters of an exported recogniser of the same depth and input, so that it can learn on.
 
     The export merges every batch norm into the convolution before it. Here each gets the mean and the variance that its
@@ -108,26 +103,29 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True,
         card: the recogniser.
         views: what it will see in training, (B, C, S, S) in 0 .. 1, B some dozens.
         last: take the last layers too; otherwise those of the network stay as they are.
-        which: of the networks that the recogniser averages.
+        which: of the networks that the recogniser averages, last layer and all; None if it must be one network.
 
     Raises:
-        ModelError: it is no recogniser, or not of this depth and input.
+        ModelError: it is no recogniser, or not one network of this depth and input.
     """
     model = find_card(card)
     if model.kind != "recogniser":
         raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
-    if network.depth not in _depths(model.facts)[which : which + 1]:
-        raise ModelError(f"{card}: is no network of this depth and input (see its network)")
+    depths, at = _depths(model.facts), which or 0
+    if (which is None and len(depths) > 1) or network.depth not in depths[at : at + 1]:
+        named = model.facts.get("network")
+        raise ModelError(f"{card}: is not one network of this depth and input: {named}, not ResNet-{network.depth}")
     open_weights(model)  # refuses a file that is not the card's
     graph = onnx.load(model.path).graph
-    prefix = f"networks.{which}."
-    arrays = {i.name.removeprefix(prefix): numpy_helper.to_array(i) for i in graph.initializer}
+    arrays = {re.sub(rf"^networks?\.({at}\.)?", "", i.name): numpy_helper.to_array(i) for i in graph.initializer}
 
     def exported(name: str, shape: torch.Size) -> Tensor:
         kept = [arrays[name + end] for end in ("", "_half", "_small") if name + end in arrays]
-        if not kept or kept[0].shape != shape:
-            raise ModelError(f"{card}: is no network of this depth and input (see {name})")
-        return torch.from_numpy(kept[0].astype(np.float32) * arrays.get(f"{name}_scale", np.float32(1)))
+        if kept and kept[0].shape == shape:
+            return torch.from_numpy(kept[0].astype(np.float32) * arrays.get(f"{name}_scale", np.float32(1)))
+        if len(depths) > 1:  # the export keeps once what two networks have in common
+            raise ModelError(f"{card}: {name} of its network {at + 1} is not there; are two of them the same?")
+        raise ModelError(f"{card}: is not one network of this depth and input (see {name})")
 
     norms: list[nn.BatchNorm2d] = []
     with torch.no_grad():
@@ -145,9 +143,11 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True,
             norms.append(norm)
         for name in ("fc", "side"):
             layer = getattr(network, name)
-            if last and layer is not None and arrays.get(f"{name}.bias", np.zeros(0)).shape == layer.bias.shape:
+            if not last or layer is None:
+                continue
+            if which is not None or arrays.get(f"{name}.bias", np.zeros(0)).shape == layer.bias.shape:
                 layer.weight.copy_(exported(f"{name}.weight", layer.weight.shape))
-                layer.bias.copy_(torch.from_numpy(arrays[f"{name}.bias"].copy()))
+                layer.bias.copy_(exported(f"{name}.bias", layer.bias.shape))
         _make_norms(network, norms, views)
 
 
