@@ -3,9 +3,9 @@
     python benchmarks/loader.py modelnet10.zarr [--steps 50] [--preset thesis]
 
 Both run the same module on the same device, augmentations included, in turns, so that what else the machine does falls
-on both alike. Real batches come as in training: drawn at random from the memory-mapped inputs of the training objects
-(nextview train recogniser makes them), and made in the background. The aim is a ratio of at least 0.9. The first round
-may read from the disk; where the inputs fit into memory, the later ones do not.
+on both alike. Real batches come as in training: drawn at random from the packed inputs of the training objects (which
+nextview train recogniser makes), and made in the background. The aim is a ratio of at least 0.9. The first round may read
+from the disk; where the inputs fit into memory, the later ones do not.
 """
 
 from __future__ import annotations
@@ -67,6 +67,8 @@ def main(
     preset: Literal["default", "thesis"] = "default",
     depth: Literal[18, 34, 50, 101, 152] | None = None,
     batch: int | None = None,
+    size: int | None = None,
+    blocks: Literal[1, 2, 4] | None = None,
 ) -> None:
     """Print samples a second of both, the ratio of every round, and the median ratio.
 
@@ -77,9 +79,11 @@ def main(
         preset: the recipe.
         depth: of the ResNet, if not the recipe's.
         batch: views a step, if not the recipe's.
+        size: side of the input, pixels, if not the recipe's.
+        blocks: of pixels that become channels, if not the recipe's.
     """
-    recipe = RECIPES[preset]
-    recipe = replace(recipe, depth=depth or recipe.depth, batch=batch or recipe.batch)
+    chosen = {"depth": depth, "batch": batch, "size": size, "blocks": blocks}
+    recipe = replace(RECIPES[preset], **{name: value for name, value in chosen.items() if value is not None})
     views = ViewStore.open(store)
     training, _ = split_training(views, recipe.validation, recipe.seed)
     inputs = load_inputs(store, recipe.size, recipe.input)
@@ -95,7 +99,8 @@ def main(
     learn(module, optimizer, in_memory, max(2, steps // 10))
     learn(module, optimizer, from_store, max(2, steps // 10))
     where = torch.cuda.get_device_name() if device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
-    print(f"ResNet-{recipe.depth}, {recipe.input} of {recipe.size} px, batches of {recipe.batch}, {where}")
+    sees = f"{recipe.input} of {recipe.size} px" + (f" in blocks of {recipe.blocks}" if recipe.blocks > 1 else "")
+    print(f"ResNet-{recipe.depth}, {sees}, batches of {recipe.batch}, {where}")
     ratios = []
     for k in range(rounds):
         memory, data = (learn(module, optimizer, batches, steps) for batches in (in_memory, from_store))

@@ -130,6 +130,22 @@ def test_a_network_goes_on_from_the_exported_one(boxes):
     assert network.conv1.weight.std().item() == pytest.approx((2 / (64 * 49)) ** 0.5, rel=0.01)
 
 
+def test_a_network_of_blocks_goes_on_from_one_that_saw_their_first_pixels(boxes):
+    fine = torch.zeros(16, 4, 224, 224)
+    fine[..., ::2, ::2] = torch.from_numpy(boxes).float() / 255
+    rest = torch.rand(16, 4, 224, 224)
+    rest[..., ::2, ::2] = 0
+    plain, network = ResNet(18, 10, 4, azimuths=8), ResNet(18, 10, 4, azimuths=8, blocks=2)
+    load_exported(plain, bundled(), fine[..., ::2, ::2])
+    load_exported(network, bundled(), fine)
+    with torch.no_grad():
+        wanted = plain.eval()(fine[..., ::2, ::2])[0]
+        assert torch.allclose(network.eval()(fine + rest)[0], wanted, atol=1e-3)
+        network.conv1.weight[:, 1] += 0.01  # the pixel to the right of each first one
+        assert not torch.allclose(network(fine + rest)[0], wanted, atol=1e-2)
+    assert network.conv1.weight[:, ::4].std().item() == pytest.approx(plain.conv1.weight.std().item())
+
+
 def test_a_map_network_starts_from_what_the_recogniser_knows(boxes, tmp_path):
     sphere = ViewSphere.named("40")
     seen = np.random.default_rng(0).choice(boxes[:, :, ::2, ::2], (4, 40))

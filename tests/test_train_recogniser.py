@@ -28,6 +28,7 @@ from nextview.models.image_input import image_input  # noqa: E402
 from nextview.training.grid import published_cells  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.networks import ResNet  # noqa: E402
+from nextview.training.packed import load_packed, pack, save_packed  # noqa: E402
 from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe  # noqa: E402
 from nextview.training.recogniser import RecogniserModule, Source, ValidationViews, Views, augment  # noqa: E402
 from nextview.training.runs import begin  # noqa: E402
@@ -116,9 +117,9 @@ def test_devices_share_every_batch(balanced):
 
 def test_the_disk_is_asked_for_the_views_that_come(tmp_path, monkeypatch):
     inputs = np.random.default_rng(0).integers(0, 256, (6, V, 4, 16, 16), dtype=np.uint8)
-    np.save(tmp_path / "inputs.npy", inputs)
-    mapped = np.load(tmp_path / "inputs.npy", mmap_mode="r")
-    file, asked = (tmp_path / "inputs.npy").read_bytes(), []
+    list(save_packed(tmp_path / "inputs", inputs.shape, ((i, pack(inputs[i])) for i in range(6))))
+    mapped = load_packed(tmp_path / "inputs")
+    file, asked = (tmp_path / "inputs/views.lz4").read_bytes(), []
 
     def note(_file, start, length, _advice):
         asked.append(file[start : start + length])
@@ -129,12 +130,41 @@ def test_the_disk_is_asked_for_the_views_that_come(tmp_path, monkeypatch):
     came = 0
     for images, _ in batches:
         came += len(images)
-        assert {image.numpy().tobytes() for image in images} <= set(asked)
+        assert {pack(image.numpy()[None])[0] for image in images} <= set(asked)
     assert came == len(asked) == 6 * V
     asked.clear()
     objects = [images.numpy().tobytes() for images, _ in ValidationViews(mapped, np.arange(6), np.arange(6))]
     assert len(objects) == 6
-    assert asked == [mapped[i].tobytes() for i in range(1, 6)]
+    assert asked == [b"".join(pack(inputs[i])) for i in range(1, 6)]
+
+
+def test_packed_views_are_read_like_an_array(tmp_path):
+    views = np.random.default_rng(0).integers(0, 256, (4, V, 2, 8, 8), dtype=np.uint8)
+    views[2] = 0
+    there = ((i, pack(views[i])) for i in (3, 0, 1))  # in any order; object 2 was not rendered
+    assert list(save_packed(tmp_path / "views", views.shape, there)) == [1, 2, 3]
+    packed = load_packed(tmp_path / "views")
+    assert packed.shape == views.shape
+    assert len(packed) == 4
+    for at in (0, 2, (3, 4), (1, slice(1, None, 2)), (3, slice(2)), (2, 0)):
+        assert (packed[at] == views[at]).all()
+
+    file = tmp_path / "views/views.lz4"
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(ValueError, match="views: is damaged; delete it, and it is made again"):
+        load_packed(tmp_path / "views")
+
+
+def test_views_that_are_packed_only_in_part_are_no_views(tmp_path):
+    def fails():
+        yield 0, pack(np.ones((V, 1, 2, 2), np.uint8))
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        list(save_packed(tmp_path / "views", (2, V, 1, 2, 2), fails()))
+    assert not (tmp_path / "views").exists()
+    list(save_packed(tmp_path / "views", (2, V, 1, 2, 2), []))  # what was left does not stand in the way
+    assert not load_packed(tmp_path / "views")[1].any()
 
 
 def test_devices_share_the_validation():
@@ -236,7 +266,7 @@ def test_published_recipe_on_images_by_the_command(store, tmp_path, capsys):
     assert torch.load(run / "network.pt", weights_only=True)["conv1.weight"].shape == (64, 1, 7, 7)
     images = load_inputs(store, 32, "image")
     assert (images[3] == image_input(ViewStore.open(store).image(3), 32)).all()
-    assert not store.with_name("views.zarr.inputs32.npy").exists()
+    assert not store.with_name("views.zarr.inputs32").exists()
 
     before = (run / "network.pt").read_bytes()
     main(["train", "recogniser", str(store), str(run), "--preset", "thesis", "--depth", "18", *FAST])

@@ -28,9 +28,10 @@ from nextview.viewsphere import ViewSphere
 torch = pytest.importorskip("torch")
 
 from nextview.benchmark.scores import map_scores, recogniser_scores  # noqa: E402
-from nextview.models.card import ModelError  # noqa: E402
+from nextview.models.card import ModelError, find_card  # noqa: E402
 from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
+from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.maps import MapModule, Windows  # noqa: E402
 from nextview.training.merge import merge  # noqa: E402
 from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
@@ -295,9 +296,9 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
     assert set(predictions.names) == unseen[0] | unseen[1]
     for k, card in enumerate(cards):  # each network judged what it has not seen, and nothing else
         name = sorted(unseen[k] - unseen[1 - k])[0]
-        inputs = np.load(trained / "views.zarr.inputs112.npy", mmap_mode="r")[views.names.index(name)]
+        inputs = load_inputs(store, 112)[views.names.index(name)]
         assert predictions.logits[predictions.names.index(name)] == pytest.approx(
-            Recogniser(card).from_inputs(np.array(inputs)).logits, abs=1e-4
+            Recogniser(card).from_inputs(inputs).logits, abs=1e-4
         )
     main(["train", "lcm", str(store), str(out), str(runs / "lcm"), *small])
     main(["export", "lcm", str(runs / "lcm"), str(store), str(out), str(models), "--name", "tiny-lcm"])
@@ -379,6 +380,28 @@ def test_several_networks_are_exported_as_their_mean(trained):
     assert together.features.shape == (3, 1024)
     mirrored = jury.from_inputs(x[..., ::-1].copy())  # what was side 1 is side -1 in the mirror
     assert together.sides == pytest.approx(mirrored.sides[..., -np.arange(8) % 8], abs=1e-3)
+
+
+def test_a_network_that_sees_blocks_of_pixels(trained, capsys):
+    run, store, models = str(trained / "runs/blocks"), str(trained / "views.zarr"), str(trained / "models")
+    small = ["--epochs", "1", "--views", "2", "--batch", "8", "--validation", "0.25", "--blocks", "2"]
+    main(["train", "recogniser", store, run, *small])
+    main(["export", "recogniser", run, store, models, "--name", "blocks"])
+    facts = find_card(trained / "models/blocks.json").facts
+    assert (facts["input_size"], facts["blocks"]) == (112, 2)
+    main(["export", "recogniser", str(trained / "models/blocks.json"), store, models, "--name", "again"])
+    once, again = (Recogniser(trained / f"models/{name}.json") for name in ("blocks", "again"))
+    x = seen_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
+    once, again = (model.from_inputs(x).logits * model.card.facts["temperature"] for model in (once, again))
+    assert once == pytest.approx(again, abs=2e-2)
+    with pytest.raises(SystemExit):
+        main(
+            ["export", "recogniser", run, store, models, "--name", "mixed", "--also", str(trained / "models/tiny.json")]
+        )
+    assert "pixels in blocks of [1, 2]" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["train", "recogniser", store, str(trained / "runs/odd"), *small, "--size", "7"])
+    assert "images of 7 pixels, and small ones, must be whole blocks of 2" in capsys.readouterr().err
 
 
 def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):

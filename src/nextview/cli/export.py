@@ -80,6 +80,9 @@ def export_recogniser(
     inputs = load_inputs(store, size, sees)
     sample = np.concatenate([inputs[i] for i in validation[:3]])
     networks = [network for one in members for network in member_networks(one, views, sample)]
+    blocks = {network.blocks for network in networks}
+    if len(blocks) > 1:
+        raise ModelError(f"{run} and the others do not see the same: pixels in blocks of {sorted(blocks)}")
     names = [f"ResNet-{network.depth}" for network in networks]
     if merged:
         drawn = drawn_views(inputs, training, views.labels, members[0].recipes[-1], 32)
@@ -98,21 +101,23 @@ def export_recogniser(
         "classes": views.classes,
         "temperature": 1.0,
     }
-    example = np.array(inputs[validation[0], :2])
+    example = inputs[validation[0], :2]
     uncalibrated = CalibratedRecogniser(networks, 1.0, mirror)
+    if blocks != {1}:
+        (facts["blocks"],) = blocks
     if uncalibrated.sides:
         facts["sides"] = uncalibrated.sides
     export_onnx(uncalibrated, example, "input", uncalibrated.outputs, weights, bits)
     write_card(card, facts)
     plain = Recogniser(card)
-    raw = _tracked(lambda i: plain.from_inputs(np.array(inputs[i])).logits, validation, "validation views")
+    raw = _tracked(lambda i: plain.from_inputs(inputs[i]).logits, validation, "validation views")
     labels = views.labels[validation]
     temperature = fit_temperature(raw.reshape(-1, raw.shape[2]), np.repeat(labels, raw.shape[1]))
 
     shipped = CalibratedRecogniser(networks, temperature, mirror).eval()
     export_onnx(shipped, example, "input", shipped.outputs, weights, bits)
     write_card(card, facts)
-    sample = np.array(inputs[validation[:: max(1, len(validation) // 8)][:8], 5])
+    sample = np.stack([inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]])
     difference = float(np.abs(answer(shipped, sample) - Recogniser(card).from_inputs(sample).logits).max())
     console.print(f"largest difference between torch and ONNX logits on real views: {difference:.2g}")
     if not difference < 0.1:

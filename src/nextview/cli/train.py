@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from nextview.data.store import ViewStore
+    from nextview.training.packed import PackedViews
     from nextview.training.recogniser import Source
     from nextview.training.targets import Target
 
@@ -59,6 +60,8 @@ def train_recogniser(
 
     if fold is not None and not 0 <= fold < folds:
         raise ModelError(f"there is no fold {fold} of {folds}: they are counted from 0")
+    if recipe.size % recipe.blocks or (recipe.small_epochs and recipe.small % recipe.blocks):
+        raise ModelError(f"images of {recipe.size} pixels, and small ones, must be whole blocks of {recipe.blocks}")
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation, recipe.seed)
     azimuths = views.sphere.azimuths if recipe.side else 0
@@ -112,7 +115,7 @@ def _source(
     return Source(inputs, rows, None if planes is None else sides(store, views.sphere.azimuths, planes))
 
 
-def _prepared(path: Path, store: ViewStore, size: int, kind: str) -> NDArray[np.uint8]:
+def _prepared(path: Path, store: ViewStore, size: int, kind: str) -> PackedViews:
     """Inputs of a store (N, V, C, size, size), prepared if they are not yet."""
     import time
 
@@ -211,7 +214,9 @@ def _train_map(
             console.print(f"{out}: is trained already", soft_wrap=True)
             return
         cloud = recipe.input == "cloud"
-        seen: NDArray = views.all_points() if cloud else _prepared(store, views, recipe.size, recipe.input)
+        seen: NDArray | PackedViews = (
+            views.all_points() if cloud else _prepared(store, views, recipe.size, recipe.input)
+        )
         network = maps.train(seen, target.values, views.sphere, training, validation, recipe, out, hardware, weights)
         _draw_curves(out)
         finish(network, out)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from nextview.benchmark.published import published_recognisers, read_rows
+from nextview.training.packed import PackedViews
 
 
 def published_cells(classes: tuple[str, ...], views: int) -> dict[tuple[int, int], list[float]]:
@@ -30,7 +31,7 @@ def published_cells(classes: tuple[str, ...], views: int) -> dict[tuple[int, int
 
 
 def count_right(
-    network: nn.Module, inputs: NDArray[np.uint8], objects: NDArray[np.int64], labels: NDArray[np.int64]
+    network: nn.Module, inputs: PackedViews, objects: NDArray[np.int64], labels: NDArray[np.int64]
 ) -> Iterator[int]:
     """How many single views of each object are named right, on a GPU where there is one.
 
@@ -47,7 +48,7 @@ def count_right(
     network = network.eval().to(device)
     for i in objects:
         with torch.inference_mode():
-            x = torch.from_numpy(np.array(inputs[i])).to(device).float() / 255
+            x = torch.from_numpy(inputs[i]).to(device).float() / 255
             yield int((network(x)[0].argmax(1) == int(labels[i])).sum())
 
 

@@ -18,8 +18,8 @@ from nextview.models.card import ModelError
 from nextview.models.cloud_input import cloud_input
 from nextview.training.fit import fit
 from nextview.training.hardware import Hardware
-from nextview.training.inputs import AHEAD, ask_for
 from nextview.training.networks import map_columns, map_network, orthogonality
+from nextview.training.packed import AHEAD, PackedViews, ask_for
 from nextview.training.recipes import MapRecipe
 from nextview.training.weights import load_exported
 from nextview.viewsphere import ViewSphere
@@ -33,7 +33,7 @@ class Windows(IterableDataset):
 
     def __init__(
         self,
-        seen: NDArray[Any],
+        seen: NDArray[Any] | PackedViews,
         values: NDArray[np.float32],
         sphere: ViewSphere,
         objects: NDArray[np.int64],
@@ -143,7 +143,7 @@ class MapModule(L.LightningModule):
 
 
 def train(
-    seen: NDArray[Any],
+    seen: NDArray[Any] | PackedViews,
     values: NDArray[np.float32],
     sphere: ViewSphere,
     training: NDArray[np.int64],

@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
 
 from nextview.data.split import split_training
 from nextview.data.store import ViewStore
@@ -77,7 +76,7 @@ def _exported(source: Path, views: ViewStore) -> Member:
     return Member(source, size, sees, kept, frozenset(), recipes, training.get("commands", []))
 
 
-def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) -> list[nn.Module]:
+def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) -> list[ResNet]:
     """Its networks, in evaluation mode: that of a run, or all that an exported recogniser averages.
 
     Args:
@@ -86,11 +85,11 @@ def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) ->
         sample: some views' inputs, (B, C, S, S); see ``weights.load_exported``.
     """
     if one.source.suffix == ".json":
-        return list(exported_networks(one.source, CHANNELS_OF[one.sees], torch.from_numpy(sample).float() / 255))
+        return exported_networks(one.source, CHANNELS_OF[one.sees], torch.from_numpy(sample).float() / 255)
     return [run_network(one.source, one.recipes[0], views)]
 
 
-def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> nn.Module:
+def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet:
     """The recogniser of a finished run, in evaluation mode."""
     azimuths = views.sphere.azimuths if recipe.side else 0
-    return load_run(ResNet(recipe.depth, len(views.classes), CHANNELS_OF[recipe.input], azimuths), run)
+    return load_run(ResNet(recipe.depth, len(views.classes), CHANNELS_OF[recipe.input], azimuths, recipe.blocks), run)

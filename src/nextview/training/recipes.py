@@ -13,6 +13,8 @@ class RecogniserRecipe:
     Attributes:
         depth: ResNet-18, -34, -50, -101 or -152.
         size: side of the input image, pixels.
+        blocks: side of the blocks of pixels that the first convolution sees as channels of one pixel (space to depth):
+            with 2, an image of twice the side takes hardly longer.
         small: side of the images in the first epochs, which are faster so; see ``small_epochs``.
         small_epochs: how many epochs see small images.
         epochs: passes over the training objects.
@@ -37,6 +39,7 @@ class RecogniserRecipe:
 
     depth: Literal[18, 34, 50, 101, 152] = 18
     size: int = 112
+    blocks: Literal[1, 2, 4] = 1
     small: int = 80
     small_epochs: int = 0
     epochs: int = 12

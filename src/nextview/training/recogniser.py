@@ -18,8 +18,9 @@ from torch.utils.data import IterableDataset
 
 from nextview.training.fit import fit
 from nextview.training.hardware import Hardware
-from nextview.training.inputs import AHEAD, CHANNELS_OF, ask_for
+from nextview.training.inputs import CHANNELS_OF
 from nextview.training.networks import ResNet
+from nextview.training.packed import AHEAD, PackedViews, ask_for
 from nextview.training.recipes import RecogniserRecipe
 from nextview.training.sides import side_loss
 from nextview.training.weights import load_exported, load_torchvision
@@ -35,7 +36,7 @@ class Source:
         sides: that each view sees of its object, (rows, V), see ``sides.sides``; None if they are not to be learned.
     """
 
-    inputs: NDArray[np.uint8]
+    inputs: NDArray[np.uint8] | PackedViews
     row: NDArray[np.int64]
     sides: NDArray[np.float32] | None = None
 
@@ -119,7 +120,7 @@ def augment(x: Tensor, s: int) -> tuple[Tensor, Tensor]:
 
 
 def drawn_views(
-    inputs: NDArray[np.uint8],
+    inputs: NDArray[np.uint8] | PackedViews,
     objects: NDArray[np.int64],
     labels: NDArray[np.int64],
     recipe: RecogniserRecipe,
@@ -148,7 +149,7 @@ class RecogniserModule(L.LightningModule):
     def __init__(self, recipe: RecogniserRecipe, classes: int, steps: int, azimuths: int = 0) -> None:
         super().__init__()
         self.recipe, self.steps = recipe, steps
-        network = ResNet(recipe.depth, classes, CHANNELS_OF[recipe.input], azimuths)
+        network = ResNet(recipe.depth, classes, CHANNELS_OF[recipe.input], azimuths, recipe.blocks)
         self.net = network.to(memory_format=torch.channels_last)
         for name in ("hits", "seen", "lost"):  # of each class in validation
             self.register_buffer(name, torch.zeros(classes), persistent=False)
@@ -205,7 +206,9 @@ class RecogniserModule(L.LightningModule):
 class ValidationViews(IterableDataset):
     """Every fifth view of the validation objects, shifted by one from object to object: all views get their turn."""
 
-    def __init__(self, inputs: NDArray[np.uint8], objects: NDArray[np.int64], labels: NDArray[np.int64]) -> None:
+    def __init__(
+        self, inputs: NDArray[np.uint8] | PackedViews, objects: NDArray[np.int64], labels: NDArray[np.int64]
+    ) -> None:
         self.inputs, self.objects, self.labels, self.share = inputs, objects, labels, slice(None)
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
@@ -213,7 +216,7 @@ class ValidationViews(IterableDataset):
         for at, (k, i) in enumerate(mine):
             ask_for(self.inputs, [(later,) for _, later in mine[at + 1 : at + 2]])
             views = self.inputs[i, k % 5 :: 5]
-            yield torch.from_numpy(np.array(views)), torch.full((len(views),), int(self.labels[i]))
+            yield torch.from_numpy(views), torch.full((len(views),), int(self.labels[i]))
 
 
 def train(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import onnx
@@ -16,8 +16,10 @@ from nextview.models.card import ModelError, find_card
 from nextview.models.networks import open_weights
 from nextview.training.networks import RESNETS, ResNet
 
+N = TypeVar("N", bound=nn.Module)
 
-def load_run(network: nn.Module, run: Path) -> nn.Module:
+
+def load_run(network: N, run: Path) -> N:
     """Give a network the parameters of a finished run: the network, in evaluation mode. Nothing in it is executed.
 
     Raises:
@@ -83,7 +85,7 @@ def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet]:
     for which, depth in enumerate(_depths(facts)):
         if depth not in RESNETS:
             raise ModelError(f"{card}: there is no ResNet-{depth}")
-        network = ResNet(depth, len(facts.get("classes", [])), channels, facts.get("sides", 0))
+        network = ResNet(depth, len(facts.get("classes", [])), channels, facts.get("sides", 0), facts.get("blocks", 1))
         load_exported(network, card, views, which=which)
         networks.append(network.eval())
     if not networks:
@@ -96,7 +98,8 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True,
 
     The export merges every batch norm into the convolution before it. Here each gets the mean and the variance that its
     input has over ``views``, and a scale and a shift that undo them: the network answers as the exported one, save for
-    the temperature. A last layer that is not there, or has other classes, is left as it is.
+    the temperature. A last layer that is not there, or has other classes, is left as it is. A network that sees blocks
+    of pixels may take the parameters of one that saw the first pixel of each: it begins blind to the others.
 
     Args:
         network: is changed in place.
@@ -115,6 +118,9 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True,
     if (which is None and len(depths) > 1) or network.depth not in depths[at : at + 1]:
         named = model.facts.get("network")
         raise ModelError(f"{card}: is not one network of this depth and input: {named}, not ResNet-{network.depth}")
+    blocks = model.facts.get("blocks", 1)
+    if blocks not in (1, network.blocks):
+        raise ModelError(f"{card}: sees pixels in blocks of {blocks}, not of {network.blocks}")
     open_weights(model)  # refuses a file that is not the card's
     graph = onnx.load(model.path).graph
     arrays = {re.sub(rf"^networks?\.({at}\.)?", "", i.name): numpy_helper.to_array(i) for i in graph.initializer}
@@ -132,10 +138,12 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True,
         for name, module in network.named_modules():
             if not isinstance(module, nn.Conv2d):
                 continue
-            weight = exported(f"{name}.weight", module.weight.shape)
+            known = slice(None, None, network.blocks**2 // blocks**2 if name == "conv1" else 1)
+            weight = exported(f"{name}.weight", module.weight[:, known].shape)
             # A norm forgets the scale of what it is given: bring it to where training begins, as the rate expects.
             scale = float((2 / (weight.shape[0] * weight[0, 0].numel())) ** 0.5 / weight.std())
-            module.weight.copy_(weight * scale)
+            module.weight.zero_()
+            module.weight[:, known] = weight * scale
             norm = network.get_submodule(re.sub(r"conv(\d)$", r"bn\1", name.replace("downsample.0", "downsample.1")))
             assert isinstance(norm, nn.BatchNorm2d)
             norm.weight.fill_(1 / scale)

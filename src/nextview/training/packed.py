@@ -1,0 +1,116 @@
+"""Views of many objects in one file, each packed for itself, so that any of them is read without the others."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numcodecs import Blosc
+from numpy.typing import NDArray
+
+PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)
+"""Views of objects are mostly background and flat faces: a tenth is left, which fits into memory."""
+
+AHEAD = 4
+"""So many batches before a view is trained on, the disk is asked for it."""
+
+
+@dataclass(frozen=True)
+class PackedViews:
+    """Views of all objects, read like an array (N, V, C, H, W) of uint8.
+
+    ``views[i]`` and ``views[i, 2:5]`` are some views of one object, ``views[i, v]`` is one.
+
+    Attributes:
+        file: holds the packed views one after another.
+        packed: its bytes, memory-mapped.
+        places: first byte and number of bytes of each view, (N, V, 2); none for views that are not there, which are 0.
+        size: of a view, (C, H, W).
+    """
+
+    file: Path
+    packed: NDArray[np.uint8]
+    places: NDArray[np.int64]
+    size: tuple[int, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """N, V, C, H, W."""
+        return (*self.places.shape[:2], *self.size)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __getitem__(self, at: int | tuple[int, int | slice]) -> NDArray[np.uint8]:
+        places = self.places[at]
+        views = np.zeros((*places.shape[:-1], *self.size), np.uint8)
+        for (start, count), view in zip(places.reshape(-1, 2), views.reshape(-1, *self.size), strict=True):
+            if count:
+                PACKING.decode(self.packed[start : start + count], view)
+        return views
+
+
+def pack(views: NDArray[np.uint8]) -> list[bytes]:
+    """The views of an object, (V, C, H, W), each packed for itself."""
+    return [PACKING.encode(np.ascontiguousarray(view)) for view in views]
+
+
+def save_packed(folder: Path, shape: tuple[int, ...], objects: Iterable[tuple[int, list[bytes]]]) -> Iterator[int]:
+    """Write views as they come. The folder appears under its name only when it is whole.
+
+    Args:
+        folder: that ``load_packed`` reads.
+        shape: (N, V, C, H, W).
+        objects: some of them, each with its views packed, (i, V packed views).
+
+    Yields:
+        Objects written so far.
+    """
+    places = np.zeros((*shape[:2], 2), np.int64)
+    part = folder.with_name(f"{folder.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    with open(part / "views.lz4", "wb") as file:
+        for total, (i, packed) in enumerate(objects, 1):
+            counts = np.array([len(view) for view in packed])
+            places[i] = np.stack([file.tell() + np.cumsum(counts) - counts, counts], 1)
+            file.writelines(packed)
+            yield total
+    np.savez(part / "index.npz", places=places, size=shape[2:])
+    part.rename(folder)
+
+
+def load_packed(folder: Path) -> PackedViews:
+    """Views that ``save_packed`` wrote.
+
+    Raises:
+        ValueError: the file of the views is not as long as it was.
+    """
+    with np.load(folder / "index.npz") as index:
+        places, size = index["places"], tuple(index["size"].tolist())
+    file, total = folder / "views.lz4", int(places[..., 1].sum())
+    if file.stat().st_size != total:
+        raise ValueError(f"{folder}: is damaged; delete it, and it is made again")
+    packed = np.memmap(file, np.uint8, "r") if total else np.zeros(0, np.uint8)
+    return PackedViews(file, packed, places, size)
+
+
+def ask_for(views: NDArray | PackedViews, places: Iterable[tuple[int, ...]]) -> None:
+    """Have the disk fetch views that are read soon, all at once and nothing else.
+
+    Left to page faults, they come one after the other, each with much around it. Views in memory are let be.
+
+    Args:
+        views: of all objects.
+        places: leading indices: (object, view), or (object,) for all views of it.
+    """
+    if not isinstance(views, PackedViews) or not hasattr(os, "posix_fadvise"):
+        return
+    with open(views.file, "rb") as file:
+        for place in places:
+            wanted = views.places[place].reshape(-1, 2)
+            os.posix_fadvise(file.fileno(), wanted[0, 0], int(wanted[:, 1].sum()), os.POSIX_FADV_WILLNEED)
