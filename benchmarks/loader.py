@@ -4,8 +4,8 @@
 
 Both run the same module on the same device, augmentations included, in turns, so that what else the machine does falls
 on both alike. Real batches come as in training: drawn at random from the packed inputs of the training objects (which
-nextview train recogniser makes), and made in the background. The aim is a ratio of at least 0.9. The first round may read
-from the disk; where the inputs fit into memory, the later ones do not.
+nextview train recogniser makes), and made in the background. The aim is a ratio of at least 0.9. The first round may
+read from the disk; where the inputs fit into memory, the later ones do not.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class ResNet(nn.Module):
         channels: of the input image (B, channels, H, W), values in 0 .. 1.
         azimuths: sides that are told apart; 0 for none.
         blocks: side of the blocks of pixels that the first convolution sees as channels of one pixel (space to depth):
-            with 2, an image of twice the side takes hardly longer.
+            with 2, an image of twice the side takes half as long again, not four times as long.
     """
 
     def __init__(self, depth: int, classes: int, channels: int, azimuths: int = 0, blocks: int = 1) -> None:

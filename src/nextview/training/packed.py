@@ -13,7 +13,7 @@ from numcodecs import Blosc
 from numpy.typing import NDArray
 
 PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)
-"""Views of objects are mostly background and flat faces: a tenth is left, which fits into memory."""
+"""Views of objects are mostly background and flat faces: a sixth is left or less, which fits into memory."""
 
 AHEAD = 4
 """So many batches before a view is trained on, the disk is asked for it."""

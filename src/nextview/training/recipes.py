@@ -14,7 +14,7 @@ class RecogniserRecipe:
         depth: ResNet-18, -34, -50, -101 or -152.
         size: side of the input image, pixels.
         blocks: side of the blocks of pixels that the first convolution sees as channels of one pixel (space to depth):
-            with 2, an image of twice the side takes hardly longer.
+            with 2, an image of twice the side takes half as long again, not four times as long.
         small: side of the images in the first epochs, which are faster so; see ``small_epochs``.
         small_epochs: how many epochs see small images.
         epochs: passes over the training objects.
