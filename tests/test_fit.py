@@ -34,7 +34,7 @@ def data(classes=3, objects=12, views=5, size=32):
 class SmallNet(torch.nn.Module):
     """In place of a ResNet, whose checkpoints are 130 MB: convolution, batch norm and what is needed around them."""
 
-    def __init__(self, depth, classes, channels, azimuths=0):
+    def __init__(self, depth, classes, channels, azimuths=0, blocks=1):
         super().__init__()
         self.features = torch.nn.Sequential(
             torch.nn.Conv2d(channels, 8, 5, 4), torch.nn.BatchNorm2d(8), torch.nn.ReLU(), torch.nn.AdaptiveAvgPool2d(1)
