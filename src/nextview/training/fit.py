@@ -146,8 +146,6 @@ def fit(
     callbacks = [StepSeed(), Log(out), Checkpoint(out, "best", select, mode), Checkpoint(out, "last")]
     if patience:
         callbacks.append(Patience(select, mode, patience))
-    # Numbers too small for the normal format are slow on CPUs and mean nothing here.
-    torch.set_flush_denormal(True)
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with warnings.catch_warnings():
         # All of them describe what is meant here: a run that resumes, and data sets that make their own batches.
@@ -173,6 +171,8 @@ def fit(
         last = out / "last.ckpt"
         resume = last if last.exists() and _read(last) else None
         try:
+            # Numbers too small for the normal format are slow on CPUs and mean nothing here.
+            torch.set_flush_denormal(True)
             trainer.fit(module, datamodule=Batches(training, validation), ckpt_path=resume, weights_only=True)
         finally:
             torch.set_flush_denormal(False)  # it holds for the whole process
