@@ -22,7 +22,7 @@ from nextview.data.predictions import Predictions
 from nextview.data.split import split_training
 from nextview.data.store import ViewStore
 from nextview.fitting.calibration import fit_temperature, loss
-from nextview.fitting.evidence import fitting_set
+from nextview.fitting.evidence import FittingSet
 
 
 def told(p: Predictions, store: ViewStore) -> str:
@@ -45,8 +45,8 @@ def told(p: Predictions, store: ViewStore) -> str:
 
 def main(validation: Path, test: Path, store: Path | None = None) -> None:
     """Print both tables."""
-    known, other = Predictions.load(validation), Predictions.load(test)
-    data = fitting_set(known, 1.0, 0)
+    known, other = Predictions.load(validation).each_shape_once(), Predictions.load(test)
+    data = FittingSet.of_all(known)
     both = [replace(data, sides=None), data]
     calibrations = [fit_temperature(d, np.random.default_rng([0, 0]), walks=1 + 8000 // len(data)) for d in both]
     for what, d, c in zip(("logits alone", "agreeing on the side"), both, calibrations, strict=True):

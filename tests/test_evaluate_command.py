@@ -123,6 +123,17 @@ def test_other_spheres_and_no_maps(tmp_path, capsys):
     assert (tmp_path / "out" / "lem_examples.png").exists()
 
 
+def test_copies_of_a_shape_are_judged_once_where_that_is_asked_for(tmp_path):
+    p = some_predictions(6)
+    rows = np.array([0, 1, 2, 3, 4, 0])
+    replace(p, depth_entropy=p.depth_entropy[rows], labels=p.labels[rows]).save(tmp_path / "p.npz")
+    for more, objects in (([], 6), (["--each-shape-once"], 5)):
+        main(["evaluate", str(tmp_path / "p.npz"), "--out", str(tmp_path / "out"), "--samples", "5", *more])
+        settings = json.loads((tmp_path / "out" / "results.json").read_text())["settings"]
+        assert settings["objects"] == objects
+        assert settings["each_shape_once"] == bool(more)
+
+
 def test_one_object_is_enough(tmp_path):
     some_predictions(1).save(tmp_path / "p.npz")
     main(["evaluate", str(tmp_path / "p.npz"), "--out", str(tmp_path / "out"), "--samples", "5"])

@@ -133,6 +133,32 @@ def test_bounds_fall_with_the_threshold_and_promise_nothing_where_few_stop():
 # What may be fitted to
 
 
+def copied(p: Predictions, often: int) -> Predictions:
+    """With the first object there so many times more, under other names and a little otherwise recognised."""
+    rows = np.array([*range(len(p)), *[0] * often])
+    arrays = {name: getattr(p, name)[rows] for name in ("labels", "splits", "conflicting", "depth_entropy")}
+    logits = p.logits[rows]
+    logits[len(p) :] += 1
+    names = (*p.names, *(f"copy{i}" for i in range(often)))
+    return replace(p, **arrays, logits=logits, maps={k: m[rows] for k, m in p.maps.items()}, names=names)
+
+
+def test_a_shape_that_was_copied_counts_once():
+    p = replace(some_predictions(60), splits=np.array(["train"] * 60))
+    many = copied(p, 9)
+    once = many.each_shape_once()
+    assert once.names == p.names
+    np.testing.assert_array_equal(once.logits, p.logits)
+    assert many.each_shape_once().each_shape_once().names == p.names
+    relabelled = replace(many, labels=np.r_[many.labels[:-1], (many.labels[-1] + 1) % 3])
+    assert relabelled.each_shape_once().names == (*p.names, "copy8")  # which of two labels is right is not for us
+    np.testing.assert_array_equal(fitting_set(many, 1.0, 0).logits, p.logits)
+    drawn = [fitting_set(many, 0.1, seed) for seed in range(40)]
+    assert any(p.logits[0] in data.logits for data in drawn)
+    assert all(sum((row == p.logits[0]).all() for row in data.logits) < 2 for data in drawn)
+    assert not any((row == p.logits[0] + 1).all() for data in drawn for row in data.logits)
+
+
 def test_nothing_is_fitted_to_the_test_split():
     p = some_predictions(30)
     with pytest.raises(PredictionsError, match="test split"):

@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch")
 
 from nextview.models.card import ModelError  # noqa: E402
 from nextview.training.networks import ResNet  # noqa: E402
-from nextview.training.weights import load_torchvision  # noqa: E402
+from nextview.training.weights import load_checkpoint  # noqa: E402
 
 BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3), 152: (3, 8, 36, 3)}
 PUBLISHED = {18: 11_689_512, 34: 21_797_672, 50: 25_557_032, 101: 44_549_160, 152: 60_192_808}
@@ -82,7 +82,7 @@ def test_any_number_of_channels(depth, features):
 def test_a_torchvision_checkpoint_loads_whole(tmp_path, depth):
     state = checkpoint(tmp_path / "resnet.pth", depth, classes=10)
     network = ResNet(depth, 10, 3)
-    load_torchvision(network, tmp_path / "resnet.pth")
+    load_checkpoint(network, tmp_path / "resnet.pth")
     ours = network.state_dict()
     assert all(torch.equal(ours[name], value) for name, value in state.items())
 
@@ -90,7 +90,7 @@ def test_a_torchvision_checkpoint_loads_whole(tmp_path, depth):
 def test_a_checkpoint_from_before_batches_were_counted_loads(tmp_path):
     state = checkpoint(tmp_path / "old.pth", counts_batches=False)
     network = ResNet(18, 1000, 3)
-    load_torchvision(network, tmp_path / "old.pth")
+    load_checkpoint(network, tmp_path / "old.pth")
     assert torch.equal(network.layer4[1].bn2.running_var, state["layer4.1.bn2.running_var"])
 
 
@@ -99,7 +99,7 @@ def test_other_channels_answer_grey_images_as_before(tmp_path, channels):
     checkpoint(tmp_path / "rgb.pth", classes=5)
     rgb, ours = ResNet(18, 5, 3), ResNet(18, 5, channels)
     for network in (rgb, ours):
-        load_torchvision(network, tmp_path / "rgb.pth")
+        load_checkpoint(network, tmp_path / "rgb.pth")
     grey = torch.rand(2, 1, 32, 32)
     with torch.no_grad():
         expected = rgb.conv1(grey.expand(-1, 3, -1, -1))
@@ -110,7 +110,7 @@ def test_other_classes_keep_the_last_layer_of_the_network(tmp_path):
     state = checkpoint(tmp_path / "imagenet.pth")
     network = ResNet(18, 10, 3)
     before = network.fc.weight.clone()
-    load_torchvision(network, tmp_path / "imagenet.pth")
+    load_checkpoint(network, tmp_path / "imagenet.pth")
     assert torch.equal(network.fc.weight, before)
     assert torch.equal(network.layer3[0].conv1.weight, state["layer3.0.conv1.weight"])
 
@@ -166,7 +166,7 @@ def test_broken_and_foreign_files_are_refused_and_nothing_is_executed(tmp_path, 
     network = ResNet(18, 10, 4)
     before = {name: value.clone() for name, value in network.state_dict().items()}
     with pytest.raises(ModelError, match=r"weights\.pth: ") as refusal:
-        load_torchvision(network, path)
+        load_checkpoint(network, path)
     assert "\n" not in str(refusal.value)
     assert not (tmp_path / "executed").exists()
     assert all(torch.equal(before[name], value) for name, value in network.state_dict().items())

@@ -124,6 +124,9 @@ def trained(tmp_path_factory):
             folder = root / "meshes" / label / ("test" if k > 7 else "train")
             folder.mkdir(parents=True, exist_ok=True)
             write_off(folder / f"{label}_{k}.off", boxes_mesh(boxes, label))
+    table = boxes_mesh(SAMPLES["table"](), "table")
+    for name, scale in (("table_8", 1), ("table_larger", 2)):
+        write_off(root / "meshes/table/train" / f"{name}.off", replace(table, vertices=scale * table.vertices))
     twin = root / "meshes/table/train/table_0.off"
     (root / "meshes/monitor/train/monitor_twin.off").write_bytes(twin.read_bytes())
     store, runs, models = root / "views.zarr", root / "runs", root / "models"
@@ -146,6 +149,31 @@ def test_split_keeps_twins_together_and_test_objects_out(trained):
         twins = [store.names.index(name) for name in ("table_0", "monitor_twin")]
         assert np.isin(twins, validation).sum() in (0, 2)
         assert set(store.labels[validation]) == {0, 1}
+        copies = np.isin([store.names.index(name) for name in ("table_8", "table_larger")], validation)
+        assert copies.all() == copies.any()
+        judging = split.each_shape_once(store, validation)  # the twin has another label
+        assert len(judging) == len(validation) - copies.all()
+
+
+def test_a_shape_that_was_copied_judges_training_once(trained, tmp_path, monkeypatch):
+    store = ViewStore.open(trained / "views.zarr")
+    copy = store.names.index("table_larger")
+    seed = next(s for s in range(99) if copy in split.split_training(store, 0.25, s)[1])
+
+    class Judged(Exception):
+        pass
+
+    def judged_on(objects: np.ndarray) -> None:
+        raise Judged([store.names[i] for i in objects])
+
+    monkeypatch.setattr("nextview.training.recogniser.train", lambda *given: judged_on(given[3]))
+    monkeypatch.setattr("nextview.training.maps.train", lambda *given: judged_on(given[4]))
+    for what in ("recogniser", "lem"):
+        command = ["train", what, str(trained / "views.zarr"), str(tmp_path / what)]
+        with pytest.raises(Judged) as judged:
+            main([*command, "--validation", "0.25", "--seed", str(seed)])
+        assert "table_8" in judged.value.args[0]
+        assert "table_larger" not in judged.value.args[0]
 
 
 def test_trained_models_have_cards_and_run(trained):

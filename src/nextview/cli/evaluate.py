@@ -20,6 +20,7 @@ def evaluate(
     /,
     out: Path = Path("evaluation"),
     split: Literal["train", "test"] | None = None,
+    each_shape_once: bool = False,
     cards: tuple[str, ...] = (),
     samples: int = 2000,
     seed: int = 0,
@@ -30,6 +31,8 @@ def evaluate(
         predictions: made by nextview predict.
         out: folder for numbers, tables, figures and evaluate.html; an earlier evaluation there is replaced.
         split: take only the objects of this one; needed where the predictions hold several.
+        each_shape_once: of objects with the same label that look the same from every view, copies of one mesh, judge
+            only the first; the published numbers count them all.
         cards: of the models that made the predictions; their scores are noted on these.
         samples: of the bootstrap.
         seed: decides the bootstrap, the orders of views and the examples.
@@ -52,11 +55,14 @@ def evaluate(
         table = table.of_split(split)
     elif len(set(table.splits)) > 1:
         raise ValueError(f"{predictions}: holds training and test objects; choose with --split which are judged")
+    if each_shape_once:
+        table = table.each_shape_once()
     noted = {}
     for name in cards:
         card = find_card(name)
         known = "" if table.of_size is None else ", of known size"
-        of = f"{split or table.splits[0] or 'all'} ({len(table)} objects{known})"
+        things = "shapes" if each_shape_once else "objects"
+        of = f"{split or table.splits[0] or 'all'} ({len(table)} {things}{known})"
         noted[card.path] = card.facts | {
             "scores": card.facts.get("scores", {}) | {of: judge.scores_for_card(card, table)}
         }
@@ -66,6 +72,7 @@ def evaluate(
         "predictions_sha256": file_hash(predictions),
         "models": table.models,
         "split": split,
+        "each_shape_once": each_shape_once,
         "objects": len(table),
         "samples": samples,
         "seed": seed,

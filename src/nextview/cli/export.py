@@ -45,7 +45,7 @@ def export_recogniser(
         merged: average their weights instead, into one network; for runs that went on from one another (--weights).
         mirror: average what the networks say of a view and of its mirror image.
         bits: that a weight takes in the file.
-        name: what to call the model; resnetDEPTH-modelnet10 by default.
+        name: what to call the model; by default after its first network, resnet18-modelnet10 or so.
         commands: the commands that made the run, for the card.
         note: what else the card should say.
     """
@@ -55,6 +55,7 @@ def export_recogniser(
 
     from nextview.benchmark.scores import recogniser_scores
     from nextview.cli.progress import console
+    from nextview.data.split import each_shape_once
     from nextview.data.store import ViewStore
     from nextview.models.card import ModelError, write_card
     from nextview.models.networks import Recogniser
@@ -83,13 +84,13 @@ def export_recogniser(
     blocks = {network.blocks for network in networks}
     if len(blocks) > 1:
         raise ModelError(f"{run} and the others do not see the same: pixels in blocks of {sorted(blocks)}")
-    names = [f"ResNet-{network.depth}" for network in networks]
+    names = [network.name for network in networks]
     if merged:
         drawn = drawn_views(inputs, training, views.labels, members[0].recipes[-1], 32)
         networks, names = [merge(networks, drawn)], [f"{names[0]}, the mean of {len(networks)} runs"]
 
     out.mkdir(parents=True, exist_ok=True)
-    name = name or f"resnet{members[0].recipes[-1].depth}-modelnet10"
+    name = name or f"{networks[0].name.lower().replace('resnet-', 'resnet')}-modelnet10"
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
     facts: dict[str, Any] = {
         "name": name,
@@ -109,9 +110,9 @@ def export_recogniser(
         facts["sides"] = uncalibrated.sides
     export_onnx(uncalibrated, example, "input", uncalibrated.outputs, weights, bits)
     write_card(card, facts)
-    plain = Recogniser(card)
-    raw = _tracked(lambda i: plain.from_inputs(inputs[i]).logits, validation, "validation views")
-    labels = views.labels[validation]
+    plain, judging = Recogniser(card), each_shape_once(views, validation)
+    raw = _tracked(lambda i: plain.from_inputs(inputs[i]).logits, judging, "validation views")
+    labels = views.labels[judging]
     temperature = fit_temperature(raw.reshape(-1, raw.shape[2]), np.repeat(labels, raw.shape[1]))
 
     shipped = CalibratedRecogniser(networks, temperature, mirror).eval()
@@ -129,7 +130,7 @@ def export_recogniser(
             "recipes": [asdict(recipe) for one in members for recipe in one.recipes],
             "commands": [*(command for one in members for command in one.commands), *commands],
         },
-        "scores": {f"validation ({len(validation)} objects of the training split)": recogniser_scores(raw, labels)},
+        "scores": {f"validation ({len(judging)} objects of the training split)": recogniser_scores(raw, labels)},
         "largest_difference_to_torch": round(difference, 4),
         "note": note,
         "unseen": sorted(unseen),
@@ -222,7 +223,7 @@ def _export_map(
     from nextview.benchmark.scores import map_scores
     from nextview.cli.progress import console
     from nextview.data.seen import seen_views
-    from nextview.data.split import split_training
+    from nextview.data.split import each_shape_once, split_training
     from nextview.data.store import ViewStore
     from nextview.models.card import ModelError, write_card
     from nextview.models.networks import MapNetwork
@@ -265,9 +266,10 @@ def _export_map(
     def one(i: int) -> NDArray:
         return predictor.from_inputs(seen_views(views, i, *predictor.sees))[kind]
 
-    maps = _tracked(one, validation, "validation maps")
+    judging = each_shape_once(views, validation)
+    maps = _tracked(one, judging, "validation maps")
     shape = (-1, sphere.rings, 3)
-    true = target.values[validation][:, sphere.windows]
+    true = target.values[judging][:, sphere.windows]
     facts |= {
         "training": {
             "data": f"{len(training)} objects of the training split, {len(sphere)} views each",
@@ -275,7 +277,7 @@ def _export_map(
             "commands": list(commands),
         },
         "scores": {
-            f"validation ({len(validation)} objects of the training split)": map_scores(
+            f"validation ({len(judging)} objects of the training split)": map_scores(
                 maps.reshape(shape), true.reshape(shape)
             ),
         },

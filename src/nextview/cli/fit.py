@@ -81,23 +81,24 @@ def fit_size(
     from nextview.data.folders import DatasetError
     from nextview.data.predictions import Predictions, PredictionsError
     from nextview.data.store import ViewStore
-    from nextview.fitting.evidence import fitting_set
+    from nextview.fitting.evidence import FittingSet
     from nextview.fitting.size import densities, fit_weight
     from nextview.models.card import read_card, write_card
 
-    model, views, table = read_card(card), ViewStore.open(store), Predictions.load(predictions).by_shape()
+    model, views, predicted = read_card(card), ViewStore.open(store), Predictions.load(predictions)
+    table = predicted.each_shape_once().by_shape()
     radii, labels = views.radii, views.labels
     if np.isnan(radii[views.done]).any():
         raise DatasetError(f"{store}: does not know the unit of its meshes; tell it with nextview render --unit")
     row = {name: i for i, name in enumerate(views.names)}
-    strangers = [name for name in table.names if name not in row]
+    strangers = [name for name in predicted.names if name not in row]
     if strangers:
         raise PredictionsError(f"{predictions}: holds {strangers[0]!r}, which {store} does not")
     if table.models["recogniser"][1] != model.sha256:
         raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
-    data, judged = fitting_set(table, 1.0, 0), [row[name] for name in table.names]
+    data, judged = FittingSet.of_all(table), [row[name] for name in table.names]
     of_training = views.done & (views.splits == "train") & np.isin(views.group.attrs["labels"], table.classes)
-    taught = np.setdiff1d(np.flatnonzero(of_training), judged)
+    taught = np.setdiff1d(np.flatnonzero(of_training), [row[name] for name in predicted.names])
     classes = np.array([table.classes.index(name) if name in table.classes else -1 for name in views.classes])
     log_density = densities(radii[taught], classes[labels[taught]], len(table.classes))
     found, before, after = fit_weight(data, radii[judged], log_density)
@@ -128,14 +129,14 @@ def fit_valleys(
 
     from nextview.cli.progress import console
     from nextview.data.predictions import Predictions, PredictionsError
-    from nextview.fitting.evidence import fitting_set
+    from nextview.fitting.evidence import FittingSet
     from nextview.fitting.valleys import valley_gains
     from nextview.models.card import read_card, write_card
 
-    model, table = read_card(card), Predictions.load(predictions)
+    model, table = read_card(card), Predictions.load(predictions).each_shape_once()
     if model.kind not in table.maps or table.models[model.kind] != (model.name, model.sha256):
         raise PredictionsError(f"{predictions}: holds no maps by {card}")
-    data = fitting_set(table, 1.0, 0)
+    data = FittingSet.of_all(table)
     kept = np.flatnonzero(np.isin(table.names, model.facts.get("unseen", [])))
     if len(kept) == 0:
         raise PredictionsError(f"{predictions}: holds no object of which {card} says that it was not trained on it")

@@ -39,7 +39,7 @@ def train_grid(
         out: folder for the runs, grid.csv and grid.png.
         depths: train only networks of these depths.
         batches: train only networks with these batch sizes.
-        recipe: how to train; depth and batch are those of the table.
+        recipe: how to train; network, depth and batch are those of the table.
         hardware: on what.
     """
     from nextview.cli.progress import console
@@ -60,7 +60,7 @@ def train_grid(
         raise ModelError("table 6 holds no network of these depths and batch sizes")
     recipes = {}
     for depth, batch in cells:
-        changes: dict[str, Any] = {"depth": depth, "batch": batch}
+        changes: dict[str, Any] = {"network": "resnet", "depth": depth, "batch": batch}
         recipes[out / f"resnet{depth}-batch{batch}"] = replace(recipe, **changes)
     for run, own in recipes.items():
         console.print(str(run), soft_wrap=True)

@@ -38,8 +38,8 @@ def train_recogniser(
         out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the best class mean.
         deformed: stores of the same objects, stretched and turned (nextview render --stretch .25 --turn --seed 1 and so
             on); their views may be others.
-        weights: start from a torchvision checkpoint of the same depth, or go on from an exported recogniser (its card,
-            NAME.json) on other data or for longer.
+        weights: start from a published checkpoint, torchvision's of the same depth or EfficientNet-Lite0's, or go on
+            from an exported recogniser (its card, NAME.json) on other data or for longer.
         folds: train so many recognisers instead, OUT/fold0 and so on, each without its share of the training objects,
             for evidence from networks that have not seen the object.
         fold: train only this one of them, 0 the first.
@@ -49,7 +49,7 @@ def train_recogniser(
     import numpy as np
 
     from nextview.cli.progress import console
-    from nextview.data.split import split_training
+    from nextview.data.split import each_shape_once, split_training
     from nextview.data.store import ViewStore
     from nextview.models.card import ModelError
     from nextview.training import recogniser
@@ -60,10 +60,13 @@ def train_recogniser(
 
     if fold is not None and not 0 <= fold < folds:
         raise ModelError(f"there is no fold {fold} of {folds}: they are counted from 0")
+    if recipe.network == "lite" and recipe.blocks > 1:
+        raise ModelError("only a ResNet sees pixels in blocks: leave --blocks, or take --network resnet")
     if recipe.size % recipe.blocks or (recipe.small_epochs and recipe.small % recipe.blocks):
         raise ModelError(f"images of {recipe.size} pixels, and small ones, must be whole blocks of {recipe.blocks}")
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation, recipe.seed)
+    judging = each_shape_once(views, validation)
     azimuths = views.sphere.azimuths if recipe.side else 0
     planes = mirror_planes(views, training) if recipe.side else None
     sources = [_source(path, views, training, recipe, planes) for path in (store, *deformed)]
@@ -83,9 +86,7 @@ def train_recogniser(
                 continue
             (run / "held_out.json").write_text(json.dumps([views.names[i] for i in held]) + "\n")
             seen = np.setdiff1d(training, held)
-            network = recogniser.train(
-                sources, views.labels, seen, validation, recipe, run, weights, hardware, azimuths
-            )
+            network = recogniser.train(sources, views.labels, seen, judging, recipe, run, weights, hardware, azimuths)
             _draw_curves(run)
             finish(network, run)
 
@@ -199,7 +200,7 @@ def _train_map(
     store: Path, target: Target, out: Path, weights: Path | None, recipe: MapRecipe, hardware: Hardware
 ) -> None:
     from nextview.cli.progress import console
-    from nextview.data.split import split_training
+    from nextview.data.split import each_shape_once, split_training
     from nextview.data.store import ViewStore
     from nextview.training import maps
     from nextview.training.runs import begin, finish, is_done
@@ -217,6 +218,7 @@ def _train_map(
         seen: NDArray | PackedViews = (
             views.all_points() if cloud else _prepared(store, views, recipe.size, recipe.input)
         )
-        network = maps.train(seen, target.values, views.sphere, training, validation, recipe, out, hardware, weights)
+        judging = each_shape_once(views, validation)
+        network = maps.train(seen, target.values, views.sphere, training, judging, recipe, out, hardware, weights)
         _draw_curves(out)
         finish(network, out)

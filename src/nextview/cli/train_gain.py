@@ -51,8 +51,8 @@ def train_gain(
 
     if out.suffix != ".json":
         raise ValueError(f"{out}: the card of a policy is called NAME.json")
-    table = Predictions.load(predictions)
-    other = table if validation is None else Predictions.load(validation)
+    table = Predictions.load(predictions).each_shape_once()
+    other = table if validation is None else Predictions.load(validation).each_shape_once()
     if (other.classes, other.sphere) != (table.classes, table.sphere):
         raise PredictionsError(f"{validation}: is of other classes or viewpoints than {predictions}")
     for path, source in ((predictions, table), (validation, other)):

@@ -18,6 +18,7 @@ from nextview.data.lock import only_one
 from nextview.data.pool import WorkerDied, each
 from nextview.data.predictions import Predictions, PredictionsError
 from nextview.data.seen import seen_views
+from nextview.data.split import alike
 from nextview.data.store import ViewStore
 from nextview.models.card import Card
 from nextview.models.networks import MapNetwork, Recogniser, knows_sphere, size_evidence
@@ -26,11 +27,8 @@ from nextview.viewsphere import ViewSphere
 
 
 def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
-    """Objects that look exactly like one with another label, in any split of the store, (N,) bool.
-
-    Byte-identical meshes have identical depth-entropies from all views, and different ones hardly ever do.
-    """
-    _, twin = np.unique(store.measure(), axis=0, return_inverse=True)
+    """Objects that look exactly like one with another label, in any split of the store, (N,) bool."""
+    twin = alike(store.measure())
     several = np.zeros((twin.max() + 1, len(store.classes)), bool)
     several[twin, store.labels] = True
     return (several.sum(1) > 1)[twin] & store.done

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.data.split import distinct
 from nextview.recognition import PLAIN_SUM, Calibration, additive
 from nextview.viewsphere import ViewSphere
 
@@ -109,10 +110,18 @@ class Predictions:
         if not kept.any():
             there = ", ".join(repr(str(name)) for name in np.unique(self.splits))
             raise PredictionsError(f"these predictions hold no objects of the split {split!r}, only of {there}")
+        return self._of(np.flatnonzero(kept))
+
+    def each_shape_once(self) -> Predictions:
+        """One object of each shape and label: without the copies that look the same from every view."""
+        return self._of(distinct(self.labels, self.depth_entropy))
+
+    def _of(self, kept: NDArray[np.int64]) -> Predictions:
+        """Some of the objects."""
         arrays = {name: getattr(self, name)[kept] for name in ("logits", "depth_entropy", "labels", "splits")}
-        names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
         maps = {name: values[kept] for name, values in self.maps.items()}
         said = {name: values[kept] for name in ("sides", "of_size") if (values := getattr(self, name)) is not None}
+        names = tuple(self.names[i] for i in kept)
         return replace(self, **arrays, **said, names=names, maps=maps, conflicting=self.conflicting[kept])
 
     def by_shape(self) -> Predictions:

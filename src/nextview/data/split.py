@@ -9,13 +9,38 @@ from nextview.data.folders import DatasetError
 from nextview.data.store import ViewStore
 
 
+def alike(measured: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Which objects look the same from every view: a number for each, shared by those that do, (N,).
+
+    Copies of a mesh, be they byte for byte or moved and scaled, have identical depth-entropies from all views, and
+    different meshes hardly ever do.
+
+    Args:
+        measured: depth-entropy from every view, (N, V).
+    """
+    return np.unique(measured, axis=0, return_inverse=True)[1].ravel()
+
+
+def distinct(labels: NDArray[np.int64], measured: NDArray[np.floating]) -> NDArray[np.int64]:
+    """One object of each shape and label, the first: indices, sorted.
+
+    What is judged or fitted counts every shape once, so that one that was copied often does not rule.
+
+    Args:
+        labels: (N,).
+        measured: depth-entropy from every view, (N, V).
+    """
+    _, first = np.unique(np.stack([alike(measured), labels], 1), axis=0, return_index=True)
+    return np.sort(first)
+
+
 def divide(
     labels: NDArray[np.int64], measured: NDArray[np.floating], share: float, seed: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Divide objects into those that train and those that validate.
 
-    Meshes that are byte-identical look identical, so an equal measure from all views marks them; they stay on one side
-    whatever their labels.
+    What looks the same stays on one side, whatever its labels: objects are drawn, and their copies follow them. So a
+    shape that was copied often is drawn more often than others; see ``distinct``.
 
     Args:
         labels: (N,).
@@ -26,7 +51,7 @@ def divide(
     Returns:
         Indices of either, sorted.
     """
-    _, twin = np.unique(measured, axis=0, return_inverse=True)
+    twin = alike(measured)
     rng = np.random.default_rng(seed)
     validates = np.zeros(len(labels), bool)
     for label in np.unique(labels):
@@ -54,6 +79,11 @@ def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple
         raise DatasetError(f"{store.path}: holds no rendered object of the training split")
     training, validation = divide(store.labels[usable], store.measure()[usable], share, seed)
     return usable[training], usable[validation]
+
+
+def each_shape_once(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One object of each shape and label among some of a store, see ``distinct``."""
+    return objects[distinct(store.labels[objects], store.measure()[objects])]
 
 
 def test_objects(store: ViewStore) -> NDArray[np.int64]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nextview.data.predictions import Predictions, PredictionsError
 from nextview.fitting.calibration import fit_temperature
-from nextview.fitting.evidence import FittingSet, fitting_set
+from nextview.fitting.evidence import FittingSet
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.baselines import Random
 from nextview.policies.gain import Gain
@@ -45,7 +45,7 @@ class ReplayTable:
         """
         if len(kept) == 0:
             raise PredictionsError("no object is left to learn from")
-        data = fitting_set(predictions, 1.0, 0).of(kept)
+        data = FittingSet.of_all(predictions).of(kept)
         maps = {name: values[kept] for name, values in predictions.maps.items()}
         known = predictions.calibration != PLAIN_SUM
         return cls(data, maps, predictions.calibration if known else fit_temperature(data, rng))

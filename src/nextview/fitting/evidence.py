@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.data.predictions import Predictions, PredictionsError
-from nextview.data.split import divide
+from nextview.data.split import distinct, divide
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.recognition import additive
 from nextview.viewsphere import ViewSphere
@@ -33,6 +33,18 @@ class FittingSet:
     classes: tuple[str, ...]
     sides: NDArray[np.float32] | None = None
 
+    @classmethod
+    def of_all(cls, predictions: Predictions) -> FittingSet:
+        """All objects of predictions, in their order.
+
+        Raises:
+            PredictionsError: there are test objects among them.
+        """
+        if (predictions.splits == "test").any():
+            raise PredictionsError("these predictions hold objects of the test split, to which nothing may be fitted")
+        p = predictions
+        return cls(p.logits, p.labels, p.sphere, p.classes, p.sides)
+
     def __len__(self) -> int:
         return len(self.labels)
 
@@ -54,7 +66,7 @@ class FittingSet:
 
 
 def fitting_set(predictions: Predictions, validation: float, seed: int) -> FittingSet:
-    """The objects of the training split that the recogniser was not trained on.
+    """The objects of the training split that the recogniser was not trained on, each shape once.
 
     Args:
         predictions: of the whole training split, as ``nextview predict --split train`` makes them.
@@ -65,15 +77,13 @@ def fitting_set(predictions: Predictions, validation: float, seed: int) -> Fitti
     Raises:
         PredictionsError: there are test objects, or none is left.
     """
-    if (predictions.splits == "test").any():
-        raise PredictionsError("these predictions hold objects of the test split, to which nothing may be fitted")
+    data = FittingSet.of_all(predictions)
     if not 0 < validation <= 1:
         raise PredictionsError(f"the validation part lies between 0 and 1, not {validation}")
     _, kept = divide(predictions.labels, predictions.depth_entropy, validation, seed)
     if len(kept) == 0:
         raise PredictionsError("no object is left to fit to")
-    p = predictions
-    return FittingSet(p.logits, p.labels, p.sphere, p.classes, p.sides).of(kept)
+    return data.of(kept[distinct(predictions.labels[kept], predictions.depth_entropy[kept])])
 
 
 def blind_walks(

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.data.split import alike
+
 
 def hold_out(
     labels: NDArray[np.int64], measured: NDArray[np.floating], folds: int, seed: int
 ) -> list[NDArray[np.int64]]:
     """Divide objects into parts, each to be kept from one network; every class is spread evenly.
 
-    Meshes that are byte-identical, which equal depth-entropy from all views tells, are kept together.
+    Objects that look the same are kept together.
 
     Args:
         labels: class of each object, (N,).
@@ -28,7 +30,7 @@ def hold_out(
     if not 2 <= folds <= len(labels):
         raise ValueError(f"{len(labels)} objects cannot be divided into {folds} folds")
     rng = np.random.default_rng([seed, folds])
-    _, twin = np.unique(measured, axis=0, return_inverse=True)
+    twin = alike(measured)
     _, first = np.unique(twin, return_index=True)  # one object stands for all that look the same
     first = rng.permutation(first)
     first = first[np.argsort(labels[first], kind="stable")]  # dealt out class by class

@@ -15,7 +15,8 @@ from nextview.data.split import split_training
 from nextview.data.store import ViewStore
 from nextview.models.card import ModelError, find_card
 from nextview.training.inputs import CHANNELS_OF
-from nextview.training.networks import ResNet
+from nextview.training.lite import LiteNet
+from nextview.training.networks import ResNet, recogniser_network
 from nextview.training.recipes import RecogniserRecipe
 from nextview.training.runs import read_recipe
 from nextview.training.weights import exported_networks, load_run
@@ -76,7 +77,7 @@ def _exported(source: Path, views: ViewStore) -> Member:
     return Member(source, size, sees, kept, frozenset(), recipes, training.get("commands", []))
 
 
-def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) -> list[ResNet]:
+def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) -> list[ResNet | LiteNet]:
     """Its networks, in evaluation mode: that of a run, or all that an exported recogniser averages.
 
     Args:
@@ -89,7 +90,7 @@ def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) ->
     return [run_network(one.source, one.recipes[0], views)]
 
 
-def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet:
+def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet | LiteNet:
     """The recogniser of a finished run, in evaluation mode."""
     azimuths = views.sphere.azimuths if recipe.side else 0
-    return load_run(ResNet(recipe.depth, len(views.classes), CHANNELS_OF[recipe.input], azimuths, recipe.blocks), run)
+    return load_run(recogniser_network(recipe, len(views.classes), azimuths), run)

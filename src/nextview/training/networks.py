@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from nextview.training.inputs import CHANNELS_OF
-from nextview.training.recipes import MapRecipe
+from nextview.training.lite import LiteNet
+from nextview.training.recipes import MapRecipe, RecogniserRecipe
 from nextview.viewsphere import ViewSphere
 
 RESNETS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3), 152: (3, 8, 36, 3)}
@@ -69,7 +70,7 @@ class ResNet(nn.Module):
 
     With ``azimuths``, it returns a third: the logarithms of how likely each of so many sides of the object is the one
     that is seen, if it is of each class, (B, classes, azimuths). Parameters carry torchvision's names, so that its
-    checkpoints fit; see ``weights.load_torchvision``.
+    checkpoints fit; see ``weights.load_checkpoint``.
 
     Args:
         depth: 18, 34, 50, 101 or 152.
@@ -97,7 +98,7 @@ class ResNet(nn.Module):
             setattr(self, f"layer{stage + 1}", nn.Sequential(*layer))
         self.avgpool = nn.AdaptiveAvgPool2d(1)
         self.fc = nn.Linear(inputs, classes)
-        self.depth, self.azimuths, self.blocks = depth, azimuths, blocks
+        self.name, self.azimuths, self.blocks = f"ResNet-{depth}", azimuths, blocks
         self.side = nn.Linear(inputs, classes * azimuths) if azimuths else None
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
@@ -117,6 +118,14 @@ class ResNet(nn.Module):
         if self.side is None:
             return logits, features
         return logits, features, self.side(features).unflatten(1, (-1, self.azimuths)).log_softmax(2)
+
+
+def recogniser_network(recipe: RecogniserRecipe, classes: int, azimuths: int) -> ResNet | LiteNet:
+    """The network of a recipe, untrained; ``azimuths`` sides are told apart, if any."""
+    channels = CHANNELS_OF[recipe.input]
+    if recipe.network == "lite":
+        return LiteNet(classes, channels, azimuths)
+    return ResNet(recipe.depth, classes, channels, azimuths, recipe.blocks)
 
 
 class PointLayer(nn.Module):

@@ -1,4 +1,4 @@
-"""Train the recogniser: a ResNet that names the object in one view."""
+"""Train the recogniser: a network that names the object in one view."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ from torch.utils.data import IterableDataset
 
 from nextview.training.fit import fit
 from nextview.training.hardware import Hardware
-from nextview.training.inputs import CHANNELS_OF
-from nextview.training.networks import ResNet
+from nextview.training.networks import recogniser_network
 from nextview.training.packed import AHEAD, PackedViews, ask_for
 from nextview.training.recipes import RecogniserRecipe
 from nextview.training.sides import side_loss
-from nextview.training.weights import load_exported, load_torchvision
+from nextview.training.weights import load_checkpoint, load_exported
 
 
 @dataclass(frozen=True)
@@ -149,8 +148,7 @@ class RecogniserModule(L.LightningModule):
     def __init__(self, recipe: RecogniserRecipe, classes: int, steps: int, azimuths: int = 0) -> None:
         super().__init__()
         self.recipe, self.steps = recipe, steps
-        network = ResNet(recipe.depth, classes, CHANNELS_OF[recipe.input], azimuths, recipe.blocks)
-        self.net = network.to(memory_format=torch.channels_last)
+        self.net = recogniser_network(recipe, classes, azimuths).to(memory_format=torch.channels_last)
         for name in ("hits", "seen", "lost"):  # of each class in validation
             self.register_buffer(name, torch.zeros(classes), persistent=False)
 
@@ -239,7 +237,7 @@ def train(
         validation: objects that validate.
         recipe: how.
         out: folder for checkpoints and logs.
-        weights: a torchvision checkpoint, or the card of an exported recogniser, to start from.
+        weights: a published checkpoint, or the card of an exported recogniser, to start from.
         hardware: on what.
         azimuths: sides of the object that the network learns to tell apart, 0 for none.
 
@@ -254,7 +252,7 @@ def train(
         sample = next(drawn_views(sources[0].inputs, training, labels, recipe, 1))
         load_exported(module.net, weights, sample)
     elif weights:
-        load_torchvision(module.net, weights)
+        load_checkpoint(module.net, weights)
     validation_views = ValidationViews(sources[0].inputs, validation, labels)
     best = fit(module, views, validation_views, recipe.epochs, out, "class_accuracy", "max", recipe.patience, hardware)
     return best.net.eval()

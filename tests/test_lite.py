@@ -1,0 +1,149 @@
+"""EfficientNet-Lite0: its shape, its checkpoints, and what its export keeps."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nextview.cli.main import main
+from nextview.models.card import write_card
+from nextview.models.networks import Recogniser
+
+torch = pytest.importorskip("torch")
+
+from nextview.models.card import ModelError  # noqa: E402
+from nextview.training.export import CalibratedRecogniser, export_onnx  # noqa: E402
+from nextview.training.lite import Depthwise, LiteNet  # noqa: E402
+from nextview.training.weights import exported_networks, load_checkpoint, load_exported  # noqa: E402
+
+
+def checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
+    """Random weights under the names that published checkpoints use, from the network's plan in words."""
+    rng, state = torch.Generator().manual_seed(seed), {}
+
+    def convolution(name, *shape):
+        state[f"{name}.weight"] = torch.randn(shape, generator=rng) / (shape[1] * shape[2] * shape[3]) ** 0.5
+
+    def norm(name, width):
+        for part in ("weight", "bias", "running_mean"):
+            state[f"{name}.{part}"] = torch.randn(width, generator=rng) / 10 + (part == "weight")
+        state[f"{name}.running_var"] = torch.rand(width, generator=rng) + 0.5
+        state[f"{name}.num_batches_tracked"] = torch.tensor(7)
+
+    convolution("_conv_stem", 32, 3, 3, 3)
+    norm("_bn0", 32)
+    inputs, index = 32, 0
+    for widths, kernel, repeats in (
+        (16, 3, 1),
+        (24, 3, 2),
+        (40, 5, 2),
+        (80, 3, 3),
+        (112, 5, 3),
+        (192, 5, 4),
+        (320, 3, 1),
+    ):
+        for _ in range(repeats):
+            block, wide = f"_blocks.{index}", inputs * (6 if index else 1)
+            if index:
+                convolution(f"{block}._expand_conv", wide, inputs, 1, 1)
+                norm(f"{block}._bn0", wide)
+            convolution(f"{block}._depthwise_conv", wide, 1, kernel, kernel)
+            norm(f"{block}._bn1", wide)
+            convolution(f"{block}._project_conv", widths, wide, 1, 1)
+            norm(f"{block}._bn2", widths)
+            inputs, index = widths, index + 1
+    convolution("_conv_head", 1280, 320, 1, 1)
+    norm("_bn1", 1280)
+    state["_fc.weight"] = torch.randn(classes, 1280, generator=rng) / 1280**0.5
+    state["_fc.bias"] = torch.randn(classes, generator=rng)
+    torch.save(state, path)
+    return state
+
+
+def test_it_is_as_large_as_published():
+    """4.7 million parameters, 407 million multiplications at 224 pixels (TensorFlow's EfficientNet-Lite, 2020)."""
+    network, products = LiteNet(1000, 3).eval(), []
+    for part in network.modules():
+        if isinstance(part, torch.nn.Conv2d | torch.nn.Linear):
+            size = part.weight.numel()
+            part.register_forward_hook(lambda _, __, out, size=size: products.append(size * out[0, 0].numel()))
+    network(torch.zeros(1, 3, 224, 224))
+    assert sum(p.numel() for p in network.parameters()) == pytest.approx(4.7e6, rel=0.02)
+    assert sum(products) == pytest.approx(407e6, rel=0.06)
+
+
+def test_any_number_of_channels_and_the_sides():
+    logits, features, sides = LiteNet(7, 5, 8).eval()(torch.rand(2, 5, 64, 64))
+    assert (logits.shape, features.shape, sides.shape) == ((2, 7), (2, 1280), (2, 7, 8))
+    assert torch.allclose(sides.exp().sum(2), torch.ones(2, 7))
+
+
+def test_a_published_checkpoint_loads_whole(tmp_path):
+    state = checkpoint(tmp_path / "lite.pth")
+    network = LiteNet(1000, 3)
+    load_checkpoint(network, tmp_path / "lite.pth")
+    ours = network.state_dict()
+    assert len(ours) == len(state)
+    assert torch.equal(ours["stem.weight"], state["_conv_stem.weight"])
+    assert torch.equal(ours["stages.15.depthwise.weight"], state["_blocks.15._depthwise_conv.weight"])
+    assert torch.equal(ours["stages.3.norm2.running_var"], state["_blocks.3._bn2.running_var"])
+    assert torch.equal(ours["norm1.bias"], state["_bn1.bias"])
+    assert torch.equal(ours["fc.weight"], state["_fc.weight"])
+
+
+@pytest.mark.parametrize("channels", [1, 2, 4])
+def test_other_channels_answer_grey_images_as_before(tmp_path, channels):
+    checkpoint(tmp_path / "lite.pth")
+    rgb, ours = LiteNet(5, 3, 8), LiteNet(5, channels, 8)
+    for network in (rgb, ours):
+        load_checkpoint(network, tmp_path / "lite.pth")
+    grey = torch.rand(2, 1, 32, 32)
+    with torch.no_grad():
+        expected = rgb.stem(grey.expand(-1, 3, -1, -1))
+        assert torch.allclose(ours.stem(grey.expand(-1, channels, -1, -1)), expected, atol=1e-5)
+        if channels == 4:  # the first three are told apart as colours were
+            assert not torch.allclose(ours.stem.weight[:, 0], ours.stem.weight[:, 1])
+
+
+def test_a_checkpoint_of_another_network_is_refused(tmp_path):
+    state = checkpoint(tmp_path / "lite.pth")
+    torch.save({name: value for name, value in state.items() if "_blocks.15." not in name}, tmp_path / "short.pth")
+    with pytest.raises(ModelError, match=r"not the weights of this EfficientNet-Lite0 \(it lacks stages\.15\."):
+        load_checkpoint(LiteNet(10, 4), tmp_path / "short.pth")
+
+
+def test_single_kernels_stay_in_single_precision():
+    kernels = Depthwise(8, 3, 1)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert kernels(torch.rand(1, 8, 5, 5, dtype=torch.bfloat16)).dtype == torch.float32
+
+
+@pytest.mark.parametrize("bits", [16, 8])
+def test_it_goes_on_from_its_export_also_beside_another(tmp_path, bits):
+    torch.manual_seed(0)
+    networks = [LiteNet(2, 4, 8), LiteNet(2, 4, 8)]
+    for seed, network in enumerate(networks):
+        checkpoint(tmp_path / "lite.pth", 2, seed)
+        load_checkpoint(network, tmp_path / "lite.pth")
+    views = np.random.default_rng(0).integers(0, 256, (16, 4, 64, 64)).astype(np.uint8)
+    shipped = CalibratedRecogniser(networks, 1.0).eval()
+    export_onnx(shipped, views[:2], "input", shipped.outputs, tmp_path / "two.onnx", bits)
+    facts = {"name": "two", "kind": "recogniser", "input_size": 64, "sees": "geometry", "temperature": 1.0}
+    facts |= {"classes": ["a", "b"], "sides": 8, "network": "EfficientNet-Lite0 + EfficientNet-Lite0"}
+    write_card(tmp_path / "two.json", facts)
+    x = torch.from_numpy(views).float() / 255
+    again = exported_networks(tmp_path / "two.json", 4, x)
+    with torch.no_grad():
+        said = torch.stack([network(x)[0] for network in again]).mean(0).numpy()
+    exact = Recogniser(tmp_path / "two.json").from_inputs(views).logits
+    assert np.abs(said - exact).max() < 1e-3
+    assert np.ptp(exact) > 0.1
+    with pytest.raises(ModelError, match="not one network of this depth and input"):
+        load_exported(LiteNet(2, 4, 8), tmp_path / "two.json", x)
+
+
+def test_blocks_of_pixels_are_for_resnets(tmp_path, capsys):
+    command = ["train", "recogniser", str(tmp_path / "no.zarr"), str(tmp_path / "run")]
+    with pytest.raises(SystemExit):
+        main([*command, "--network", "lite", "--blocks", "2", "--size", "224"])
+    assert "only a ResNet sees pixels in blocks" in capsys.readouterr().err
