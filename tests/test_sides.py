@@ -14,13 +14,13 @@ from nextview.data.render import Deform, render, render_object, turns  # noqa: E
 from nextview.data.store import DONE, ViewStore  # noqa: E402
 from nextview.mesh import make_mesh  # noqa: E402
 from nextview.models.card import ModelError, find_card  # noqa: E402
-from nextview.models.networks import Recogniser  # noqa: E402
+from nextview.models.networks import RECOGNISER, Recogniser  # noqa: E402
 from nextview.training import maps  # noqa: E402
 from nextview.training.hardware import Hardware  # noqa: E402
 from nextview.training.networks import ResNet  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
 from nextview.training.sides import mirror_planes, side_loss, sides  # noqa: E402
-from nextview.training.weights import load_exported, refuse_seen  # noqa: E402
+from nextview.training.weights import exported_networks, load_exported, refuse_seen  # noqa: E402
 from nextview.viewsphere import ViewSphere  # noqa: E402
 
 SPHERE = ViewSphere((0.0, 30.0), 8, 3.0)
@@ -101,7 +101,7 @@ def test_a_network_of_sides_answers_with_likelihoods_of_each_class():
 
 
 def bundled():
-    return Path(find_card("resnet18-modelnet10").path).with_suffix(".json")
+    return Path(find_card(RECOGNISER).path).with_suffix(".json")
 
 
 @pytest.fixture(scope="module")
@@ -118,16 +118,20 @@ def boxes():
 
 def test_a_network_goes_on_from_the_exported_one(boxes):
     exported = Recogniser(bundled())
-    network = ResNet(18, 10, 4, azimuths=8)
     views = torch.from_numpy(boxes).float() / 255
-    load_exported(network, bundled(), views)
+    networks = exported_networks(bundled(), 4, views)
     wanted = exported.from_inputs(boxes).logits * exported.card.facts["temperature"]
     with torch.no_grad():
-        kept = network.eval()(views)[0].numpy()
-        moving = network.train()(views)[0].numpy()
+        kept = torch.stack([network.eval()(views)[0] for network in networks]).mean(0).numpy()
+        moving = torch.stack([network.train()(views)[0] for network in networks]).mean(0).numpy()
     assert np.abs(kept - wanted).max() < 0.02
     assert np.abs(moving - wanted).max() < 0.1  # its norms have the moments of what they see
-    assert network.conv1.weight.std().item() == pytest.approx((2 / (64 * 49)) ** 0.5, rel=0.01)
+    first = networks[0].conv1.weight
+    assert first.std().item() == pytest.approx((2 / (64 * 49)) ** 0.5, rel=0.01)
+    alone = ResNet(18, 10, 4, azimuths=8)  # the only one of its kind there
+    load_exported(alone, bundled(), views)
+    assert torch.equal(alone.conv1.weight, first)
+    assert torch.equal(alone.fc.weight, networks[0].fc.weight)
 
 
 def test_a_network_of_blocks_goes_on_from_one_that_saw_their_first_pixels(boxes):

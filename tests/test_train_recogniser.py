@@ -25,6 +25,7 @@ from nextview.data.split import split_training  # noqa: E402
 from nextview.data.store import DONE, ViewStore  # noqa: E402
 from nextview.models.card import ModelError, find_card  # noqa: E402
 from nextview.models.image_input import image_input  # noqa: E402
+from nextview.models.networks import RECOGNISER  # noqa: E402
 from nextview.training.grid import published_cells  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.networks import ResNet  # noqa: E402
@@ -283,7 +284,7 @@ def test_going_on_from_a_network_that_has_seen_the_validation_objects_is_refused
     views = ViewStore.open(store)
     kept = [views.names[i] for i in split_training(views, 0.25, 0)[1]]
     unseen = kept if "--folds" in what else kept[:1]  # every object is held out for some fold
-    bundled = Path(find_card("resnet18-modelnet10").path)
+    bundled = Path(find_card(RECOGNISER).path)
     facts = json.loads(bundled.with_suffix(".json").read_text())
     (tmp_path / "mine.onnx").write_bytes(bundled.read_bytes())
     (tmp_path / "mine.json").write_text(json.dumps(facts | {"name": "mine", "unseen": unseen}))

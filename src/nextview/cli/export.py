@@ -31,7 +31,7 @@ def export_recogniser(
     merged: bool = False,
     mirror: bool = False,
     bits: Literal[8, 16] = 16,
-    name: str | None = None,
+    name: str = "recogniser-modelnet10",
     commands: tuple[str, ...] = (),
     note: str = "",
 ) -> None:
@@ -45,7 +45,7 @@ def export_recogniser(
         merged: average their weights instead, into one network; for runs that went on from one another (--weights).
         mirror: average what the networks say of a view and of its mirror image.
         bits: that a weight takes in the file.
-        name: what to call the model; by default after its first network, resnet18-modelnet10 or so.
+        name: what to call the model.
         commands: the commands that made the run, for the card.
         note: what else the card should say.
     """
@@ -90,7 +90,6 @@ def export_recogniser(
         networks, names = [merge(networks, drawn)], [f"{names[0]}, the mean of {len(networks)} runs"]
 
     out.mkdir(parents=True, exist_ok=True)
-    name = name or f"{networks[0].name.lower().replace('resnet-', 'resnet')}-modelnet10"
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
     facts: dict[str, Any] = {
         "name": name,

@@ -21,7 +21,7 @@ from nextview.policies.base import Evidence, maps_among
 from nextview.recognition import Calibration
 from nextview.weights import WeightsError, open_onnx
 
-RECOGNISER = "resnet18-modelnet10"
+RECOGNISER = "recogniser-modelnet10"
 MAPS = {"lem": "lem-modelnet10", "lcm": "lcm-modelnet10"}
 
 

@@ -14,6 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 OPSET = 18
+SMALL = 2**17
 
 
 class CalibratedRecogniser(nn.Module):
@@ -129,7 +130,8 @@ def shrink_weights(model: onnx.ModelProto, bits: int) -> onnx.ModelProto:
 
     Args:
         model: changed in place.
-        bits: 16 for half precision; 8 for integers, with a scale of its own for every output (row of the weight).
+        bits: 16 for half precision; 8 for integers, with a scale of its own for every output (row of the weight), save
+            for weights of fewer than ``SMALL`` numbers: the first convolutions, where rounding does the most harm.
     """
     nodes, scales = [], []
     for weight in model.graph.initializer:
@@ -137,7 +139,7 @@ def shrink_weights(model: onnx.ModelProto, bits: int) -> onnx.ModelProto:
             continue
         name, values = weight.name, numpy_helper.to_array(weight)
         small = f"{name}_small"
-        if bits == 16:
+        if bits == 16 or values.size < SMALL:
             weight.CopyFrom(numpy_helper.from_array(values.astype(np.float16), small))
             nodes.append(helper.make_node("Cast", [small], [name], to=TensorProto.FLOAT))
             continue

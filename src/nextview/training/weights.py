@@ -143,19 +143,20 @@ def load_exported(
         card: the recogniser.
         views: what it will see in training, (B, C, S, S) in 0 .. 1, B some dozens.
         last: take the last layers too; otherwise those of the network stay as they are.
-        which: of the networks that the recogniser averages, last layer and all; None if it must be one network.
+        which: of the networks that the recogniser averages, last layer and all; None takes the only one of this kind.
 
     Raises:
-        ModelError: it is no recogniser, or not one network of this kind and input.
+        ModelError: it is no recogniser, or has not one network of this kind and input.
     """
     model = find_card(card)
     if model.kind != "recogniser":
         raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
-    names, at = _names(model.facts), which or 0
-    if (which is None and len(names) > 1) or network.name not in names[at : at + 1]:
+    names = _names(model.facts)
+    fitting = [k for k, name in enumerate(names) if name == network.name and which in (None, k)]
+    if len(fitting) != 1:
         named = model.facts.get("network")
         raise ModelError(f"{card}: is not one network of this depth and input: {named}, not {network.name}")
-    blocks = model.facts.get("blocks", 1)
+    (at,), blocks = fitting, model.facts.get("blocks", 1)
     if blocks not in (1, network.blocks):
         raise ModelError(f"{card}: sees pixels in blocks of {blocks}, not of {network.blocks}")
     open_weights(model)  # refuses a file that is not the card's
@@ -166,7 +167,7 @@ def load_exported(
         kept = [arrays[name + end] for end in ("", "_half", "_small") if name + end in arrays]
         if kept and kept[0].shape == shape:
             return torch.from_numpy(kept[0].astype(np.float32) * arrays.get(f"{name}_scale", np.float32(1)))
-        if len(names) > 1:  # the export keeps once what two networks have in common
+        if not kept and len(names) > 1:  # the export keeps once what two networks have in common
             raise ModelError(f"{card}: {name} of its network {at + 1} is not there; are two of them the same?")
         raise ModelError(f"{card}: is not one network of this depth and input (see {name})")
 
