@@ -125,7 +125,7 @@ def trained(tmp_path_factory):
             folder.mkdir(parents=True, exist_ok=True)
             write_off(folder / f"{label}_{k}.off", boxes_mesh(boxes, label))
     table = boxes_mesh(SAMPLES["table"](), "table")
-    for name, scale in (("table_8", 1), ("table_larger", 2)):
+    for name, scale in (("table_small", 1), ("table_larger", 2)):
         write_off(root / "meshes/table/train" / f"{name}.off", replace(table, vertices=scale * table.vertices))
     twin = root / "meshes/table/train/table_0.off"
     (root / "meshes/monitor/train/monitor_twin.off").write_bytes(twin.read_bytes())
@@ -149,7 +149,7 @@ def test_split_keeps_twins_together_and_test_objects_out(trained):
         twins = [store.names.index(name) for name in ("table_0", "monitor_twin")]
         assert np.isin(twins, validation).sum() in (0, 2)
         assert set(store.labels[validation]) == {0, 1}
-        copies = np.isin([store.names.index(name) for name in ("table_8", "table_larger")], validation)
+        copies = np.isin([store.names.index(name) for name in ("table_small", "table_larger")], validation)
         assert copies.all() == copies.any()
         judging = split.each_shape_once(store, validation)  # the twin has another label
         assert len(judging) == len(validation) - copies.all()
@@ -172,8 +172,7 @@ def test_a_shape_that_was_copied_judges_training_once(trained, tmp_path, monkeyp
         command = ["train", what, str(trained / "views.zarr"), str(tmp_path / what)]
         with pytest.raises(Judged) as judged:
             main([*command, "--validation", "0.25", "--seed", str(seed)])
-        assert "table_8" in judged.value.args[0]
-        assert "table_larger" not in judged.value.args[0]
+        assert len({"table_small", "table_larger"} & set(judged.value.args[0])) == 1
 
 
 def test_trained_models_have_cards_and_run(trained):
@@ -339,7 +338,7 @@ def test_valley_classes_are_fitted_to_objects_that_neither_network_has_seen(trai
     cards = ["--maps", f"lem={card}", "--recogniser", str(models / "tiny.json"), "--workers", "1"]
     main(["predict", store, str(out), "--unseen", *cards])
     main(["fit", "valleys", str(out), str(card)])
-    facts, p = json.loads(card.read_text()), Predictions.load(out)
+    facts, p = json.loads(card.read_text()), Predictions.load(out).each_shape_once()
     gains = valley_gains(p.sphere, p.logits, p.maps["lem"], p.labels)
     assert facts["valley_classes"] == [p.classes[c] for c, gain in gains.items() if gain > 0]
     assert facts["valley_gain"] == {p.classes[c]: round(gain, 4) for c, gain in gains.items()}
