@@ -34,10 +34,10 @@ def data(classes=3, objects=12, views=5, size=32):
 class SmallNet(torch.nn.Module):
     """In place of a ResNet, whose checkpoints are 130 MB: convolution, batch norm and what is needed around them."""
 
-    def __init__(self, depth, classes, channels, azimuths=0, blocks=1):
+    def __init__(self, recipe, classes, azimuths):
         super().__init__()
         self.features = torch.nn.Sequential(
-            torch.nn.Conv2d(channels, 8, 5, 4), torch.nn.BatchNorm2d(8), torch.nn.ReLU(), torch.nn.AdaptiveAvgPool2d(1)
+            torch.nn.Conv2d(4, 8, 5, 4), torch.nn.BatchNorm2d(8), torch.nn.ReLU(), torch.nn.AdaptiveAvgPool2d(1)
         )
         self.fc = torch.nn.Linear(8, classes)
 
@@ -49,7 +49,7 @@ class SmallNet(torch.nn.Module):
 def train(out, recipe=RECIPE, hardware=Hardware(), stop=None):
     """Train on the small set; ``stop`` is (epoch, batch, "raise" or "kill")."""
     sources, labels = data()
-    recogniser.ResNet, resnet = SmallNet, recogniser.ResNet
+    recogniser.recogniser_network, usual = SmallNet, recogniser.recogniser_network
     if stop:
         rest = recogniser.RecogniserModule.training_step
 
@@ -65,7 +65,7 @@ def train(out, recipe=RECIPE, hardware=Hardware(), stop=None):
         objects = np.arange(len(labels))
         return recogniser.train(sources, labels, objects[:9], objects[9:], recipe, out, None, hardware)
     finally:
-        recogniser.ResNet = resnet
+        recogniser.recogniser_network = usual
         if stop:
             recogniser.RecogniserModule.training_step = rest
 
