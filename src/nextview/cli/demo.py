@@ -7,7 +7,7 @@ from typing import Literal
 
 
 def demo(
-    shape: Literal["table", "chair", "monitor"] = "table", start: int = 26, figure: Path = Path("nextview_demo.png")
+    shape: Literal["table", "chair", "monitor"] = "table", start: int = 33, figure: Path = Path("nextview_demo.png")
 ) -> None:
     """Recognise a sample object that ships with nextview, and draw the episode.
 
