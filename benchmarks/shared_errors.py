@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.predictions import Predictions
+from nextview.benchmark.paired import of_the_same
 
 
 def alike(answers: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -31,11 +31,8 @@ def alike(answers: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArra
 
 def main(*paths: Path) -> None:
     """Print it."""
-    tables = [Predictions.load(path) for path in paths]
+    tables = of_the_same(paths)
     first = tables[0]
-    for path, p in zip(paths, tables, strict=True):
-        if (p.names, p.classes, p.sphere) != (first.names, first.classes, first.sphere):
-            raise ValueError(f"{path}: is not of the same objects, classes and views as {paths[0]}")
     fused = np.stack([p.logits.sum(1).argmax(1) for p in tables])
     single = np.stack([p.logits.argmax(2).ravel() for p in tables])
     each = np.repeat(first.labels, first.logits.shape[1])

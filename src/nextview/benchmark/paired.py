@@ -1,8 +1,9 @@
-"""Two ways to fuse the same views, side by side: rows of a Markdown table."""
+"""Several ways to say something of the same views, side by side: what they are compared on, and Markdown rows."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,20 @@ from nextview.recognition import Calibration
 
 Float = NDArray[np.float64]
 LOOKS = (1, 2, 3, 5, 8, 15, 40)
+
+
+def of_the_same(paths: Sequence[Path]) -> list[Predictions]:
+    """Several predictions of the same objects, classes and views.
+
+    Raises:
+        ValueError: they are of others.
+    """
+    tables = [Predictions.load(path) for path in paths]
+    of = [(p.names, p.classes, p.sphere) for p in tables]
+    for path, others in zip(paths, of, strict=True):
+        if others != of[0]:
+            raise ValueError(f"{path}: is not of the same objects, classes and views as {paths[0]}")
+    return tables
 
 
 def accuracy_after_looks(p: Predictions, calibration: Calibration) -> Float:

@@ -19,7 +19,7 @@ FEATURES = 1280
 
 
 class Depthwise(nn.Conv2d):
-    """A kernel for each channel, always in float32: on a CPU its gradient takes twice as long in bfloat16."""
+    """A kernel for each channel, always in float32: in bfloat16 its gradient is slow on a CPU."""
 
     def __init__(self, width: int, kernel: int, stride: int) -> None:
         super().__init__(width, width, kernel, stride, kernel // 2, groups=width, bias=False)

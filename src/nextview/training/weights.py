@@ -111,16 +111,16 @@ def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet |
     """
     facts = find_card(card).facts
     classes, sides = len(facts.get("classes", [])), facts.get("sides", 0)
+    resnets = {f"ResNet-{depth}": depth for depth in RESNETS}
     networks: list[ResNet | LiteNet] = []
     for which, name in enumerate(_names(facts)):
-        depth = int(name.removeprefix("ResNet-")) if name != LiteNet.name else None
-        if depth is not None and depth not in RESNETS:
+        network: ResNet | LiteNet
+        if name == LiteNet.name:
+            network = LiteNet(classes, channels, sides)
+        elif name in resnets:
+            network = ResNet(resnets[name], classes, channels, sides, facts.get("blocks", 1))
+        else:
             raise ModelError(f"{card}: there is no {name}")
-        network = (
-            LiteNet(classes, channels, sides)
-            if depth is None
-            else ResNet(depth, classes, channels, sides, facts.get("blocks", 1))
-        )
         load_exported(network, card, views, which=which)
         networks.append(network.eval())
     if not networks:
