@@ -13,11 +13,15 @@ torch = pytest.importorskip("torch")
 
 from nextview.models.card import ModelError  # noqa: E402
 from nextview.training.export import CalibratedRecogniser, export_onnx  # noqa: E402
-from nextview.training.lite import Depthwise, LiteNet  # noqa: E402
+from nextview.training.lite import Depthwise, InvertedBottleneck, LiteNet  # noqa: E402
 from nextview.training.weights import exported_networks, load_checkpoint, load_exported  # noqa: E402
 
+LITE0 = ((16, 3, 1), (24, 3, 2), (40, 5, 2), (80, 3, 3), (112, 5, 3), (192, 5, 4), (320, 3, 1))
+"""Width, kernel and blocks of the stages."""
+LITE2 = ((16, 3, 1), (24, 3, 3), (48, 5, 3), (88, 3, 4), (120, 5, 4), (208, 5, 5), (352, 3, 1))
 
-def checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
+
+def checkpoint(path: Path, classes: int = 1000, seed: int = 0, plan: tuple = LITE0) -> dict:
     """Random weights under the names that published checkpoints use, from the network's plan in words."""
     rng, state = torch.Generator().manual_seed(seed), {}
 
@@ -33,15 +37,7 @@ def checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
     convolution("_conv_stem", 32, 3, 3, 3)
     norm("_bn0", 32)
     inputs, index = 32, 0
-    for widths, kernel, repeats in (
-        (16, 3, 1),
-        (24, 3, 2),
-        (40, 5, 2),
-        (80, 3, 3),
-        (112, 5, 3),
-        (192, 5, 4),
-        (320, 3, 1),
-    ):
+    for widths, kernel, repeats in plan:
         for _ in range(repeats):
             block, wide = f"_blocks.{index}", inputs * (6 if index else 1)
             if index:
@@ -52,7 +48,7 @@ def checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
             convolution(f"{block}._project_conv", widths, wide, 1, 1)
             norm(f"{block}._bn2", widths)
             inputs, index = widths, index + 1
-    convolution("_conv_head", 1280, 320, 1, 1)
+    convolution("_conv_head", 1280, inputs, 1, 1)
     norm("_bn1", 1280)
     state["_fc.weight"] = torch.randn(classes, 1280, generator=rng) / 1280**0.5
     state["_fc.bias"] = torch.randn(classes, generator=rng)
@@ -60,16 +56,19 @@ def checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
     return state
 
 
-def test_it_is_as_large_as_published():
-    """4.7 million parameters, 407 million multiplications at 224 pixels (TensorFlow's EfficientNet-Lite, 2020)."""
-    network, products = LiteNet(1000, 3).eval(), []
+@pytest.mark.parametrize(
+    ("scale", "size", "parameters", "multiplications"), [(0, 224, 4.7, 407), (1, 240, 5.4, 631), (2, 260, 6.1, 899)]
+)
+def test_it_is_as_large_as_published(scale, size, parameters, multiplications):
+    """Millions, at the published image size (TensorFlow's EfficientNet-Lite, 2020)."""
+    network, products = LiteNet(1000, 3, scale=scale).eval(), []
     for part in network.modules():
         if isinstance(part, torch.nn.Conv2d | torch.nn.Linear):
-            size = part.weight.numel()
-            part.register_forward_hook(lambda _, __, out, size=size: products.append(size * out[0, 0].numel()))
-    network(torch.zeros(1, 3, 224, 224))
-    assert sum(p.numel() for p in network.parameters()) == pytest.approx(4.7e6, rel=0.02)
-    assert sum(products) == pytest.approx(407e6, rel=0.06)
+            weights = part.weight.numel()
+            part.register_forward_hook(lambda _, __, out, weights=weights: products.append(weights * out[0, 0].numel()))
+    network(torch.zeros(1, 3, size, size))
+    assert sum(p.numel() for p in network.parameters()) == pytest.approx(parameters * 1e6, rel=0.02)
+    assert sum(products) == pytest.approx(multiplications * 1e6, rel=0.06)
 
 
 def test_any_number_of_channels_and_the_sides():
@@ -89,6 +88,32 @@ def test_a_published_checkpoint_loads_whole(tmp_path):
     assert torch.equal(ours["stages.3.norm2.running_var"], state["_blocks.3._bn2.running_var"])
     assert torch.equal(ours["norm1.bias"], state["_bn1.bias"])
     assert torch.equal(ours["fc.weight"], state["_fc.weight"])
+
+
+def test_the_largest_checkpoint_fits_its_own_network_alone(tmp_path):
+    state = checkpoint(tmp_path / "lite2.pth", plan=LITE2)
+    network = LiteNet(1000, 3, scale=2)
+    load_checkpoint(network, tmp_path / "lite2.pth")
+    last = network.state_dict()["stages.22.project.weight"]
+    assert torch.equal(last, state["_blocks.22._project_conv.weight"])
+    with pytest.raises(ModelError, match=r"not the weights of this EfficientNet-Lite0 \(it holds stages\.16\."):
+        load_checkpoint(LiteNet(1000, 3), tmp_path / "lite2.pth")
+
+
+def test_blocks_are_skipped_for_some_images_in_training_alone():
+    block = InvertedBottleneck(4, 6, 4, 3, 1, skip=0.25)
+    x = torch.rand(1, 4, 5, 5).expand(4000, -1, -1, -1)
+    whole = (block(x) - x).detach()
+    done = whole.flatten(1).abs().amax(1) > 0
+    assert done.float().mean().item() == pytest.approx(0.75, abs=0.03)
+    assert torch.allclose(whole[done] * 0.75, (InvertedBottleneck.forward(_sure(block), x) - x)[done], atol=1e-6)
+    block.eval()
+    assert (block(x) - x).flatten(1).abs().amax(1).min() > 0
+
+
+def _sure(block):
+    block.skip = 0.0
+    return block
 
 
 @pytest.mark.parametrize("channels", [1, 2, 4])
@@ -142,8 +167,17 @@ def test_it_goes_on_from_its_export_also_beside_another(tmp_path, bits):
         load_exported(LiteNet(2, 4, 8), tmp_path / "two.json", x)
 
 
-def test_blocks_of_pixels_are_for_resnets(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--network", "lite0", "--blocks", "2", "--size", "224"], "only a ResNet sees pixels in blocks"),
+        (["--network", "lite2", "--depth", "34"], "only a ResNet has a --depth"),
+        (["--drop", "0.2"], "only an EfficientNet-Lite drops features"),
+        (["--network", "lite0", "--drop", "1"], "--drop is a chance, 0 or more and less than 1, not 1.0"),
+    ],
+)
+def test_options_of_another_network_are_refused(tmp_path, capsys, options, said):
     command = ["train", "recogniser", str(tmp_path / "no.zarr"), str(tmp_path / "run")]
     with pytest.raises(SystemExit):
-        main([*command, "--network", "lite", "--blocks", "2", "--size", "224"])
-    assert "only a ResNet sees pixels in blocks" in capsys.readouterr().err
+        main([*command, *options])
+    assert said in " ".join(capsys.readouterr().err.split())

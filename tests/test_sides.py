@@ -14,10 +14,10 @@ from nextview.data.render import Deform, render, render_object, turns  # noqa: E
 from nextview.data.store import DONE, ViewStore  # noqa: E402
 from nextview.mesh import make_mesh  # noqa: E402
 from nextview.models.card import ModelError, find_card  # noqa: E402
-from nextview.models.networks import RECOGNISER, Recogniser  # noqa: E402
+from nextview.models.networks import RECOGNISER, MapNetwork, Recogniser  # noqa: E402
 from nextview.training import maps  # noqa: E402
 from nextview.training.hardware import Hardware  # noqa: E402
-from nextview.training.networks import ResNet  # noqa: E402
+from nextview.training.networks import ResNet, ViewMap  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
 from nextview.training.sides import mirror_planes, side_loss, sides  # noqa: E402
 from nextview.training.weights import exported_networks, load_exported, refuse_seen  # noqa: E402
@@ -169,6 +169,23 @@ def test_a_map_network_starts_from_what_the_recogniser_knows(boxes, tmp_path):
         maps.train(seen, values, sphere, objects[:3], objects[3:], cloud, tmp_path / "cloud", hardware, bundled())
 
 
+def test_a_map_network_goes_on_from_an_exported_one(boxes, tmp_path):
+    lem = Path(find_card("lem-modelnet10").path).with_suffix(".json")
+    begun, views = ViewMap(5, 8, 18, 4), torch.from_numpy(boxes).float() / 255
+    load_exported(begun.resnet, lem, views, kinds=("lem",))
+    with torch.no_grad():
+        said = begun.eval()(views)[0].numpy()
+    wanted = MapNetwork(lem).from_inputs(boxes)["lem-sphere"]
+    assert np.abs(said - wanted).max() < 0.02
+    assert np.ptp(wanted) > 0.1
+    sphere, values = ViewSphere.named("40"), np.random.default_rng(1).random((4, 40)).astype(np.float32)
+    seen = np.random.default_rng(0).choice(boxes[:, :, ::2, ::2], (4, 40))
+    recipe = MapRecipe(epochs=1, views=4, batch=4, rate=1e-9, around="sphere")
+    hardware = Hardware(precision="32-true")
+    network = maps.train(seen, values, sphere, np.arange(3), np.array([3]), recipe, tmp_path, hardware, lem)
+    assert torch.allclose(network.resnet.fc.weight, begun.resnet.fc.weight, atol=1e-6)
+
+
 def test_other_classes_keep_a_last_layer_of_their_own(boxes):
     network = ResNet(18, 3, 4)
     before = network.fc.weight.clone()
@@ -182,7 +199,7 @@ def test_another_network_is_refused(boxes, depth, channels):
         load_exported(ResNet(depth, 10, channels), bundled(), torch.zeros(2, channels, 64, 64))
 
 
-def test_a_map_network_is_refused():
+def test_a_recogniser_does_not_go_on_from_a_map_network():
     card = Path(find_card("lem-modelnet10").path).with_suffix(".json")
     with pytest.raises(ModelError, match="is a lem, not a recogniser"):
         load_exported(ResNet(18, 10, 4), card, torch.zeros(2, 4, 64, 64))

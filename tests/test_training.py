@@ -12,6 +12,7 @@ import numpy as np
 import onnxruntime as ort
 import pytest
 from scipy.special import softmax
+from tests.test_lite import LITE2, checkpoint
 from tests.test_readme import write_off
 
 from nextview.cli.main import main
@@ -32,11 +33,12 @@ from nextview.models.card import ModelError, find_card  # noqa: E402
 from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
+from nextview.training.lite import LiteNet  # noqa: E402
 from nextview.training.maps import MapModule, Windows  # noqa: E402
 from nextview.training.merge import merge  # noqa: E402
 from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
-from nextview.training.weights import load_exported  # noqa: E402
+from nextview.training.weights import load_exported, load_run  # noqa: E402
 
 
 def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
@@ -327,9 +329,14 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
         assert predictions.logits[predictions.names.index(name)] == pytest.approx(
             Recogniser(card).from_inputs(inputs).logits, abs=1e-4
         )
+    never_right = predictions.names.index(views.names[validation[0]])
+    predictions.logits[never_right] = np.where(np.arange(2) == predictions.labels[never_right], 0, 5)
+    predictions.save(out)
     main(["train", "lcm", str(store), str(out), str(runs / "lcm"), *small])
     main(["export", "lcm", str(runs / "lcm"), str(store), str(out), str(models), "--name", "tiny-lcm"])
-    assert MapNetwork(models / "tiny-lcm.json").card.kind == "lcm"
+    card = MapNetwork(models / "tiny-lcm.json").card
+    assert card.kind == "lcm"
+    assert set(card.facts["unseen"]) == {views.names[i] for i in validation}  # also of which it could not be judged
 
 
 def test_valley_classes_are_fitted_to_objects_that_neither_network_has_seen(trained, capsys):
@@ -531,3 +538,25 @@ def test_merged_networks_have_the_mean_weights_and_norms_that_know_what_they_see
     assert not one.training
     with pytest.raises(ModelError, match="cannot be merged"):
         merge([networks[0], ResNet(34, 3, 4)], views)
+
+
+def test_a_lite_network_goes_from_a_checkpoint_to_a_card_that_it_shares(trained, tmp_path, capsys):
+    checkpoint(tmp_path / "imagenet.pth", plan=LITE2)
+    run, store, models = trained / "runs/lite", str(trained / "views.zarr"), trained / "models"
+    small = ["--epochs", "1", "--views", "4", "--batch", "8", "--validation", "0.25", "--side", "0.3"]
+    command = ["train", "recogniser", store, str(run), *small, "--network", "lite2", "--drop", "0.2"]
+    main([*command, "--weights", str(tmp_path / "imagenet.pth")])
+    main(["export", "recogniser", str(run), store, str(models), "--name", "pair", "--also", str(models / "tiny.json")])
+    facts = find_card(models / "pair.json").facts
+    assert facts["network"] == "EfficientNet-Lite2 + ResNet-18"
+    assert [recipe["network"] for recipe in facts["training"]["recipes"]] == ["lite2", "resnet"]
+    x = seen_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
+    alone, pair = Recogniser(models / "tiny.json"), Recogniser(models / "pair.json")
+    with torch.no_grad():
+        said = load_run(LiteNet(2, 4, 8, scale=2), run)(torch.from_numpy(x).float() / 255)[0].numpy()
+    mean = (said + alone.from_inputs(x).logits * alone.card.facts["temperature"]) / 2
+    assert pair.from_inputs(x).logits * facts["temperature"] == pytest.approx(mean, abs=2e-2)
+    main([*command[:3], str(trained / "runs/on"), *command[4:], "--weights", str(models / "pair.json")])
+    with pytest.raises(SystemExit):
+        main([*command[:3], str(trained / "runs/wrong"), *small, "--weights", str(tmp_path / "imagenet.pth")])
+    assert "not the weights of this ResNet-18" in " ".join(capsys.readouterr().err.split())

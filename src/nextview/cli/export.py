@@ -235,7 +235,8 @@ def _export_map(
     recipe = read_recipe(run, MapRecipe)
     views = ViewStore.open(store)
     sphere = views.sphere
-    training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
+    parts = split_training(views, recipe.validation, recipe.seed)
+    training, validation = map(target.known, parts)
     network = load_run(map_network(recipe, sphere), run)
     shipped = ShippedMap(network, mirror).eval()
 
@@ -282,7 +283,7 @@ def _export_map(
         },
         "largest_difference_to_torch": round(difference, 4),
         "note": note,
-        "unseen": [views.names[i] for i in validation],
+        "unseen": [views.names[i] for i in parts[1]],  # those without values too
     }
     write_card(card, facts)
 

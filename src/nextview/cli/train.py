@@ -60,8 +60,14 @@ def train_recogniser(
 
     if fold is not None and not 0 <= fold < folds:
         raise ModelError(f"there is no fold {fold} of {folds}: they are counted from 0")
-    if recipe.network == "lite" and recipe.blocks > 1:
+    if recipe.network != "resnet" and recipe.blocks > 1:
         raise ModelError("only a ResNet sees pixels in blocks: leave --blocks, or take --network resnet")
+    if recipe.network != "resnet" and recipe.depth != RecogniserRecipe.depth:
+        raise ModelError(f"only a ResNet has a --depth: {recipe.network} is as deep as it is")
+    if recipe.network == "resnet" and recipe.drop:
+        raise ModelError("only an EfficientNet-Lite drops features and blocks: leave --drop, or take --network lite0")
+    if not 0 <= recipe.drop < 1:
+        raise ModelError(f"--drop is a chance, 0 or more and less than 1, not {recipe.drop}")
     if recipe.size % recipe.blocks or (recipe.small_epochs and recipe.small % recipe.blocks):
         raise ModelError(f"images of {recipe.size} pixels, and small ones, must be whole blocks of {recipe.blocks}")
     views = ViewStore.open(store)
@@ -156,8 +162,8 @@ def train_lem(
     Args:
         store: view store made by nextview render, with the 40 views.
         out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the lowest squared error.
-        weights: card of a recogniser (NAME.json) of the same depth and input, from which a ResNet starts: what it knows
-            of shapes and of the side that is seen is of use.
+        weights: card (NAME.json) of the same depth and input from which a ResNet starts: a recogniser's, as what it
+            knows of shapes and of the side that is seen is of use; or that of a map network, to go on with it.
         recipe: how to train.
         hardware: on what.
     """
@@ -183,8 +189,8 @@ def train_lcm(
             that have not seen the objects (nextview train recogniser --folds, export each, nextview predict --unseen
             --recogniser CARD CARD).
         out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the lowest squared error.
-        weights: card of a recogniser (NAME.json) of the same depth and input, from which a ResNet starts: what it knows
-            of shapes and of the side that is seen is of use.
+        weights: card (NAME.json) of the same depth and input from which a ResNet starts: a recogniser's, as what it
+            knows of shapes and of the side that is seen is of use; or that of a map network, to go on with it.
         recipe: how to train.
         hardware: on what.
     """

@@ -1,9 +1,12 @@
-"""EfficientNet-Lite0: a small recogniser whose first weights can come from ImageNet."""
+"""EfficientNet-Lite: small recognisers whose first weights can come from ImageNet."""
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 STAGES = (
     (1, 16, 3, 1, 1),
@@ -15,6 +18,8 @@ STAGES = (
     (6, 320, 3, 1, 1),
 )
 """Expansion, width, kernel, stride and blocks of the seven stages (Tan and Le, EfficientNet, ICML 2019, table 1)."""
+SCALES = {0: (1.0, 1.0), 1: (1.0, 1.1), 2: (1.1, 1.2)}
+"""By how much EfficientNet-Lite0, 1 and 2 are wider and deeper (TensorFlow's EfficientNet-Lite, 2020)."""
 FEATURES = 1280
 
 
@@ -30,9 +35,12 @@ class Depthwise(nn.Conv2d):
 
 
 class InvertedBottleneck(nn.Module):
-    """Widen, filter each channel, narrow; with a shortcut where nothing changes its shape."""
+    """Widen, filter each channel, narrow; with a shortcut where nothing changes its shape.
 
-    def __init__(self, inputs: int, expansion: int, width: int, kernel: int, stride: int) -> None:
+    In training, a block with a shortcut is skipped for each image with chance ``skip`` (stochastic depth).
+    """
+
+    def __init__(self, inputs: int, expansion: int, width: int, kernel: int, stride: int, skip: float = 0.0) -> None:
         super().__init__()
         wide = inputs * expansion
         self.expand = nn.Conv2d(inputs, wide, 1, bias=False) if expansion > 1 else nn.Identity()
@@ -40,7 +48,7 @@ class InvertedBottleneck(nn.Module):
         self.depthwise, self.norm1 = Depthwise(wide, kernel, stride), _norm(wide)
         self.project, self.norm2 = nn.Conv2d(wide, width, 1, bias=False), _norm(width)
         self.relu, self.expands = nn.ReLU6(inplace=True), expansion > 1
-        self.has_shortcut = stride == 1 and inputs == width
+        self.has_shortcut, self.skip = stride == 1 and inputs == width, skip
 
     def forward(self, x: Tensor) -> Tensor:
         past = x
@@ -48,31 +56,39 @@ class InvertedBottleneck(nn.Module):
             x = self.relu(self.norm0(self.expand(x)))
         x = self.relu(self.norm1(self.depthwise(x)))
         x = self.norm2(self.project(x))
-        return x + past if self.has_shortcut else x
+        if not self.has_shortcut:
+            return x
+        if self.training and self.skip:
+            x = x * (torch.rand(len(x), 1, 1, 1, device=x.device) >= self.skip) / (1 - self.skip)
+        return x + past
 
 
 class LiteNet(nn.Module):
-    """EfficientNet-Lite0: EfficientNet-B0 without squeeze and excitation, with ReLU6 for swish.
+    """EfficientNet-Lite: EfficientNet without squeeze and excitation, with ReLU6 for swish.
 
-    A fifth of the arithmetic of a ResNet-18 and three tenths of its parameters. ``forward`` returns what
-    ``networks.ResNet`` does, with pooled features (B, 1280). For first weights see ``weights.load_imagenet``.
+    The smallest has a fifth of the arithmetic of a ResNet-18 and three tenths of its parameters. ``forward`` returns
+    what ``networks.ResNet`` does, with pooled features (B, 1280). For first weights see ``weights.load_checkpoint``.
 
     Args:
         classes: outputs.
         channels: of the input image (B, channels, H, W), values in 0 .. 1.
         azimuths: sides that are told apart; 0 for none.
+        scale: 0, 1 or 2: which of them, the smallest first.
+        drop: chance in training that a pooled feature is dropped, and that the last block is skipped for an image;
+            less for those before it.
     """
 
-    name, blocks = "EfficientNet-Lite0", 1
+    blocks = 1
 
-    def __init__(self, classes: int, channels: int, azimuths: int = 0) -> None:
+    def __init__(self, classes: int, channels: int, azimuths: int = 0, scale: int = 0, drop: float = 0.0) -> None:
         super().__init__()
-        inputs, stages = 32, []
+        self.name, self.drop = f"EfficientNet-Lite{scale}", drop
+        inputs, shapes = 32, _shapes(scale)
         self.stem, self.norm0 = nn.Conv2d(channels, inputs, 3, 2, 1, bias=False), _norm(inputs)
-        for expansion, width, kernel, stride, length in STAGES:
-            for index in range(length):
-                stages.append(InvertedBottleneck(inputs, expansion, width, kernel, 1 if index else stride))
-                inputs = width
+        stages = []
+        for index, (expansion, width, kernel, stride) in enumerate(shapes):
+            stages.append(InvertedBottleneck(inputs, expansion, width, kernel, stride, drop * index / len(shapes)))
+            inputs = width
         self.stages = nn.Sequential(*stages)
         self.head, self.norm1 = nn.Conv2d(inputs, FEATURES, 1, bias=False), _norm(FEATURES)
         self.relu, self.avgpool = nn.ReLU6(inplace=True), nn.AdaptiveAvgPool2d(1)
@@ -86,10 +102,23 @@ class LiteNet(nn.Module):
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         x = self.stages(self.relu(self.norm0(self.stem(x))))
         features = self.avgpool(self.relu(self.norm1(self.head(x)))).flatten(1)
-        logits = self.fc(features)
+        kept = F.dropout(features, self.drop, self.training)
+        logits = self.fc(kept)
         if self.side is None:
             return logits, features
-        return logits, features, self.side(features).unflatten(1, (-1, self.azimuths)).log_softmax(2)
+        return logits, features, self.side(kept).unflatten(1, (-1, self.azimuths)).log_softmax(2)
+
+
+def _shapes(scale: int) -> list[tuple[int, int, int, int]]:
+    """Expansion, width, kernel and stride of each block. The first and the last stage are as deep in all of them."""
+    wider, deeper = SCALES[scale]
+    shapes = []
+    for stage, (expansion, width, kernel, stride, length) in enumerate(STAGES):
+        near = int(width * wider + 4) // 8 * 8  # the nearest multiple of 8, of which none is a tenth too narrow
+        scaled = near if near >= 0.9 * width * wider else near + 8
+        blocks = length if stage in (0, len(STAGES) - 1) else math.ceil(length * deeper)
+        shapes += [(expansion, scaled, kernel, 1 if index else stride) for index in range(blocks)]
+    return shapes
 
 
 def _norm(width: int) -> nn.BatchNorm2d:

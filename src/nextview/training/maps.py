@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.data import IterableDataset
 
-from nextview.models.card import ModelError
+from nextview.models.card import ModelError, find_card
 from nextview.models.cloud_input import cloud_input
 from nextview.training.fit import fit
 from nextview.training.hardware import Hardware
@@ -167,7 +167,8 @@ def train(
         recipe: how.
         out: folder for checkpoints and logs.
         hardware: on what.
-        weights: card of an exported recogniser from which a ResNet starts; its last layer is new.
+        weights: card from which a ResNet starts: of an exported recogniser, where its last layer is new, or of a map
+            network, with which it goes on.
 
     Raises:
         ModelError: a checkpoint in ``out`` cannot be used, or the weights are not of this network.
@@ -179,7 +180,8 @@ def train(
     if weights:
         if recipe.input == "cloud":
             raise ModelError(f"{weights}: a PointNet cannot start from a ResNet")
-        load_exported(module.net.resnet, weights, next(iter(windows))[0].float() / 255, last=False)
+        views, goes_on = next(iter(windows))[0].float() / 255, find_card(weights).kind != "recogniser"
+        load_exported(module.net.resnet, weights, views, last=goes_on, kinds=("recogniser", "lem", "lcm"))
     score = "validation_mse"
     return fit(
         module, windows, validation_windows, recipe.epochs, out, score, "min", recipe.patience, hardware

@@ -123,8 +123,8 @@ class ResNet(nn.Module):
 def recogniser_network(recipe: RecogniserRecipe, classes: int, azimuths: int) -> ResNet | LiteNet:
     """The network of a recipe, untrained; ``azimuths`` sides are told apart, if any."""
     channels = CHANNELS_OF[recipe.input]
-    if recipe.network == "lite":
-        return LiteNet(classes, channels, azimuths)
+    if recipe.network != "resnet":
+        return LiteNet(classes, channels, azimuths, int(recipe.network.removeprefix("lite")), recipe.drop)
     return ResNet(recipe.depth, classes, channels, azimuths, recipe.blocks)
 
 

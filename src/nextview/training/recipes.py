@@ -11,8 +11,10 @@ class RecogniserRecipe:
     """How the recogniser is trained.
 
     Attributes:
-        network: a ResNet, or EfficientNet-Lite0, which has a fifth of the arithmetic of a ResNet-18.
+        network: a ResNet, or EfficientNet-Lite0, -1 or -2; the first has a fifth of the arithmetic of a ResNet-18.
         depth: ResNet-18, -34, -50, -101 or -152.
+        drop: of an EfficientNet-Lite: chance that a pooled feature is dropped, and that the last block is skipped for a
+            view; less for those before it.
         size: side of the input image, pixels.
         blocks: side of the blocks of pixels that the first convolution sees as channels of one pixel (space to depth):
             with 2, an image of twice the side takes half as long again, not four times as long. A ResNet's only.
@@ -38,8 +40,9 @@ class RecogniserRecipe:
         patience: stop after so many epochs without a better class mean on validation; 0 never stops early.
     """
 
-    network: Literal["resnet", "lite"] = "resnet"
+    network: Literal["resnet", "lite0", "lite1", "lite2"] = "resnet"
     depth: Literal[18, 34, 50, 101, 152] = 18
+    drop: float = 0.0
     size: int = 112
     blocks: Literal[1, 2, 4] = 1
     small: int = 80

