@@ -74,8 +74,8 @@ class LiteNet(nn.Module):
         channels: of the input image (B, channels, H, W), values in 0 .. 1.
         azimuths: sides that are told apart; 0 for none.
         scale: 0, 1 or 2: which of them, the smallest first.
-        drop: chance in training that a pooled feature is dropped, and that the last block is skipped for an image;
-            less for those before it.
+        drop: chance in training that a pooled feature is dropped; the chance that a block with a shortcut is skipped
+            for an image rises from 0 at the first block towards it at the last.
     """
 
     blocks = 1

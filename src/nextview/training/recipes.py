@@ -13,8 +13,8 @@ class RecogniserRecipe:
     Attributes:
         network: a ResNet, or EfficientNet-Lite0, -1 or -2; the first has a fifth of the arithmetic of a ResNet-18.
         depth: ResNet-18, -34, -50, -101 or -152.
-        drop: of an EfficientNet-Lite: chance that a pooled feature is dropped, and that the last block is skipped for a
-            view; less for those before it.
+        drop: of an EfficientNet-Lite: chance that a pooled feature is dropped; the chance that a block is skipped for a
+            view rises from 0 at the first towards it at the last.
         size: side of the input image, pixels.
         blocks: side of the blocks of pixels that the first convolution sees as channels of one pixel (space to depth):
             with 2, an image of twice the side takes half as long again, not four times as long. A ResNet's only.

@@ -210,13 +210,13 @@ def _names(facts: dict[str, Any]) -> list[str]:
 
 
 def refuse_seen(card: Path, kept: list[str]) -> None:
-    """Refuse to go on from a recogniser that was trained on objects which are to be kept from the network now.
+    """Refuse to go on from a network that was trained on objects which are to be kept from the network now.
 
     A card names the objects of its split that it has not seen. Where none of them is among ``kept``, it was trained on
     another dataset.
 
     Args:
-        card: of the recogniser.
+        card: of the network.
         kept: names of the objects that validate, and of those held out for a fold.
 
     Raises:
