@@ -275,6 +275,23 @@ def test_a_calibration_goes_into_the_card_and_is_used(training_predictions):
     assert "45 objects" in after["calibration"]["fitted_to"]
 
 
+def test_a_calibration_is_fitted_to_what_the_card_calls_unseen_whatever_the_sizes(training_predictions, capsys):
+    card, path = training_predictions
+    with pytest.raises(SystemExit):
+        main(["fit", "calibration", str(path), str(card)])
+    assert "holds no object that" in capsys.readouterr().err
+    p, facts = Predictions.load(path), json.loads(card.read_text())
+    card.write_text(json.dumps(facts | {"unseen": [*p.names[:30], "elsewhere"]}))
+    main(["fit", "calibration", str(path), str(card)])
+    by_shape = json.loads(card.read_text())["calibration"]
+    assert "30 objects" in by_shape["fitted_to"]
+    of_size = np.random.default_rng(0).normal(0, 3, (90, 3)).astype(np.float32)
+    replace(p, logits=p.logits + of_size[:, None], of_size=of_size).save(path)
+    main(["fit", "calibration", str(path), str(card)])
+    sized = json.loads(card.read_text())["calibration"]
+    assert sized["temperature_of_one"] == pytest.approx(by_shape["temperature_of_one"], abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ("spoil", "sentence"),
     [

@@ -11,20 +11,22 @@ def fit_calibration(
     predictions: tyro.conf.Positional[Path],
     card: tyro.conf.Positional[Path],
     /,
-    validation: float = 0.1,
+    validation: float | None = None,
     split_seed: int = 0,
     delta: float = 0.1,
     seed: int = 0,
 ) -> None:
     """Calibrate a recogniser: how far to trust the sum of several looks, and which error rates can be promised.
 
-    Both go into its card; nextview predict takes them into predictions made before, without predicting again.
+    Both go into its card; nextview predict takes them into predictions made before, without predicting again. How large
+    the objects are is left aside.
 
     Args:
-        predictions: of the training split (nextview predict --split train).
-        card: of the recogniser; "calibration" is written into it.
-        validation: part of every class that the recogniser was not trained on; 1 for out-of-fold predictions.
-        split_seed: the recogniser's seed, which decided which.
+        predictions: of the training split (nextview predict --unseen, or --split train).
+        card: of the recogniser; "calibration" is written into it. Those objects are taken that it calls unseen.
+        validation: take this part of every class instead, as training kept it out of the whole split; 1 for
+            out-of-fold predictions. A card that names no unseen objects needs it.
+        split_seed: the recogniser's seed, which decided that part.
         delta: how often a promised error rate may not hold.
         seed: decides the walks over which is fitted.
     """
@@ -35,16 +37,22 @@ def fit_calibration(
     from nextview.cli.progress import console
     from nextview.data.predictions import Predictions, PredictionsError
     from nextview.fitting.calibration import fit_risk, fit_temperature, loss
-    from nextview.fitting.evidence import fitting_set
+    from nextview.fitting.evidence import FittingSet, fitting_set
     from nextview.models.card import read_card, write_card
     from nextview.recognition import PLAIN_SUM
 
     if not 0 < delta < 1:
         raise ValueError(f"delta is a probability between 0 and 1, not {delta}")
-    model, table = read_card(card), Predictions.load(predictions)
-    if validation < 1 and table.models["recogniser"][1] != model.sha256:
+    model, table = read_card(card), Predictions.load(predictions).by_shape()
+    if validation != 1 and table.models["recogniser"][1] != model.sha256:
         raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
-    data = fitting_set(table, validation, split_seed)
+    if validation is None:
+        shapes = table.each_shape_once()
+        data = FittingSet.of_all(shapes).of(np.isin(shapes.names, model.facts.get("unseen", [])))
+        if len(data) == 0:
+            raise PredictionsError(f"{predictions}: holds no object that {card} calls unseen; see --validation")
+    else:
+        data = fitting_set(table, validation, split_seed)
     walks = 1 + 8000 // len(data)  # few objects are walked over more often
     calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=walks)
     risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
