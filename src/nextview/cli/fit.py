@@ -37,7 +37,7 @@ def fit_calibration(
     from nextview.cli.progress import console
     from nextview.data.predictions import Predictions, PredictionsError
     from nextview.fitting.calibration import fit_risk, fit_temperature, loss
-    from nextview.fitting.evidence import FittingSet, fitting_set
+    from nextview.fitting.evidence import FittingSet, fitting_set, unseen_by
     from nextview.models.card import read_card, write_card
     from nextview.recognition import PLAIN_SUM
 
@@ -47,8 +47,7 @@ def fit_calibration(
     if validation != 1 and table.models["recogniser"][1] != model.sha256:
         raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
     if validation is None:
-        shapes = table.each_shape_once()
-        data = FittingSet.of_all(shapes).of(np.isin(shapes.names, model.facts.get("unseen", [])))
+        data = FittingSet.of_all(table).of(unseen_by(model, table))
         if len(data) == 0:
             raise PredictionsError(f"{predictions}: holds no object that {card} calls unseen; see --validation")
     else:
@@ -133,22 +132,20 @@ def fit_valleys(
             neither be the recogniser (nextview predict --unseen).
         card: of the map network; "valley_classes" is written into it.
     """
-    import numpy as np
-
     from nextview.cli.progress import console
     from nextview.data.predictions import Predictions, PredictionsError
-    from nextview.fitting.evidence import FittingSet
+    from nextview.fitting.evidence import FittingSet, unseen_by
     from nextview.fitting.valleys import valley_gains
     from nextview.models.card import read_card, write_card
 
-    model, table = read_card(card), Predictions.load(predictions).each_shape_once()
+    model, table = read_card(card), Predictions.load(predictions)
     if model.kind not in table.maps or table.models[model.kind] != (model.name, model.sha256):
         raise PredictionsError(f"{predictions}: holds no maps by {card}")
-    data = FittingSet.of_all(table)
-    kept = np.flatnonzero(np.isin(table.names, model.facts.get("unseen", [])))
+    kept = unseen_by(model, table)
+    data = FittingSet.of_all(table).of(kept)
     if len(kept) == 0:
         raise PredictionsError(f"{predictions}: holds no object of which {card} says that it was not trained on it")
-    gains = valley_gains(table.sphere, data.logits[kept], table.maps[model.kind][kept], data.labels[kept])
+    gains = valley_gains(data.sphere, data.logits, table.maps[model.kind][kept], data.labels)
     told = {
         "valley_classes": [table.classes[c] for c, gain in gains.items() if gain > 0],
         "valley_gain": {table.classes[c]: round(gain, 4) for c, gain in gains.items()},

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from nextview.data.predictions import Predictions, PredictionsError
 from nextview.data.split import distinct, divide
+from nextview.models.card import Card
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.recognition import additive
 from nextview.viewsphere import ViewSphere
@@ -63,6 +64,12 @@ class FittingSet:
         """Of the objects, (N,), sum N: every class that there is counts the same, whatever its share."""
         count = np.bincount(self.labels, minlength=len(self.classes))
         return len(self) / ((count > 0).sum() * count[self.labels])
+
+
+def unseen_by(card: Card, predictions: Predictions) -> NDArray[np.int64]:
+    """The objects on which a network was not trained, as its card says, each shape once: their indices, maybe none."""
+    once = distinct(predictions.labels, predictions.depth_entropy)
+    return once[np.isin(np.array(predictions.names)[once], card.facts.get("unseen", []))]
 
 
 def fitting_set(predictions: Predictions, validation: float, seed: int) -> FittingSet:
