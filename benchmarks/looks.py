@@ -141,13 +141,16 @@ def knows(policy: str) -> bool:
 
 
 def families(names: Sequence[str], trials: Trials) -> dict[str, list[tuple[float, str]]]:
-    """The policies that were run at two prices or more: price and full name of each, ascending."""
-    found: dict[str, list[tuple[float, str]]] = {}
-    for name in names:
+    """The policies that were run at two prices or more: price and full name of each, ascending.
+
+    Where a policy's own price was asked for by number too, it is the policy's.
+    """
+    found: dict[str, dict[float, str]] = {}
+    for name in sorted(names):
         price = getattr(contestant_policy(name, trials), "price", None)
         if price is not None:
-            found.setdefault(name.partition("@")[0], []).append((price, name))
-    return {family: sorted(members) for family, members in found.items() if len(members) > 1}
+            found.setdefault(name.partition("@")[0], {}).setdefault(price, name)
+    return {family: sorted(members.items()) for family, members in found.items() if len(members) > 1}
 
 
 def front(table: pd.DataFrame, prices: dict[str, list[tuple[float, str]]]) -> Figure:
@@ -156,7 +159,9 @@ def front(table: pd.DataFrame, prices: dict[str, list[tuple[float, str]]]) -> Fi
     A line joins the prices of one policy. Dots are filled where McNemar's p against random is under 0.05.
     """
     found, looks = by_key(table), table["looks"].unique().tolist()
-    names = [name for name in table["policy"].unique() if not knows(name)]
+    at_prices = {name for members in prices.values() for _, name in members}
+    drawn = [name for name in table["policy"].unique() if not knows(name)]
+    names = [name for name in drawn if name in at_prices or name.partition("@")[0] not in prices]
     colour = {name: COLOURS.get(name, "#4a5560") for name in names}
     said = {name: Path(name).name for name in names}
     for own, (family, members) in zip(OWN * len(prices), prices.items(), strict=False):

@@ -3,6 +3,7 @@
 import runpy
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -111,3 +112,18 @@ def test_no_name_in_the_figure_covers_another_and_only_robots_have_a_dot():
     joined = next(line for line in axes.lines if len(line.get_xdata()) == 3)
     by = table.set_index(["policy", "measure"])["value"]
     assert [*joined.get_xdata()] == [by[name, "travel"] for _, name in family]
+
+
+def test_a_price_that_is_the_policys_own_is_drawn_once(monkeypatch):
+    own = {"random": None, "gain@0.01": 0.01, "gain": 0.01, "gain@0": 0.0}
+    monkeypatch.setitem(
+        LOOKS["families"].__globals__, "contestant_policy", lambda name, _: SimpleNamespace(price=own[name])
+    )
+    found = LOOKS["families"](list(own), None)
+    assert found == {"gain": [(0.0, "gain@0"), (0.01, "gain")]}
+    measured = {"accuracy": 0.9, "travel": 2.0, "to_random": 0.0}
+    rows = [(name, 2, measure, x, x, x, 0.01) for name in own for measure, x in measured.items()]
+    (axes,) = LOOKS["front"](
+        pd.DataFrame(rows, columns=["policy", "looks", "measure", "value", "low", "high", "p"]), found
+    ).axes
+    assert sorted(t.get_text() for t in axes.texts if t.get_text()) == ["@0", "gain@0.01", "random"]
