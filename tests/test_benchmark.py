@@ -11,10 +11,10 @@ from test_predictions import some_predictions
 
 from nextview.benchmark import results
 from nextview.benchmark.published import ACCURACY, TRAVEL, published, read_table
-from nextview.benchmark.replay import ContestantError, cut, make_trials, replay
+from nextview.benchmark.replay import cut, make_trials, replay
 from nextview.benchmark.statistics import calibration_error
 from nextview.cli.benchmark import benchmark
-from nextview.data.predictions import PredictionsError
+from nextview.errors import EntryError, PredictionsError
 from nextview.recognition import Calibration, RiskBounds
 
 TEN = tuple(read_table(ACCURACY[10]))
@@ -123,7 +123,7 @@ def test_results_are_read_back_whole(folder, predictions):
 
 def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes_nothing_from_it(folder, capsys):
     names = ("test_replay:Asked", "test_replay:Raises", "lcm", "best-99")
-    with pytest.raises(ContestantError) as caught:
+    with pytest.raises(EntryError) as caught:
         benchmark(folder / "p.npz", out=folder / "own", policies=names, runs=1, samples=50)
     sentences = str(caught.value).splitlines()
     assert len(sentences) == 3

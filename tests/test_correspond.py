@@ -7,9 +7,9 @@ import trimesh
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.cli.correspond import correspond
 from nextview.data.correspond import correspondence, correspondence_maps
-from nextview.data.folders import DatasetError
 from nextview.data.render import render
 from nextview.data.store import ViewStore
+from nextview.errors import DatasetError
 from nextview.mesh import make_mesh
 from nextview.viewsphere import ViewSphere
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from nextview.data.download import Archive, download
-from nextview.data.folders import DatasetError
 from nextview.data.lock import only_one
+from nextview.errors import DatasetError
 
 MESH = b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 

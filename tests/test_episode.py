@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import softmax
 
-from nextview.episode import Episodes, PolicyError, run_episodes, select
+from nextview.episode import Episodes, run_episodes, select
+from nextview.errors import PolicyError
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.baselines import Random, RandomAll, Unidirectional
 from nextview.policies.maps import MapPeak

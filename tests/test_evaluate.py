@@ -9,8 +9,9 @@ from scipy.special import softmax
 from scipy.stats import bootstrap
 from test_predictions import some_predictions
 
-from nextview.benchmark.evaluate import EvaluationError, evaluate, fused_views, yardsticks
+from nextview.benchmark.evaluate import evaluate, fused_views, yardsticks
 from nextview.benchmark.published import published_map, published_recognisers, read_table
+from nextview.errors import ResultsError
 from nextview.recognition import Calibration
 from nextview.viewsphere import ViewSphere
 
@@ -208,9 +209,9 @@ def test_the_mean_map_has_the_least_squared_error_of_all_constant_maps():
 def test_what_cannot_be_judged_says_so():
     p = some_predictions(4)
     alone = replace(p, logits=p.logits[:, :, :1], classes=("ball",), labels=np.zeros(4, int), maps={})
-    with pytest.raises(EvaluationError, match="one class only, ball"):
+    with pytest.raises(ResultsError, match="one class only, ball"):
         evaluate(alone, 10, np.random.default_rng(0))
-    with pytest.raises(EvaluationError, match="at least one sample"):
+    with pytest.raises(ResultsError, match="at least one sample"):
         evaluate(p, 0, np.random.default_rng(0))
     always_next = np.zeros_like(p.logits)
     always_next[np.arange(4), :, (p.labels + 1) % 3] = 1

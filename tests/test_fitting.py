@@ -11,8 +11,9 @@ from test_predictions import some_predictions
 from tiny_models import make_recogniser
 
 from nextview.cli.main import main
-from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.predictions import Predictions
 from nextview.data.split import divide
+from nextview.errors import PredictionsError
 from nextview.fitting.calibration import error_bound, fit_risk, fit_temperature, loss
 from nextview.fitting.evidence import FittingSet, blind_walks, fitting_set
 from nextview.fitting.tables import fit_class_table, fit_ring, fit_sequence

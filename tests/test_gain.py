@@ -15,10 +15,11 @@ from test_policies import SPHERE, state_of
 from test_predictions import some_predictions
 
 from nextview.cli.main import main
+from nextview.errors import PolicyError
 from nextview.fitting.choices import OUTCOMES, ReplayTable, choices, follow, judge, outcome, travel_price
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Random, RandomAll
-from nextview.policies.card import PolicyCardError, bundled_policies
+from nextview.policies.card import bundled_policies
 from nextview.policies.gain import INPUTS, MAPS, Gain, mirrored, told, told_mirrored
 from nextview.policies.registry import make_policy
 from nextview.recognition import PLAIN_SUM, Calibration, reorient
@@ -344,7 +345,7 @@ def test_damaged_weights_are_refused_in_one_sentence(fault, tmp_path):
     spoil(weights)
     if hashed:
         card.write_text(json.dumps(json.loads(card.read_text()) | {"sha256": file_hash(weights)}))
-    with pytest.raises(PolicyCardError) as error:
+    with pytest.raises(PolicyError) as error:
         make_policy(str(card), SPHERE)
     assert sentence in str(error.value)
     assert "\n" not in str(error.value)
@@ -357,7 +358,7 @@ def test_a_card_that_lacks_something_is_refused(lost, tmp_path):
     facts = json.loads(card.read_text())
     facts.pop(lost)
     card.write_text(json.dumps(facts))
-    with pytest.raises(PolicyCardError, match=rf"mine\.json: not a policy card \(KeyError: '{lost}'\)"):
+    with pytest.raises(PolicyError, match=rf"mine\.json: not a policy card \(KeyError: '{lost}'\)"):
         make_policy(str(card), SPHERE)
 
 

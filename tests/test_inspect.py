@@ -6,10 +6,10 @@ import trimesh
 
 from nextview.cli.inspect import inspect
 from nextview.cli.main import main
-from nextview.data.folders import DatasetError
 from nextview.data.measure import measure
 from nextview.data.render import render
 from nextview.data.store import ViewStore
+from nextview.errors import DatasetError
 from nextview.report.store_figures import disk_use, median_radii, object_figure, store_figure, summary
 from nextview.viewsphere import ViewSphere
 

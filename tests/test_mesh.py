@@ -14,7 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from nextview.mesh import FORMATS, Mesh, MeshError, load_mesh, make_mesh
+from nextview.errors import MeshError
+from nextview.mesh import FORMATS, Mesh, load_mesh, make_mesh
 from nextview.off import read_off
 
 SQUARE = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]

@@ -9,11 +9,11 @@ import pytest
 import trimesh
 from tiny_models import make_map_network, make_recogniser
 
-from nextview.data.folders import DatasetError
 from nextview.data.predict import predict
-from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.predictions import Predictions
 from nextview.data.render import Deform, render
 from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, PredictionsError
 from nextview.models.card import read_card
 from nextview.models.networks import MapNetwork, Recogniser
 from nextview.observation import Observation

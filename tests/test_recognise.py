@@ -15,7 +15,8 @@ from tests.test_readme import write_off
 from nextview import SimulatedCamera, Stopping, ViewSphere, load_mesh, load_models, make_policy, recognise
 from nextview.cli.main import main
 from nextview.data.samples import SAMPLES, sample_mesh
-from nextview.models.card import BUNDLED, ModelError, bundled_cards
+from nextview.errors import ModelError
+from nextview.models.card import BUNDLED, bundled_cards
 from nextview.models.networks import RECOGNISER, MapNetwork, Recogniser
 from nextview.policies.card import bundled_policies
 

@@ -10,7 +10,8 @@ from hypothesis.extra import numpy as npst
 from scipy.special import log_softmax, softmax
 from scipy.stats import multivariate_normal
 
-from nextview.recognition import Calibration, RiskBounds, RiskError, Stopping, additive, fuse, reorient
+from nextview.errors import RiskError
+from nextview.recognition import Calibration, RiskBounds, Stopping, additive, fuse, reorient
 
 logits = npst.arrays(
     st.sampled_from([np.float32, np.float64]),

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from nextview.data.folders import DatasetError, list_dataset
+from nextview.data.folders import list_dataset
 from nextview.data.lock import only_one
 from nextview.data.pool import WorkerDied, each
 from nextview.data.render import Deform, render
 from nextview.data.store import ViewStore
+from nextview.errors import DatasetError
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("12")

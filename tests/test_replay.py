@@ -11,18 +11,18 @@ from test_predictions import some_predictions
 from tiny_models import make_map_network, make_recogniser
 
 from nextview.benchmark.contestants import default_contestants, true_lcm, true_lem
-from nextview.benchmark.replay import ContestantError, cut, make_trials, replay
+from nextview.benchmark.replay import cut, make_trials, replay
 from nextview.benchmark.run import Grid, run_grid
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.predict import predict
 from nextview.data.predictions import Predictions
 from nextview.data.render import render
 from nextview.episode import run_episodes
+from nextview.errors import EntryError, PolicyError
 from nextview.mesh import load_mesh
 from nextview.models.card import read_card
 from nextview.models.networks import MapNetwork, Models, Recogniser
 from nextview.policies.base import Evidence
-from nextview.policies.card import PolicyCardError
 from nextview.policies.registry import make_policy
 from nextview.recognition import Calibration, Stopping
 from nextview.session import recognise
@@ -233,7 +233,7 @@ def test_a_policy_that_fails_is_named_with_the_object_and_the_others_are_kept(tr
     assert list(run_grid(grid, ["furthest", path, "test_replay:Asked"])) == [1, 2, 3]
     assert set(grid.paths) == {"furthest", "test_replay:Asked"}
     with pytest.raises(ValueError, match=sentence):
-        raise ContestantError(grid.failures[path])
+        raise EntryError(grid.failures[path])
     assert path in grid.failures[path]
 
 
@@ -256,7 +256,7 @@ def test_a_damaged_policy_is_named_and_not_left_out(trials, tmp_path, monkeypatc
     broken.write_text("{}")
     monkeypatch.setattr("nextview.benchmark.contestants.bundled_policies", lambda: {"broken": broken})
     monkeypatch.setattr("nextview.policies.registry.bundled_policies", lambda: {"broken": broken})
-    with pytest.raises(PolicyCardError, match="not a policy card"):
+    with pytest.raises(PolicyError, match="not a policy card"):
         default_contestants(trials)
 
 

@@ -11,11 +11,11 @@ import pytest
 from test_predictions import some_predictions
 
 from nextview.benchmark import results
-from nextview.benchmark.replay import ContestantError
 from nextview.cli.benchmark import benchmark
 from nextview.cli.report import report
 from nextview.data.folders import Entry
 from nextview.data.store import DONE, ViewStore
+from nextview.errors import EntryError
 from nextview.report import curves
 from nextview.report.html import headline_policy
 
@@ -177,7 +177,7 @@ def test_captions_tell_where_the_rest_of_a_crowd_is(crowd, made):
 def test_a_report_of_few_policies(made, policies):
     out = made / "-".join(name.replace(":", ".") for name in policies)
     fails = "Raises" in policies[0]
-    with pytest.raises(ContestantError) if fails else nullcontext():
+    with pytest.raises(EntryError) if fails else nullcontext():
         benchmark(made / "p.npz", out=out, policies=policies, thresholds=(0.9,), runs=2, max_views=3, samples=20)
     report(out)
     Page((out / "report.html").read_text())

@@ -12,8 +12,9 @@ pytest.importorskip("lightning")
 from nextview.data.folders import Entry  # noqa: E402
 from nextview.data.render import Deform, render, render_object, turns  # noqa: E402
 from nextview.data.store import DONE, ViewStore  # noqa: E402
+from nextview.errors import ModelError  # noqa: E402
 from nextview.mesh import make_mesh  # noqa: E402
-from nextview.models.card import ModelError, find_card  # noqa: E402
+from nextview.models.card import find_card  # noqa: E402
 from nextview.models.networks import RECOGNISER, MapNetwork, Recogniser  # noqa: E402
 from nextview.training import maps  # noqa: E402
 from nextview.training.hardware import Hardware  # noqa: E402

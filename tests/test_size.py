@@ -16,15 +16,15 @@ from tiny_models import make_recogniser
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.cli.main import main
 from nextview.cli.recognise import Unit
-from nextview.data.folders import DatasetError
 from nextview.data.predict import predict
-from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.predictions import Predictions
 from nextview.data.render import Deform, render
 from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, MeshError, ModelError, PredictionsError
 from nextview.fitting.evidence import FittingSet
 from nextview.fitting.size import ANY_SIZE, RADII, densities, fit_weight
-from nextview.mesh import UNITS, MeshError, load_mesh
-from nextview.models.card import ModelError, read_card
+from nextview.mesh import UNITS, load_mesh
+from nextview.models.card import read_card
 from nextview.models.networks import Recogniser
 from nextview.models.size import SizeEvidence
 from nextview.viewsphere import ViewSphere

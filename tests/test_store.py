@@ -10,10 +10,10 @@ import trimesh
 from nextview.cli.main import main
 from nextview.data.check import check
 from nextview.data.correspond import correspond
-from nextview.data.folders import DatasetError
 from nextview.data.measure import measure
 from nextview.data.render import render
 from nextview.data.store import RENDERED, ViewStore
+from nextview.errors import DatasetError
 from nextview.measures.registry import MEASURES
 from nextview.viewsphere import ViewSphere
 

@@ -19,11 +19,12 @@ torch = pytest.importorskip("torch")
 from nextview.cli.main import COMMANDS, main  # noqa: E402
 from nextview.cli.presets import with_preset  # noqa: E402
 from nextview.cli.train import train_recogniser  # noqa: E402
-from nextview.data.folders import DatasetError, Entry  # noqa: E402
+from nextview.data.folders import Entry  # noqa: E402
 from nextview.data.lock import only_one  # noqa: E402
 from nextview.data.split import split_training  # noqa: E402
 from nextview.data.store import DONE, ViewStore  # noqa: E402
-from nextview.models.card import ModelError, find_card  # noqa: E402
+from nextview.errors import DatasetError, ModelError  # noqa: E402
+from nextview.models.card import find_card  # noqa: E402
 from nextview.models.image_input import image_input  # noqa: E402
 from nextview.models.networks import RECOGNISER  # noqa: E402
 from nextview.training.grid import published_cells  # noqa: E402

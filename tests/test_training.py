@@ -21,6 +21,7 @@ from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
 from nextview.data.seen import seen_views
 from nextview.data.store import ViewStore
+from nextview.errors import ModelError
 from nextview.fitting.valleys import valley_gains
 from nextview.models.networks import MapNetwork, Recogniser
 from nextview.observation import Observation
@@ -29,7 +30,7 @@ from nextview.viewsphere import ViewSphere
 torch = pytest.importorskip("torch")
 
 from nextview.benchmark.scores import map_scores, recogniser_scores  # noqa: E402
-from nextview.models.card import ModelError, find_card  # noqa: E402
+from nextview.models.card import find_card  # noqa: E402
 from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402

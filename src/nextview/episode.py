@@ -8,17 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import PolicyError, SessionError, UsageError
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.recognition import PLAIN_SUM, Calibration, Stopping, additive
 from nextview.viewsphere import ViewSphere
-
-
-class PolicyError(ValueError):
-    """A policy that failed or gave something that is not a next view; the message names it, ``episode`` is where."""
-
-    def __init__(self, message: str, episode: int | None = None) -> None:
-        super().__init__(message)
-        self.episode = episode
 
 
 @dataclass(frozen=True)
@@ -93,7 +86,7 @@ class Episodes:
         self.running = np.arange(len(starts))
         self.current = np.array(starts, np.int64)
         if ((self.current < 0) | (self.current >= len(sphere))).any():
-            raise ValueError(f"a first view has to be one of the {len(sphere)} views, 0 to {len(sphere) - 1}")
+            raise UsageError(f"a first view has to be one of the {len(sphere)} views, 0 to {len(sphere) - 1}")
         self.steps: list[Step] = []
         self._visited = np.zeros((len(starts), len(sphere)), bool)
         self._total: NDArray[np.float64] = np.zeros((len(starts), 0))
@@ -104,12 +97,12 @@ class Episodes:
         Where this raises, nothing is taken in: the same look can be told again.
 
         Raises:
-            ValueError: the evidence is of another number of episodes, or a logit is not finite.
+            UsageError: the evidence is of another number of episodes, or a logit is not finite.
             PolicyError: the policy failed or chose something that is not a next view.
         """
         now, views = self.running, self.current[self.running]
         if len(evidence.logits) != len(now):
-            raise ValueError(f"evidence of {len(evidence.logits)} looks for {len(now)} running episodes")
+            raise UsageError(f"evidence of {len(evidence.logits)} looks for {len(now)} running episodes")
         before = self._total[now] if self.steps else 0.0
         azimuth = self.sphere.turn[views]
         total = before + np.asarray(additive(evidence.logits, evidence.sides, azimuth), np.float64)
@@ -188,10 +181,10 @@ class Episodes:
         """How the episodes ended.
 
         Raises:
-            ValueError: some are still running.
+            SessionError: some are still running.
         """
         if len(self.running):
-            raise ValueError("the episodes are still running")
+            raise SessionError("the episodes are still running")
         b = len(self.current)
         views = np.full((b, len(self.steps)), -1)
         answer, looks, confidence = np.zeros(b, np.int64), np.zeros(b, np.int64), np.zeros(b)

@@ -9,16 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import MeshError
 from nextview.obj import read_obj
 from nextview.off import read_off
 
 FORMATS = (".off", ".obj", ".ply", ".stl", ".glb")
 UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}
 """What a file's unit of length may be, and how many metres it is."""
-
-
-class MeshError(ValueError):
-    """A mesh that cannot be used; the message is one sentence that names the file and the reason."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +140,7 @@ def _read_with_trimesh(data: bytes, suffix: str) -> tuple[NDArray[np.float64], N
 
     damage = _DAMAGE.get(suffix, lambda data: None)(data)
     if damage:
-        raise ValueError(damage)
+        raise MeshError(damage)
     loaded = trimesh.load(io.BytesIO(data), file_type=suffix[1:], process=False)
     if isinstance(loaded, trimesh.Scene):
         loaded = loaded.to_mesh()

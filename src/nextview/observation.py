@@ -8,6 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import ObservationError
+
 POINTS = 1024
 """Points in the partial cloud of one look (thesis, section 4.1.2)."""
 FARTHEST = 50.0
@@ -29,7 +31,7 @@ class Observation:
         radius: the object radius, metres: what positions were divided by. None if the camera does not know its scale.
 
     Raises:
-        ValueError: a radius that is not a positive number.
+        ObservationError: a radius that is not a positive number.
     """
 
     image: NDArray[np.uint8]
@@ -41,7 +43,7 @@ class Observation:
 
     def __post_init__(self) -> None:
         if self.radius is not None and not 0 < self.radius < np.inf:
-            raise ValueError(f"the object radius is a positive number of metres, or None, not {self.radius}")
+            raise ObservationError(f"the object radius is a positive number of metres, or None, not {self.radius}")
         object.__setattr__(self, "depth", object_depth(self.depth))
 
 
@@ -78,9 +80,9 @@ def pinhole(size: int, distance: float) -> NDArray[np.float64]:
         (3, 3) float64.
 
     Raises:
-        ValueError: the camera stands inside the sphere.
+        ObservationError: the camera stands inside the sphere.
     """
     if not distance > 1:
-        raise ValueError(f"the camera has to stand more than one object radius from the centre, not {distance}")
+        raise ObservationError(f"the camera has to stand more than one object radius from the centre, not {distance}")
     focal = size / 2 * np.sqrt(distance**2 - 1)  # size/2 over the tangent of the half angle asin(1/distance)
     return np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])

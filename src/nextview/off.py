@@ -11,22 +11,24 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import MeshError
+
 
 def read_off(data: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Vertices (V, 3) float64 and triangles (F, 3) int64 of an OFF file; polygons become fans.
 
     Raises:
-        ValueError: the file is not OFF, is cut short or holds something that is not a number.
+        MeshError: the file is not OFF, is cut short or holds something that is not a number.
     """
     if b"#" in data:
         data = re.sub(rb"#[^\r\n]*", b"", data)
     header = re.match(rb"\s*(?:ST)?(?:C|N|CN)?OFF\b|\s*OFF(?=[0-9])", data)
     if header is None:
-        raise ValueError("it does not begin with OFF")
+        raise MeshError("it does not begin with OFF")
     body = data[header.end() :]
     counts = re.match(rb"\s*(\d+)\s+(\d+)(?:[ \t]+\d+)?[ \t]*(?=[\r\n]|$)", body)
     if counts is None:
-        raise ValueError("the counts of vertices and faces are missing")
+        raise MeshError("the counts of vertices and faces are missing")
     vertex_count, face_count = int(counts[1]), int(counts[2])
     body = body[counts.end() :]
     plain = _read_plain(body, vertex_count, face_count)
@@ -63,7 +65,7 @@ def _read_lines(body: bytes, vertex_count: int, face_count: int) -> tuple[NDArra
     lines = [line for line in body.splitlines() if line.strip()]
     if len(lines) < vertex_count + face_count:
         found = max(len(lines) - vertex_count, 0)
-        raise ValueError(
+        raise MeshError(
             f"the file is cut short, {vertex_count} vertices and {face_count} faces announced, "
             f"{min(len(lines), vertex_count)} and {found} found"
         )
@@ -71,16 +73,16 @@ def _read_lines(body: bytes, vertex_count: int, face_count: int) -> tuple[NDArra
     for i, line in enumerate(lines[:vertex_count]):
         columns = line.split()
         if len(columns) < 3:
-            raise ValueError(f"vertex {i} has {len(columns)} of 3 coordinates")
+            raise MeshError(f"vertex {i} has {len(columns)} of 3 coordinates")
         vertices[i] = [float(c) for c in columns[:3]]
     triangles: list[tuple[int, int, int]] = []
     for i, line in enumerate(lines[vertex_count : vertex_count + face_count]):
         columns = line.split()
         corners = int(columns[0])
         if corners < 0 or len(columns) < 1 + corners:
-            raise ValueError(f"face {i} has {len(columns) - 1} of {corners} corners")
+            raise MeshError(f"face {i} has {len(columns) - 1} of {corners} corners")
         polygon = [int(c) for c in columns[1 : 1 + corners]]
         if max(polygon, default=0) >= vertex_count:
-            raise ValueError(f"face {i} refers to vertex {max(polygon)}, but there are only {vertex_count} vertices")
+            raise MeshError(f"face {i} refers to vertex {max(polygon)}, but there are only {vertex_count} vertices")
         triangles += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, corners - 1)]
     return vertices, np.array(triangles, np.int64).reshape(-1, 3)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import ModelError, RiskError, UsageError
+
 Float = NDArray[np.float64]
 
 
@@ -23,11 +25,11 @@ def fuse(logits: NDArray[np.floating], temperature: float = 1.0) -> NDArray[np.f
         (..., classes) float64, sums to 1.
 
     Raises:
-        ValueError: a logit is not finite.
+        ModelError: a logit is not finite.
     """
     logits = np.asarray(logits, np.float64)
     if not np.isfinite(logits).all():
-        raise ValueError("the recogniser gave a logit that is not a finite number")
+        raise ModelError("the recogniser gave a logit that is not a finite number")
     return _softmax(logits.sum(-2) / temperature)
 
 
@@ -100,10 +102,6 @@ def of_true_class(logs: Float, labels: NDArray[np.int64]) -> Float:
     return of_truth - top - np.log(np.exp(logs - top[..., None]).sum(-1))
 
 
-class RiskError(ValueError):
-    """An error rate that cannot be promised; the message is one sentence."""
-
-
 @dataclass(frozen=True)
 class RiskBounds:
     """How often those who stop at a threshold are wrong, at most, as far as validation objects can tell.
@@ -155,7 +153,7 @@ class Calibration:
         side_correlation: of what two looks say of the side, 0 .. 1; None where that shall not count for the class.
 
     Raises:
-        ValueError: a temperature that is not positive, or a negative correlation.
+        ModelError: a temperature that is not positive, or a negative correlation.
     """
 
     temperature_of_one: float = 1.0
@@ -166,7 +164,7 @@ class Calibration:
     def __post_init__(self) -> None:
         numbers = (self.correlation, self.side_correlation or 0.0)
         if not 0 < self.temperature_of_one < np.inf or not all(0 <= x < np.inf for x in numbers):
-            raise ValueError(
+            raise ModelError(
                 f"no calibration: temperature {self.temperature_of_one}, correlation {self.correlation}, of sides "
                 f"{self.side_correlation}"
             )
@@ -187,10 +185,10 @@ class Calibration:
             (..., classes) float64.
 
         Raises:
-            ValueError: something that was said is not finite.
+            ModelError: something that was said is not finite.
         """
         if not np.isfinite(total).all():
-            raise ValueError("the recogniser said something that is not a finite number")
+            raise ModelError("the recogniser said something that is not a finite number")
         more = np.asarray(looks)[..., None] - 1
         total = np.asarray(total, np.float64)
         logs = total[..., :classes] / (self.temperature_of_one * (1 + self.correlation * more))
@@ -240,7 +238,7 @@ class Calibration:
         """From what a model's card says under "calibration"; the plain sum if it says nothing.
 
         Raises:
-            ValueError: it makes no sense.
+            ModelError: it makes no sense.
         """
         if not facts:
             return cls()
@@ -249,7 +247,7 @@ class Calibration:
             bounds = risk and RiskBounds(tuple(risk["thresholds"]), tuple(map(tuple, risk["bounds"])), risk["delta"])
             return cls(facts["temperature_of_one"], facts["correlation"], bounds, facts.get("side_correlation"))
         except (KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"a calibration that cannot be read ({type(error).__name__}: {error})") from None
+            raise ModelError(f"a calibration that cannot be read ({type(error).__name__}: {error})") from None
 
     def facts(self) -> dict[str, Any]:
         """What ``of_facts`` reads, for JSON."""
@@ -283,7 +281,7 @@ class Stopping:
         decline: how fast the bar comes down; 0 keeps it.
 
     Raises:
-        ValueError: a threshold outside 0 .. 1, fewer than one view, or a negative decline.
+        UsageError: a threshold outside 0 .. 1, fewer than one view, or a negative decline.
     """
 
     threshold: float = 0.97
@@ -292,11 +290,11 @@ class Stopping:
 
     def __post_init__(self) -> None:
         if not 0 <= self.threshold <= 1:
-            raise ValueError(f"the threshold is a probability between 0 and 1, not {self.threshold}")
+            raise UsageError(f"the threshold is a probability between 0 and 1, not {self.threshold}")
         if self.max_views < 1:
-            raise ValueError(f"at least one view has to be taken, not {self.max_views}")
+            raise UsageError(f"at least one view has to be taken, not {self.max_views}")
         if not 0 <= self.decline < np.inf:
-            raise ValueError(f"the decline is a number from 0 on, not {self.decline}")
+            raise UsageError(f"the decline is a number from 0 on, not {self.decline}")
 
     def bar(self, looks: NDArray[np.int64] | int) -> NDArray[np.float64]:
         """The belief at which to stop after so many looks, same shape."""

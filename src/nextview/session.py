@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.episode import Episodes
+from nextview.errors import SessionError
 from nextview.models.networks import Models
 from nextview.observation import Camera, Observation
 from nextview.policies.base import Policy, maps_among
@@ -99,10 +100,10 @@ class Session:
         rng: np.random.Generator | None = None,
     ) -> None:
         if "sides" in policy.needs and not models.recogniser.sides:
-            raise ValueError("this policy wants to know the side that is seen, and the recogniser was not taught it")
+            raise SessionError("this policy wants to know the side that is seen, and the recogniser was not taught it")
         missing = [name for name in maps_among(policy.needs) if name.removesuffix("-sphere") not in models.maps]
         if missing:
-            raise ValueError(f"this policy needs the map {missing[0]!r}; load it with the models")
+            raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")
         self.models, self.sphere = models, sphere
         self.looks: list[Look] = []
         rng = rng or np.random.default_rng(0)
@@ -128,10 +129,10 @@ class Session:
         """Take in what was seen from ``pose``.
 
         Raises:
-            ValueError: the episode has ended.
+            SessionError: the episode has ended.
         """
         if self.done:
-            raise ValueError("this session has ended; begin another one")
+            raise SessionError("this session has ended; begin another one")
         step = self._episodes.tell(self.models.evidence([observation]))
         view, to = int(step.views[0]), int(step.next_views[0])
         travel, arc = (self.looks[-1].travel, self.looks[-1].arc) if self.looks else (0.0, 0.0)
@@ -159,7 +160,7 @@ class Session:
         """How it ended.
 
         Raises:
-            ValueError: it has not.
+            SessionError: it has not.
         """
         return Recognition(tuple(self.looks), self.models.classes, bool(self._episodes.outcome.confident[0]))
 

@@ -12,6 +12,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nextview.errors import UsageError
+
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -70,17 +72,17 @@ class ViewSphere:
 
     def __post_init__(self) -> None:
         if not self.elevations or self.azimuths < 3:
-            raise ValueError("a view sphere needs at least one ring of at least three viewpoints")
+            raise UsageError("a view sphere needs at least one ring of at least three viewpoints")
         if not all(-90 <= e <= 90 for e in self.elevations):
-            raise ValueError(f"elevations must lie between -90 and 90 degrees, not {self.elevations}")
+            raise UsageError(f"elevations must lie between -90 and 90 degrees, not {self.elevations}")
         if not 0 < self.distance < np.inf:
-            raise ValueError(f"the distance must be a positive number of object radii, not {self.distance}")
+            raise UsageError(f"the distance must be a positive number of object radii, not {self.distance}")
 
     @classmethod
     def named(cls, name: str) -> ViewSphere:
         """The thesis's layouts: "40" (5 rings of 8, section 4.1.1) and "12" (one ring at 45 degrees)."""
         if name not in LAYOUTS:
-            raise ValueError(f"no view sphere is called {name!r}; there are {', '.join(LAYOUTS)}")
+            raise UsageError(f"no view sphere is called {name!r}; there are {', '.join(LAYOUTS)}")
         return LAYOUTS[name]
 
     def __len__(self) -> int:

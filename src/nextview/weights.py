@@ -7,9 +7,7 @@ from pathlib import Path
 
 import onnxruntime as ort
 
-
-class WeightsError(ValueError):
-    """An ONNX file that cannot be used; the message is one sentence."""
+from nextview.errors import ModelError
 
 
 def open_onnx(path: Path, sha256: str, threads: int = 0) -> ort.InferenceSession:
@@ -21,18 +19,18 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> ort.InferenceSession
         threads: of ONNX Runtime, 0 for one on each core.
 
     Raises:
-        WeightsError: the file is missing, is not the one that the card describes, or ONNX Runtime refuses it.
+        ModelError: the file is missing, is not the one that the card describes, or ONNX Runtime refuses it.
     """
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise WeightsError(f"{path}: the weights are missing or cannot be read ({error.strerror})") from None
+        raise ModelError(f"{path}: the weights are missing or cannot be read ({error.strerror})") from None
     if hashlib.sha256(content).hexdigest() != sha256:
-        raise WeightsError(f"{path}: is not the file that its card describes (the SHA-256 differs)")
+        raise ModelError(f"{path}: is not the file that its card describes (the SHA-256 differs)")
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
     try:
         return ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the runtime has a class of exception for every reason
-        raise WeightsError(f"{path}: not a usable ONNX model ({str(error).splitlines()[0]})") from None
+        raise ModelError(f"{path}: not a usable ONNX model ({str(error).splitlines()[0]})") from None

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from scipy.special import log_softmax
 
 from nextview.data.predictions import Predictions
+from nextview.errors import EntryError, OtherUseError
 from nextview.measures.confidence_map import confidence_maps
 from nextview.measures.depth_entropy import normalise_per_object
 from nextview.policies.base import Policy
-from nextview.policies.card import OtherUseError, bundled_policies
+from nextview.policies.card import bundled_policies
 from nextview.policies.fixed import orbit, ranked
 from nextview.policies.maps import MapPeak
 from nextview.policies.oracle import OracleGain, OracleValley
@@ -87,13 +88,13 @@ def contestant_policy(name: str, trials: Trials) -> Policy:
     """The policy of that name.
 
     Raises:
-        ValueError: there is none, it cannot be made, or it needs a map that the predictions lack.
+        EntryError: there is none, it cannot be made, or it needs a map that the predictions lack.
     """
     policy = _make(name, trials)
     lacking = _lacking(policy, trials)
     if lacking:
         what = "what the recogniser says of the sides" if lacking[0] == "sides" else f"the map {lacking[0]!r}"
-        raise ValueError(f"policy {name} needs {what}, which these predictions lack")
+        raise EntryError(f"policy {name} needs {what}, which these predictions lack")
     return policy
 
 
@@ -106,7 +107,7 @@ def _make(name: str, trials: Trials) -> Policy:
         valleys = trials.lcm_valley_classes if name.startswith("lcm") else trials.valley_classes
         return make_policy(name, p.sphere, valleys, p.classes)
     names = [*POLICIES, *bundled_policies(), *ORACLES, *(f"{kind}-K" for kind in FIXED)]
-    raise ValueError(f"no policy is called {name!r}; there are {', '.join(names)}")
+    raise EntryError(f"no policy is called {name!r}; there are {', '.join(names)}")
 
 
 def _fits(name: str, trials: Trials) -> bool:
@@ -131,7 +132,7 @@ def fixed_views(name: str, trials: Trials, rng: np.random.Generator) -> NDArray[
         return None
     p, objects, kind, k = trials.predictions, trials.objects, match[1], int(match[2])
     if not 1 <= k <= len(p.sphere):
-        raise ValueError(f"{name}: the sphere has {len(p.sphere)} views, so between 1 and {len(p.sphere)} can be taken")
+        raise EntryError(f"{name}: the sphere has {len(p.sphere)} views, so between 1 and {len(p.sphere)} can be taken")
     if kind == "orbit":
         return orbit(p.sphere, trials.starts, k)
     if kind == "random-fixed":

@@ -15,6 +15,7 @@ from nextview.benchmark.contestants import true_lcm, true_lem
 from nextview.benchmark.published import published_map, published_recognisers
 from nextview.benchmark.scores import map_errors, map_scores, recogniser_scores
 from nextview.data.predictions import Predictions
+from nextview.errors import ResultsError
 from nextview.models.card import Card
 from nextview.recognition import Calibration
 
@@ -25,10 +26,6 @@ TRUTHS: dict[str, Callable[[Predictions], NDArray]] = {"lem": true_lem, "lcm": t
 
 RELIABILITY_LOOKS = (1, 2, 5)
 """Looks after which confidence is compared with accuracy, beside all of them."""
-
-
-class EvaluationError(ValueError):
-    """Predictions in which there is nothing to judge; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +69,12 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
         rng: draws them, and the orders in which views are fused.
 
     Raises:
-        EvaluationError: the recogniser knows one class only.
+        ResultsError: the recogniser knows one class only.
     """
     if len(p.classes) < 2:
-        raise EvaluationError(f"the recogniser knows one class only, {p.classes[0]}: there is nothing to tell apart")
+        raise ResultsError(f"the recogniser knows one class only, {p.classes[0]}: there is nothing to tell apart")
     if samples < 1:
-        raise EvaluationError(f"at least one sample of the bootstrap is needed, not {samples}")
+        raise ResultsError(f"at least one sample of the bootstrap is needed, not {samples}")
     weights = st.resample(len(p), samples, rng)
     right, confidence = fused_views(p.said, p.labels, p.calibration, rng, len(p.classes))
     judged = _judged(p)
@@ -270,14 +267,14 @@ def scores_for_card(card: Card, p: Predictions) -> dict[str, Any]:
     """The scores of one of the models that made some predictions, as its card notes them.
 
     Raises:
-        EvaluationError: the model did not make them, or they hold nothing that it can be judged by.
+        ResultsError: the model did not make them, or they hold nothing that it can be judged by.
     """
     if p.models.get(card.kind) != (card.name, card.sha256):
-        raise EvaluationError(f"these predictions were not made by model {card.name}")
+        raise ResultsError(f"these predictions were not made by model {card.name}")
     if card.kind == "recogniser":
         return recogniser_scores(p.logits, p.labels)
     kept = judged_objects(p, card.kind)
     if card.kind not in TRUTHS or len(kept) == 0:
-        raise EvaluationError(f"these predictions hold no object by which model {card.name} can be judged")
+        raise ResultsError(f"these predictions hold no object by which model {card.name} can be judged")
     shape = (-1, p.sphere.rings, 3)
     return map_scores(p.maps[card.kind][kept].reshape(shape), TRUTHS[card.kind](p)[kept].reshape(shape))

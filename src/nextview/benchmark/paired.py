@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from nextview.benchmark.evaluate import fused_views
 from nextview.benchmark.statistics import interval, ratio, resample
 from nextview.data.predictions import Predictions
+from nextview.errors import PredictionsError
 from nextview.recognition import Calibration
 
 Float = NDArray[np.float64]
@@ -21,13 +22,13 @@ def of_the_same(paths: Sequence[Path]) -> list[Predictions]:
     """Several predictions of the same objects, classes and views.
 
     Raises:
-        ValueError: they are of others.
+        PredictionsError: they are of others.
     """
     tables = [Predictions.load(path) for path in paths]
     of = [(p.names, p.classes, p.sphere) for p in tables]
     for path, others in zip(paths, of, strict=True):
         if others != of[0]:
-            raise ValueError(f"{path}: is not of the same objects, classes and views as {paths[0]}")
+            raise PredictionsError(f"{path}: is not of the same objects, classes and views as {paths[0]}")
     return tables
 
 

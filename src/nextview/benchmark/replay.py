@@ -16,14 +16,11 @@ from numpy.typing import NDArray
 
 from nextview.benchmark.contestants import TRUE_MAPS, Trials, contestant_policy, fixed_views
 from nextview.data.predictions import Predictions
-from nextview.episode import PolicyError, run_episodes
+from nextview.episode import run_episodes
+from nextview.errors import EntryError, PolicyError, UsageError
 from nextview.policies.base import Evidence, maps_among
 from nextview.recognition import Stopping
 from nextview.viewsphere import ViewSphere
-
-
-class ContestantError(ValueError):
-    """A policy that could not be run to its end; the message names it and the object."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +68,7 @@ def make_trials(
         valley_classes: classes (indices) for the policies that need them; those of each map's card by default.
     """
     if runs < 1:
-        raise ValueError(f"at least one run is needed, not {runs}")
+        raise UsageError(f"at least one run is needed, not {runs}")
     n = len(predictions)
 
     def on_card(map_name: str) -> tuple[int, ...]:
@@ -93,7 +90,7 @@ def replay(name: str, trials: Trials, max_views: int, seed: int) -> Paths:
         seed: for policies that draw; what a policy draws depends on the seed and its name alone.
 
     Raises:
-        ContestantError: it failed, or chose a view that cannot be taken.
+        EntryError: it failed, or chose a view that cannot be taken.
     """
     p, objects = trials.predictions, trials.objects
     rng = np.random.default_rng([seed, *name.encode()])
@@ -116,7 +113,7 @@ def replay(name: str, trials: Trials, max_views: int, seed: int) -> Paths:
         done = run_episodes(observe, p.sphere, policy, trials.starts, Stopping(1.0, max_views), rng, p.calibration)
     except PolicyError as error:
         where = "" if error.episode is None else f" (object {p.names[objects[error.episode]]})"
-        raise ContestantError(f"{name}: {error}{where}") from error
+        raise EntryError(f"{name}: {error}{where}") from error
     shape = (len(objects), len(done.steps))
     answers, confidences = np.zeros(shape, np.int64), np.full(shape, -1.0)
     for k, step in enumerate(done.steps):

@@ -20,10 +20,7 @@ from nextview.benchmark.replay import Ends
 from nextview.benchmark.run import Grid
 from nextview.benchmark.summary import Tables
 from nextview.data.predictions import Predictions
-
-
-class ResultsError(ValueError):
-    """A folder that holds no results, or should not be written; the message is one sentence."""
+from nextview.errors import ResultsError
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from nextview.benchmark.contestants import Trials
 from nextview.benchmark.replay import Ends, Paths, cut, replay
+from nextview.errors import NextviewError
 
 THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)
 """The thesis's (section 5.3)."""
@@ -59,6 +60,6 @@ def run_grid(grid: Grid, names: Sequence[str]) -> Iterator[int]:
     for n, name in enumerate(names, 1):
         try:
             grid.paths[name] = replay(name, grid.trials, grid.max_views, grid.seed)
-        except ValueError as error:
+        except NextviewError as error:
             grid.failures[name] = str(error)
         yield n

@@ -7,6 +7,8 @@ from typing import Literal
 
 import tyro
 
+from nextview.errors import EntryError, UsageError
+
 
 def benchmark(
     predictions: tyro.conf.Positional[Path],
@@ -49,7 +51,7 @@ def benchmark(
     from dataclasses import replace
 
     from nextview.benchmark.contestants import default_contestants
-    from nextview.benchmark.replay import ContestantError, make_trials
+    from nextview.benchmark.replay import make_trials
     from nextview.benchmark.run import Grid, run_grid
     from nextview.cli.extra import needs_extra
     from nextview.cli.progress import console, track
@@ -65,7 +67,7 @@ def benchmark(
     began = time.perf_counter()
     check_target(out)
     if not thresholds:
-        raise ValueError("at least one threshold is needed")
+        raise UsageError("at least one threshold is needed")
     table = Predictions.load(predictions)
     if uncalibrated:
         table = replace(table, calibration=PLAIN_SUM)
@@ -74,15 +76,15 @@ def benchmark(
     for threshold in thresholds:
         Stopping(threshold, max_views, decline)  # says what is wrong with it
     if risks and decline:
-        raise ValueError("error rates are promised for thresholds without a decline")
+        raise UsageError("error rates are promised for thresholds without a decline")
     promised = {risk: table.calibration.threshold(risk, max_views) for risk in risks}
     if split:
         table = table.of_split(split)
     elif len(set(table.splits)) > 1:
-        raise ValueError(f"{predictions}: holds training and test objects; choose with --split which are compared")
+        raise UsageError(f"{predictions}: holds training and test objects; choose with --split which are compared")
     unknown = [name for name in valley_classes or () if name not in table.classes]
     if unknown:
-        raise ValueError(f"{predictions}: knows no class {unknown[0]!r}; there are {', '.join(table.classes)}")
+        raise UsageError(f"{predictions}: knows no class {unknown[0]!r}; there are {', '.join(table.classes)}")
     valleys = None if valley_classes is None else tuple(map(table.classes.index, valley_classes))
     trials = make_trials(table, runs, seed, valleys)
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
@@ -113,4 +115,4 @@ def benchmark(
         episodes = runs * len(table) * len(list(grid.cells()))
         console.print(f"{episodes:,} episodes in {time.perf_counter() - began:.1f} s; results in {out}")
     if grid.failures:
-        raise ContestantError("\n".join(grid.failures.values()))
+        raise EntryError("\n".join(grid.failures.values()))

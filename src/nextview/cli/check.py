@@ -7,6 +7,8 @@ from pathlib import Path
 
 import tyro
 
+from nextview.errors import DatasetError
+
 
 def check(
     store: tyro.conf.Positional[Path], /, repair: bool = False, workers: int | None = None, scheduler: str | None = None
@@ -21,7 +23,6 @@ def check(
     """
     from nextview.cli.progress import console, track
     from nextview.data.check import check as check_store
-    from nextview.data.folders import DatasetError
     from nextview.data.store import ViewStore
 
     views = ViewStore.open(store)

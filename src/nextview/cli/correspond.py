@@ -6,6 +6,8 @@ from pathlib import Path
 
 import tyro
 
+from nextview.errors import DatasetError
+
 
 def correspond(
     store: tyro.conf.Positional[Path],
@@ -32,7 +34,6 @@ def correspond(
     from nextview.cli.progress import console, track
     from nextview.data.correspond import ARRAY, correspondence_maps
     from nextview.data.correspond import correspond as correspond_store
-    from nextview.data.folders import DatasetError
     from nextview.data.store import ViewStore
     from nextview.report.store_figures import correspondence_figure, save
 

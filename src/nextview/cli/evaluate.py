@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from nextview.errors import UsageError
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -54,7 +56,7 @@ def evaluate(
     if split:
         table = table.of_split(split)
     elif len(set(table.splits)) > 1:
-        raise ValueError(f"{predictions}: holds training and test objects; choose with --split which are judged")
+        raise UsageError(f"{predictions}: holds training and test objects; choose with --split which are judged")
     if each_shape_once:
         table = table.each_shape_once()
     noted = {}

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
+from nextview.errors import ModelError
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -57,7 +59,7 @@ def export_recogniser(
     from nextview.cli.progress import console
     from nextview.data.split import each_shape_once
     from nextview.data.store import ViewStore
-    from nextview.models.card import ModelError, write_card
+    from nextview.models.card import write_card
     from nextview.models.networks import Recogniser
     from nextview.training.export import CalibratedRecogniser, answer, export_onnx, fit_temperature
     from nextview.training.inputs import load_inputs
@@ -224,7 +226,7 @@ def _export_map(
     from nextview.data.seen import seen_views
     from nextview.data.split import each_shape_once, split_training
     from nextview.data.store import ViewStore
-    from nextview.models.card import ModelError, write_card
+    from nextview.models.card import write_card
     from nextview.models.networks import MapNetwork
     from nextview.training.export import ShippedMap, answer, export_onnx
     from nextview.training.networks import map_network

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from nextview.errors import MissingExtraError
+
 
 @contextmanager
 def needs_extra(extra: str) -> Iterator[None]:
@@ -12,4 +14,4 @@ def needs_extra(extra: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise ValueError(f"this command needs {error.name}: pip install 'nextview[{extra}]'") from None
+        raise MissingExtraError(f"this command needs {error.name}: pip install 'nextview[{extra}]'") from None

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import tyro
 
+from nextview.errors import DatasetError, PredictionsError, UsageError
+
 
 def fit_calibration(
     predictions: tyro.conf.Positional[Path],
@@ -35,14 +37,14 @@ def fit_calibration(
     import numpy as np
 
     from nextview.cli.progress import console
-    from nextview.data.predictions import Predictions, PredictionsError
+    from nextview.data.predictions import Predictions
     from nextview.fitting.calibration import fit_risk, fit_temperature, loss
     from nextview.fitting.evidence import FittingSet, fitting_set, unseen_by
     from nextview.models.card import read_card, write_card
     from nextview.recognition import PLAIN_SUM
 
     if not 0 < delta < 1:
-        raise ValueError(f"delta is a probability between 0 and 1, not {delta}")
+        raise UsageError(f"delta is a probability between 0 and 1, not {delta}")
     model, table = read_card(card), Predictions.load(predictions).by_shape()
     if validation != 1 and table.models["recogniser"][1] != model.sha256:
         raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
@@ -85,8 +87,7 @@ def fit_size(
     import numpy as np
 
     from nextview.cli.progress import console
-    from nextview.data.folders import DatasetError
-    from nextview.data.predictions import Predictions, PredictionsError
+    from nextview.data.predictions import Predictions
     from nextview.data.store import ViewStore
     from nextview.fitting.evidence import FittingSet
     from nextview.fitting.size import densities, fit_weight
@@ -133,7 +134,7 @@ def fit_valleys(
         card: of the map network; "valley_classes" is written into it.
     """
     from nextview.cli.progress import console
-    from nextview.data.predictions import Predictions, PredictionsError
+    from nextview.data.predictions import Predictions
     from nextview.fitting.evidence import FittingSet, unseen_by
     from nextview.fitting.valleys import valley_gains
     from nextview.models.card import read_card, write_card
@@ -195,7 +196,7 @@ def fit_policies(
     from nextview.recognition import PLAIN_SUM
 
     if length < 1 or looks < 2 or shrinkage < 0 or price < 0:
-        raise ValueError("length has to be at least 1, looks at least 2, shrinkage and price not negative")
+        raise UsageError("length has to be at least 1, looks at least 2, shrinkage and price not negative")
     table = Predictions.load(predictions)
     data = fitting_set(table, validation, split_seed)
     calibration, sphere = table.calibration, data.sphere

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from nextview.cli.train import train_recogniser
+from nextview.errors import ModelError
 from nextview.training.hardware import Hardware
 from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe
 
@@ -44,7 +45,6 @@ def train_grid(
     """
     from nextview.cli.progress import console
     from nextview.data.store import ViewStore
-    from nextview.models.card import ModelError
     from nextview.report.grid_figure import grid_figure
     from nextview.report.style import to_png
     from nextview.training.fit import is_first

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import tyro
 
+from nextview.errors import DatasetError
+
 
 def inspect(
     store: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path | None] = None, /, object: str | None = None
@@ -18,7 +20,6 @@ def inspect(
         object: name of the object to draw instead of the whole store.
     """
     from nextview.cli.progress import console
-    from nextview.data.folders import DatasetError
     from nextview.data.store import ViewStore
     from nextview.report.store_figures import median_radii, object_figure, save, store_figure, summary
 

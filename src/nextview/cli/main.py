@@ -28,6 +28,7 @@ from nextview.cli.render import render
 from nextview.cli.report import report
 from nextview.cli.train import train_lcm, train_lem, train_recogniser
 from nextview.cli.train_gain import train_gain
+from nextview.errors import NextviewError
 
 COMMANDS: dict[str, Any] = {
     "recognise": recognise,
@@ -61,7 +62,11 @@ GROUPS = {
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command. A user's mistake ends in one sentence on standard error and exit status 2."""
+    """Run a command.
+
+    A ``NextviewError``, and an OSError that names its file, end in one sentence on standard error and exit status 2.
+    Anything else is a bug: its traceback is shown, and the status is 1.
+    """
     commands = COMMANDS
     prog, arguments = "nextview", sys.argv[1:] if arguments is None else arguments
     description = "Active 3D object recognition: what it is, and where to look next."
@@ -80,8 +85,13 @@ def main(arguments: list[str] | None = None) -> None:
                 args=arguments,
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
             )
-        except ValueError as error:
+        except NextviewError as error:
             print(f"nextview: {error}", file=sys.stderr)
+            sys.exit(2)
+        except OSError as error:
+            if error.filename is None or isinstance(error, BrokenPipeError):
+                raise
+            print(f"nextview: {error.filename}: {error.strerror}", file=sys.stderr)
             sys.exit(2)
         finally:
             sys.stdout.flush()  # here and not at the interpreter's end, also after --help, which exits by itself

@@ -7,6 +7,8 @@ from typing import Literal
 
 import tyro
 
+from nextview.errors import ModelError, UsageError
+
 
 def predict(
     store: tyro.conf.Positional[Path],
@@ -40,13 +42,13 @@ def predict(
     from nextview.cli.progress import track
     from nextview.data import predict as job
     from nextview.data.store import ViewStore
-    from nextview.models.card import ModelError, find_card
+    from nextview.models.card import find_card
     from nextview.models.networks import MAPS, RECOGNISER
 
     if len(recogniser) > 1 and not unseen:
-        raise ValueError("several recognisers can only share the work with --unseen")
+        raise UsageError("several recognisers can only share the work with --unseen")
     if out.suffix != ".npz":
-        raise ValueError(f"{out}: predictions are one .npz file; end the name in .npz")
+        raise UsageError(f"{out}: predictions are one .npz file; end the name in .npz")
     cards = {}
     for item in maps:
         name, _, card = item.partition("=")

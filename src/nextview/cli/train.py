@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from nextview.errors import DatasetError, ModelError
 from nextview.training.hardware import Hardware
 from nextview.training.recipes import MapRecipe, RecogniserRecipe
 
@@ -51,7 +52,6 @@ def train_recogniser(
     from nextview.cli.progress import console
     from nextview.data.split import each_shape_once, split_training
     from nextview.data.store import ViewStore
-    from nextview.models.card import ModelError
     from nextview.training import recogniser
     from nextview.training.folds import hold_out
     from nextview.training.runs import begin, finish, is_done
@@ -107,7 +107,6 @@ def _source(
     """Inputs of a store, prepared if they are not yet, and the row of each object of ``views`` in them, -1 for none."""
     import numpy as np
 
-    from nextview.data.folders import DatasetError
     from nextview.data.store import ViewStore
     from nextview.training.recogniser import Source
     from nextview.training.sides import sides

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import tyro
 
+from nextview.errors import PredictionsError, UsageError
 from nextview.training.recipes import GainRecipe
 
 
@@ -41,7 +42,7 @@ def train_gain(
     import numpy as np
 
     from nextview.cli.progress import console, track
-    from nextview.data.predictions import Predictions, PredictionsError
+    from nextview.data.predictions import Predictions
     from nextview.fitting.choices import ReplayTable, Worth, travel_price
     from nextview.models.card import file_hash
     from nextview.policies.gain import MAPS, Gain
@@ -50,7 +51,7 @@ def train_gain(
     from nextview.training.gain_export import write_gain
 
     if out.suffix != ".json":
-        raise ValueError(f"{out}: the card of a policy is called NAME.json")
+        raise UsageError(f"{out}: the card of a policy is called NAME.json")
     table = Predictions.load(predictions).each_shape_once()
     other = table if validation is None else Predictions.load(validation).each_shape_once()
     if (other.classes, other.sphere) != (table.classes, table.sphere):

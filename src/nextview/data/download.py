@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.error import HTTPError, URLError
 
-from nextview.data.folders import DatasetError
 from nextview.data.lock import only_one
+from nextview.errors import DatasetError
 
 CHUNK = 1 << 18
 PATIENCE = 5

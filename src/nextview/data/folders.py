@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from nextview.errors import DatasetError
 from nextview.mesh import FORMATS
 
 SPLITS = ("train", "test")
-
-
-class DatasetError(ValueError):
-    """A dataset that cannot be used; the message is one sentence."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from nextview.data.folders import DatasetError
+from nextview.errors import DatasetError
 
 
 @contextmanager

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.folders import DatasetError
 from nextview.data.lock import only_one
 from nextview.data.pool import WorkerDied, each
 from nextview.data.render import writing
 from nextview.data.store import DEPTH_UNIT, ViewStore
+from nextview.errors import DatasetError
 from nextview.measures.registry import MEASURES
 
 

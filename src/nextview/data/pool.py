@@ -11,7 +11,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
-from nextview.data.folders import DatasetError
+from nextview.errors import DatasetError
 
 PATIENCE = "10s"
 """How long a scheduler may take to answer."""

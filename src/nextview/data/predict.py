@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.folders import DatasetError
 from nextview.data.lock import only_one
 from nextview.data.pool import WorkerDied, each
-from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.predictions import Predictions
 from nextview.data.seen import seen_views
 from nextview.data.split import alike
 from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, PredictionsError
 from nextview.models.card import Card
 from nextview.models.networks import MapNetwork, Recogniser, knows_sphere, size_evidence
 from nextview.recognition import Calibration

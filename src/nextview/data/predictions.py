@@ -14,14 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.data.split import distinct
+from nextview.errors import PredictionsError
 from nextview.recognition import PLAIN_SUM, Calibration, additive
 from nextview.viewsphere import ViewSphere
 
 FORMAT = 1
-
-
-class PredictionsError(ValueError):
-    """Predictions that cannot be used; the message is one sentence."""
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,13 @@ import zarr
 from numpy.typing import NDArray
 
 from nextview.cameras.simulated import SimulatedCamera
-from nextview.data.folders import DatasetError, Entry, list_dataset
+from nextview.data.folders import Entry, list_dataset
 from nextview.data.lock import only_one
 from nextview.data.pool import each
 from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, RENDERED, ViewStore
+from nextview.errors import DatasetError, MeshError
 from nextview.measures.depth_entropy import depth_entropy
-from nextview.mesh import Mesh, MeshError, load_mesh, make_mesh
+from nextview.mesh import Mesh, load_mesh, make_mesh
 from nextview.observation import POINTS
 from nextview.viewsphere import ViewSphere
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import UsageError
 from nextview.mesh import Mesh, make_mesh
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -49,10 +50,10 @@ def sample_mesh(name: str) -> Mesh:
     """A sample object by name.
 
     Raises:
-        ValueError: there is none of that name.
+        UsageError: there is none of that name.
     """
     if name not in SAMPLES:
-        raise ValueError(f"no sample is called {name!r}; there are {', '.join(SAMPLES)}")
+        raise UsageError(f"no sample is called {name!r}; there are {', '.join(SAMPLES)}")
     return boxes_mesh(SAMPLES[name](), name)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.folders import DatasetError
 from nextview.data.store import ViewStore
+from nextview.errors import DatasetError
 
 
 def alike(measured: NDArray[np.floating]) -> NDArray[np.int64]:

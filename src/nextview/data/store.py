@@ -11,7 +11,8 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from nextview.data.folders import DatasetError, Entry
+from nextview.data.folders import Entry
+from nextview.errors import DatasetError
 from nextview.mesh import UNITS
 from nextview.observation import POINTS, pinhole
 from nextview.viewsphere import ViewSphere

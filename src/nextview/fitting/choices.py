@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.predictions import Predictions
+from nextview.errors import PredictionsError
 from nextview.fitting.calibration import fit_temperature
 from nextview.fitting.evidence import FittingSet
 from nextview.policies.base import EpisodeState, Evidence, Policy

@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.predictions import Predictions
 from nextview.data.split import distinct, divide
+from nextview.errors import PredictionsError
 from nextview.models.card import Card
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.recognition import additive

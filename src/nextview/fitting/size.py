@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import gaussian_kde
 
+from nextview.errors import DatasetError
 from nextview.fitting.evidence import FittingSet
 from nextview.models.size import SizeEvidence
 from nextview.recognition import of_true_class
@@ -31,14 +32,14 @@ def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
         classes: how many.
 
     Raises:
-        ValueError: a class has fewer than two objects, or only objects of one size.
+        DatasetError: a class has fewer than two objects, or only objects of one size.
     """
     at, span = np.log(RADII), np.log(RADII[-1] / RADII[0])
     found = np.empty((classes, len(RADII)))
     for c in range(classes):
         logs = np.log(radii[labels == c])
         if len(logs) < 2 or np.ptp(logs) == 0:
-            raise ValueError("every class needs objects of several sizes")
+            raise DatasetError("every class needs objects of several sizes")
         middle = np.subtract(*np.percentile(logs, (75, 25))) / 1.34  # the deviation of a Gaussian with these quartiles
         deviation = logs.std(ddof=1)
         width = len(logs) ** -0.2 * (min(middle, deviation) or deviation)

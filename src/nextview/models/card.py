@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from nextview.errors import ModelError
+
 BUNDLED = Path(__file__).parent / "bundled"
-
-
-class ModelError(ValueError):
-    """A model that cannot be used; the message is one sentence."""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import ObservationError
 from nextview.observation import object_depth
 
 CHANNELS = ("facing", "up", "height", "nearness")
@@ -31,11 +32,11 @@ def geometry_input(
         (B, 4, size, size) uint8.
 
     Raises:
-        ValueError: the image is not a square multiple of ``size``.
+        ObservationError: the image is not a square multiple of ``size``.
     """
     _b, h, w = depth.shape
     if h != w or h % size:
-        raise ValueError(f"a depth image of {h}x{w} cannot be thinned to {size}x{size}: use a multiple of {size}")
+        raise ObservationError(f"a depth image of {h}x{w} cannot be thinned to {size}x{size}: use a multiple of {size}")
     k = h // size
     rotation, origin = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
     padded = np.pad(object_depth(depth).astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))

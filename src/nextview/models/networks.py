@@ -11,7 +11,8 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from nextview.models.card import Card, ModelError, find_card
+from nextview.errors import ModelError
+from nextview.models.card import Card, find_card
 from nextview.models.cloud_input import cloud_input
 from nextview.models.geometry_input import geometry_input
 from nextview.models.image_input import image_input
@@ -19,7 +20,7 @@ from nextview.models.size import SizeEvidence
 from nextview.observation import Observation
 from nextview.policies.base import Evidence, maps_among
 from nextview.recognition import Calibration
-from nextview.weights import WeightsError, open_onnx
+from nextview.weights import open_onnx
 
 RECOGNISER = "recogniser-modelnet10"
 MAPS = {"lem": "lem-modelnet10", "lcm": "lcm-modelnet10"}
@@ -37,7 +38,7 @@ def open_weights(card: Card, threads: int = 0) -> ort.InferenceSession:
     """
     try:
         return open_onnx(card.path, card.sha256, threads)
-    except WeightsError as error:
+    except ModelError as error:
         raise ModelError(str(error)) from None
 
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import ModelError
+
 Float = NDArray[np.float64]
 
 
@@ -22,7 +24,7 @@ class SizeEvidence:
         weight: of it beside the logits.
 
     Raises:
-        ValueError: numbers that make no sense, or shapes that do not fit.
+        ModelError: numbers that make no sense, or shapes that do not fit.
     """
 
     radii: Float
@@ -32,9 +34,9 @@ class SizeEvidence:
     def __post_init__(self) -> None:
         fits = self.radii.ndim == 1 and self.log_density.ndim == 2 and self.log_density.shape[1:] == self.radii.shape
         if not fits or not (self.radii > 0).all() or not (np.diff(self.radii) > 0).all():
-            raise ValueError("sizes that do not fit together")
+            raise ModelError("sizes that do not fit together")
         if not np.isfinite(self.log_density).all() or not 0 <= self.weight < np.inf:
-            raise ValueError("a density or weight of sizes that is not a finite number")
+            raise ModelError("a density or weight of sizes that is not a finite number")
 
     def logits(self, radii: NDArray[np.floating]) -> NDArray[np.float32]:
         """What is added to the logits.
@@ -55,15 +57,15 @@ class SizeEvidence:
         """From what a recogniser's card says under "size".
 
         Raises:
-            ValueError: it makes no sense.
+            ModelError: it makes no sense.
         """
         try:
             radii, density = (np.asarray(facts[key], np.float64) for key in ("radii_m", "log_density"))
             weight = float(facts["weight"])
         except (KeyError, TypeError) as error:
-            raise ValueError(f"sizes that cannot be read ({type(error).__name__}: {error})") from None
+            raise ModelError(f"sizes that cannot be read ({type(error).__name__}: {error})") from None
         if len(density) != classes:
-            raise ValueError(f"sizes of {len(density)} classes, not {classes}")
+            raise ModelError(f"sizes of {len(density)} classes, not {classes}")
         return cls(radii, density, weight)
 
     def facts(self) -> dict[str, Any]:

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from nextview.errors import ModelError, OtherUseError, PolicyError
 from nextview.policies.base import Policy
 from nextview.policies.gain_weights import read_gain
 from nextview.policies.tables import ClassTable, FixedRing, FixedSequence
 from nextview.viewsphere import ViewSphere
-from nextview.weights import WeightsError
 
 BUNDLED = Path(__file__).parent / "bundled"
 
@@ -28,14 +28,6 @@ KINDS: dict[str, Callable[[ViewSphere, dict[str, Any], Path], Policy]] = {
     "gain": read_gain,
 }
 """How to make a policy of each kind from the sphere, what the card says, and the ONNX file, which most have not."""
-
-
-class PolicyCardError(ValueError):
-    """A policy's card that cannot be used; the message is one sentence."""
-
-
-class OtherUseError(PolicyCardError):
-    """A sound card of a policy for other viewpoints or classes; the message is one sentence."""
 
 
 def bundled_policies() -> dict[str, Path]:
@@ -60,7 +52,7 @@ def read_policy(path: Path, sphere: ViewSphere, classes: Sequence[str] | None = 
 
     Raises:
         OtherUseError: it is for other viewpoints or classes.
-        PolicyCardError: there is no such card, or it or its weights are damaged.
+        PolicyError: there is no such card, or it or its weights are damaged.
     """
     try:
         facts = json.loads(path.read_text())
@@ -69,11 +61,11 @@ def read_policy(path: Path, sphere: ViewSphere, classes: Sequence[str] | None = 
         make, fits = KINDS[facts["kind"]], place == (sphere.elevations, sphere.azimuths)
         made = make(sphere, facts, path.with_suffix(".onnx")) if fits else None
     except FileNotFoundError:
-        raise PolicyCardError(f"{path}: there is no such policy card") from None
-    except WeightsError as error:
-        raise PolicyCardError(str(error)) from None
+        raise PolicyError(f"{path}: there is no such policy card") from None
+    except ModelError as error:
+        raise PolicyError(str(error)) from None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise PolicyCardError(f"{path}: not a policy card ({type(error).__name__}: {error})") from None
+        raise PolicyError(f"{path}: not a policy card ({type(error).__name__}: {error})") from None
     if made is None:
         raise OtherUseError(f"{path}: was learned for {len(place[0])} rings of {place[1]} views, not for this sphere")
     if classes is not None and known != tuple(classes):

@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import PolicyError
 from nextview.policies.base import EpisodeState, best_in_window
 from nextview.policies.tables import cells_from, cells_to
 from nextview.viewsphere import ViewSphere
@@ -46,7 +47,7 @@ def origin(sphere: ViewSphere, state: EpisodeState, frame: Frame) -> NDArray[np.
     """The view from which the cells of each episode are counted, (B,) int64.
 
     Raises:
-        ValueError: the frame is the object's, and the recogniser does not tell its sides apart.
+        PolicyError: the frame is the object's, and the recogniser does not tell its sides apart.
     """
     if frame == "camera":
         return state.current
@@ -58,7 +59,7 @@ def origin(sphere: ViewSphere, state: EpisodeState, frame: Frame) -> NDArray[np.
 def _sides(sphere: ViewSphere, state: EpisodeState) -> Float:
     """Belief in the side that is seen from the current view, for each class, (B, C, azimuths)."""
     if state.sides is None or state.sides.shape[2] != sphere.azimuths:
-        raise ValueError(f"this policy needs a recogniser that tells {sphere.azimuths} sides of an object apart")
+        raise PolicyError(f"this policy needs a recogniser that tells {sphere.azimuths} sides of an object apart")
     return state.sides
 
 
@@ -80,7 +81,7 @@ def told(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], frame: 
         (B, D) float64.
 
     Raises:
-        ValueError: the sides matter, and the recogniser does not tell as many apart as the sphere has azimuths.
+        PolicyError: the sides matter, and the recogniser does not tell as many apart as the sphere has azimuths.
     """
     n, start = sphere.azimuths, origin(sphere, state, frame)
     ahead = (sphere.azimuth_index[state.current] - sphere.azimuth_index[start]) % n
@@ -162,11 +163,11 @@ class Gain:
 
     def __post_init__(self) -> None:
         if unknown := set(self.inputs) - set(INPUTS):
-            raise ValueError(f"a gain policy is told some of {', '.join(INPUTS)}, not {', '.join(sorted(unknown))}")
+            raise PolicyError(f"a gain policy is told some of {', '.join(INPUTS)}, not {', '.join(sorted(unknown))}")
         if not np.isfinite(self.price) or self.price < 0:
-            raise ValueError(f"needs a price that is not negative, not {self.price}")
+            raise PolicyError(f"needs a price that is not negative, not {self.price}")
         if self.frame not in get_args(Frame):
-            raise ValueError(f"cells are counted from one of {', '.join(get_args(Frame))}, not {self.frame!r}")
+            raise PolicyError(f"cells are counted from one of {', '.join(get_args(Frame))}, not {self.frame!r}")
 
     @property
     def needs(self) -> tuple[str, ...]:

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import ModelError
 from nextview.policies.gain import Gain, told_mirrored
 from nextview.viewsphere import ViewSphere
-from nextview.weights import WeightsError, open_onnx
+from nextview.weights import open_onnx
 
 
 def read_gain(sphere: ViewSphere, facts: dict[str, Any], weights: Path) -> Gain:
@@ -22,8 +23,8 @@ def read_gain(sphere: ViewSphere, facts: dict[str, Any], weights: Path) -> Gain:
         weights: the ONNX file, from "told" (B, D) to "cells" (B, V), both float32; see ``Gain.score``.
 
     Raises:
-        WeightsError: the file cannot be used, or is one for other inputs or viewpoints.
-        ValueError, KeyError or TypeError: the card is damaged.
+        ModelError: the file cannot be used, or is one for other inputs or viewpoints.
+        PolicyError, KeyError or TypeError: the card is damaged.
     """
     table = facts["table"]
     session = open_onnx(weights, facts["sha256"], threads=1)
@@ -46,8 +47,8 @@ def read_gain(sphere: ViewSphere, facts: dict[str, Any], weights: Path) -> Gain:
     found = [(end.name, end.type, list(end.shape[1:])) for end in ends]
     if found != wanted or any(isinstance(end.shape[0], int) for end in ends):
         shapes = ", ".join(f"{end.name} {tuple(end.shape)}" for end in ends)
-        raise WeightsError(f"{weights}: has {shapes}, not told (batch, {width}) and cells (batch, {len(sphere)})")
+        raise ModelError(f"{weights}: has {shapes}, not told (batch, {width}) and cells (batch, {len(sphere)})")
     # The graph answers with what is not a number if any weight is not finite, whatever it is told.
     if not np.isfinite(score(np.zeros((1, width), np.float32))).all():
-        raise WeightsError(f"{weights}: a weight is not a finite number")
+        raise ModelError(f"{weights}: a weight is not a finite number")
     return policy

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import PolicyError
 from nextview.policies.base import EpisodeState, best_in_window
 from nextview.viewsphere import ViewSphere
 
@@ -56,7 +57,7 @@ class MapPeak:
         """See ``Policy.next_views``."""
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
         if maps.shape[1:] != (self.sphere.rings, 3):
-            raise ValueError(
+            raise PolicyError(
                 f"the map {self.map_name!r} is {maps.shape[1:]}, but the sphere has {self.sphere.rings} rings"
             )
         valley = np.isin(state.belief.argmax(1), self.valley_classes)

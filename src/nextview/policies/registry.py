@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from nextview.errors import PolicyError
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
 from nextview.policies.card import bundled_policies, read_policy
@@ -43,7 +44,7 @@ def make_policy(
         classes: names of the recogniser's classes; a learned policy for others is refused.
 
     Raises:
-        ValueError: there is no such policy, or it cannot be made.
+        PolicyError: there is no such policy, or it cannot be made.
     """
     if name in POLICIES:
         return POLICIES[name](sphere, tuple(valley_classes))
@@ -54,16 +55,16 @@ def make_policy(
         return _at_price(policy, name, price) if priced else policy
     if ":" in name:
         return _import_policy(name, sphere)
-    raise ValueError(f"no policy is called {name!r}; there are {', '.join([*POLICIES, *learned])}")
+    raise PolicyError(f"no policy is called {name!r}; there are {', '.join([*POLICIES, *learned])}")
 
 
 def _at_price(policy: Policy, name: str, price: str) -> Policy:
     if not isinstance(policy, Gain):
-        raise ValueError(f"{name}: this policy pays no price for travel")
+        raise PolicyError(f"{name}: this policy pays no price for travel")
     try:
         return replace(policy, price=float(price))
     except ValueError:
-        raise ValueError(f"{name}: a price is a number of at least 0") from None
+        raise PolicyError(f"{name}: a price is a number of at least 0") from None
 
 
 def _import_policy(path: str, sphere: ViewSphere) -> Policy:
@@ -71,8 +72,8 @@ def _import_policy(path: str, sphere: ViewSphere) -> Policy:
     try:
         policy = getattr(importlib.import_module(module), attribute)(sphere)
     except Exception as error:  # whatever a user's module may raise
-        raise ValueError(f"policy {path} cannot be made ({type(error).__name__}: {error})") from error
+        raise PolicyError(f"policy {path} cannot be made ({type(error).__name__}: {error})") from error
     for part in ("next_views", "needs"):
         if not hasattr(policy, part):
-            raise ValueError(f"policy {path} has no {part}; see nextview.policies.base.Policy")
+            raise PolicyError(f"policy {path} has no {part}; see nextview.policies.base.Policy")
     return policy

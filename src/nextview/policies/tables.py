@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import PolicyError
 from nextview.policies.base import EpisodeState, best_in_window
 from nextview.policies.spread import Spread
 from nextview.viewsphere import ViewSphere
@@ -48,7 +49,7 @@ class FixedSequence:
     def __post_init__(self) -> None:
         on_it = (self.moves >= 0) & (self.moves < len(self.sphere))
         if self.moves.ndim != 2 or len(self.moves) != self.sphere.rings or not on_it.all():
-            raise ValueError(f"a sequence needs moves over the sphere from each of its {self.sphere.rings} rings")
+            raise PolicyError(f"a sequence needs moves over the sphere from each of its {self.sphere.rings} rings")
 
     @cached_property
     def paths(self) -> NDArray[np.int64]:
@@ -89,7 +90,7 @@ class FixedRing:
 
     def __post_init__(self) -> None:
         if not 0 <= self.ring < self.sphere.rings or not 1 <= self.steps < self.sphere.azimuths:
-            raise ValueError(f"there is no ring {self.ring} to be walked in steps of {self.steps}")
+            raise PolicyError(f"there is no ring {self.ring} to be walked in steps of {self.steps}")
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
@@ -119,7 +120,7 @@ class ClassTable:
     def __post_init__(self) -> None:
         wanted = (self.sphere.rings, len(self.sphere))
         if self.values.ndim != 3 or self.values.shape[1:] != wanted or not np.isfinite(self.values).all():
-            raise ValueError(f"the table has to hold finite numbers of the shape (classes, {wanted[0]}, {wanted[1]})")
+            raise PolicyError(f"the table has to hold finite numbers of the shape (classes, {wanted[0]}, {wanted[1]})")
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from mpl_toolkits.mplot3d import Axes3D
 
+from nextview.errors import UsageError
 from nextview.session import Look, Recognition
 from nextview.viewsphere import ViewSphere
 
@@ -21,13 +22,13 @@ def save_episode(result: Recognition, sphere: ViewSphere, path: Path, title: str
     """Draw an episode into a PNG, PDF or SVG file.
 
     Raises:
-        ValueError: the file cannot be written, or its suffix is not a picture's.
+        UsageError: the file cannot be written, or its suffix is not a picture's.
     """
     figure = draw_episode(result, sphere, title)
     try:
         figure.savefig(path, dpi=110, facecolor="white")
     except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: the figure cannot be written ({error})") from None
+        raise UsageError(f"{path}: the figure cannot be written ({error})") from None
 
 
 def draw_episode(result: Recognition, sphere: ViewSphere, title: str) -> Figure:

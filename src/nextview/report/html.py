@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from nextview.benchmark.results import Results
+from nextview.errors import ResultsError
 from nextview.report import curves, tables
 from nextview.report.elements import asset, card, description, document, numbers, picture, side_by_side, write
 from nextview.report.trajectories import Pictures, gains, trajectories, worst_failures
@@ -32,10 +33,10 @@ def write_report(results: Results, path: Path, pictures: Pictures) -> None:
         pictures: of the objects, for the failures and the viewer.
 
     Raises:
-        ValueError: there are fixed views only.
+        ResultsError: there are fixed views only.
     """
     if results.tables.sweep.empty:
-        raise ValueError(f"{results.folder}: holds fixed views only; a report needs a policy that chooses")
+        raise ResultsError(f"{results.folder}: holds fixed views only; a report needs a policy that chooses")
     write(page(results, pictures), path)
 
 

@@ -18,7 +18,7 @@ from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch.utils.data import DataLoader, IterableDataset
 
-from nextview.models.card import ModelError
+from nextview.errors import ModelError
 from nextview.training.ahead import Ahead
 from nextview.training.hardware import Hardware
 

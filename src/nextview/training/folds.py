@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.data.split import alike
+from nextview.errors import DatasetError
 
 
 def hold_out(
@@ -25,10 +26,10 @@ def hold_out(
         ``folds`` sorted arrays of indices that together are all objects.
 
     Raises:
-        ValueError: fewer than two folds, or fewer objects than folds.
+        DatasetError: fewer than two folds, or fewer objects than folds.
     """
     if not 2 <= folds <= len(labels):
-        raise ValueError(f"{len(labels)} objects cannot be divided into {folds} folds")
+        raise DatasetError(f"{len(labels)} objects cannot be divided into {folds} folds")
     rng = np.random.default_rng([seed, folds])
     twin = alike(measured)
     _, first = np.unique(twin, return_index=True)  # one object stands for all that look the same

@@ -10,6 +10,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
+from nextview.errors import ModelError
 from nextview.models.card import file_hash
 from nextview.policies.card import write_policy
 from nextview.policies.gain import Gain
@@ -39,7 +40,7 @@ def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
     p, e = perceptrons, len(perceptrons.networks)
     depths = {len(layers) for layers in p.networks}
     if len(depths) > 1:
-        raise ValueError("the networks are not equally deep")
+        raise ModelError("the networks are not equally deep")
     d, v = len(p.told_flip), len(p.cells_flip)
     faces = np.stack([np.arange(d), p.told_flip])[:, None, None, :]
     straight = np.arange(e * v).reshape(e, v)
@@ -100,10 +101,10 @@ def write_gain(card: Path, policy: Gain, facts: dict[str, Any], told: NDArray[np
         By how much their answers differ at most.
 
     Raises:
-        ValueError: by more than BOUND, or the policy is of other networks; then nothing is written.
+        ModelError: by more than BOUND, or the policy is of other networks; then nothing is written.
     """
     if not isinstance(policy.score, Perceptrons):
-        raise ValueError("only a policy that was just trained can be written")
+        raise ModelError("only a policy that was just trained can be written")
     weights = card.with_suffix(".onnx")
     part = weights.with_name(weights.name + ".part")
     onnx.save(gain_graph(policy.score), part)
@@ -112,7 +113,7 @@ def write_gain(card: Path, policy: Gain, facts: dict[str, Any], told: NDArray[np
     difference = float(np.abs(answers - policy.score(told.astype(np.float64))).max())
     if not difference <= BOUND:
         part.unlink()
-        raise ValueError(
+        raise ModelError(
             f"{weights}: ONNX Runtime's answers differ by {difference:.2g} from the networks'; not written"
         )
     part.rename(weights)

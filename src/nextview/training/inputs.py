@@ -32,7 +32,7 @@ def prepare_inputs(path: Path, size: int, kind: str = "geometry", workers: int |
         Objects done so far.
 
     Raises:
-        ValueError: the views cannot be brought to this size.
+        ObservationError: the views cannot be brought to this size.
     """
     target = inputs_path(path, size, kind)
     if target.exists():

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.data import IterableDataset
 
-from nextview.models.card import ModelError, find_card
+from nextview.errors import ModelError
+from nextview.models.card import find_card
 from nextview.models.cloud_input import cloud_input
 from nextview.training.fit import fit
 from nextview.training.hardware import Hardware

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from nextview.data.split import split_training
 from nextview.data.store import ViewStore
-from nextview.models.card import ModelError, find_card
+from nextview.errors import ModelError
+from nextview.models.card import find_card
 from nextview.training.inputs import CHANNELS_OF
 from nextview.training.lite import LiteNet
 from nextview.training.networks import ResNet, recogniser_network

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import update_bn
 
-from nextview.models.card import ModelError
+from nextview.errors import ModelError
 
 
 def merge(networks: Sequence[nn.Module], views: Iterable[Tensor]) -> nn.Module:

@@ -12,6 +12,8 @@ import numpy as np
 from numcodecs import Blosc
 from numpy.typing import NDArray
 
+from nextview.errors import DatasetError
+
 PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)
 """Views of objects are mostly background and flat faces: a sixth is left or less, which fits into memory."""
 
@@ -88,13 +90,13 @@ def load_packed(folder: Path) -> PackedViews:
     """Views that ``save_packed`` wrote.
 
     Raises:
-        ValueError: the file of the views is not as long as it was.
+        DatasetError: the file of the views is not as long as it was.
     """
     with np.load(folder / "index.npz") as index:
         places, size = index["places"], tuple(index["size"].tolist())
     file, total = folder / "views.lz4", int(places[..., 1].sum())
     if file.stat().st_size != total:
-        raise ValueError(f"{folder}: is damaged; delete it, and it is made again")
+        raise DatasetError(f"{folder}: is damaged; delete it, and it is made again")
     packed = np.memmap(file, np.uint8, "r") if total else np.zeros(0, np.uint8)
     return PackedViews(file, packed, places, size)
 

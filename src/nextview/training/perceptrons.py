@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import ModelError
 from nextview.policies.gain import Frame, mirrored, told_mirrored
 from nextview.viewsphere import ViewSphere
 
@@ -30,14 +31,14 @@ class Perceptrons:
 
     def __post_init__(self) -> None:
         if not self.networks:
-            raise ValueError("needs at least one network")
+            raise ModelError("needs at least one network")
         for layers in self.networks:
             shapes = [weights.shape for weights, _ in layers]
             wide = [len(self.told_flip), *(bias.size for _, bias in layers)]
             if shapes != list(pairwise(wide)) or wide[-1] != len(self.cells_flip):
-                raise ValueError(f"weights of the shapes {shapes} do not lead from {wide[0]} inputs to the views")
+                raise ModelError(f"weights of the shapes {shapes} do not lead from {wide[0]} inputs to the views")
             if not all(np.isfinite(numbers).all() for layer in layers for numbers in layer):
-                raise ValueError("a weight is not a finite number")
+                raise ModelError("a weight is not a finite number")
 
     @classmethod
     def of(

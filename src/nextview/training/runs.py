@@ -14,7 +14,8 @@ import torch
 from torch import nn
 
 from nextview.data.lock import only_one
-from nextview.models.card import ModelError, file_hash, find_card
+from nextview.errors import ModelError
+from nextview.models.card import file_hash, find_card
 from nextview.training.fit import is_first
 
 Recipe = TypeVar("Recipe")

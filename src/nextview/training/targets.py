@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.predictions import Predictions, PredictionsError
+from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
+from nextview.errors import PredictionsError
 from nextview.measures.confidence_map import confidence_maps
 from nextview.measures.depth_entropy import normalise_per_object
 

@@ -12,7 +12,8 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor, nn
 
-from nextview.models.card import ModelError, find_card
+from nextview.errors import ModelError
+from nextview.models.card import find_card
 from nextview.models.networks import open_weights
 from nextview.training.lite import SCALES, LiteNet
 from nextview.training.networks import RESNETS, ResNet
