@@ -247,7 +247,7 @@ def test_a_map_that_is_missing_or_of_another_sphere():
     with pytest.raises(PolicyError, match="policy MapPeak raised KeyError: 'lcm'"):
         run(table, MapPeak(SPHERE, "lcm"), np.arange(3), Stopping(1.0))
     ring = ViewSphere.named("12")
-    with pytest.raises(PolicyError, match="policy MapPeak raised ValueError"):
+    with pytest.raises(PolicyError, match="policy MapPeak raised PolicyError"):
         run(table, MapPeak(ring), np.arange(3), Stopping(1.0), ring)
 
 
