@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from nextview.mesh_format import MAX_FACES
+
 if TYPE_CHECKING:
     from nextview.cli.timing import Stopwatch
     from nextview.mesh import Mesh
@@ -26,6 +28,7 @@ def recognise(
     start: int | None = None,
     up: Literal["y", "z"] | None = None,
     unit: Unit | None = None,
+    max_faces: int = MAX_FACES,
     seed: int = 0,
     figure: Path | None = None,
     json: bool = False,
@@ -44,6 +47,7 @@ def recognise(
         start: first view, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
         up: the file's up axis; z if not given, but y for GLB.
         unit: the file's unit of length, if it is known: how large an object is says something of its class.
+        max_faces: refuse a mesh of more triangles, or a file of more than 60 bytes for each of these.
         seed: decides the first view and whatever the policy draws.
         figure: write a picture of the episode to this file (PNG, PDF or SVG).
         json: print JSON instead of a table.
@@ -55,7 +59,7 @@ def recognise(
     from nextview.mesh import load_mesh
 
     def load() -> Mesh:
-        return load_mesh(mesh, up, unit)
+        return load_mesh(mesh, up, unit, max_faces)
 
     show(load, mesh.name, watch, policy, threshold, max_views, start, seed, figure, json, timing, risk)
 
