@@ -6,9 +6,11 @@ import json
 
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
+from nextview.cli.ending import printable
+from nextview.cli.terminal import Terminal
 from nextview.recognition import Stopping
 from nextview.session import Look, Recognition
 from nextview.viewsphere import ViewSphere
@@ -52,14 +54,15 @@ def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: 
             "stop" if look.next_view is None else _angles(sphere, look.next_view),
             f"{look.travel:.2f}",
         )
-    console = Console()
+    console = Terminal()
     console.print(table)
     bar = float(stopping.bar(len(result.looks)))
     reason = f"threshold {bar:.3g} reached" if result.confident else "no views left"
-    console.print(
-        f"It is a [bold]{result.answer}[/bold], belief {result.confidence:.3f}, after {len(result.looks)} "
-        f"look{'s' * (len(result.looks) > 1)} and {result.travel:.2f} cells of travel ({reason})."
+    rest = (
+        f", belief {result.confidence:.3f}, after {len(result.looks)} look{'s' * (len(result.looks) > 1)} "
+        f"and {result.travel:.2f} cells of travel ({reason})."
     )
+    console.print(Text.assemble("It is a ", (printable(result.answer), "bold"), rest))
 
 
 def as_json(result: Recognition, sphere: ViewSphere) -> str:

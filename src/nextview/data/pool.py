@@ -9,6 +9,8 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from typing import TypeVar
 
 from nextview.errors import DatasetError
@@ -72,18 +74,37 @@ def each(
 
 
 def _in_pool(function: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[tuple[Item, Result]]:
+    others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(min(workers, len(items)), multiprocessing.get_context("spawn"), _end_with_parent)
     try:
-        jobs = {pool.submit(function, item): item for item in items}
+        with _interrupts_wait():
+            jobs = {pool.submit(function, item): item for item in items}
         for job in as_completed(jobs):
             yield jobs[job], job.result()
+    except KeyboardInterrupt:  # what is being worked on counts as not done: wait for none of it
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.kill()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
 
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Keep Ctrl-C from this process for a moment, and for ever from those it starts: the parent decides what it means.
+
+    A terminal sends it to all of them, also to those that are still importing.
+    """
+    resource_tracker.ensure_running()  # its start would let interrupts through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _end_with_parent() -> None:
     """A worker whose parent was killed would wait for work forever."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
     parent = multiprocessing.parent_process()
     assert parent is not None
 
