@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import shutil
 import signal
@@ -70,6 +71,7 @@ def orderly_end(advice: str) -> Iterator[None]:
             say(f"standard output or a file cannot be written ({error.strerror or 'it is closed'})")
             _forget_output(1)
         except KeyboardInterrupt as interrupt:
+            logging.getLogger("asyncio").disabled = True  # zarr's reads would complain, at great length, of being left
             say(f"stopped; {advice}")
             sys.exit(143 if isinstance(interrupt, Terminated) else 130)
 
@@ -93,7 +95,7 @@ def _columns() -> Iterator[None]:
     """Lay out for no fewer and no more columns than make sense."""
     before = os.environ.get("COLUMNS")
     columns = shutil.get_terminal_size().columns
-    if not NARROWEST <= columns <= WIDEST:
+    if before is not None or not NARROWEST <= columns <= WIDEST:
         os.environ["COLUMNS"] = str(min(max(columns, NARROWEST), WIDEST))
     try:
         yield

@@ -12,6 +12,7 @@ from matplotlib.patches import Rectangle
 from mpl_toolkits.mplot3d import Axes3D
 
 from nextview.errors import UsageError
+from nextview.report.style import PlainFigure
 from nextview.session import Look, Recognition
 from nextview.viewsphere import ViewSphere
 
@@ -35,7 +36,7 @@ def draw_episode(result: Recognition, sphere: ViewSphere, title: str) -> Figure:
     """One column for each look (image, predicted map with the choice marked, belief), and the sphere beside them."""
     looks = result.looks
     heights = [2.7, 2.6, 2.9] if looks[0].maps else [2.7, 2.9]
-    figure = Figure(figsize=(2.5 * len(looks) + 5.2, sum(heights)), layout="constrained")
+    figure = PlainFigure(figsize=(2.5 * len(looks) + 5.2, sum(heights)), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.5 * len(looks), 5.2])[0]
     axes = left.subplots(len(heights), len(looks), squeeze=False, gridspec_kw={"height_ratios": heights})
     shown = np.argsort(-np.max([look.belief for look in looks], axis=0))[:5]
