@@ -5,7 +5,7 @@
 prints a section in Markdown. TRAINING.npz are predictions of the training split; what is learned is learned from its
 validation objects (VALIDATION_SHARE as for nextview fit). All numbers are shares of right answers over the objects of
 TEST.npz and all first views, in brackets 95 % bootstrap intervals over objects; looks are fused by summing
-logits, without what the recogniser says of the sides.
+logits, without what the recogniser says of the azimuth bins.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.benchmark.contestants import Trials
+from nextview.benchmark.entries import EpisodeSpecs
 from nextview.benchmark.replay import replay
 from nextview.benchmark.statistics import interval, resample
+from nextview.calibration.fitting_set import FittingSet, fitting_set
+from nextview.calibration.policy_tables import greedy_path
 from nextview.cli.progress import track
 from nextview.data.predictions import Predictions
-from nextview.fitting.evidence import FittingSet, fitting_set
-from nextview.fitting.tables import greedy_path
-from nextview.policies.tables import cells_from
+from nextview.policies.learned_tables import cells_from
 from nextview.viewsphere import ViewSphere
 
-LOOKS = 5
+VIEW_COUNTS = 5
 
 
 def leads(p: Predictions) -> NDArray[np.float64]:
@@ -39,17 +39,17 @@ def leads(p: Predictions) -> NDArray[np.float64]:
     return (of_truth - np.take_along_axis(p.logits, others[:, None], 2)).astype(np.float64)
 
 
-def any_sets(sphere: ViewSphere, start: int, looks: int) -> NDArray[np.int64]:
+def any_sets(sphere: ViewSphere, start: int, n_views: int) -> NDArray[np.int64]:
     """All sets of so many views with the start among them, (S, looks)."""
     others = np.delete(np.arange(len(sphere)), start)
-    sets = np.array(list(combinations(others, looks - 1)), np.int64)
+    sets = np.array(list(combinations(others, n_views - 1)), np.int64)
     return np.insert(sets, 0, start, axis=1)
 
 
-def local_sets(sphere: ViewSphere, start: int, looks: int) -> NDArray[np.int64]:
+def local_sets(sphere: ViewSphere, start: int, n_views: int) -> NDArray[np.int64]:
     """The sets of views of all paths from the start that stay in the local window at each step, (S, looks)."""
     paths = np.array([[start]])
-    for _ in range(looks - 1):
+    for _ in range(n_views - 1):
         steps = sphere.windows[paths[:, -1]].reshape(len(paths), -1)
         longer = np.hstack([np.repeat(paths, steps.shape[1], axis=0), steps.reshape(-1, 1)])
         paths = longer[~(longer[:, :-1] == longer[:, -1:]).any(1)]
@@ -57,24 +57,24 @@ def local_sets(sphere: ViewSphere, start: int, looks: int) -> NDArray[np.int64]:
 
 
 def solvable(p: Predictions, sets: Callable[[ViewSphere, int, int], NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Looks after which the right answer can be had at the earliest, by any choice of views, (N, V) by first view.
+    """Views after which the right answer can be had at the earliest, by any choice of views, (N, V) by first view.
 
     Exact: every set of up to LOOKS views is tried. LOOKS + 1 where none will do.
     """
     lead = leads(p)
-    found = np.full((len(p), len(p.sphere)), LOOKS + 1)
+    found = np.full((len(p), len(p.sphere)), VIEW_COUNTS + 1)
 
     def tried():
         for start in range(len(p.sphere)):
-            for looks in range(1, LOOKS + 1):
-                left = np.flatnonzero(found[:, start] > LOOKS)
-                candidates = sets(p.sphere, start, looks) if len(left) else np.zeros((0, looks), np.int64)
+            for n_views in range(1, VIEW_COUNTS + 1):
+                left = np.flatnonzero(found[:, start] > VIEW_COUNTS)
+                candidates = sets(p.sphere, start, n_views) if len(left) else np.zeros((0, n_views), np.int64)
                 for i in left:
                     total = np.zeros((len(candidates), lead.shape[2]))
                     for views in candidates.T:
                         total += lead[i, views]
                     if (total.min(1) > 0).any():
-                        found[i, start] = looks
+                        found[i, start] = n_views
             yield start + 1
 
     track(tried(), len(p.sphere), sets.__name__.replace("_", " "))
@@ -82,18 +82,18 @@ def solvable(p: Predictions, sets: Callable[[ViewSphere, int, int], NDArray[np.i
 
 
 def right_along(p: Predictions, paths: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Share of right answers after each look, (N, LOOKS), for views (N, V, LOOKS) or (V, LOOKS) by first view."""
+    """Share of right answers after each view, (N, LOOKS), for views (N, V, LOOKS) or (V, LOOKS) by first view."""
     paths = np.broadcast_to(paths, (len(p), *paths.shape[-2:]))
     rows = np.arange(len(p))[:, None]
     total, right = np.zeros((len(p), len(p.sphere), len(p.classes))), []
-    for k in range(LOOKS):
+    for k in range(VIEW_COUNTS):
         total += p.logits[rows, paths[..., k]]
         right.append((total.argmax(2) == p.labels[:, None]).mean(1))
     return np.stack(right, 1)
 
 
 def learned_paths(data: FittingSet, p: Predictions, by_class: bool, by_pose: bool) -> NDArray[np.int64]:
-    """Greedily best paths from each first view, (N, V, LOOKS), for a robot that knows what is said of it.
+    """Greedily best paths from each first view, (N, V, LOOKS), for a robot that knows the log-evidence of it.
 
     Args:
         data: from which is learned.
@@ -102,21 +102,21 @@ def learned_paths(data: FittingSet, p: Predictions, by_class: bool, by_pose: boo
         by_pose: it knows the object's azimuth; otherwise only the ring that it is on.
     """
     sphere, n = data.sphere, data.sphere.azimuths
-    paths = np.zeros((len(data.classes), len(sphere), LOOKS), np.int64)
+    paths = np.zeros((len(data.classes), len(sphere), VIEW_COUNTS), np.int64)
     for label in range(len(data.classes)) if by_class else [0]:
         mine = data.labels == label if by_class else np.ones(len(data), bool)
         known = replace(data, logits=data.logits[mine], labels=data.labels[mine])
         for ring in range(sphere.rings):
             on_it = ring * n + np.arange(n)
             for starts in on_it[:, None] if by_pose else [on_it]:
-                cells = greedy_path(known, starts, True, LOOKS - 1, p.calibration)
+                cells = greedy_path(known, starts, True, VIEW_COUNTS - 1, p.calibration)
                 paths[label, starts] = cells_from(sphere)[starts[:, None], cells]
     return paths[p.labels] if by_class else np.broadcast_to(paths[0], (len(p), *paths.shape[1:]))
 
 
 def section(test: Path, training: Path, validation: float = 0.1, samples: int = 2000) -> str:
-    p = replace(Predictions.load(test), sides=None)
-    data = replace(fitting_set(Predictions.load(training), validation, 0), sides=None)
+    p = replace(Predictions.load(test), azimuth_bins=None)
+    data = replace(fitting_set(Predictions.load(training), validation, 0), azimuth_bins=None)
     weights = resample(len(p), samples, np.random.default_rng(0)) / len(p)
 
     def number(of_objects: NDArray) -> str:
@@ -124,11 +124,11 @@ def section(test: Path, training: Path, validation: float = 0.1, samples: int = 
         return f"{of_objects.mean():.3f} ({low[0]:.3f}-{high[0]:.3f})"
 
     v = len(p.sphere)
-    trials = Trials(p, np.repeat(np.arange(len(p)), v), np.tile(np.arange(v), len(p)), ())
+    specs = EpisodeSpecs(p, np.repeat(np.arange(len(p)), v), np.tile(np.arange(v), len(p)), ())
 
     def replayed(name: str) -> NDArray[np.float64]:
-        right = replay(name, trials, LOOKS, 0).answers == trials.labels[:, None]
-        return right.reshape(len(p), v, LOOKS).mean(1)
+        right = replay(name, specs, VIEW_COUNTS, 0).answers == specs.labels[:, None]
+        return right.reshape(len(p), v, VIEW_COUNTS).mean(1)
 
     rows = {
         "random in the window": replayed("random"),
@@ -148,7 +148,7 @@ def section(test: Path, training: Path, validation: float = 0.1, samples: int = 
         ("any views of the sphere, exact bound", any_sets),
     ]:
         found = solvable(p, sets)
-        rows[what] = np.stack([(found <= k).mean(1) for k in range(1, LOOKS + 1)], 1)
+        rows[what] = np.stack([(found <= k).mean(1) for k in range(1, VIEW_COUNTS + 1)], 1)
     alone = (p.logits.argmax(2) == p.labels[:, None]).mean(1)
     fused = p.logits.sum(1).argmax(1) == p.labels
     wrong_after_all = [p.classes[label] for label in p.labels[~fused]]
@@ -159,13 +159,13 @@ def section(test: Path, training: Path, validation: float = 0.1, samples: int = 
         f"{len(p)} objects from every first view; learned from {len(data)} objects of the training split "
         f"({', '.join(name for name, _ in p.models.values())}). `python benchmarks/ceilings.py`.",
         "",
-        "| choice of views | " + " | ".join(f"{k} look{'s' * (k > 1)}" for k in range(1, LOOKS + 1)) + " |",
-        "|---|" + "---|" * LOOKS,
+        "| choice of views | " + " | ".join(f"{k} look{'s' * (k > 1)}" for k in range(1, VIEW_COUNTS + 1)) + " |",
+        "|---|" + "---|" * VIEW_COUNTS,
     ]
     lines += [f"| {what} | " + " | ".join(number(x) for x in right.T) + " |" for what, right in rows.items()]
     window, step = rows["random in the window"], rows["sees all views, one step ahead, in the window"]
     lines += ["", "Share of the gap between random in the window and one step of foresight there:", ""]
-    lines += ["| choice of views | 2 looks | 3 looks | 5 looks |", "|---|---|---|---|"]
+    lines += ["| choice of views | 2 views | 3 views | 5 views |", "|---|---|---|---|"]
     for what, right in rows.items():
         if what.startswith(("learned", "random over")):
             share = [(right[:, k] - window[:, k]).mean() / (step[:, k] - window[:, k]).mean() for k in (1, 2, 4)]

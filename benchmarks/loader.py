@@ -22,7 +22,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from nextview.data.split import split_training
+from nextview.data.splits import split_training
 from nextview.data.store import ViewStore
 from nextview.training.ahead import Ahead
 from nextview.training.inputs import load_inputs

@@ -33,7 +33,7 @@ class Settings:
         dataset: folder in ModelNet's layout.
         runs: first views for each object.
         threshold: stop at this belief.
-        max_views: or after so many looks.
+        max_views: or after so many views.
         limit: only so many objects, spread over the split; all by default.
         seed: decides the first views and what the policies draw.
     """
@@ -63,8 +63,8 @@ def run_object(entry: Entry, starts: np.ndarray, settings: Settings) -> np.ndarr
             stopping = Stopping(settings.threshold, settings.max_views, models.recogniser.calibration.correlation)
             result = recognise(camera, models, policy, sphere, int(start), stopping, rng)
             seconds = time.perf_counter() - begun
-            last = result.looks[-1]
-            found[p, r] = result.answer == entry.label, len(result.looks), last.travel, last.arc, seconds
+            last = result.n_views[-1]
+            found[p, r] = result.answer == entry.label, len(result.n_views), last.travel, last.arc, seconds
     return found
 
 
@@ -87,7 +87,7 @@ def main(settings: Settings) -> None:
     labels = np.array([e.label for e in entries])
     draws = rng.integers(len(entries), size=(2000, len(entries)))
     table = Table(
-        "policy", "accuracy", "95 %", "class mean", "looks", "travel, cells", "travel, rad", "ms an episode",
+        "policy", "accuracy", "95 %", "class mean", "n_views", "travel, cells", "travel, rad", "ms an episode",
         title=f"{len(entries)} test objects x {settings.runs} first views, threshold {settings.threshold}, "
         f"at most {settings.max_views} views",
     )  # fmt: skip
@@ -95,9 +95,9 @@ def main(settings: Settings) -> None:
         right = found[:, p, :, 0].mean(1)
         low, high = np.percentile(right[draws].mean(1), [2.5, 97.5])
         class_mean = np.mean([right[labels == c].mean() for c in np.unique(labels)])
-        looks, travel, arc, seconds = found[:, p, :, 1:].mean((0, 1))
+        n_views, travel, arc, seconds = found[:, p, :, 1:].mean((0, 1))
         table.add_row(
-            name, f"{right.mean():.4f}", f"{low:.3f} .. {high:.3f}", f"{class_mean:.4f}", f"{looks:.2f}",
+            name, f"{right.mean():.4f}", f"{low:.3f} .. {high:.3f}", f"{class_mean:.4f}", f"{n_views:.2f}",
             f"{travel:.2f}", f"{arc:.2f}", f"{1000 * seconds:.0f}",
         )  # fmt: skip
     Console(width=120).print(table)

@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from nextview.benchmark.paired import of_the_same
 
 
-def alike(answers: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def duplicate_groups(
+    answers: NDArray[np.int64], labels: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which objects all recognisers get wrong, and which of these get one and the same wrong name, (N,) each.
 
     Args:
@@ -40,7 +42,7 @@ def main(*paths: Path) -> None:
     print("| wrong | objects, all views summed | single views |\n|---|---|---|")
     for path, objects, views in zip(paths, fused, single, strict=True):
         print(f"| {path.stem} | {(objects != first.labels).sum()} | {(views != each).mean():.3f} |")
-    (wrong, same), (wrong_views, same_views) = alike(fused, first.labels), alike(single, each)
+    (wrong, same), (wrong_views, same_views) = duplicate_groups(fused, first.labels), duplicate_groups(single, each)
     print(f"| all of them | {wrong.sum()} | {wrong_views.mean():.3f} |")
     print(f"| all, by the same name | {same.sum()} | {same_views.mean():.3f} |\n")
     print("| object | is called by all | objects |\n|---|---|---|")

@@ -19,26 +19,26 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from nextview.benchmark.paired import accuracy_after_looks, in_points, rows
+from nextview.benchmark.paired import accuracy_after_views, in_points, rows
 from nextview.data.predictions import Predictions
-from nextview.models.card import find_card
-from nextview.models.networks import RECOGNISER, size_evidence
-from nextview.models.size import SizeEvidence
+from nextview.models.inference import RECOGNISER, size_evidence
+from nextview.models.model_card import find_card
+from nextview.models.size_evidence import SizeEvidence
 from nextview.report.style import INK, STYLE, new_figure, to_png
 
 
 def lines(p: Predictions) -> Iterator[str]:
-    """Two tables: accuracy without the size and with it, and the difference; by looks, and of one look by class."""
-    before, after = (accuracy_after_looks(x, x.calibration) for x in (p.by_shape(), p))
+    """Two tables: accuracy without the size and with it, and the difference; by views, and of one view by class."""
+    before, after = (accuracy_after_views(x, x.calibration) for x in (p.by_shape(), p))
     yield "| looks | by shape alone (class mean) | size known | difference, points |"
     yield "|---|---|---|---|"
     yield from rows(before, after, p.labels)
-    yield "\n| class, one look | by shape alone | size known | difference, points |"
+    yield "\n| class, one view | by shape alone | size known | difference, points |"
     yield "|---|---|---|---|"
     for c in np.unique(p.labels):
-        alone, told = before[0, p.labels == c], after[0, p.labels == c]
+        alone, features = before[0, p.labels == c], after[0, p.labels == c]
         name = p.classes[c].replace("_", " ")
-        yield f"| {name} | {alone.mean():.3f} | {told.mean():.3f} | {in_points(alone, told)} |"
+        yield f"| {name} | {alone.mean():.3f} | {features.mean():.3f} | {in_points(alone, features)} |"
 
 
 def sizes_figure(evidence: SizeEvidence, classes: tuple[str, ...]) -> Figure:
@@ -76,7 +76,7 @@ def main(path: Path, figure: Path | None = None, card: str = RECOGNISER) -> None
         to_png(sizes_figure(evidence, tuple(known.facts["classes"])), figure)
     p = Predictions.load(path)
     if "test" not in p.splits:  # the test split counts as it is published, copies and all
-        p = p.each_shape_once()
+        p = p.deduplicate()
     if p.of_size is None:
         raise ValueError(f"{path}: nothing is said of sizes; see nextview render --unit and nextview fit size")
     print(f"{len(p)} objects, split {p.splits[0]}:\n")

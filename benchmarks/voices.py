@@ -2,7 +2,7 @@
 
     python benchmarks/voices.py PREDICTIONS.npz [PREDICTIONS.npz+PREDICTIONS.npz ...]
 
-prints Markdown, each shape once. A + averages what recognisers say of the same objects. Every contestant is calibrated
+prints Markdown, duplicates left out. A + averages what recognisers say of the same objects. Every entry is calibrated
 anew; what the later ones gain over the first has a bootstrap interval over shapes. By shape alone.
 """
 
@@ -16,34 +16,34 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_softmax
 
+from nextview.belief import of_true_class
 from nextview.benchmark.paired import of_the_same
 from nextview.benchmark.statistics import class_mean, interval, resample
+from nextview.calibration.fitting_set import FittingSet
+from nextview.calibration.temperature import fit_temperature
 from nextview.data.predictions import Predictions
-from nextview.fitting.calibration import fit_temperature
-from nextview.fitting.evidence import FittingSet
-from nextview.recognition import of_true_class
 
 Float = NDArray[np.float64]
-LOOKS, WALKS = 5, 20
+VIEW_COUNTS, WALKS = 5, 20
 
 
 def averaged(paths: list[Path]) -> Predictions:
-    """The mean of the logits, and of what is said of sides, over predictions of the same objects; each shape once."""
+    """The mean of the logits, and of the log-evidence of azimuth bins, over predictions of the same objects; duplicates left out."""
     tables = [p.by_shape() for p in of_the_same(paths)]
-    told = [p.sides for p in tables if p.sides is not None]
-    sides = log_softmax(np.mean(told, 0), axis=-1) if len(told) == len(tables) else None
-    return replace(tables[0], logits=np.mean([p.logits for p in tables], 0), sides=sides).each_shape_once()
+    features = [p.azimuth_bins for p in tables if p.azimuth_bins is not None]
+    azimuth_bins = log_softmax(np.mean(features, 0), axis=-1) if len(features) == len(tables) else None
+    return replace(tables[0], logits=np.mean([p.logits for p in tables], 0), azimuth_bins=azimuth_bins).deduplicate()
 
 
 def log_beliefs(p: Predictions) -> Float:
     """In the true class after 1 to LOOKS views in random order, calibrated, the mean over WALKS orders, (N, LOOKS)."""
     data = FittingSet.of_all(p)
-    calibration = fit_temperature(data, np.random.default_rng(0), LOOKS, 1 + 8000 // len(data))
-    rng, numbers, total = np.random.default_rng(1), np.arange(1, LOOKS + 1), np.zeros((len(p), LOOKS))
+    calibration = fit_temperature(data, np.random.default_rng(0), VIEW_COUNTS, 1 + 8000 // len(data))
+    rng, numbers, total = np.random.default_rng(1), np.arange(1, VIEW_COUNTS + 1), np.zeros((len(p), VIEW_COUNTS))
     for _ in range(WALKS):
-        order = rng.permuted(np.tile(np.arange(len(p.sphere)), (len(p), 1)), axis=1)[:, :LOOKS]
-        said = np.cumsum(data.said[np.arange(len(p))[:, None], order].astype(np.float64), axis=1)
-        total += of_true_class(calibration.log_belief(said, numbers, len(p.classes)), p.labels)
+        order = rng.permuted(np.tile(np.arange(len(p.sphere)), (len(p), 1)), axis=1)[:, :VIEW_COUNTS]
+        log_evidence = np.cumsum(data.log_evidence[np.arange(len(p))[:, None], order].astype(np.float64), axis=1)
+        total += of_true_class(calibration.log_belief(log_evidence, numbers, len(p.classes)), p.labels)
     return total / WALKS
 
 
@@ -60,12 +60,14 @@ def gained(difference: Float, labels: NDArray[np.int64], samples: int = 4000) ->
     return f"{of_all:+.3f} ({low[0]:+.3f} to {high[0]:+.3f})"
 
 
-def main(*contestants: str) -> None:
+def main(*entries: str) -> None:
     """Print it."""
-    print(f"| | single view | all fused | log-belief, 1 look | mean of 2 to {LOOKS} | gain, 1 look | 2 to {LOOKS} |")
+    print(
+        f"| | single view | all fused | log-belief, 1 view | mean of 2 to {VIEW_COUNTS} | gain, 1 view | 2 to {VIEW_COUNTS} |"
+    )
     print("|---|---|---|---|---|---|---|")
     first = None
-    for name in contestants:
+    for name in entries:
         p = averaged([Path(part) for part in name.split("+")])
         single = (p.logits.argmax(2) == p.labels[:, None]).mean(1)
         fused = (p.logits.sum(1).argmax(1) == p.labels).astype(float)

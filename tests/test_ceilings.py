@@ -31,12 +31,12 @@ def test_the_earliest_right_answer_is_that_of_trying_every_walk(name):
     for i in range(len(p)):
         for start in (0, 5):
             earliest = 6
-            for looks in range(5, 0, -1):
-                for rest in permutations(np.delete(np.arange(8), start), looks - 1):
+            for n_views in range(5, 0, -1):
+                for rest in permutations(np.delete(np.arange(8), start), n_views - 1):
                     walk = [start, *rest]
                     near = all(b in SMALL.window(a) for a, b in pairwise(walk))
                     if (name == "any_sets" or near) and p.logits[i, walk].sum(0).argmax() == p.labels[i]:
-                        earliest = looks
+                        earliest = n_views
                         break
             assert found[i, start] == earliest
 

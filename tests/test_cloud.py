@@ -1,4 +1,4 @@
-"""Points of a look, against the depth image they come from, and what the map networks are given of them."""
+"""Points of a view, against the depth image they come from, and what the map networks are given of them."""
 
 import numpy as np
 import pytest

@@ -10,7 +10,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 
-from nextview.data.download import Archive, download
+from nextview.data.downloading import Archive, download
 from nextview.data.lock import only_one
 from nextview.errors import DatasetError
 

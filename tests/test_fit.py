@@ -12,7 +12,7 @@ import pytest
 torch = pytest.importorskip("torch")
 L = pytest.importorskip("lightning")
 
-from nextview.models.card import ModelError  # noqa: E402
+from nextview.models.model_card import ModelError  # noqa: E402
 from nextview.report.training_curves import read_log, training_curves  # noqa: E402
 from nextview.training import fit as fitting  # noqa: E402
 from nextview.training import recogniser  # noqa: E402

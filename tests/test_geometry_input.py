@@ -166,9 +166,9 @@ def test_what_a_sensor_gives_for_nothing_is_background(nothing):
     expected = geometry_input(clean[None], POSES[[13]], INTRINSICS, 112)
     np.testing.assert_array_equal(geometry_input(sensed[None], POSES[[13]], INTRINSICS, 112), expected)
     image, points = np.zeros(clean.shape, np.uint8), np.zeros((POINTS, 3), np.float32)
-    look = Observation(image, sensed, points, POSES[13], INTRINSICS)
-    np.testing.assert_array_equal(look.depth, clean)
-    assert look.depth.dtype == np.float32
+    observation = Observation(image, sensed, points, POSES[13], INTRINSICS)
+    np.testing.assert_array_equal(observation.depth, clean)
+    assert observation.depth.dtype == np.float32
     assert Observation(image, clean, points, POSES[13], INTRINSICS).depth is clean  # nothing is copied
 
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from nextview.cli.main import main
-from nextview.models.card import write_card
-from nextview.models.networks import Recogniser
+from nextview.models.inference import Recogniser
+from nextview.models.model_card import write_card
 
 torch = pytest.importorskip("torch")
 
-from nextview.models.card import ModelError  # noqa: E402
-from nextview.training.export import CalibratedRecogniser, export_onnx  # noqa: E402
+from nextview.models.model_card import ModelError  # noqa: E402
+from nextview.training.checkpoints import exported_networks, load_checkpoint, load_exported  # noqa: E402
 from nextview.training.lite import Depthwise, InvertedBottleneck, LiteNet  # noqa: E402
-from nextview.training.weights import exported_networks, load_checkpoint, load_exported  # noqa: E402
+from nextview.training.onnx_export import CalibratedRecogniser, export_onnx  # noqa: E402
 
 LITE0 = ((16, 3, 1), (24, 3, 2), (40, 5, 2), (80, 3, 3), (112, 5, 3), (192, 5, 4), (320, 3, 1))
 """Width, kernel and blocks of the stages."""
@@ -72,9 +72,9 @@ def test_it_is_as_large_as_published(scale, size, parameters, multiplications):
 
 
 def test_any_number_of_channels_and_the_sides():
-    logits, features, sides = LiteNet(7, 5, 8).eval()(torch.rand(2, 5, 64, 64))
-    assert (logits.shape, features.shape, sides.shape) == ((2, 7), (2, 1280), (2, 7, 8))
-    assert torch.allclose(sides.exp().sum(2), torch.ones(2, 7))
+    logits, features, azimuth_bins = LiteNet(7, 5, 8).eval()(torch.rand(2, 5, 64, 64))
+    assert (logits.shape, features.shape, azimuth_bins.shape) == ((2, 7), (2, 1280), (2, 7, 8))
+    assert torch.allclose(azimuth_bins.exp().sum(2), torch.ones(2, 7))
 
 
 def test_a_published_checkpoint_loads_whole(tmp_path):
@@ -151,21 +151,21 @@ def test_it_goes_on_from_its_export_also_beside_another(tmp_path, bits):
     shipped = CalibratedRecogniser(networks, 1.0).eval()
     export_onnx(shipped, views[:2], "input", shipped.outputs, tmp_path / "two.onnx", bits)
     facts = {"name": "two", "kind": "recogniser", "input_size": 64, "sees": "geometry", "temperature": 1.0}
-    facts |= {"classes": ["a", "b"], "sides": 8, "network": "EfficientNet-Lite0 + EfficientNet-Lite0"}
+    facts |= {"classes": ["a", "b"], "azimuth_bins": 8, "network": "EfficientNet-Lite0 + EfficientNet-Lite0"}
     write_card(tmp_path / "two.json", facts)
     x = torch.from_numpy(views).float() / 255
     again = exported_networks(tmp_path / "two.json", 4, x)
     with torch.no_grad():
-        said = torch.stack([network(x)[0] for network in again]).mean(0).numpy()
+        output = torch.stack([network(x)[0] for network in again]).mean(0).numpy()
     exact = Recogniser(tmp_path / "two.json").from_inputs(views).logits
-    assert np.abs(said - exact).max() < 1e-3
+    assert np.abs(output - exact).max() < 1e-3
     assert np.ptp(exact) > 0.1
     with pytest.raises(ModelError, match="not one network of this depth and input"):
         load_exported(LiteNet(2, 4, 8), tmp_path / "two.json", x)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "log_evidence"),
     [
         (["--network", "lite0", "--blocks", "2", "--size", "224"], "only a ResNet sees pixels in blocks"),
         (["--network", "lite2", "--depth", "34"], "only a ResNet has a --depth"),
@@ -173,8 +173,8 @@ def test_it_goes_on_from_its_export_also_beside_another(tmp_path, bits):
         (["--network", "lite0", "--drop", "1"], "--drop is a chance, 0 or more and less than 1, not 1.0"),
     ],
 )
-def test_options_of_another_network_are_refused(tmp_path, capsys, options, said):
+def test_options_of_another_network_are_refused(tmp_path, capsys, options, output):
     command = ["train", "recogniser", str(tmp_path / "no.zarr"), str(tmp_path / "run")]
     with pytest.raises(SystemExit):
         main([*command, *options])
-    assert said in " ".join(capsys.readouterr().err.split())
+    assert output in " ".join(capsys.readouterr().err.split())

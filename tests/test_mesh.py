@@ -111,10 +111,10 @@ def test_off_as_it_is_found_in_the_wild(text):
     vertices, faces = read_off(text.encode())
     read = make_mesh(vertices, faces)
     apex, base = (1, 1, 3), SQUARE
-    sides = [(base[i], base[(i + 1) % 4], apex) for i in range(4)]
+    azimuth_bins = [(base[i], base[(i + 1) % 4], apex) for i in range(4)]
     assert read.radius == pytest.approx(np.sqrt(1 + 1 + 1.5**2))
     assert {tuple(map(tuple, f)) for f in vertices[faces][-4:].astype(int)} == {
-        tuple(map(tuple, f)) for f in np.array(sides)
+        tuple(map(tuple, f)) for f in np.array(azimuth_bins)
     }
     closed = trimesh.Trimesh(vertices, faces)
     assert closed.is_watertight
@@ -191,7 +191,7 @@ def test_the_up_axis_can_be_told(tmp_path):
         "f 1 2 3\nf 1 3 4\nf 4 3 5\nf 1 4 5\nf 2 1 5\nf 3 2 5\n",
         "f 1 2 3 4\nf 4 3 5\nf 1 4 5\nf 2 1 5\nf 3 2 5\n",
         "f 1 2 3 # part 0\nf 1 3 4 # 0\nf 4 3 5\nf 1 4 5\nf 2 1 5\nf 3 2 5\n",
-        "f 1/1/1 2/1/1 3/1/1 4/1/1\ng sides\nf 4//1 3//1 5//1\nf 1/1 4/1 5/1\ns off\nf 2 1 5\nusemtl a\nf 3 2 5",
+        "f 1/1/1 2/1/1 3/1/1 4/1/1\ng azimuth bins\nf 4//1 3//1 5//1\nf 1/1 4/1 5/1\ns off\nf 2 1 5\nusemtl a\nf 3 2 5",
         "f 1 2 \\\n 3 4\nf -2 3 5\nf 1 4 -1\nf 2 -5 5\nf 3 2 5\n",
     ],
     ids=["triangles", "polygon", "comments", "texture, normals and groups", "continued and relative"],

@@ -7,9 +7,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from nextview.models.card import ModelError  # noqa: E402
-from nextview.training.networks import ResNet  # noqa: E402
-from nextview.training.weights import load_checkpoint  # noqa: E402
+from nextview.models.model_card import ModelError  # noqa: E402
+from nextview.training.architectures import ResNet  # noqa: E402
+from nextview.training.checkpoints import load_checkpoint  # noqa: E402
 
 BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3), 152: (3, 8, 36, 3)}
 PUBLISHED = {18: 11_689_512, 34: 21_797_672, 50: 25_557_032, 101: 44_549_160, 152: 60_192_808}

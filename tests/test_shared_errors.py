@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-ALIKE = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "shared_errors.py"))["alike"]
+ALIKE = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "shared_errors.py"))["duplicate_groups"]
 
 
 def test_errors_are_shared_only_where_all_are_wrong():

@@ -10,18 +10,18 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("lightning")
 
 from nextview.data.folders import Entry  # noqa: E402
-from nextview.data.render import Deform, render, render_object, turns  # noqa: E402
+from nextview.data.rendering import Deform, render, render_object, turns  # noqa: E402
 from nextview.data.store import DONE, ViewStore  # noqa: E402
 from nextview.errors import ModelError  # noqa: E402
 from nextview.mesh import make_mesh  # noqa: E402
-from nextview.models.card import find_card  # noqa: E402
-from nextview.models.networks import RECOGNISER, MapNetwork, Recogniser  # noqa: E402
+from nextview.models.inference import RECOGNISER, MapNetwork, Recogniser  # noqa: E402
+from nextview.models.model_card import find_card  # noqa: E402
 from nextview.training import maps  # noqa: E402
+from nextview.training.architectures import ResNet, ViewMap  # noqa: E402
+from nextview.training.azimuth_bins import azimuth_bins, mirror_planes, side_loss  # noqa: E402
+from nextview.training.checkpoints import exported_networks, load_exported, refuse_seen  # noqa: E402
 from nextview.training.hardware import Hardware  # noqa: E402
-from nextview.training.networks import ResNet, ViewMap  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
-from nextview.training.sides import mirror_planes, side_loss, sides  # noqa: E402
-from nextview.training.weights import exported_networks, load_exported, refuse_seen  # noqa: E402
 from nextview.viewsphere import ViewSphere  # noqa: E402
 
 SPHERE = ViewSphere((0.0, 30.0), 8, 3.0)
@@ -47,13 +47,13 @@ def test_the_mirror_plane_is_the_one_that_maps_the_views_into_each_other(tmp_pat
         values.append(profile[:, distance].ravel())
     store = measured_store(tmp_path, np.array(values), labels)
     assert mirror_planes(store, np.arange(15)).tolist() == [0, 1, 2]
-    assert sides(store, 8, np.array([0.0, 1.0, 2.0])).reshape(15, 2, 8)[:, :, 0].tolist() == [
+    assert azimuth_bins(store, 8, np.array([0.0, 1.0, 2.0])).reshape(15, 2, 8)[:, :, 0].tolist() == [
         [(-label) % 8] * 2 for label in labels
     ]
 
 
 def test_a_turned_object_is_seen_from_the_side_that_its_turn_says():
-    """The mesh is turned back by the angle and looks as if it had never been turned."""
+    """The mesh is turned back by the angle and views as if it had never been turned."""
     mesh = make_mesh(
         np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0.7]], float), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3]])
     )
@@ -78,7 +78,7 @@ def test_the_turns_of_a_store_are_those_of_its_rendering(tmp_path):
     angle = turns(store)[0]
     assert angle == Deform(turn=True).draw(3, store.names[0])[1]
     # Views of the turned object from between two viewpoints: the side moves by the same angle the other way.
-    assert sides(store, 8, np.zeros(1))[0, 0] == pytest.approx((-angle / (2 * np.pi / 8)) % 8, abs=1e-4)
+    assert azimuth_bins(store, 8, np.zeros(1))[0, 0] == pytest.approx((-angle / (2 * np.pi / 8)) % 8, abs=1e-4)
 
 
 def test_the_side_between_two_steps_counts_by_nearness():
@@ -175,9 +175,9 @@ def test_a_map_network_goes_on_from_an_exported_one(boxes, tmp_path):
     begun, views = ViewMap(5, 8, 18, 4), torch.from_numpy(boxes).float() / 255
     load_exported(begun.resnet, lem, views, kinds=("lem",))
     with torch.no_grad():
-        said = begun.eval()(views)[0].numpy()
+        output = begun.eval()(views)[0].numpy()
     wanted = MapNetwork(lem).from_inputs(boxes)["lem-sphere"]
-    assert np.abs(said - wanted).max() < 0.02
+    assert np.abs(output - wanted).max() < 0.02
     assert np.ptp(wanted) > 0.1
     sphere, values = ViewSphere.named("40"), np.random.default_rng(1).random((4, 40)).astype(np.float32)
     seen = np.random.default_rng(0).choice(boxes[:, :, ::2, ::2], (4, 40))

@@ -21,15 +21,15 @@ from nextview.cli.presets import with_preset  # noqa: E402
 from nextview.cli.train import train_recogniser  # noqa: E402
 from nextview.data.folders import Entry  # noqa: E402
 from nextview.data.lock import only_one  # noqa: E402
-from nextview.data.split import split_training  # noqa: E402
+from nextview.data.splits import split_training  # noqa: E402
 from nextview.data.store import DONE, ViewStore  # noqa: E402
 from nextview.errors import DatasetError, ModelError  # noqa: E402
-from nextview.models.card import find_card  # noqa: E402
 from nextview.models.image_input import image_input  # noqa: E402
-from nextview.models.networks import RECOGNISER  # noqa: E402
+from nextview.models.inference import RECOGNISER  # noqa: E402
+from nextview.models.model_card import find_card  # noqa: E402
+from nextview.training.architectures import ResNet  # noqa: E402
 from nextview.training.grid import published_cells  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
-from nextview.training.networks import ResNet  # noqa: E402
 from nextview.training.packed import load_packed, pack, save_packed  # noqa: E402
 from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe  # noqa: E402
 from nextview.training.recogniser import RecogniserModule, Source, ValidationViews, Views, augment  # noqa: E402
@@ -97,10 +97,10 @@ def test_balanced_draws_even_out_the_classes():
 
 def test_deformed_twins_may_have_fewer_views_and_each_gets_its_share():
     own = np.zeros((6, 40, 1, 1, 1), np.uint8)
-    twins = [np.full((3, 20, 1, 1, 1), k, np.uint8) for k in (1, 2)]
+    duplicates = [np.full((3, 20, 1, 1, 1), k, np.uint8) for k in (1, 2)]
     row = np.array([0, 1, 2, -1, -1, -1])
     recipe = RecogniserRecipe(views=2000, batch=50, deformed_share=0.5)
-    sources = [Source(own, np.arange(6)), *(Source(twin, row) for twin in twins)]
+    sources = [Source(own, np.arange(6)), *(Source(duplicate, row) for duplicate in duplicates)]
     views = Views(sources, np.arange(3), np.zeros(6, int), recipe)
     found = np.concatenate([images.numpy().ravel() for images, _ in views])
     assert np.bincount(found) / len(found) == pytest.approx([0.5, 0.25, 0.25], abs=0.03)
@@ -196,17 +196,17 @@ def test_the_published_rate_halves_every_fifth_epoch():
 def test_the_published_optimiser_is_adam():
     torch.manual_seed(0)
     module = RecogniserModule(replace(THESIS_RECOGNISER, depth=18), 10, 1000)
-    twin = RecogniserModule(replace(THESIS_RECOGNISER, depth=18), 10, 1000)
-    twin.load_state_dict(module.state_dict())
+    duplicate = RecogniserModule(replace(THESIS_RECOGNISER, depth=18), 10, 1000)
+    duplicate.load_state_dict(module.state_dict())
     for network, optimizer in (
         (module.net, module.configure_optimizers()["optimizer"]),
-        (twin.net, torch.optim.Adam(twin.net.parameters(), lr=1e-3)),
+        (duplicate.net, torch.optim.Adam(duplicate.net.parameters(), lr=1e-3)),
     ):
         for _ in range(2):
             for k, parameter in enumerate(network.parameters()):
                 parameter.grad = torch.full_like(parameter, 0.1 * (k % 3 - 1)) + parameter.detach()
             optimizer.step()
-    for ours, theirs in zip(module.net.parameters(), twin.net.parameters(), strict=True):
+    for ours, theirs in zip(module.net.parameters(), duplicate.net.parameters(), strict=True):
         assert torch.allclose(ours, theirs, atol=1e-7)
 
 

@@ -15,31 +15,31 @@ from scipy.special import softmax
 from tests.test_lite import LITE2, checkpoint
 from tests.test_readme import write_off
 
+from nextview.calibration.valleys import valley_gains
 from nextview.cli.main import main
-from nextview.data import split
+from nextview.data import splits as split
+from nextview.data.input_views import input_views
 from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
-from nextview.data.seen import seen_views
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError
-from nextview.fitting.valleys import valley_gains
-from nextview.models.networks import MapNetwork, Recogniser
+from nextview.models.inference import MapNetwork, Recogniser
 from nextview.observation import Observation
 from nextview.viewsphere import ViewSphere
 
 torch = pytest.importorskip("torch")
 
 from nextview.benchmark.scores import map_scores, recogniser_scores  # noqa: E402
-from nextview.models.card import find_card  # noqa: E402
-from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
+from nextview.models.model_card import find_card  # noqa: E402
+from nextview.training.architectures import PointNet, ResNet, orthogonality  # noqa: E402
+from nextview.training.checkpoints import load_exported, load_run  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.lite import LiteNet  # noqa: E402
-from nextview.training.maps import MapModule, Windows  # noqa: E402
+from nextview.training.map_training import MapModule, Windows  # noqa: E402
 from nextview.training.merge import merge  # noqa: E402
-from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
+from nextview.training.onnx_export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
-from nextview.training.weights import load_exported, load_run  # noqa: E402
 
 
 def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
@@ -130,8 +130,8 @@ def trained(tmp_path_factory):
     table = boxes_mesh(SAMPLES["table"](), "table")
     for name, scale in (("table_small", 1), ("table_larger", 2)):
         write_off(root / "meshes/table/train" / f"{name}.off", replace(table, vertices=scale * table.vertices))
-    twin = root / "meshes/table/train/table_0.off"
-    (root / "meshes/monitor/train/monitor_twin.off").write_bytes(twin.read_bytes())
+    duplicate = root / "meshes/table/train/table_0.off"
+    (root / "meshes/monitor/train/monitor_twin.off").write_bytes(duplicate.read_bytes())
     store, runs, models = root / "views.zarr", root / "runs", root / "models"
     small = ["--epochs", "2", "--views", "4", "--batch", "8", "--validation", "0.25"]
     main(["render", str(root / "meshes"), str(store), "--workers", "1"])
@@ -149,12 +149,12 @@ def test_split_keeps_twins_together_and_test_objects_out(trained):
         assert not set(training) & set(validation)
         assert set(training) | set(validation) | set(split.test_objects(store)) == set(range(len(store)))
         assert (store.splits[[*training, *validation]] == "train").all()
-        twins = [store.names.index(name) for name in ("table_0", "monitor_twin")]
-        assert np.isin(twins, validation).sum() in (0, 2)
+        duplicates = [store.names.index(name) for name in ("table_0", "monitor_twin")]
+        assert np.isin(duplicates, validation).sum() in (0, 2)
         assert set(store.labels[validation]) == {0, 1}
         copies = np.isin([store.names.index(name) for name in ("table_small", "table_larger")], validation)
         assert copies.all() == copies.any()
-        judging = split.each_shape_once(store, validation)  # the twin has another label
+        judging = split.deduplicate(store, validation)  # the twin has another label
         assert len(judging) == len(validation) - copies.all()
 
 
@@ -183,11 +183,11 @@ def test_trained_models_have_cards_and_run(trained):
     assert card["classes"] == ["monitor", "table"]
     assert {part.split()[0] for part in card["scores"]} == {"validation"}  # training leaves the test split alone
     recogniser = Recogniser(trained / "models/tiny.json")
-    said = recogniser.from_inputs(np.zeros((3, 4, 112, 112), np.uint8))
-    assert said.logits.shape == (3, 2)
-    assert said.features.shape == (3, 512)
-    assert card["sides"] == recogniser.sides == 8
-    assert np.exp(said.sides).sum(2) == pytest.approx(np.ones((3, 2)), abs=1e-4)
+    output = recogniser.from_inputs(np.zeros((3, 4, 112, 112), np.uint8))
+    assert output.logits.shape == (3, 2)
+    assert output.features.shape == (3, 512)
+    assert card["azimuth_bins"] == recogniser.azimuth_bins == 8
+    assert np.exp(output.azimuth_bins).sum(2) == pytest.approx(np.ones((3, 2)), abs=1e-4)
     lem = MapNetwork(trained / "models/tiny-lem.json").from_inputs(np.zeros((2, 4, 56, 56), np.uint8))
     assert lem["lem"].shape == (2, 5, 3)
     assert lem["lem-sphere"].shape == (2, 5, 8)
@@ -199,7 +199,7 @@ def test_a_mirrored_view_has_the_mirrored_map(trained):
     options = ["--mirror", "--bits", "8", "--name", "both"]
     main(["export", "lem", str(run), str(store), str(trained / "models"), *options])
     network = MapNetwork(trained / "models/both.json")
-    seen = seen_views(ViewStore.open(store), 0, "geometry", 56)
+    seen = input_views(ViewStore.open(store), 0, "geometry", 56)
     maps, flipped = (network.from_inputs(np.ascontiguousarray(views)) for views in (seen, seen[..., ::-1]))
     assert np.abs(maps["lem"] - flipped["lem"][..., ::-1]).max() < 1e-5
     assert np.abs(maps["lem"] - maps["lem"][..., ::-1]).max() > 1e-4  # or nothing would be tested
@@ -212,7 +212,7 @@ def test_the_published_map_network_trains_on_clouds_and_predicts_the_window(trai
     recipe = json.loads((run / "recipe.json").read_text())
     assert (recipe["input"], recipe["batch"], recipe["schedule"]) == ("cloud", 16, "tenth")
     main(["export", "lem", str(run), store, str(trained / "models"), "--name", "published"])
-    cloud = seen_views(ViewStore.open(trained / "views.zarr"), 0, "cloud", 0)[:2]
+    cloud = input_views(ViewStore.open(trained / "views.zarr"), 0, "cloud", 0)[:2]
     assert {k: v.shape for k, v in MapNetwork(trained / "models/published.json").from_inputs(cloud).items()} == {
         "lem": (2, 5, 3)
     }
@@ -284,15 +284,15 @@ def within_one_cell(at, other):
 @pytest.mark.parametrize("reach", [0, 1])
 def test_the_peak_weighs_in_which_cell_of_the_window_is_highest(monkeypatch, reach):
     rng, sphere = np.random.default_rng(0), ViewSphere.named("40")
-    said, true = rng.random((2, 4, 5, 8)).astype(np.float32)
+    output, true = rng.random((2, 4, 5, 8)).astype(np.float32)
     module = MapModule(MapRecipe(peak=0.3, sharpness=0.1, reach=reach), sphere, 1)
-    monkeypatch.setattr(module, "forward", lambda seen: (torch.from_numpy(said),))
+    monkeypatch.setattr(module, "forward", lambda seen: (torch.from_numpy(output),))
     monkeypatch.setattr(module, "log", lambda *args, **options: None)
     loss = module.training_step((torch.zeros(4), torch.from_numpy(true)), 0)
-    near, goal = (values[:, :, [-1, 0, 1]].reshape(4, 15) for values in (said, true))
+    near, goal = (values[:, :, [-1, 0, 1]].reshape(4, 15) for values in (output, true))
     counts = [[k == best or (reach and within_one_cell(k, best)) for k in range(15)] for best in goal.argmax(1)]
     chance = (softmax(near / 0.1, 1) * counts).sum(1)
-    squared = (((near - goal) ** 2).mean() + ((said - true) ** 2).mean()) / 2
+    squared = (((near - goal) ** 2).mean() + ((output - true) ** 2).mean()) / 2
     assert loss.item() == pytest.approx(squared - 0.3 * np.log(chance).mean(), rel=1e-5)
 
 
@@ -346,7 +346,7 @@ def test_valley_classes_are_fitted_to_objects_that_neither_network_has_seen(trai
     cards = ["--maps", f"lem={card}", "--recogniser", str(models / "tiny.json"), "--workers", "1"]
     main(["predict", store, str(out), "--unseen", *cards])
     main(["fit", "valleys", str(out), str(card)])
-    facts, p = json.loads(card.read_text()), Predictions.load(out).each_shape_once()
+    facts, p = json.loads(card.read_text()), Predictions.load(out).deduplicate()
     gains = valley_gains(p.sphere, p.logits, p.maps["lem"], p.labels)
     assert facts["valley_classes"] == [p.classes[c] for c, gain in gains.items() if gain > 0]
     assert facts["valley_gain"] == {p.classes[c]: round(gain, 4) for c, gain in gains.items()}
@@ -368,13 +368,13 @@ def test_a_recogniser_of_images_sees_images_live_and_in_predictions(trained):
     out = trained / "images.npz"
     main(["predict", str(store), str(out), "--maps", "--recogniser", str(models / "of-images.json"), "--workers", "1"])
     views, predictions = ViewStore.open(store), Predictions.load(out)
-    look = Observation(
+    observation = Observation(
         views.image(3)[7], views.depth(3)[7], views.points(3)[7], views.sphere.poses[7], views.intrinsics
     )
     at = predictions.names.index(views.names[3])
-    live = Recogniser(models / "of-images.json")([look]).logits
+    live = Recogniser(models / "of-images.json")([observation]).logits
     assert predictions.logits[at, 7] == pytest.approx(live[0], abs=1e-4)
-    dark = Recogniser(models / "of-images.json")([replace(look, image=look.image // 4)]).logits
+    dark = Recogniser(models / "of-images.json")([replace(observation, image=observation.image // 4)]).logits
     assert np.abs(live - dark).max() > 1e-3  # it does look at the image
     mixture = ["export", "recogniser", str(run), str(store), str(models), "--also", str(trained / "runs/recogniser")]
     with pytest.raises(SystemExit) as mixed:
@@ -414,7 +414,7 @@ def test_several_networks_are_exported_as_their_mean(trained):
     assert together.logits == pytest.approx(mean * scale, abs=2e-2)
     assert together.features.shape == (3, 1024)
     mirrored = jury.from_inputs(x[..., ::-1].copy())  # what was side 1 is side -1 in the mirror
-    assert together.sides == pytest.approx(mirrored.sides[..., -np.arange(8) % 8], abs=1e-3)
+    assert together.azimuth_bins == pytest.approx(mirrored.azimuth_bins[..., -np.arange(8) % 8], abs=1e-3)
 
 
 def test_a_network_that_sees_blocks_of_pixels(trained, capsys):
@@ -426,7 +426,7 @@ def test_a_network_that_sees_blocks_of_pixels(trained, capsys):
     assert (facts["input_size"], facts["blocks"]) == (112, 2)
     main(["export", "recogniser", str(trained / "models/blocks.json"), store, models, "--name", "again"])
     once, again = (Recogniser(trained / f"models/{name}.json") for name in ("blocks", "again"))
-    x = seen_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
+    x = input_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
     once, again = (model.from_inputs(x).logits * model.card.facts["temperature"] for model in (once, again))
     assert once == pytest.approx(again, abs=2e-2)
     with pytest.raises(SystemExit):
@@ -443,15 +443,15 @@ def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
     run, store, models = trained / "runs/recogniser", trained / "views.zarr", trained / "models"
     command = ["export", "recogniser", str(run), str(store), str(models)]
     main([*command, "--name", "two", "--also", str(models / "tiny.json")])
-    x = seen_views(ViewStore.open(store), 0, "geometry", 112)[:3]
+    x = input_views(ViewStore.open(store), 0, "geometry", 112)[:3]
     alone, joined = Recogniser(models / "tiny.json"), Recogniser(models / "two.json")
     facts = joined.card.facts
     assert facts["network"] == "ResNet-18 + ResNet-18"
     assert facts["unseen"] == alone.card.facts["unseen"]
     assert len(facts["training"]["recipes"]) == 2
-    raw, said = alone.from_inputs(x).logits * alone.card.facts["temperature"], joined.from_inputs(x)
-    assert said.features.shape == (3, 1024)
-    assert said.logits * facts["temperature"] == pytest.approx(raw, abs=2e-2)
+    raw, output = alone.from_inputs(x).logits * alone.card.facts["temperature"], joined.from_inputs(x)
+    assert output.features.shape == (3, 1024)
+    assert output.logits * facts["temperature"] == pytest.approx(raw, abs=2e-2)
     with pytest.raises(SystemExit):
         main([*command, "--name", "three", "--also", str(models / "two.json")])
     with pytest.raises(ModelError, match="not one network"):
@@ -461,8 +461,8 @@ def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
         main([*command, "--also", str(models / "tiny-lem.json")])
     assert "not a recogniser" in capsys.readouterr().err
     facts = json.loads((models / "tiny.json").read_text())
-    for name, told in (("foreign", facts | {"unseen": ["chair_9"]}), ("silent", facts | {"training": {}})):
-        (models / f"{name}.json").write_text(json.dumps(told))
+    for name, features in (("foreign", facts | {"unseen": ["chair_9"]}), ("silent", facts | {"training": {}})):
+        (models / f"{name}.json").write_text(json.dumps(features))
         shutil.copy(models / "tiny.onnx", models / f"{name}.onnx")
         with pytest.raises(SystemExit):
             main([*command, "--also", str(models / f"{name}.json")])
@@ -503,7 +503,7 @@ def test_merged_runs_ship_as_one_network_that_training_goes_on_from(trained, cap
     assert "name the others with --also" in capsys.readouterr().err
     main([*command, "--also", str(runs / "recogniser")])
     assert json.loads((models / "merged.json").read_text())["network"] == "ResNet-18, the mean of 2 runs"
-    views = seen_views(ViewStore.open(store), 0, "geometry", 112)
+    views = input_views(ViewStore.open(store), 0, "geometry", 112)
     assert np.isfinite(Recogniser(models / "merged.json").from_inputs(views).logits).all()
     load_exported(ResNet(18, 2, 4, 8), models / "merged.json", torch.from_numpy(views).float() / 255)
 
@@ -514,14 +514,14 @@ def test_eight_bits_a_weight_are_enough_for_the_answers_and_nearly_halve_the_fil
     with torch.no_grad():  # every row of another magnitude, as in trained networks
         network.layer4[1].conv1.weight *= torch.logspace(-2, 1, 512)[:, None, None, None]
     x = np.random.default_rng(0).random((2, 4, 64, 64)).astype(np.float32)
-    said = {}
+    output = {}
     for bits in (16, 8):
         export_onnx(network, x, "input", ["logits", "features"], tmp_path / f"{bits}.onnx", bits)
         session = ort.InferenceSession(tmp_path / f"{bits}.onnx", providers=["CPUExecutionProvider"])
-        said[bits] = session.run(["features"], {"input": x})[0]
+        output[bits] = session.run(["features"], {"input": x})[0]
     true = network(torch.from_numpy(x))[1].detach().numpy()
-    assert np.abs(said[8] - true).max() < 0.02 * np.abs(true).max()
-    assert np.abs(said[8] - true).max() > np.abs(said[16] - true).max()  # so they do have fewer
+    assert np.abs(output[8] - true).max() < 0.02 * np.abs(true).max()
+    assert np.abs(output[8] - true).max() > np.abs(output[16] - true).max()  # so they do have fewer
     assert (tmp_path / "8.onnx").stat().st_size < 0.55 * (tmp_path / "16.onnx").stat().st_size
 
 
@@ -551,11 +551,11 @@ def test_a_lite_network_goes_from_a_checkpoint_to_a_card_that_it_shares(trained,
     facts = find_card(models / "pair.json").facts
     assert facts["network"] == "EfficientNet-Lite2 + ResNet-18"
     assert [recipe["network"] for recipe in facts["training"]["recipes"]] == ["lite2", "resnet"]
-    x = seen_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
+    x = input_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
     alone, pair = Recogniser(models / "tiny.json"), Recogniser(models / "pair.json")
     with torch.no_grad():
-        said = load_run(LiteNet(2, 4, 8, scale=2), run)(torch.from_numpy(x).float() / 255)[0].numpy()
-    mean = (said + alone.from_inputs(x).logits * alone.card.facts["temperature"]) / 2
+        output = load_run(LiteNet(2, 4, 8, scale=2), run)(torch.from_numpy(x).float() / 255)[0].numpy()
+    mean = (output + alone.from_inputs(x).logits * alone.card.facts["temperature"]) / 2
     assert pair.from_inputs(x).logits * facts["temperature"] == pytest.approx(mean, abs=2e-2)
     main([*command[:3], str(trained / "runs/on"), *command[4:], "--weights", str(models / "pair.json")])
     with pytest.raises(SystemExit):

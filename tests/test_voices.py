@@ -11,8 +11,8 @@ from test_predictions import some_predictions
 SCRIPT = Path(__file__).parent.parent / "benchmarks" / "voices.py"
 
 
-def voices(*contestants):
-    return subprocess.run([sys.executable, str(SCRIPT), *map(str, contestants)], capture_output=True, text=True)
+def voices(*entries):
+    return subprocess.run([sys.executable, str(SCRIPT), *map(str, entries)], capture_output=True, text=True)
 
 
 def test_two_that_err_elsewhere_are_better_together(tmp_path):
@@ -20,7 +20,7 @@ def test_two_that_err_elsewhere_are_better_together(tmp_path):
     p = replace(p, splits=np.array(["train"] * 60))
     truth = 2.0 * np.eye(3)[p.labels][:, None]
     paths = []
-    for k in range(2):  # an error of its own for each object, which more looks do not take away
+    for k in range(2):  # an error of its own for each object, which more views do not take away
         logits = truth + 2.5 * rng.normal(size=(60, 1, 3)) + 0.3 * rng.normal(size=(60, 40, 3))
         paths.append(tmp_path / f"{k}.npz")
         replace(p, logits=logits.astype(np.float32)).save(paths[-1])
@@ -41,8 +41,8 @@ def test_others_objects_and_the_test_split_are_refused(tmp_path):
     train = replace(p, splits=np.array(["train"] * 6))
     train.save(tmp_path / "a.npz")
     replace(train, names=tuple("abcdef")).save(tmp_path / "b.npz")
-    for contestant, sentence in (("a.npz+b.npz", "not of the same objects"), ("test.npz", "test split")):
-        done = voices("+".join(str(tmp_path / part) for part in contestant.split("+")))
+    for entry, sentence in (("a.npz+b.npz", "not of the same objects"), ("test.npz", "test split")):
+        done = voices("+".join(str(tmp_path / part) for part in entry.split("+")))
         assert done.returncode != 0
         assert done.stderr.startswith("voices.py: ")
         assert sentence in done.stderr

@@ -1,4 +1,4 @@
-"""What one look yields, and what can take a look."""
+"""What one view yields, and what can take a view."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from nextview.errors import ObservationError
 
 POINTS = 1024
-"""Points in the partial cloud of one look (thesis, section 4.1.2)."""
+"""Points in the partial cloud of one view (thesis, section 4.1.2)."""
 FARTHEST = 50.0
 """Depth at which nothing counts as an object any more, object radii: depth cameras have large numbers for "nothing"."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """One look at an object.
+    """One view of an object.
 
     Attributes:
         image: grey image, (H, W) uint8, 0 where there is no object.

@@ -7,30 +7,30 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.belief import Stopping, fuse
 from nextview.episode import Episodes
 from nextview.errors import SessionError
-from nextview.models.networks import Models
+from nextview.models.inference import Models
 from nextview.observation import Camera, Observation
 from nextview.policies.base import Policy, maps_among
-from nextview.recognition import Stopping, fuse
 from nextview.viewsphere import ViewSphere
 
 
 @dataclass(frozen=True)
-class Look:
-    """One look and what followed from it.
+class View:
+    """One view and what followed from it.
 
     Attributes:
         view: where it was taken from.
         observation: what was seen.
         guess: what this image alone says, (classes,) float64.
-        belief: fused over all looks so far, (classes,) float64.
+        belief: fused over all views so far, (classes,) float64.
         maps: predicted local maps by name, each (rings, 3).
         next_view: where to look next; None where the episode ends.
         travel: so far, in grid cells.
         arc: so far, in radians.
-        sides: belief, over all looks, in the side of the object that is seen from here, for each class, (classes,
-            sides), in even steps of azimuth; None if the recogniser was not taught them.
+        azimuth bins: belief, over all views, in the side of the object that is seen from here, for each class, (classes,
+            azimuth bins), in even steps of azimuth; None if the recogniser was not taught them.
     """
 
     view: int
@@ -41,7 +41,7 @@ class Look:
     next_view: int | None
     travel: float
     arc: float
-    sides: NDArray[np.float64] | None = None
+    azimuth_bins: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -49,29 +49,29 @@ class Recognition:
     """The end of an episode.
 
     Attributes:
-        looks: in order.
+        views: in order.
         classes: their names.
         confident: whether the threshold was reached (else the views ran out).
     """
 
-    looks: tuple[Look, ...]
+    views: tuple[View, ...]
     classes: tuple[str, ...]
     confident: bool
 
     @property
     def answer(self) -> str:
         """The class believed most."""
-        return self.classes[int(self.looks[-1].belief.argmax())]
+        return self.classes[int(self.views[-1].belief.argmax())]
 
     @property
     def confidence(self) -> float:
         """The belief in the answer."""
-        return float(self.looks[-1].belief.max())
+        return float(self.views[-1].belief.max())
 
     @property
     def travel(self) -> float:
         """Of the whole episode, in grid cells."""
-        return self.looks[-1].travel
+        return self.views[-1].travel
 
 
 class Session:
@@ -99,13 +99,15 @@ class Session:
         stopping: Stopping = Stopping(),
         rng: np.random.Generator | None = None,
     ) -> None:
-        if "sides" in policy.needs and not models.recogniser.sides:
-            raise SessionError("this policy wants to know the side that is seen, and the recogniser was not taught it")
+        if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:
+            raise SessionError(
+                "this policy wants to know the azimuth bin that is seen, and the recogniser was not taught it"
+            )
         missing = [name for name in maps_among(policy.needs) if name.removesuffix("-sphere") not in models.maps]
         if missing:
             raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")
         self.models, self.sphere = models, sphere
-        self.looks: list[Look] = []
+        self.views: list[View] = []
         rng = rng or np.random.default_rng(0)
         calibration = models.recogniser.calibration
         self._episodes = Episodes(sphere, policy, np.array([start]), stopping, rng, calibration)
@@ -125,7 +127,7 @@ class Session:
         """Where to look now, as a camera-to-world pose (4, 4), OpenCV axes, object radii."""
         return self.sphere.poses[self.view]
 
-    def tell(self, observation: Observation) -> Look:
+    def tell(self, observation: Observation) -> View:
         """Take in what was seen from ``pose``.
 
         Raises:
@@ -135,13 +137,13 @@ class Session:
             raise SessionError("this session has ended; begin another one")
         step = self._episodes.tell(self.models.evidence([observation]))
         view, to = int(step.views[0]), int(step.next_views[0])
-        travel, arc = (self.looks[-1].travel, self.looks[-1].arc) if self.looks else (0.0, 0.0)
-        if self.looks:
-            travel += float(self.sphere.travel[self.looks[-1].view, view])
-            arc += float(self.sphere.arc[self.looks[-1].view, view])
+        travel, arc = (self.views[-1].travel, self.views[-1].arc) if self.views else (0.0, 0.0)
+        if self.views:
+            travel += float(self.sphere.travel[self.views[-1].view, view])
+            arc += float(self.sphere.arc[self.views[-1].view, view])
         calibration, azimuth = self._episodes.calibration, self.sphere.turn[step.views]
-        sides = calibration.sides(step.total, len(self.looks) + 1, len(self.models.classes), azimuth)
-        look = Look(
+        azimuth_bins = calibration.azimuth_bins(step.total, len(self.views) + 1, len(self.models.classes), azimuth)
+        view = View(
             view,
             observation,
             fuse(step.evidence.logits[:, None], self._episodes.calibration.temperature(1))[0],
@@ -150,10 +152,10 @@ class Session:
             None if to < 0 else to,
             travel,
             arc,
-            None if sides is None else sides[0],
+            None if azimuth_bins is None else azimuth_bins[0],
         )
-        self.looks.append(look)
-        return look
+        self.views.append(view)
+        return view
 
     @property
     def result(self) -> Recognition:
@@ -162,7 +164,7 @@ class Session:
         Raises:
             SessionError: it has not.
         """
-        return Recognition(tuple(self.looks), self.models.classes, bool(self._episodes.outcome.confident[0]))
+        return Recognition(tuple(self.views), self.models.classes, bool(self._episodes.outcome.confident[0]))
 
 
 def recognise(

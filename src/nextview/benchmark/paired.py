@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.benchmark.evaluate import fused_views
+from nextview.belief import Calibration
+from nextview.benchmark.evaluation import fused_views
 from nextview.benchmark.statistics import interval, ratio, resample
 from nextview.data.predictions import Predictions
 from nextview.errors import PredictionsError
-from nextview.recognition import Calibration
 
 Float = NDArray[np.float64]
-LOOKS = (1, 2, 3, 5, 8, 15, 40)
+VIEW_COUNTS = (1, 2, 3, 5, 8, 15, 40)
 
 
 def of_the_same(paths: Sequence[Path]) -> list[Predictions]:
@@ -32,9 +32,9 @@ def of_the_same(paths: Sequence[Path]) -> list[Predictions]:
     return tables
 
 
-def accuracy_after_looks(p: Predictions, calibration: Calibration) -> Float:
-    """How often each object is named right after 1, 2, ... looks, over a random order of views turned round, (V, N)."""
-    return fused_views(p.said, p.labels, calibration, np.random.default_rng(0), len(p.classes))[0].mean(2)
+def accuracy_after_views(p: Predictions, calibration: Calibration) -> Float:
+    """How often each object is named right after 1, 2, ... views, over a random order of views turned round, (V, N)."""
+    return fused_views(p.log_evidence, p.labels, calibration, np.random.default_rng(0), len(p.classes))[0].mean(2)
 
 
 def in_points(before: Float, after: Float, samples: int = 2000) -> str:
@@ -46,14 +46,14 @@ def in_points(before: Float, after: Float, samples: int = 2000) -> str:
 
 
 def rows(before: Float, after: Float, labels: NDArray[np.int64]) -> Iterator[str]:
-    """Looks, accuracy both ways (class mean in brackets), and the difference where there is one.
+    """Views, accuracy both ways (class mean in brackets), and the difference where there is one.
 
     Args:
-        before: of ``accuracy_after_looks``, (V, N).
+        before: of ``accuracy_after_views``, (V, N).
         after: the other way, (V, N).
         labels: of the objects, (N,).
     """
-    for k in [k for k in LOOKS if k <= len(before)]:
+    for k in [k for k in VIEW_COUNTS if k <= len(before)]:
         both = before[k - 1], after[k - 1]
         cells = [f"{r.mean():.3f} ({np.mean([r[labels == c].mean() for c in np.unique(labels)]):.3f})" for r in both]
         yield f"| {k} | {cells[0]} | {cells[1]} | {in_points(*both) if (both[0] != both[1]).any() else ''} |"

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from nextview.benchmark.replay import Ends
+from nextview.benchmark.replay import Outcomes
 from nextview.benchmark.run import Grid
 from nextview.benchmark.summary import Tables
 from nextview.data.predictions import Predictions
@@ -56,7 +56,7 @@ def save(folder: Path, grid: Grid, tables: Tables, settings: dict[str, Any]) -> 
         _write_episodes(part / "episodes.parquet", grid)
         for name, table in tables.named().items():
             table.to_csv(part / f"{name}.csv", index=False)
-        grid.trials.predictions.save(part / "predictions.npz")
+        grid.specs.predictions.save(part / "predictions.npz")
         (part / "benchmark.json").write_text(json.dumps(settings, indent=1) + "\n")
 
 
@@ -104,9 +104,9 @@ def load(folder: Path) -> Results:
 
 def _write_episodes(path: Path, grid: Grid) -> None:
     """One row an episode, one row group a cell."""
-    p, runs = grid.trials.predictions, grid.runs
-    names = pa.DictionaryArray.from_arrays(pa.array(grid.trials.objects, pa.int32()), pa.array(p.names))
-    labels = pa.DictionaryArray.from_arrays(pa.array(grid.trials.labels, pa.int32()), pa.array(p.classes))
+    p, runs = grid.specs.predictions, grid.runs
+    names = pa.DictionaryArray.from_arrays(pa.array(grid.specs.objects, pa.int32()), pa.array(p.names))
+    labels = pa.DictionaryArray.from_arrays(pa.array(grid.specs.labels, pa.int32()), pa.array(p.classes))
     run = pa.array(np.repeat(np.arange(runs, dtype=np.int32), len(p)))
     writer = None
     for policy, threshold, ends in grid.cells():
@@ -118,11 +118,11 @@ def _write_episodes(path: Path, grid: Grid) -> None:
                 "run": run,
                 "policy": _constant(policy, len(names)),
                 "threshold": pa.array(np.full(len(names), np.nan if threshold is None else threshold)),
-                "views": _lists(grid.paths[policy].views, ends.looks),
+                "views": _lists(grid.paths[policy].views, ends.n_views),
                 "stop": _stops(ends, fixed),
                 "answer": pa.DictionaryArray.from_arrays(pa.array(ends.answer, pa.int32()), pa.array(p.classes)),
                 "confidence": pa.array(ends.confidence),
-                "looks": pa.array(ends.looks, pa.int32()),
+                "n_views": pa.array(ends.n_views, pa.int32()),
                 "travel": pa.array(ends.travel),
                 "arc": pa.array(ends.arc),
             }
@@ -140,12 +140,12 @@ def _constant(text: str, n: int) -> pa.DictionaryArray:
 STOPS = ("views ran out", "confident", "fixed views")
 
 
-def _stops(ends: Ends, fixed: bool) -> pa.DictionaryArray:
+def _stops(ends: Outcomes, fixed: bool) -> pa.DictionaryArray:
     return pa.DictionaryArray.from_arrays(pa.array(np.where(fixed, 2, ends.confident), pa.int32()), pa.array(STOPS))
 
 
-def _lists(views: NDArray[np.int64], looks: NDArray[np.int64]) -> pa.ListArray:
+def _lists(views: NDArray[np.int64], n_views: NDArray[np.int64]) -> pa.ListArray:
     """The first so many views of each row, as lists."""
-    taken = np.arange(views.shape[1]) < looks[:, None]
-    offsets = np.concatenate([[0], np.cumsum(looks)]).astype(np.int32)
+    taken = np.arange(views.shape[1]) < n_views[:, None]
+    offsets = np.concatenate([[0], np.cumsum(n_views)]).astype(np.int32)
     return pa.ListArray.from_arrays(pa.array(offsets), pa.array(views[taken].astype(np.int16)))

@@ -9,8 +9,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from nextview.recognition import Stopping
-from nextview.session import Look, Recognition
+from nextview.belief import Stopping
+from nextview.session import Recognition, View
 from nextview.viewsphere import ViewSphere
 
 
@@ -19,16 +19,16 @@ def _angles(sphere: ViewSphere, view: int) -> str:
     return f"{view}\n{elevation:.0f}°, {azimuth:.0f}°"
 
 
-def _peak(sphere: ViewSphere, look: Look) -> tuple[int, float] | None:
-    """View and value of the highest cell of the look's predicted map."""
-    for predicted in look.maps.values():
+def _peak(sphere: ViewSphere, view: View) -> tuple[int, float] | None:
+    """View and value of the highest cell of the view's predicted map."""
+    for predicted in view.maps.values():
         cell = int(predicted.argmax())
-        return int(sphere.window(look.view).flat[cell]), float(predicted.flat[cell])
+        return int(sphere.window(view.view).flat[cell]), float(predicted.flat[cell])
     return None
 
 
 def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: Stopping) -> None:
-    """Print each look and the answer."""
+    """Print each view and the answer."""
     table = Table(
         box=box.SIMPLE,
         show_lines=True,
@@ -39,26 +39,26 @@ def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: 
     )
     for column in ("step", "view", "image says", "belief, top 3", "map's peak", "next", "travel"):
         table.add_column(column, justify="right" if column in ("step", "travel") else "left", no_wrap=True)
-    for step, look in enumerate(result.looks, 1):
-        top = np.argsort(-look.belief)[:3]
-        own = int(look.guess.argmax())
-        peak = _peak(sphere, look)
+    for step, view in enumerate(result.views, 1):
+        top = np.argsort(-view.belief)[:3]
+        own = int(view.guess.argmax())
+        peak = _peak(sphere, view)
         table.add_row(
             str(step),
-            _angles(sphere, look.view),
-            f"{result.classes[own]}\n{look.guess[own]:.3f}",
-            "\n".join(f"{result.classes[c]} {look.belief[c]:.3f}" for c in top),
+            _angles(sphere, view.view),
+            f"{result.classes[own]}\n{view.guess[own]:.3f}",
+            "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top),
             "-" if peak is None else f"{_angles(sphere, peak[0])}\n{peak[1]:.2f}",
-            "stop" if look.next_view is None else _angles(sphere, look.next_view),
-            f"{look.travel:.2f}",
+            "stop" if view.next_view is None else _angles(sphere, view.next_view),
+            f"{view.travel:.2f}",
         )
     console = Console()
     console.print(table)
-    bar = float(stopping.bar(len(result.looks)))
-    reason = f"threshold {bar:.3g} reached" if result.confident else "no views left"
+    threshold_at = float(stopping.threshold_at(len(result.views)))
+    reason = f"threshold {threshold_at:.3g} reached" if result.confident else "no views left"
     console.print(
-        f"It is a [bold]{result.answer}[/bold], belief {result.confidence:.3f}, after {len(result.looks)} "
-        f"look{'s' * (len(result.looks) > 1)} and {result.travel:.2f} cells of travel ({reason})."
+        f"It is a [bold]{result.answer}[/bold], belief {result.confidence:.3f}, after {len(result.views)} "
+        f"look{'s' * (len(result.views) > 1)} and {result.travel:.2f} cells of travel ({reason})."
     )
 
 
@@ -68,25 +68,25 @@ def as_json(result: Recognition, sphere: ViewSphere) -> str:
     def rounded(values: np.ndarray) -> list:
         return np.round(np.asarray(values, float), 6).tolist()
 
-    looks = []
-    for look in result.looks:
-        peak = _peak(sphere, look)
-        side = None if look.sides is None else look.sides[look.belief.argmax()]
-        looks.append(
+    views = []
+    for view in result.views:
+        peak = _peak(sphere, view)
+        side = None if view.azimuth_bins is None else view.azimuth_bins[view.belief.argmax()]
+        views.append(
             {
-                "view": look.view,
-                "elevation": sphere.angles(look.view)[0],
-                "azimuth": sphere.angles(look.view)[1],
-                "image_says": dict(zip(result.classes, rounded(look.guess), strict=True)),
-                "belief": dict(zip(result.classes, rounded(look.belief), strict=True)),
+                "view": view.view,
+                "elevation": sphere.angles(view.view)[0],
+                "azimuth": sphere.angles(view.view)[1],
+                "image_says": dict(zip(result.classes, rounded(view.guess), strict=True)),
+                "belief": dict(zip(result.classes, rounded(view.belief), strict=True)),
                 "side": None
                 if side is None
                 else {"degrees": 360 * int(side.argmax()) / len(side), "belief": round(float(side.max()), 6)},
-                "maps": {name: rounded(values) for name, values in look.maps.items()},
+                "maps": {name: rounded(values) for name, values in view.maps.items()},
                 "map_peak": None if peak is None else peak[0],
-                "next_view": look.next_view,
-                "travel_cells": round(look.travel, 6),
-                "travel_radians": round(look.arc, 6),
+                "next_view": view.next_view,
+                "travel_cells": round(view.travel, 6),
+                "travel_radians": round(view.arc, 6),
             }
         )
     return json.dumps(
@@ -94,7 +94,7 @@ def as_json(result: Recognition, sphere: ViewSphere) -> str:
             "answer": result.answer,
             "confidence": round(result.confidence, 6),
             "threshold_reached": result.confident,
-            "looks": looks,
+            "n_views": views,
         },
         indent=1,
     )

@@ -57,14 +57,14 @@ def export_recogniser(
 
     from nextview.benchmark.scores import recogniser_scores
     from nextview.cli.progress import console
-    from nextview.data.split import each_shape_once
+    from nextview.data.splits import deduplicate
     from nextview.data.store import ViewStore
-    from nextview.models.card import write_card
-    from nextview.models.networks import Recogniser
-    from nextview.training.export import CalibratedRecogniser, answer, export_onnx, fit_temperature
+    from nextview.models.inference import Recogniser
+    from nextview.models.model_card import write_card
     from nextview.training.inputs import load_inputs
     from nextview.training.members import member, member_networks
     from nextview.training.merge import merge
+    from nextview.training.onnx_export import CalibratedRecogniser, answer, export_onnx, fit_temperature
     from nextview.training.recogniser import drawn_views
 
     if merged and not also:
@@ -107,11 +107,11 @@ def export_recogniser(
     uncalibrated = CalibratedRecogniser(networks, 1.0, mirror)
     if blocks != {1}:
         (facts["blocks"],) = blocks
-    if uncalibrated.sides:
-        facts["sides"] = uncalibrated.sides
+    if uncalibrated.azimuth_bins:
+        facts["azimuth_bins"] = uncalibrated.azimuth_bins
     export_onnx(uncalibrated, example, "input", uncalibrated.outputs, weights, bits)
     write_card(card, facts)
-    plain, judging = Recogniser(card), each_shape_once(views, validation)
+    plain, judging = Recogniser(card), deduplicate(views, validation)
     raw = _tracked(lambda i: plain.from_inputs(inputs[i]).logits, judging, "validation views")
     labels = views.labels[judging]
     temperature = fit_temperature(raw.reshape(-1, raw.shape[2]), np.repeat(labels, raw.shape[1]))
@@ -223,16 +223,16 @@ def _export_map(
 
     from nextview.benchmark.scores import map_scores
     from nextview.cli.progress import console
-    from nextview.data.seen import seen_views
-    from nextview.data.split import each_shape_once, split_training
+    from nextview.data.input_views import input_views
+    from nextview.data.splits import deduplicate, split_training
     from nextview.data.store import ViewStore
-    from nextview.models.card import write_card
-    from nextview.models.networks import MapNetwork
-    from nextview.training.export import ShippedMap, answer, export_onnx
-    from nextview.training.networks import map_network
+    from nextview.models.inference import MapNetwork
+    from nextview.models.model_card import write_card
+    from nextview.training.architectures import map_network
+    from nextview.training.checkpoints import load_run
+    from nextview.training.onnx_export import ShippedMap, answer, export_onnx
     from nextview.training.recipes import MapRecipe
     from nextview.training.runs import read_recipe
-    from nextview.training.weights import load_run
 
     recipe = read_recipe(run, MapRecipe)
     views = ViewStore.open(store)
@@ -245,7 +245,7 @@ def _export_map(
     out.mkdir(parents=True, exist_ok=True)
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
     size = recipe.size if recipe.input != "cloud" else 0
-    sample = seen_views(views, int(validation[0]), recipe.input, size)[3:11]
+    sample = input_views(views, int(validation[0]), recipe.input, size)[3:11]
     export_onnx(shipped, sample, "seen", ["map", "sphere"] if shipped.whole else ["map"], weights, bits)
     facts: dict[str, Any] = {
         "name": name,
@@ -266,9 +266,9 @@ def _export_map(
         raise ModelError(f"{weights}: its maps differ from the network's by up to {difference:.2g}")
 
     def one(i: int) -> NDArray:
-        return predictor.from_inputs(seen_views(views, i, *predictor.sees))[kind]
+        return predictor.from_inputs(input_views(views, i, *predictor.sees))[kind]
 
-    judging = each_shape_once(views, validation)
+    judging = deduplicate(views, validation)
     maps = _tracked(one, judging, "validation maps")
     shape = (-1, sphere.rings, 3)
     true = target.values[judging][:, sphere.windows]

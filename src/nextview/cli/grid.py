@@ -47,8 +47,8 @@ def train_grid(
     from nextview.data.store import ViewStore
     from nextview.report.grid_figure import grid_figure
     from nextview.report.style import to_png
-    from nextview.training.fit import is_first
     from nextview.training.grid import published_cells
+    from nextview.training.loop import is_first
 
     views = ViewStore.open(store)
     cells = {
@@ -85,7 +85,7 @@ def _scores(run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe) 
     import numpy as np
 
     from nextview.cli.progress import track
-    from nextview.data.split import test_objects
+    from nextview.data.splits import test_objects
     from nextview.report.training_curves import read_log
     from nextview.training.grid import count_right
     from nextview.training.inputs import load_inputs

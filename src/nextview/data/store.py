@@ -189,7 +189,7 @@ class ViewStore:
         return self.array("radius")[:] * UNITS[unit]
 
     @property
-    def twins(self) -> list[list[int]]:
+    def duplicates(self) -> list[list[int]]:
         """Groups of objects whose mesh files hold the same bytes; none are known in a store made without hashes."""
         groups: dict[str, list[int]] = {}
         for i, digest in enumerate(self.group.attrs.get("sha256", ())):

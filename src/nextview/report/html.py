@@ -47,7 +47,7 @@ def page(results: Results, pictures: Pictures) -> str:
     failures = worst_failures(results.episodes(best, at))
     sections = [
         ("results", "Results", _results(results, at)),
-        ("curves", "Accuracy against its price", _curves(results, at)),
+        ("curves", "Accuracy against its travel weight", _curves(results, at)),
         ("calibration", "Is the confidence worth its name?", _calibration(results, best, at)),
         ("classes", "By class", _classes(results, best, at)),
         ("fixed", "Fixed views", tables.five_views(results)),
@@ -67,13 +67,13 @@ def _headline(results: Results, best: str, at: float) -> str:
 
     def of(policy: str) -> str:
         n = found[policy, at, "accuracy"]
-        looks, travel = found[policy, at, "looks"].value, found[policy, at, "travel_all"].value
+        n_views, travel = found[policy, at, "n_views"].value, found[policy, at, "travel_all"].value
         return card(
             escape(policy), f"{100 * n.value:.1f} %",
-            f"{100 * n.low:.1f} &ndash; {100 * n.high:.1f} %; {looks:.2f} looks, {travel:.2f} cells",
+            f"{100 * n.low:.1f} &ndash; {100 * n.high:.1f} %; {n_views:.2f} looks, {travel:.2f} cells",
         )  # fmt: skip
 
-    cards = [card("one look", f"{100 * first['accuracy']:.1f} %", "no travel")]
+    cards = [card("one view", f"{100 * first['accuracy']:.1f} %", "no travel")]
     ran = set(results.tables.sweep["policy"])
     cards += [of(name) for name in dict.fromkeys((reference, best)) if name in ran]
     if "oracle-gain" in ran:
@@ -108,8 +108,8 @@ def _verdict(results: Results, best: str, at: float) -> str:
 def _spoken(results: Results, policies: Sequence[str], at: float, measure: str) -> str:
     """The numbers of a figure in words, for those who cannot see it."""
     found = numbers(results.tables.summary, "policy", "threshold", "measure")
-    said = (f"{name} {found[name, at, measure].value:.3f}" for name in policies if (name, at, measure) in found)
-    return f"At threshold {at:g}: " + ", ".join(said) + "."
+    shown = (f"{name} {found[name, at, measure].value:.3f}" for name in policies if (name, at, measure) in found)
+    return f"At threshold {at:g}: " + ", ".join(shown) + "."
 
 
 def _others(results: Results, where: str = "the tables") -> str:
@@ -138,7 +138,7 @@ def _results(results: Results, at: float) -> str:
                     + _spoken(results, list(results.tables.sweep["policy"].unique()), at, measure),
                     f"Difference in {what} at threshold {at:g}; filled where Holm's p is under 0.05.",
                 )
-                for measure, what in (("accuracy", "accuracy"), ("looks", "looks"), ("travel_all", "travel"))
+                for measure, what in (("accuracy", "accuracy"), ("n_views", "n_views"), ("travel_all", "travel"))
             ),
             small=True,
         )
@@ -148,8 +148,8 @@ def _results(results: Results, at: float) -> str:
 def _curves(results: Results, at: float) -> str:
     names = curves.compared(results)
     text = (
-        "<p>A threshold buys accuracy with looks and travel. The curves go through all thresholds from &ldquo;one look "
-        "for all&rdquo; to &ldquo;all looks for nearly all&rdquo;; the number beside a name is the curve's mean "
+        "<p>A threshold buys accuracy with views and travel. The curves go through all thresholds from &ldquo;one view "
+        "for all&rdquo; to &ldquo;all views for nearly all&rdquo;; the number beside a name is the curve's mean "
         "height.</p>"
     )
     figures = [
@@ -160,7 +160,7 @@ def _curves(results: Results, at: float) -> str:
         )
         for measure, what in (("class_accuracy", "Mean class accuracy"), ("accuracy", "Accuracy over objects"))
     ]
-    for budget, what in (("looks", "looks"), ("travel_all", "travel")):
+    for budget, what in (("n_views", "n_views"), ("travel_all", "travel")):
         if results.tables.sweep[budget].max() > results.tables.sweep[budget].min():
             figures.append(
                 picture(
@@ -218,10 +218,12 @@ def _failures(results: Results, best: str, at: float, failures: list, pictures: 
         strip = "".join(
             f'<img src="{shown[v]}" alt="{escape(name)} from view {v}" title="view {v}">' for v in views if v in shown
         )
-        twin = " Its very mesh is also in the data under another label." if p.conflicting[p.names.index(name)] else ""
+        duplicate = (
+            " Its very mesh is also in the data under another label." if p.conflicting[p.names.index(name)] else ""
+        )
         items.append(
             f"<li><strong>{escape(name)}</strong>, taken for {escape(str(episode['answer'])).replace('_', ' ')}: wrong "
-            f"in {wrong} of {results.settings['runs']} runs, on average {100 * confidence:.1f}&nbsp;% sure.{twin} "
+            f"in {wrong} of {results.settings['runs']} runs, on average {100 * confidence:.1f}&nbsp;% sure.{duplicate} "
             f'<span class="soft">Views {", ".join(map(str, views))}.</span><div class="strip">{strip}</div></li>'
         )
     if not items:
@@ -249,8 +251,8 @@ def _viewer(results: Results, best: str, at: float, failures: list, pictures: Pi
         "to turn, and use the buttons or the arrow keys to step.</p>"
         '<div id="viewer"><div><div class="controls">'
         '<select id="scene" aria-label="object"></select><select id="policy" aria-label="policy"></select>'
-        '<button id="back" aria-label="one look back">&#9664;</button>'
-        '<button id="next" aria-label="next look">&#9654;</button></div>'
+        '<button id="back" aria-label="one view back">&#9664;</button>'
+        '<button id="next" aria-label="next view">&#9654;</button></div>'
         '<div class="stage"><canvas id="sphere" tabindex="0" role="img"></canvas></div></div>'
         '<div><p id="why" class="soft"></p><p id="verdict" aria-live="polite"></p><ol id="looks"></ol></div></div>'
         f'<script type="application/json" id="trajectories">{data}</script>'

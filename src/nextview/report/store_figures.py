@@ -1,4 +1,4 @@
-"""Pictures of a view store: one object from all sides, the whole data set, and point correspondence."""
+"""Pictures of a view store: one object from all azimuth bins, the whole data set, and point correspondence."""
 
 from __future__ import annotations
 
@@ -140,8 +140,8 @@ def summary(store: ViewStore) -> dict[str, str]:
     size = sum(sizes.values())
     labels, done, views = store.labels, store.done, len(store.sphere)
     rendered = int(done.sum())
-    copies = sum(map(len, store.twins)) - len(store.twins)
-    conflicting = sum(len(set(labels[group])) > 1 for group in store.twins)
+    copies = sum(map(len, store.duplicates)) - len(store.duplicates)
+    conflicting = sum(len(set(labels[group])) > 1 for group in store.duplicates)
     side = store.group.attrs["size"]
     facts = {
         "objects": f"{len(store):,} in {len(store.classes)} classes",

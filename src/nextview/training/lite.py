@@ -72,7 +72,7 @@ class LiteNet(nn.Module):
     Args:
         classes: outputs.
         channels: of the input image (B, channels, H, W), values in 0 .. 1.
-        azimuths: sides that are told apart; 0 for none.
+        azimuths: azimuth bins that are told apart; 0 for none.
         scale: 0, 1 or 2: which of them, the smallest first.
         drop: chance in training that a pooled feature is dropped; the chance that a block with a shortcut is skipped
             for an image rises from 0 at the first block towards it at the last.

@@ -160,9 +160,9 @@ class GainRecipe:
     Attributes:
         inputs: what the networks are told; see ``policies.gain.INPUTS``.
         frame: from where azimuths are counted: from the camera's, or from the one at which the object is believed to
-            show its side 0, which takes a recogniser that was taught the sides.
-        outcome: of a look: belief in the true class after it, its logarithm, or whether the answer is right.
-        looks: the outcome of looks 2 to this one is learned.
+            show its azimuth bin 0, which takes a recogniser that was taught the azimuth bins.
+        outcome: of a view: belief in the true class after it, its logarithm, or whether the answer is right.
+        n_views: the outcome of views 2 to this one is learned.
         hidden: width of the two hidden layers.
         networks: that are averaged, of each fold; each weighs the objects by a bootstrap draw of its own.
         epochs: each over new walks of all objects.
@@ -182,7 +182,7 @@ class GainRecipe:
     )
     frame: Literal["camera", "object"] = "object"
     outcome: Literal["belief", "log-belief", "right"] = "log-belief"
-    looks: int = 5
+    n_views: int = 5
     hidden: int = 32
     networks: int = 2
     epochs: int = 15

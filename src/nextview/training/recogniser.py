@@ -16,28 +16,28 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.data import IterableDataset
 
-from nextview.training.fit import fit
+from nextview.training.architectures import recogniser_network
+from nextview.training.azimuth_bins import side_loss
+from nextview.training.checkpoints import load_checkpoint, load_exported
 from nextview.training.hardware import Hardware
-from nextview.training.networks import recogniser_network
+from nextview.training.loop import fit
 from nextview.training.packed import AHEAD, PackedViews, ask_for
 from nextview.training.recipes import RecogniserRecipe
-from nextview.training.sides import side_loss
-from nextview.training.weights import load_checkpoint, load_exported
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where views of the training objects come from: their own store or one of deformed twins.
+    """Where views of the training objects come from: their own store or one of deformed duplicates.
 
     Attributes:
         inputs: (rows, V, C, S, S) uint8.
         row: of each object in them, (N,).
-        sides: that each view sees of its object, (rows, V), see ``sides.sides``; None if they are not to be learned.
+        azimuth bins: that each view sees of its object, (rows, V), see ``azimuth bins.azimuth bins``; None if they are not to be learned.
     """
 
     inputs: NDArray[np.uint8] | PackedViews
     row: NDArray[np.int64]
-    sides: NDArray[np.float32] | None = None
+    azimuth_bins: NDArray[np.float32] | None = None
 
 
 class Views(IterableDataset):
@@ -46,7 +46,7 @@ class Views(IterableDataset):
     Balanced, objects are drawn with weight 1/sqrt(objects of their class), so that rare classes are seen more often,
     and views at random. Otherwise every view comes at most once an epoch, and once exactly if ``recipe.views`` takes
     all of them. The views of an object come from its own store or, with chance ``recipe.deformed_share``, from one of
-    its deformed twins, which may have other views.
+    its deformed duplicates, which may have other views.
     """
 
     def __init__(
@@ -85,9 +85,11 @@ class Views(IterableDataset):
                 k = coming[source[coming] == s]
                 ask_for(own.inputs, zip(row[k], view[k], strict=True))
             images = [self.sources[source[k]].inputs[row[k], view[k]] for k in batch]
-            told = [self.sources[source[k]].sides for k in batch]
-            sides = [known[row[k], view[k]] for k, known in zip(batch, told, strict=True) if known is not None]
-            drawn = [np.stack(images), self.labels[objects[batch]], *([np.array(sides)] if sides else [])]
+            known_bins = [self.sources[source[k]].azimuth_bins for k in batch]
+            azimuth_bins = [
+                known[row[k], view[k]] for k, known in zip(batch, known_bins, strict=True) if known is not None
+            ]
+            drawn = [np.stack(images), self.labels[objects[batch]], *([np.array(azimuth_bins)] if azimuth_bins else [])]
             yield tuple(map(torch.from_numpy, drawn))
 
 
@@ -231,7 +233,7 @@ def train(
     """Train and return the network of the best epoch; checkpoints in ``out``, from which a second call resumes.
 
     Args:
-        sources: the store's own, whose rows are the objects, and maybe those of deformed twins.
+        sources: the store's own, whose rows are the objects, and maybe those of deformed duplicates.
         labels: class of each object, (N,).
         training: objects that train.
         validation: objects that validate.
@@ -239,7 +241,7 @@ def train(
         out: folder for checkpoints and logs.
         weights: a published checkpoint, or the card of an exported recogniser, to start from.
         hardware: on what.
-        azimuths: sides of the object that the network learns to tell apart, 0 for none.
+        azimuths: azimuth bins of the object that the network learns to tell apart, 0 for none.
 
     Raises:
         ModelError: the weights or a checkpoint in ``out`` cannot be used.

@@ -15,8 +15,8 @@ from torch import nn
 
 from nextview.data.lock import only_one
 from nextview.errors import ModelError
-from nextview.models.card import file_hash, find_card
-from nextview.training.fit import is_first
+from nextview.models.model_card import file_hash, find_card
+from nextview.training.loop import is_first
 
 Recipe = TypeVar("Recipe")
 

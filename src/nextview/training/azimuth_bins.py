@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nextview.data.render import turns
+from nextview.data.rendering import turns
 from nextview.data.store import ViewStore
 
 
@@ -29,12 +29,16 @@ def mirror_planes(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.fl
     measured = store.measure()[objects].reshape(len(objects), -1, n).astype(np.float64)
     measured -= measured.mean((1, 2), keepdims=True)
     planes = np.arange(n)[: max(1, n // 2)]  # the plane through a view also holds the one opposite
-    alike = np.stack([(measured * measured[:, :, (2 * plane - np.arange(n)) % n]).sum((1, 2)) for plane in planes], 1)
+    duplicate_groups = np.stack(
+        [(measured * measured[:, :, (2 * plane - np.arange(n)) % n]).sum((1, 2)) for plane in planes], 1
+    )
     labels = store.labels[objects]
-    return np.array([planes[alike[labels == c].sum(0).argmax()] for c in range(len(store.classes))], np.float64)
+    return np.array(
+        [planes[duplicate_groups[labels == c].sum(0).argmax()] for c in range(len(store.classes))], np.float64
+    )
 
 
-def sides(store: ViewStore, azimuths: int, planes: NDArray[np.float64]) -> NDArray[np.float32]:
+def azimuth_bins(store: ViewStore, azimuths: int, planes: NDArray[np.float64]) -> NDArray[np.float32]:
     """The side that each view sees of its object, in 0 .. azimuths, (N, V).
 
     Args:
@@ -52,7 +56,7 @@ def side_loss(likely: Tensor, label: Tensor, side: Tensor) -> Tensor:
     """Mean cross-entropy of the side given the true class; between two steps, either counts by how near it is.
 
     Args:
-        likely: logarithms of the sides' likelihoods, (B, classes, azimuths).
+        likely: logarithms of the azimuth bins' likelihoods, (B, classes, azimuths).
         label: true classes, (B,).
         side: steps, (B,).
     """

@@ -16,11 +16,11 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from nextview.fitting.choices import ReplayTable, Worth, choices, follow, judge, mean_worth
+from nextview.calibration.rollout import ReplayTable, Value, candidate_values, judge, mean_value, rollout
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Random, RandomAll
-from nextview.policies.gain import Gain, mirrored, origin, told, told_mirrored
-from nextview.policies.tables import cells_from
+from nextview.policies.gain import Gain, features, mirrored, mirrored_features, origin
+from nextview.policies.learned_tables import cells_from
 from nextview.training.perceptrons import Layers, Perceptrons
 from nextview.training.recipes import GainRecipe
 
@@ -32,13 +32,13 @@ class States:
     """S states on walks, and what each choice would lead to; cells as in ``policies.tables``.
 
     Attributes:
-        told: to the networks, (S, D).
-        outcomes: of a look at each cell, less the mean over the free ones, (S, V).
+        features: to the networks, (S, D).
+        outcomes: of a view of each cell, less the mean over the free ones, (S, V).
         free: whether the cell is unvisited, (S, V) bool.
         objects: rows of the fitting set, (S,).
     """
 
-    told: NDArray[np.float32]
+    features: NDArray[np.float32]
     outcomes: NDArray[np.float32]
     free: NDArray[np.bool_]
     objects: NDArray[np.int64]
@@ -48,14 +48,14 @@ def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np
     """The states met when each of the policies is followed once over every object."""
     sphere, parts = table.data.sphere, []
     for policy in policies:
-        for moment in follow(table, policy, recipe.looks - 1, rng):
+        for moment in rollout(table, policy, recipe.n_views - 1, rng):
             state = moment.state
             view = cells_from(sphere)[origin(sphere, state, recipe.frame)]
-            worth = np.take_along_axis(choices(table, moment, recipe.outcome), view, 1)
+            value = np.take_along_axis(candidate_values(table, moment, recipe.outcome), view, 1)
             free = ~np.take_along_axis(state.visited, view, 1)
-            mean = (worth * free).sum(1, keepdims=True) / free.sum(1, keepdims=True)
-            seen = told(sphere, state, recipe.inputs, recipe.frame)
-            parts.append((seen.astype(np.float32), (worth - mean).astype(np.float32), free, state.episodes))
+            mean = (value * free).sum(1, keepdims=True) / free.sum(1, keepdims=True)
+            seen = features(sphere, state, recipe.inputs, recipe.frame)
+            parts.append((seen.astype(np.float32), (value - mean).astype(np.float32), free, state.episodes))
     return States(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
@@ -94,19 +94,19 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
         fold: makes for other draws than those of other folds.
 
     Yields:
-        After every epoch, the policy as it then is, at price 0 and over all views.
+        After every epoch, the policy as it then is, at travel weight 0 and over all views.
     """
     rng, data = np.random.default_rng([recipe.seed, fold]), table.data
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     sphere, c = data.sphere, len(data.classes)
-    flip = torch.from_numpy(told_mirrored(sphere, c, recipe.inputs, recipe.frame))
+    flip = torch.from_numpy(mirrored_features(sphere, c, recipe.inputs, recipe.frame))
     cells_flip = torch.from_numpy(mirrored(sphere))
     widths = [len(flip), recipe.hidden, recipe.hidden, len(sphere)]
     networks = Networks(widths, recipe.networks, generator)
     drawn = rng.multinomial(len(data), np.full(len(data), 1 / len(data)), size=recipe.networks)
     weights = torch.from_numpy(drawn * data.weights).float()
     optimiser = torch.optim.AdamW(networks.parameters(), recipe.rate, weight_decay=recipe.decay)
-    states_each = recipe.walks * (recipe.looks - 1) * len(data)
+    states_each = recipe.walks * (recipe.n_views - 1) * len(data)
     steps = recipe.epochs * -(-states_each // recipe.batch)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.rate, total_steps=steps)
     policy: Policy = RandomAll(sphere)
@@ -118,11 +118,11 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
         states = walk(table, policies, recipe, rng)
         order = rng.permutation(len(states.objects))
         for batch in np.array_split(order, -(-states_each // recipe.batch)):
-            seen, worth, free = (torch.from_numpy(a[batch]) for a in (states.told, states.outcomes, states.free))
+            seen, value, free = (torch.from_numpy(a[batch]) for a in (states.features, states.outcomes, states.free))
             turned = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
             seen = torch.where(turned, seen[:, flip], seen)
-            worth, free = (torch.where(turned, a[:, cells_flip], a) for a in (worth, free))
-            error = (((networks(seen) - worth) ** 2) * free).sum(-1) / free.sum(-1)
+            value, free = (torch.where(turned, a[:, cells_flip], a) for a in (value, free))
+            error = (((networks(seen) - value) ** 2) * free).sum(-1) / free.sum(-1)
             loss = (weights[:, states.objects[batch]] * error).sum() / len(batch)
             optimiser.zero_grad()
             loss.backward()
@@ -135,8 +135,8 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
 
 def best_epoch(
     folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], recipe: GainRecipe
-) -> Iterator[tuple[tuple[Gain, ...], Worth]]:
-    """After every epoch, the policies of the best epoch so far by their outcome over 2 to ``recipe.looks`` looks.
+) -> Iterator[tuple[tuple[Gain, ...], Value]]:
+    """After every epoch, the policies of the best epoch so far by their outcome over 2 to ``recipe.n_views`` looks.
 
     Args:
         folds: trainings side by side, each a policy an epoch.
@@ -148,13 +148,13 @@ def best_epoch(
     """
     best = None
     for policies in zip(*folds, strict=True):
-        worths = [
-            judge(table, policy, recipe.looks, recipe.outcome, np.random.default_rng([recipe.seed, 2]), rounds=4)
+        values = [
+            judge(table, policy, recipe.n_views, recipe.outcome, np.random.default_rng([recipe.seed, 2]), rounds=4)
             for table, policy in zip(tables, policies, strict=True)
         ]
-        worth = mean_worth(worths, [len(table.data) for table in tables])
-        if best is None or worth.outcome.mean() > best[1].outcome.mean():
-            best = policies, worth
+        value = mean_value(values, [len(table.data) for table in tables])
+        if best is None or value.outcome.mean() > best[1].outcome.mean():
+            best = policies, value
         yield best
 
 

@@ -15,14 +15,14 @@ from torch.nn import functional as F
 from torch.utils.data import IterableDataset
 
 from nextview.errors import ModelError
-from nextview.models.card import find_card
 from nextview.models.cloud_input import cloud_input
-from nextview.training.fit import fit
+from nextview.models.model_card import find_card
+from nextview.training.architectures import map_columns, map_network, orthogonality
+from nextview.training.checkpoints import load_exported
 from nextview.training.hardware import Hardware
-from nextview.training.networks import map_columns, map_network, orthogonality
+from nextview.training.loop import fit
 from nextview.training.packed import AHEAD, PackedViews, ask_for
 from nextview.training.recipes import MapRecipe
-from nextview.training.weights import load_exported
 from nextview.viewsphere import ViewSphere
 
 

@@ -9,7 +9,7 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 
 
-def alike(measured: NDArray[np.floating]) -> NDArray[np.int64]:
+def duplicate_groups(measured: NDArray[np.floating]) -> NDArray[np.int64]:
     """Which objects look the same from every view: a number for each, shared by those that do, (N,).
 
     Copies of a mesh, be they byte for byte or moved and scaled, have identical depth-entropies from all views, and
@@ -21,7 +21,7 @@ def alike(measured: NDArray[np.floating]) -> NDArray[np.int64]:
     return np.unique(measured, axis=0, return_inverse=True)[1].ravel()
 
 
-def distinct(labels: NDArray[np.int64], measured: NDArray[np.floating]) -> NDArray[np.int64]:
+def deduplicated(labels: NDArray[np.int64], measured: NDArray[np.floating]) -> NDArray[np.int64]:
     """One object of each shape and label, the first: indices, sorted.
 
     What is judged or fitted counts every shape once, so that one that was copied often does not rule.
@@ -30,7 +30,7 @@ def distinct(labels: NDArray[np.int64], measured: NDArray[np.floating]) -> NDArr
         labels: (N,).
         measured: depth-entropy from every view, (N, V).
     """
-    _, first = np.unique(np.stack([alike(measured), labels], 1), axis=0, return_index=True)
+    _, first = np.unique(np.stack([duplicate_groups(measured), labels], 1), axis=0, return_index=True)
     return np.sort(first)
 
 
@@ -40,7 +40,7 @@ def divide(
     """Divide objects into those that train and those that validate.
 
     What looks the same stays on one side, whatever its labels: objects are drawn, and their copies follow them. So a
-    shape that was copied often is drawn more often than others; see ``distinct``.
+    shape that was copied often is drawn more often than others; see ``deduplicated``.
 
     Args:
         labels: (N,).
@@ -51,13 +51,13 @@ def divide(
     Returns:
         Indices of either, sorted.
     """
-    twin = alike(measured)
+    duplicate = duplicate_groups(measured)
     rng = np.random.default_rng(seed)
     validates = np.zeros(len(labels), bool)
     for label in np.unique(labels):
         members = rng.permutation(np.flatnonzero(labels == label))
         validates[members[: round(share * len(members))]] = True
-    validates = np.isin(twin, twin[validates])
+    validates = np.isin(duplicate, duplicate[validates])
     return np.flatnonzero(~validates), np.flatnonzero(validates)
 
 
@@ -81,9 +81,9 @@ def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple
     return usable[training], usable[validation]
 
 
-def each_shape_once(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One object of each shape and label among some of a store, see ``distinct``."""
-    return objects[distinct(store.labels[objects], store.measure()[objects])]
+def deduplicate(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One object of each shape and label among some of a store, see ``deduplicated``."""
+    return objects[deduplicated(store.labels[objects], store.measure()[objects])]
 
 
 def test_objects(store: ViewStore) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SizeEvidence:
-    """How likely each size is for an object of each class; it is added to the logits of every look.
+    """How likely each size is for an object of each class; it is added to the logits of every view.
 
     Attributes:
         radii: object radii, metres, ascending, (R,). Beyond them the nearest counts.

@@ -20,10 +20,10 @@ SMALL = 2**17
 class CalibratedRecogniser(nn.Module):
     """The recogniser as it ships: raw input bytes in, logits over a temperature and pooled features out.
 
-    Where all networks know the sides of objects, a third output is what they say of them, see ``networks.ResNet``.
+    Where all networks know the azimuth bins of objects, a third output is what they say of them, see ``networks.ResNet``.
 
     Args:
-        networks: their logits are averaged, and what they say of the sides; their features are set side by side.
+        networks: their logits are averaged, and what they say of the azimuth bins; their features are set side by side.
         temperature: what the logits are divided by.
         mirror: whether every network also sees the mirrored view, and what it says of either is averaged.
     """
@@ -31,26 +31,26 @@ class CalibratedRecogniser(nn.Module):
     def __init__(self, networks: Sequence[nn.Module], temperature: float, mirror: bool = False) -> None:
         super().__init__()
         self.networks, self.temperature, self.mirror = nn.ModuleList(networks), temperature, mirror
-        told = {getattr(network, "azimuths", 0) for network in networks}
-        self.sides = told.pop() if len(told) == 1 else 0
+        bins = {getattr(network, "azimuths", 0) for network in networks}
+        self.azimuth_bins = bins.pop() if len(bins) == 1 else 0
 
     @property
     def outputs(self) -> list[str]:
         """Names of what it gives."""
-        return ["logits", "features", *(["sides"] if self.sides else [])]
+        return ["logits", "features", *(["azimuth_bins"] if self.azimuth_bins else [])]
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         x = x.float() / 255
-        logits, features, sides = [], [], []
+        logits, features, azimuth_bins = [], [], []
         for network in self.networks:
-            said = [network(x), network(x.flip(3))] if self.mirror else [network(x)]
-            logits += [each[0] for each in said]
-            features.append(torch.stack([each[1] for each in said]).mean(0))
-            if self.sides:
-                back = [-side % self.sides for side in range(self.sides)]
-                sides += [each[2][..., back] if k else each[2] for k, each in enumerate(said)]
+            outputs = [network(x), network(x.flip(3))] if self.mirror else [network(x)]
+            logits += [each[0] for each in outputs]
+            features.append(torch.stack([each[1] for each in outputs]).mean(0))
+            if self.azimuth_bins:
+                back = [-side % self.azimuth_bins for side in range(self.azimuth_bins)]
+                azimuth_bins += [each[2][..., back] if k else each[2] for k, each in enumerate(outputs)]
         found = torch.stack(logits).mean(0) / self.temperature, torch.cat(features, 1)
-        return (*found, torch.stack(sides).mean(0).log_softmax(2)) if self.sides else found
+        return (*found, torch.stack(azimuth_bins).mean(0).log_softmax(2)) if self.azimuth_bins else found
 
 
 class ShippedMap(nn.Module):
@@ -71,10 +71,10 @@ class ShippedMap(nn.Module):
     def forward(self, seen: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         if seen.dtype == torch.uint8:
             seen = seen.float() / 255
-        said = self.network(seen)[0]
+        outputs = self.network(seen)[0]
         if self.mirror:
-            said = (said + self.network(seen.flip(3))[0][..., self.flipped]) / 2
-        return (said[..., [-1, 0, 1]], said) if self.whole else said
+            outputs = (outputs + self.network(seen.flip(3))[0][..., self.flipped]) / 2
+        return (outputs[..., [-1, 0, 1]], outputs) if self.whole else outputs
 
 
 def answer(network: nn.Module, inputs: NDArray) -> NDArray[np.float32]:

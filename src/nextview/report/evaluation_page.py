@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from nextview.benchmark.evaluate import Evaluation
+from nextview.benchmark.evaluation import Evaluation
 from nextview.benchmark.published import published_recognisers
 from nextview.benchmark.results import check_target, written_whole
 from nextview.data.predictions import Predictions
@@ -112,7 +112,7 @@ def _headline(e: Evaluation, p: Predictions, name: str) -> str:
     v = len(p.sphere)
     found = _accuracies(e)
     one, fused = found[1, "", "accuracy"], found[v, "", "accuracy"]
-    error = e.fusion.set_index("looks")["calibration_error"]
+    error = e.fusion.set_index("n_views")["calibration_error"]
     cards = [
         _share_card("one view", one, f"classes {100 * found[1, '', 'class_accuracy'].value:.1f}&nbsp;%"),
         _share_card(f"all {v} views fused", fused, f"classes {100 * found[v, '', 'class_accuracy'].value:.1f}&nbsp;%"),
@@ -123,11 +123,11 @@ def _headline(e: Evaluation, p: Predictions, name: str) -> str:
         near, loss = scores["network", "", "d_le_1"], scores["network", "", "mse"]
         cards.append(_share_card(f"{escape(kind.upper())}: peak within one cell", near, f"MSE {loss.value:.4f}"))
     twice = int(p.conflicting.sum())
-    twins = f"; {twice} of them are the very mesh of another object with another label" if twice else ""
+    duplicates = f"; {twice} of them are the very mesh of another object with another label" if twice else ""
     return (
         f"<h1>{escape(name)}: {100 * one.value:.1f}&nbsp;% of single views right, {100 * fused.value:.1f}&nbsp;% of "
         f"objects with all {v} views fused</h1>"
-        f'<p class="lead">{len(p):,} objects of {len(set(p.labels.tolist()))} classes, {v} views each{twins}.</p>'
+        f'<p class="lead">{len(p):,} objects of {len(set(p.labels.tolist()))} classes, {v} views each{duplicates}.</p>'
         "<p>All intervals are 95&nbsp;% bootstrap intervals over objects: views of one object are not independent.</p>"
         f'<div class="cards">{"".join(cards)}</div>'
     )
@@ -139,7 +139,7 @@ def _share_card(title: str, number: Number, small: str) -> str:
 
 
 def _accuracies(e: Evaluation) -> dict[tuple, Number]:
-    return numbers(e.accuracy, "looks", "label", "measure")
+    return numbers(e.accuracy, "n_views", "label", "measure")
 
 
 def _scores(e: Evaluation, name: str) -> dict[tuple, Number]:
@@ -148,17 +148,17 @@ def _scores(e: Evaluation, name: str) -> dict[tuple, Number]:
 
 def _recogniser(e: Evaluation, p: Predictions, figures: dict[str, Figure]) -> str:
     found, v = _accuracies(e), len(p.sphere)
-    columns = [(looks, measure) for looks in (1, v) for measure in ("accuracy", "clean_accuracy")]
+    columns = [(n_views, measure) for n_views in (1, v) for measure in ("accuracy", "clean_accuracy")]
     rows = []
     counts = np.bincount(p.labels, minlength=len(p.classes))
     for label in e.accuracy.query("label != ''")["label"].unique():
-        cells = (cell(found[looks, label, measure]) for looks, measure in columns)
+        cells = (cell(found[n_views, label, measure]) for n_views, measure in columns)
         rows.append([escape(label).replace("_", " "), str(counts[p.classes.index(label)]), *cells])
     for heading, before in (("mean of classes", "class_"), ("mean of objects", "")):
-        cells = (cell(found[looks, "", before + measure]) for looks, measure in columns)
+        cells = (cell(found[n_views, "", before + measure]) for n_views, measure in columns)
         rows.append([heading, f"{len(p):,}", *cells])
         if p.of_size is not None:
-            one, fused = (cell(found[looks, "", f"{before}shape_accuracy"]) for looks in (1, v))
+            one, fused = (cell(found[n_views, "", f"{before}shape_accuracy"]) for n_views in (1, v))
             rows.append([f"{heading}<small>size of the objects not known</small>", f"{len(p):,}", one, "", fused, ""])
     head = ["class", "objects", "one view", "without duplicates", f"all {v} views fused", "without duplicates"]
     published = published_recognisers(p.classes, v)
@@ -169,12 +169,12 @@ def _recogniser(e: Evaluation, p: Predictions, figures: dict[str, Figure]) -> st
         listed += [[f"{network}, published", str(batch), f"{accuracy:.4f}"] for network, batch, accuracy in published]
         caption = f"Accuracy from one of {v} views beside the published recognisers (table 6), over objects."
         beside = table(["network", "batch size", "one view"], listed, caption)
-    curve = e.fusion.set_index("looks")["accuracy"]
-    told = ", ".join(f"{k}: {curve[k]:.3f}" for k in (1, 2, 5, 10, v) if k in curve.index)
+    curve = e.fusion.set_index("n_views")["accuracy"]
+    shown = ", ".join(f"{k}: {curve[k]:.3f}" for k in (1, 2, 5, 10, v) if k in curve.index)
     shown = side_by_side(
         picture(
             figures["fusion"],
-            f"Accuracy against the number of random views fused. {told}.",
+            f"Accuracy against the number of random views fused. {shown}.",
             "Logits of random views summed: accuracy against their number. Each object's views come in one random "
             "order and all its rotations, so every view counts alike at every number.",
         ),
@@ -201,23 +201,23 @@ def _confusions(p: Predictions, figures: dict[str, Figure]) -> str:
 
 
 def _calibration(e: Evaluation, figures: dict[str, Figure]) -> str:
-    curve = e.fusion.set_index("looks")
-    looks = list(dict.fromkeys(e.reliability["looks"].tolist()))
-    said = ", ".join(f"{curve.calibration_error[k]:.3f} after {k}" for k in looks)
+    curve = e.fusion.set_index("n_views")
+    n_views = list(dict.fromkeys(e.reliability["n_views"].tolist()))
+    shown = ", ".join(f"{curve.calibration_error[k]:.3f} after {k}" for k in n_views)
     text = (
         "<p>On the diagonal, an answer of which the belief is 90&nbsp;% sure is right nine times in ten; below it the "
-        f"belief is too sure of itself. Expected calibration error over views: {said}.</p>"
+        f"belief is too sure of itself. Expected calibration error over views: {shown}.</p>"
     )
     return text + side_by_side(
         picture(
             figures["reliability"],
-            f"Share of right answers against confidence. Calibration error: {said}.",
+            f"Share of right answers against confidence. Calibration error: {shown}.",
             "Reliability after one random view and more. Bins of fewer than 20 answers are left out.",
         ),
         picture(
             figures["confidence"],
             "Mean confidence and accuracy against the number of random views fused. "
-            + ", ".join(f"{k}: {curve.confidence[k]:.3f} and {curve.accuracy[k]:.3f}" for k in looks)
+            + ", ".join(f"{k}: {curve.confidence[k]:.3f} and {curve.accuracy[k]:.3f}" for k in n_views)
             + ".",
             "Mean confidence against accuracy. Views of one object make alike mistakes: a sum of logits takes them "
             "for independent and grows too sure.",
@@ -249,10 +249,10 @@ def _map(e: Evaluation, name: str, figures: dict[str, Figure]) -> str:
         f"<p>What is true: {truth}. A peak is right where the highest predicted cell is the highest true one, or near "
         "it; of equal cells the first counts, so where cells tie the exact peak is a toss-up. The <em>regret</em> is "
         "what following the prediction loses: the highest true value less the true one at the predicted peak. The "
-        "yardsticks are made from the true maps of these very objects: one map for all views, and one for each class "
+        "baselines are made from the true maps of these very objects: one map for all views, and one for each class "
         "and view, which knows the object's class and which way it faces. The published peaks are means over classes, "
         "the published loss is over objects.</p>"
-        + table(head, rows, "The predicted maps and the yardsticks. Small print: 95&nbsp;% intervals.")
+        + table(head, rows, "The predicted maps and the baselines. Small print: 95&nbsp;% intervals.")
         + side_by_side(
             *(
                 picture(
@@ -277,9 +277,9 @@ def _map(e: Evaluation, name: str, figures: dict[str, Figure]) -> str:
 def _calibration_fact(p: Predictions) -> str:
     """How the sums of logits became confidences."""
     c = p.calibration
-    if (c.temperature_of_one, c.correlation) == (1, 0):
+    if (c.temperature, c.correlation) == (1, 0):
         return "none: the softmax of the sum of the logits as it stands"
-    return f"temperature {c.temperature_of_one:.3g} for one look, correlation {c.correlation:.3g} between looks"
+    return f"temperature {c.temperature:.3g} for one view, correlation {c.correlation:.3g} between views"
 
 
 def _facts(p: Predictions, settings: dict[str, Any]) -> dict[str, str]:

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import gaussian_kde
 
+from nextview.belief import of_true_class
+from nextview.calibration.fitting_set import FittingSet
 from nextview.errors import DatasetError
-from nextview.fitting.evidence import FittingSet
-from nextview.models.size import SizeEvidence
-from nextview.recognition import of_true_class
+from nextview.models.size_evidence import SizeEvidence
 
 Float = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
 
 
 def fit_weight(data: FittingSet, radii: Float, log_density: Float) -> tuple[SizeEvidence, float, float]:
-    """The weight beside the logits that is most likely, over single looks, at the temperature most likely with it.
+    """The weight beside the logits that is most likely, over single views, at the temperature most likely with it.
 
     Args:
         data: what the recogniser says by shape alone.
@@ -57,7 +57,7 @@ def fit_weight(data: FittingSet, radii: Float, log_density: Float) -> tuple[Size
         log_density: see ``densities``.
 
     Returns:
-        The evidence, and the mean negative log-likelihood of single looks by shape alone and with it, classes weighted
+        The evidence, and the mean negative log-likelihood of single views by shape alone and with it, classes weighted
         evenly.
     """
     of_size = SizeEvidence(RADII, log_density, 1.0).logits(radii)[:, None]

@@ -12,7 +12,7 @@ import numpy as np
 from nextview.errors import ModelError, OtherUseError, PolicyError
 from nextview.policies.base import Policy
 from nextview.policies.gain_weights import read_gain
-from nextview.policies.tables import ClassTable, FixedRing, FixedSequence
+from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence
 from nextview.viewsphere import ViewSphere
 
 BUNDLED = Path(__file__).parent / "bundled"

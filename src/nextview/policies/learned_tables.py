@@ -66,8 +66,8 @@ class FixedSequence:
             return chosen
         # Where the episode began is not told, but what was visited is: the start is the one whose path led here.
         so_far = self.paths[:, : state.step]
-        distinct = (np.diff(np.sort(so_far, axis=1)) > 0).all(1)
-        led_here = distinct & state.visited[:, so_far].all(2) & (so_far[:, -1] == state.current[:, None])
+        deduplicated = (np.diff(np.sort(so_far, axis=1)) > 0).all(1)
+        led_here = deduplicated & state.visited[:, so_far].all(2) & (so_far[:, -1] == state.current[:, None])
         following = self.paths[led_here.argmax(1), state.step]
         free = ~state.visited[np.arange(len(chosen)), following]
         return np.where(led_here.any(1) & (state.visited.sum(1) == state.step) & free, following, chosen)
@@ -80,7 +80,7 @@ class FixedRing:
     Attributes:
         sphere: the viewpoints.
         ring: which.
-        steps: from look to look; views that are left out come when it has gone round.
+        steps: from view to view; views that are left out come when it has gone round.
     """
 
     sphere: ViewSphere

@@ -1,4 +1,4 @@
-"""How far to trust a sum of logits, and how often those who stop at a threshold are wrong: from honest predictions.
+"""How far to trust a sum of logits, and how often those who stop at a threshold are wrong: from held-out predictions.
 
 Both are fitted over random walks, half of them in the local window and half over the whole sphere, with the classes
 weighted evenly: the mix of classes that a robot will meet is not the training split's.
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import beta
 
-from nextview.fitting.evidence import FittingSet, blind_walks
+from nextview.belief import Calibration, RiskBounds, of_true_class
+from nextview.calibration.fitting_set import FittingSet, blind_walks
 from nextview.policies.baselines import Random, RandomAll
-from nextview.recognition import Calibration, RiskBounds, of_true_class
 
 Float = NDArray[np.float64]
 
@@ -23,42 +23,44 @@ THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
 """Of the belief, from 0.5 to 0.998: those for which error rates are promised."""
 
 
-def fit_temperature(data: FittingSet, rng: np.random.Generator, looks: int = 5, walks: int = 4) -> Calibration:
-    """Temperature of one look and correlations of several, by maximum likelihood over 1 to ``looks`` looks.
+def fit_temperature(data: FittingSet, rng: np.random.Generator, n_views: int = 5, walks: int = 4) -> Calibration:
+    """Temperature of one view and correlations of several, by maximum likelihood over 1 to ``n_views`` looks.
 
     Args:
         data: what the recogniser says.
         rng: draws the walks.
-        looks: at most.
+        n_views: at most.
         walks: of each object in either half.
     """
-    measure = _loss(data, rng, looks, walks)
+    measure = _loss(data, rng, n_views, walks)
 
     def made_of(parameters: Float) -> Calibration:
-        temperature, correlation, *of_sides = parameters.tolist()
-        return Calibration(temperature, correlation, side_correlation=of_sides[0] if of_sides else None)
+        temperature, correlation, *of_bins = parameters.tolist()
+        return Calibration(temperature, correlation, bin_correlation=of_bins[0] if of_bins else None)
 
     def of(parameters: Float) -> float:
         return measure(made_of(parameters))
 
-    begin = np.array([1.0, 0.5] if data.sides is None else [1.0, 0.5, 0.1])
+    begin = np.array([1.0, 0.5] if data.azimuth_bins is None else [1.0, 0.5, 0.1])
     bounds = [(0.01, 100.0), (0.0, 5.0), (0.0, 5.0)][: len(begin)]
     found = minimize(of, begin, method="L-BFGS-B", bounds=bounds)
     return made_of(np.round(found.x, 4))
 
 
-def loss(data: FittingSet, calibration: Calibration, rng: np.random.Generator, looks: int = 5, walks: int = 4) -> float:
-    """Mean negative log-likelihood of the true class over 1 to ``looks`` looks; arguments as of ``fit_temperature``."""
-    return _loss(data, rng, looks, walks)(calibration)
+def loss(
+    data: FittingSet, calibration: Calibration, rng: np.random.Generator, n_views: int = 5, walks: int = 4
+) -> float:
+    """Mean negative log-likelihood of the true class over 1 to ``n_views`` looks; arguments as of ``fit_temperature``."""
+    return _loss(data, rng, n_views, walks)(calibration)
 
 
-def _loss(data: FittingSet, rng: np.random.Generator, looks: int, walks: int) -> Callable[[Calibration], float]:
+def _loss(data: FittingSet, rng: np.random.Generator, n_views: int, walks: int) -> Callable[[Calibration], float]:
     """That loss as a function of the calibration, over the same walks each time."""
-    looks = min(looks, len(data.sphere))
-    objects, views = _walks(data, looks, walks, rng)
-    totals = np.cumsum(data.said[objects[:, None], views].astype(np.float64), axis=1)
-    numbers, labels = np.arange(1, looks + 1), data.labels[objects]
-    weights = data.weights[objects] / data.weights[objects].sum() / looks
+    n_views = min(n_views, len(data.sphere))
+    objects, views = _walks(data, n_views, walks, rng)
+    totals = np.cumsum(data.log_evidence[objects[:, None], views].astype(np.float64), axis=1)
+    numbers, labels = np.arange(1, n_views + 1), data.labels[objects]
+    weights = data.weights[objects] / data.weights[objects].sum() / n_views
 
     def measure(calibration: Calibration) -> float:
         logs = calibration.log_belief(totals, numbers, len(data.classes))
@@ -72,7 +74,7 @@ def fit_risk(
     calibration: Calibration,
     rng: np.random.Generator,
     delta: float = 0.1,
-    looks: int = 8,
+    n_views: int = 8,
     walks: int = 4,
 ) -> RiskBounds:
     """Error rates that can be promised among those who stop at a threshold, on either half of the walks.
@@ -86,16 +88,16 @@ def fit_risk(
         calibration: of the belief.
         rng: draws the walks.
         delta: how often a promise may fail.
-        looks: for at most 1 to so many looks.
+        n_views: for at most 1 to so many views.
         walks: of each object in either half.
     """
-    looks = min(looks, len(data.sphere))
-    objects, views = _walks(data, looks, walks, rng)
-    totals = np.cumsum(data.said[objects[:, None], views].astype(np.float64), axis=1)
-    belief = calibration.belief(totals, np.arange(1, looks + 1), len(data.classes))
+    n_views = min(n_views, len(data.sphere))
+    objects, views = _walks(data, n_views, walks, rng)
+    totals = np.cumsum(data.log_evidence[objects[:, None], views].astype(np.float64), axis=1)
+    belief = calibration.belief(totals, np.arange(1, n_views + 1), len(data.classes))
     sure, wrong = belief.max(2), belief.argmax(2) != data.labels[objects][:, None]
-    promised = np.zeros((looks, len(THRESHOLDS)))
-    for k in range(looks):
+    promised = np.zeros((n_views, len(THRESHOLDS)))
+    for k in range(n_views):
         for half in np.split(np.arange(len(objects)), 2):
             promise = _promise(sure[half, : k + 1], wrong[half, : k + 1], data.weights, delta)
             promised[k] = np.maximum(promised[k], promise)
@@ -142,11 +144,11 @@ def error_bound(failed: Float, stopped: Float, weights: Float, delta: float) -> 
 
 
 def _walks(
-    data: FittingSet, looks: int, walks: int, rng: np.random.Generator
+    data: FittingSet, n_views: int, walks: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Objects (2 * walks * N,) and views (2 * walks * N, looks): the first half local, the second over the sphere."""
     objects, views = np.tile(np.arange(len(data)), 2 * walks), []
     for policy in (Random(data.sphere), RandomAll(data.sphere)):
         starts = rng.integers(len(data.sphere), size=walks * len(data))
-        views.append(blind_walks(data.sphere, policy, starts, looks, rng))
+        views.append(blind_walks(data.sphere, policy, starts, n_views, rng))
     return objects, np.concatenate(views)

@@ -11,16 +11,16 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from nextview.belief import Calibration
 from nextview.errors import ModelError
-from nextview.models.card import Card, find_card
 from nextview.models.cloud_input import cloud_input
 from nextview.models.geometry_input import geometry_input
 from nextview.models.image_input import image_input
-from nextview.models.size import SizeEvidence
+from nextview.models.model_card import Card, find_card
+from nextview.models.onnx_file import open_onnx
+from nextview.models.size_evidence import SizeEvidence
 from nextview.observation import Observation
 from nextview.policies.base import Evidence, maps_among
-from nextview.recognition import Calibration
-from nextview.weights import open_onnx
 
 RECOGNISER = "recogniser-modelnet10"
 MAPS = {"lem": "lem-modelnet10", "lcm": "lcm-modelnet10"}
@@ -56,10 +56,10 @@ def knows_sphere(card: Card) -> bool:
 
 
 def see(observations: Sequence[Observation], sees: str, size: int) -> NDArray[Any]:
-    """What a network sees of looks from one camera.
+    """What a network sees of views from one camera.
 
     Args:
-        observations: B looks.
+        observations: B views.
         sees: "geometry", "image" or "cloud".
         size: side of the network's image, pixels; clouds have none.
 
@@ -90,7 +90,7 @@ def size_evidence(card: Card) -> SizeEvidence | None:
 class Recogniser:
     """Names the object in each view, by what is seen and, where the camera knows it, by how large the object is.
 
-    ``sides`` is how many sides of the object it tells apart, 0 if it was not taught to.
+    ``azimuth bins`` is how many azimuth bins of the object it tells apart, 0 if it was not taught to.
 
     Args:
         model: name of a bundled model, or path of a card.
@@ -103,7 +103,7 @@ class Recogniser:
             raise ModelError(f"model {self.card.name} is a {self.card.kind}, not a recogniser")
         self.classes: tuple[str, ...] = tuple(self.card.facts["classes"])
         self.sees = sight(self.card)
-        self.sides: int = self.card.facts.get("sides", 0)
+        self.azimuth_bins: int = self.card.facts.get("azimuth_bins", 0)
         self._size = size_evidence(self.card)
         try:
             self.calibration = Calibration.of_facts(self.card.facts.get("calibration"))
@@ -112,19 +112,19 @@ class Recogniser:
         self._session = open_weights(self.card, threads)
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
-        """What it says of B looks from one camera: calibrated logits, pooled features, and sides if it knows them."""
-        said = self.from_inputs(see(observations, *self.sees))
+        """What it says of B views from one camera: calibrated logits, pooled features, and azimuth bins if it knows them."""
+        evidence = self.from_inputs(see(observations, *self.sees))
         if self._size is None:
-            return said
+            return evidence
         radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
-        return replace(said, logits=said.logits + self._size.logits(radii))
+        return replace(evidence, logits=evidence.logits + self._size.logits(radii))
 
     def from_inputs(self, inputs: NDArray[Any]) -> Evidence:
         """The same by what is seen alone, see ``see``."""
-        logits, features, *sides = self._session.run(
-            ["logits", "features", *(["sides"] if self.sides else [])], {"input": inputs}
+        logits, features, *azimuth_bins = self._session.run(
+            ["logits", "features", *(["azimuth_bins"] if self.azimuth_bins else [])], {"input": inputs}
         )
-        return Evidence(logits, features=features, sides=sides[0] if sides else None)
+        return Evidence(logits, features=features, azimuth_bins=azimuth_bins[0] if azimuth_bins else None)
 
 
 class MapNetwork:
@@ -144,7 +144,7 @@ class MapNetwork:
         self._session = open_weights(self.card, threads)
 
     def __call__(self, observations: Sequence[Observation]) -> dict[str, NDArray[np.float32]]:
-        """Maps of looks from one camera, by name.
+        """Maps of views from one camera, by name.
 
         The local one, (B, rings, 3), columns azimuth -1, 0, +1, has the name of the card's kind ("lem"). If the network
         knows it, that of the sphere, (B, rings, azimuths), columns azimuth 0, 1, ... from here, is NAME-sphere.
@@ -176,7 +176,7 @@ class Models:
         return () if network is None else tuple(self.classes.index(c) for c in network.valley_classes)
 
     def evidence(self, observations: Sequence[Observation]) -> Evidence:
-        """What the models say of looks from one camera."""
+        """What the models say of views from one camera."""
         maps = {name: values for network in self.maps.values() for name, values in network(observations).items()}
         return replace(self.recogniser(observations), maps=maps)
 
@@ -184,7 +184,7 @@ class Models:
 def load_models(maps: Sequence[str] = ("lem",), recogniser: str | Path = RECOGNISER, threads: int = 0) -> Models:
     """The bundled recogniser, or the one whose card is given, and the bundled map networks of the given names.
 
-    The names may be a policy's needs: "sides" takes no network beside the recogniser.
+    The names may be a policy's needs: "azimuth bins" takes no network beside the recogniser.
 
     Raises:
         ModelError: a model is missing, damaged or of the wrong kind.

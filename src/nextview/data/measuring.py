@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nextview.data.lock import only_one
 from nextview.data.pool import WorkerDied, each
-from nextview.data.render import writing
+from nextview.data.rendering import writing
 from nextview.data.store import DEPTH_UNIT, ViewStore
 from nextview.errors import DatasetError
 from nextview.measures.registry import MEASURES

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.belief import fuse
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.maps import MapPeak
-from nextview.recognition import fuse
 from nextview.viewsphere import ViewSphere
 
 
 def valley_gains(
     sphere: ViewSphere, logits: NDArray[np.floating], maps: NDArray[np.floating], labels: NDArray[np.int64]
 ) -> dict[int, float]:
-    """For each class, what the second look gains in belief in the truth at the valley rather than at the peak.
+    """For each class, what the second view gains in belief in the truth at the valley rather than at the peak.
 
-    Every view of every object is taken as the first look once; the second goes to the peak or to the valley of the
+    Every view of every object is taken as the first view once; the second goes to the peak or to the valley of the
     predicted map.
 
     Args:

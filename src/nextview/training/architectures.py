@@ -68,7 +68,7 @@ class Bottleneck(nn.Module):
 class ResNet(nn.Module):
     """A ResNet; ``forward`` returns (logits (B, classes), pooled features (B, 512), or (B, 2048) from depth 50 on).
 
-    With ``azimuths``, it returns a third: the logarithms of how likely each of so many sides of the object is the one
+    With ``azimuths``, it returns a third: the logarithms of how likely each of so many azimuth bins of the object is the one
     that is seen, if it is of each class, (B, classes, azimuths). Parameters carry torchvision's names, so that its
     checkpoints fit; see ``weights.load_checkpoint``.
 
@@ -76,7 +76,7 @@ class ResNet(nn.Module):
         depth: 18, 34, 50, 101 or 152.
         classes: outputs.
         channels: of the input image (B, channels, H, W), values in 0 .. 1.
-        azimuths: sides that are told apart; 0 for none.
+        azimuths: azimuth bins that are told apart; 0 for none.
         blocks: side of the blocks of pixels that the first convolution sees as channels of one pixel (space to depth):
             with 2, an image of twice the side takes half as long again, not four times as long.
     """
@@ -121,7 +121,7 @@ class ResNet(nn.Module):
 
 
 def recogniser_network(recipe: RecogniserRecipe, classes: int, azimuths: int) -> ResNet | LiteNet:
-    """The network of a recipe, untrained; ``azimuths`` sides are told apart, if any."""
+    """The network of a recipe, untrained; ``azimuths`` azimuth bins are told apart, if any."""
     channels = CHANNELS_OF[recipe.input]
     if recipe.network != "resnet":
         return LiteNet(classes, channels, azimuths, int(recipe.network.removeprefix("lite")), recipe.drop)

@@ -8,32 +8,32 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.belief import log_evidence_of
 from nextview.data.predictions import Predictions
-from nextview.data.split import distinct, divide
+from nextview.data.splits import deduplicated, divide
 from nextview.errors import PredictionsError
-from nextview.models.card import Card
+from nextview.models.model_card import Card
 from nextview.policies.base import EpisodeState, Evidence, Policy
-from nextview.recognition import additive
 from nextview.viewsphere import ViewSphere
 
 
 @dataclass(frozen=True)
 class FittingSet:
-    """What an honest recogniser says of N objects from V views.
+    """What an held-out recogniser says of N objects from V views.
 
     Attributes:
         logits: (N, V, C) float32.
         labels: (N,) int64.
         sphere: the viewpoints.
         classes: names, in the order of the logits.
-        sides: what it says of the sides, (N, V, C, sides) float32, see ``Evidence``; None if it cannot tell.
+        azimuth bins: what it says of the azimuth bins, (N, V, C, azimuth bins) float32, see ``Evidence``; None if it cannot tell.
     """
 
     logits: NDArray[np.float32]
     labels: NDArray[np.int64]
     sphere: ViewSphere
     classes: tuple[str, ...]
-    sides: NDArray[np.float32] | None = None
+    azimuth_bins: NDArray[np.float32] | None = None
 
     @classmethod
     def of_all(cls, predictions: Predictions) -> FittingSet:
@@ -45,20 +45,20 @@ class FittingSet:
         if (predictions.splits == "test").any():
             raise PredictionsError("these predictions hold objects of the test split, to which nothing may be fitted")
         p = predictions
-        return cls(p.logits, p.labels, p.sphere, p.classes, p.sides)
+        return cls(p.logits, p.labels, p.sphere, p.classes, p.azimuth_bins)
 
     def __len__(self) -> int:
         return len(self.labels)
 
     @cached_property
-    def said(self) -> NDArray[np.float32]:
-        """All of it, so that views can be summed, (N, V, D); see ``additive``."""
-        return additive(self.logits, self.sides, self.sphere.turn)
+    def log_evidence(self) -> NDArray[np.float32]:
+        """All of it, so that views can be summed, (N, V, D); see ``log_evidence_of``."""
+        return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.turn)
 
     def of(self, kept: NDArray) -> FittingSet:
         """Some of the objects."""
-        sides = None if self.sides is None else self.sides[kept]
-        return replace(self, logits=self.logits[kept], labels=self.labels[kept], sides=sides)
+        azimuth_bins = None if self.azimuth_bins is None else self.azimuth_bins[kept]
+        return replace(self, logits=self.logits[kept], labels=self.labels[kept], azimuth_bins=azimuth_bins)
 
     @property
     def weights(self) -> NDArray[np.float64]:
@@ -67,14 +67,14 @@ class FittingSet:
         return len(self) / ((count > 0).sum() * count[self.labels])
 
 
-def unseen_by(card: Card, predictions: Predictions) -> NDArray[np.int64]:
-    """The objects on which a network was not trained, as its card says, each shape once: their indices, maybe none."""
-    once = distinct(predictions.labels, predictions.depth_entropy)
+def held_out_by(card: Card, predictions: Predictions) -> NDArray[np.int64]:
+    """The objects on which a network was not trained, as its card says, duplicates left out: their indices, maybe none."""
+    once = deduplicated(predictions.labels, predictions.depth_entropy)
     return once[np.isin(np.array(predictions.names)[once], card.facts.get("unseen", []))]
 
 
 def fitting_set(predictions: Predictions, validation: float, seed: int) -> FittingSet:
-    """The objects of the training split that the recogniser was not trained on, each shape once.
+    """The objects of the training split that the recogniser was not trained on, duplicates left out.
 
     Args:
         predictions: of the whole training split, as ``nextview predict --split train`` makes them.
@@ -91,11 +91,11 @@ def fitting_set(predictions: Predictions, validation: float, seed: int) -> Fitti
     _, kept = divide(predictions.labels, predictions.depth_entropy, validation, seed)
     if len(kept) == 0:
         raise PredictionsError("no object is left to fit to")
-    return data.of(kept[distinct(predictions.labels[kept], predictions.depth_entropy[kept])])
+    return data.of(kept[deduplicated(predictions.labels[kept], predictions.depth_entropy[kept])])
 
 
 def blind_walks(
-    sphere: ViewSphere, policy: Policy, starts: NDArray[np.int64], looks: int, rng: np.random.Generator
+    sphere: ViewSphere, policy: Policy, starts: NDArray[np.int64], n_views: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
     """Where a policy goes that looks at nothing but where it has been.
 
@@ -103,7 +103,7 @@ def blind_walks(
         sphere: the viewpoints.
         policy: is shown a uniform belief.
         starts: first views, (E,).
-        looks: how many, at most all views.
+        n_views: how many, at most all views.
         rng: for policies that draw.
 
     Returns:
@@ -112,7 +112,7 @@ def blind_walks(
     rows, nothing = np.arange(len(starts)), np.zeros((len(starts), 1))
     visited = np.zeros((len(starts), len(sphere)), bool)
     views = [np.asarray(starts, np.int64)]
-    for k in range(1, looks):
+    for k in range(1, n_views):
         visited[rows, views[-1]] = True
         views.append(policy.next_views(EpisodeState(views[-1], visited, nothing + 1, Evidence(nothing), k, rows), rng))
     return np.stack(views, 1)

@@ -13,25 +13,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.belief import Calibration
+from nextview.data.input_views import input_views
 from nextview.data.lock import only_one
 from nextview.data.pool import WorkerDied, each
 from nextview.data.predictions import Predictions
-from nextview.data.seen import seen_views
-from nextview.data.split import alike
+from nextview.data.splits import duplicate_groups
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, PredictionsError
-from nextview.models.card import Card
-from nextview.models.networks import MapNetwork, Recogniser, knows_sphere, size_evidence
-from nextview.recognition import Calibration
+from nextview.models.inference import MapNetwork, Recogniser, knows_sphere, size_evidence
+from nextview.models.model_card import Card
 from nextview.viewsphere import ViewSphere
 
 
 def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
     """Objects that look exactly like one with another label, in any split of the store, (N,) bool."""
-    twin = alike(store.measure())
-    several = np.zeros((twin.max() + 1, len(store.classes)), bool)
-    several[twin, store.labels] = True
-    return (several.sum(1) > 1)[twin] & store.done
+    duplicate = duplicate_groups(store.measure())
+    several = np.zeros((duplicate.max() + 1, len(store.classes)), bool)
+    several[duplicate, store.labels] = True
+    return (several.sum(1) > 1)[duplicate] & store.done
 
 
 def predict(
@@ -109,10 +109,10 @@ def predict(
     with only_one(out):
         n, v = len(chosen), len(store.sphere)
         windows = {name: shape for kind, card in maps.items() for name, shape in map_shapes(kind, card, store.sphere)}
-        sides = recogniser.facts.get("sides", 0)
-        told = {"sides": (n, v, len(classes), sides)} if sides else {}
+        azimuth_bins = recogniser.facts.get("azimuth_bins", 0)
+        optional = {"azimuth_bins": (n, v, len(classes), azimuth_bins)} if azimuth_bins else {}
         maps_of = {f"map_{name}": (n, v, *shape) for name, shape in windows.items()}
-        shapes = {"logits": (n, v, len(classes)), **told, **maps_of}
+        shapes = {"logits": (n, v, len(classes)), **optional, **maps_of}
         arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
         # Logits are written last: an object counts as done when none of its logits is the NaN that the file began with.
         todo = np.flatnonzero(np.isnan(arrays["logits"]).any((1, 2)))
@@ -147,7 +147,7 @@ def predict(
             models,
             valleys,
             calibration,
-            np.array(arrays["sides"]) if sides else None,
+            np.array(arrays["azimuth_bins"]) if azimuth_bins else None,
             of_size,
         ).save(out)
         shutil.rmtree(out.with_name(out.name + ".part"))
@@ -164,11 +164,11 @@ def sizes_say(
     found = [size_evidence(card) for card in recognisers]
     if np.isnan(radii).all() or all(evidence is None for evidence in found):
         return None
-    said = np.zeros((len(chosen), len(recognisers[0].facts["classes"])), np.float32)
+    found_evidence = np.zeros((len(chosen), len(recognisers[0].facts["classes"])), np.float32)
     for j, evidence in enumerate(found):
         if evidence is not None:
-            said[judge == j] = evidence.logits(radii[judge == j])
-    return said
+            found_evidence[judge == j] = evidence.logits(radii[judge == j])
+    return found_evidence
 
 
 def map_shapes(name: str, card: Card, sphere: ViewSphere) -> list[tuple[str, tuple[int, int]]]:
@@ -186,7 +186,7 @@ def judges(recognisers: Sequence[Card], names: Sequence[str]) -> NDArray[np.int6
     for card in recognisers:
         if "unseen" not in card.facts:
             raise DatasetError(f"recogniser {card.name} does not say which objects it has not seen in training")
-        for what in ("classes", "sides"):
+        for what in ("classes", "azimuth_bins"):
             if card.facts.get(what) != recognisers[0].facts.get(what):
                 raise DatasetError(f"recognisers {recognisers[0].name} and {card.name} do not know the same {what}")
     unseen = np.array([np.isin(names, card.facts["unseen"]) for card in recognisers])
@@ -228,18 +228,20 @@ def _open(
 def _predict_object(
     path: Path, recognisers: tuple[Path, ...], maps: tuple[tuple[str, Path], ...], batch: int, item: tuple[int, int]
 ) -> dict[str, NDArray[np.float32]]:
-    """Maps, sides and logits of all views of one object, by the names of their files; the logits last."""
+    """Maps, azimuth bins and logits of all views of one object, by the names of their files; the logits last."""
     i, judge = item
     store, names_it, networks = _open(path, recognisers, maps)
     recogniser = names_it[judge]
-    seen = {what: seen_views(store, i, *what) for what in {recogniser.sees} | {n.sees for n in networks.values()}}
+    seen = {what: input_views(store, i, *what) for what in {recogniser.sees} | {n.sees for n in networks.values()}}
     parts = [slice(start, start + batch) for start in range(0, len(store.sphere), batch)]
     found = {}
     for name, network in networks.items():
-        said = [network.from_inputs(seen[network.sees][p]) for p in parts]
-        for kind in said[0]:
-            found[f"map_{name}{kind.removeprefix(network.card.kind)}"] = np.concatenate([part[kind] for part in said])
+        found_evidence = [network.from_inputs(seen[network.sees][p]) for p in parts]
+        for kind in found_evidence[0]:
+            found[f"map_{name}{kind.removeprefix(network.card.kind)}"] = np.concatenate(
+                [part[kind] for part in found_evidence]
+            )
     answers = [recogniser.from_inputs(seen[recogniser.sees][p]) for p in parts]
-    if all(said.sides is not None for said in answers):
-        found["sides"] = np.concatenate([said.sides for said in answers])
-    return {**found, "logits": np.concatenate([said.logits for said in answers])}
+    if all(found_evidence.azimuth_bins is not None for found_evidence in answers):
+        found["azimuth_bins"] = np.concatenate([found_evidence.azimuth_bins for found_evidence in answers])
+    return {**found, "logits": np.concatenate([found_evidence.logits for found_evidence in answers])}

@@ -10,14 +10,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from nextview.belief import Calibration
 from nextview.benchmark import statistics as st
-from nextview.benchmark.contestants import true_lcm, true_lem
+from nextview.benchmark.entries import true_lcm, true_lem
 from nextview.benchmark.published import published_map, published_recognisers
 from nextview.benchmark.scores import map_errors, map_scores, recogniser_scores
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError
-from nextview.models.card import Card
-from nextview.recognition import Calibration
+from nextview.models.model_card import Card
 
 Float = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ TRUTHS: dict[str, Callable[[Predictions], NDArray]] = {"lem": true_lem, "lcm": t
 """Maps whose truth the predictions tell."""
 
 RELIABILITY_LOOKS = (1, 2, 5)
-"""Looks after which confidence is compared with accuracy, beside all of them."""
+"""Views after which confidence is compared with accuracy, beside all of them."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class Evaluation:
     Attributes:
         accuracy: looks (1, or V: the logits of all views summed), label (empty: all classes), measure, objects, value,
             low, high, published. The measures: ``accuracy``; ``clean_accuracy``, without the objects whose very mesh
-            also has another label; ``shape_accuracy``, where the recogniser is told how large the objects are, when it
+            also has another label; ``shape_accuracy``, where the recogniser takes how large the objects are, when it
             is not; with ``class_`` before it the mean over classes.
         fusion: looks, accuracy, low, high, class_accuracy, confidence (its mean), calibration_error: that many random
             views fused, calibrated as the recogniser's card says.
         confusion: looks, label, answer, answers: how many; a view is an answer, or a whole object.
-        reliability: looks, bin, confidence, accuracy, answers: after one look and a few more, in random order.
+        reliability: looks, bin, confidence, accuracy, answers: after one view and a few more, in random order.
         maps: map, by, label, measure, value, low, high, published; the measures are those of ``scores.map_errors``.
-            ``by`` is the network or a yardstick made from the true maps of these very objects, which flatters it:
+            ``by`` is the network or a baselines made from the true maps of these very objects, which flatters it:
             their mean, the same for every view; or their mean for the object's true class at the view.
         left_out: for each map that is not judged, or not of all objects, why.
     """
@@ -76,7 +76,7 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
     if samples < 1:
         raise ResultsError(f"at least one sample of the bootstrap is needed, not {samples}")
     weights = st.resample(len(p), samples, rng)
-    right, confidence = fused_views(p.said, p.labels, p.calibration, rng, len(p.classes))
+    right, confidence = fused_views(p.log_evidence, p.labels, p.calibration, rng, len(p.classes))
     judged = _judged(p)
     maps, left_out = _maps(p, weights)
     return Evaluation(
@@ -90,17 +90,17 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
 
 
 def _judged(p: Predictions) -> dict[int, NDArray]:
-    """What single views say and all of them together, by the number of looks, each (N, answers, C)."""
+    """What single views say and all of them together, by the number of views, each (N, answers, C)."""
     return {1: p.logits, len(p.sphere): all_fused(p)[:, None]}
 
 
 def all_fused(p: Predictions) -> Float:
     """Logarithm of the belief from all views of each object, up to a constant, (N, C)."""
-    return p.calibration.log_belief(p.said.astype(np.float64).sum(1), len(p.sphere), len(p.classes))
+    return p.calibration.log_belief(p.log_evidence.astype(np.float64).sum(1), len(p.sphere), len(p.classes))
 
 
 def fused_views(
-    said: NDArray[np.floating],
+    log_evidence: NDArray[np.floating],
     labels: NDArray[np.int64],
     calibration: Calibration,
     rng: np.random.Generator,
@@ -111,18 +111,18 @@ def fused_views(
     Every view comes first once, second once, and so on: with one view this is the single-view accuracy exactly.
 
     Args:
-        said: by the recogniser, so that it adds up, (N, V, D); see ``additive``.
+        log_evidence: by the recogniser, so that it adds up, (N, V, D); see ``log_evidence_of``.
         labels: (N,).
         calibration: how far a sum of it is to be trusted.
         rng: draws one order for each object.
         classes: how many.
 
     Returns:
-        Whether the answer is right, and its confidence, each (V looks, N, V rotations).
+        Whether the answer is right, and its confidence, each (V views, N, V rotations).
     """
-    n, v, _ = said.shape
+    n, v, _ = log_evidence.shape
     order = rng.permuted(np.tile(np.arange(v), (n, 1)), axis=1)
-    shuffled = np.take_along_axis(said.astype(np.float64), order[:, :, None], axis=1)
+    shuffled = np.take_along_axis(log_evidence.astype(np.float64), order[:, :, None], axis=1)
     right, confidence = np.empty((v, n, v), bool), np.empty((v, n, v), np.float32)
     for turn in range(v):
         total = np.roll(shuffled, -turn, axis=1).cumsum(1)
@@ -160,18 +160,18 @@ def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.
     by_shape = {} if p.of_size is None else _judged(p.by_shape())
     best = published_recognisers(p.classes, len(p.sphere))
     rows = []
-    for looks, logits in judged.items():
-        said = {"accuracy": logits, "clean_accuracy": logits}
+    for n_views, logits in judged.items():
+        log_evidence = {"accuracy": logits, "clean_accuracy": logits}
         if by_shape:
-            said["shape_accuracy"] = by_shape[looks]
-        right = np.stack([(x.argmax(2) == p.labels[:, None]).mean(1) for x in said.values()], 1)
-        bottom = np.stack([clean if measure == "clean_accuracy" else one for measure in said], 1)
+            log_evidence["shape_accuracy"] = by_shape[n_views]
+        right = np.stack([(x.argmax(2) == p.labels[:, None]).mean(1) for x in log_evidence.values()], 1)
+        bottom = np.stack([clean if measure == "clean_accuracy" else one for measure in log_evidence], 1)
         for label, over, value, low, high in _means(right * bottom, bottom, p.labels, p.classes, weights):
             here = p.labels == p.classes.index(label) if label else slice(None)
-            for i, (measure, objects) in enumerate(zip(said, bottom[here].sum(0), strict=True)):
-                beside = best[0][2] if best and (looks, label, over, i) == (1, "", "", 0) else np.nan
-                rows.append((looks, label, over + measure, int(objects), value[i], low[i], high[i], beside))
-    return pd.DataFrame(rows, columns=["looks", "label", "measure", "objects", "value", "low", "high", "published"])
+            for i, (measure, objects) in enumerate(zip(log_evidence, bottom[here].sum(0), strict=True)):
+                beside = best[0][2] if best and (n_views, label, over, i) == (1, "", "", 0) else np.nan
+                rows.append((n_views, label, over + measure, int(objects), value[i], low[i], high[i], beside))
+    return pd.DataFrame(rows, columns=["n_views", "label", "measure", "objects", "value", "low", "high", "published"])
 
 
 def _fusion(p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.float32], weights: Float) -> pd.DataFrame:
@@ -180,7 +180,7 @@ def _fusion(p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.flo
     low, high = st.interval(st.ratio(top, one, weights))
     return pd.DataFrame(
         {
-            "looks": np.arange(1, len(right) + 1),
+            "n_views": np.arange(1, len(right) + 1),
             "accuracy": top.mean(0),
             "low": low,
             "high": high,
@@ -196,22 +196,22 @@ def _fusion(p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.flo
 
 def _confusion(p: Predictions, judged: dict[int, NDArray]) -> pd.DataFrame:
     rows = []
-    for looks, logits in judged.items():
+    for n_views, logits in judged.items():
         counts = np.zeros((len(p.classes), len(p.classes)), np.int64)
         np.add.at(counts, (p.labels[:, None], logits.argmax(2)), 1)
-        rows += [(looks, p.classes[i], p.classes[j], int(count)) for (i, j), count in np.ndenumerate(counts)]
-    return pd.DataFrame(rows, columns=["looks", "label", "answer", "answers"])
+        rows += [(n_views, p.classes[i], p.classes[j], int(count)) for (i, j), count in np.ndenumerate(counts)]
+    return pd.DataFrame(rows, columns=["n_views", "label", "answer", "answers"])
 
 
 def _reliability(right: NDArray[np.bool_], confidence: NDArray[np.float32]) -> pd.DataFrame:
     rows, v = [], len(right)
-    for looks in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
-        turns = slice(None) if looks < v else slice(1)  # all views are the same in every order
+    for n_views in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
+        turns = slice(None) if n_views < v else slice(1)  # all views are the same in every order
         sure, share, count = st.reliability(
-            confidence[looks - 1, :, turns].ravel().astype(np.float64), right[looks - 1, :, turns].ravel()
+            confidence[n_views - 1, :, turns].ravel().astype(np.float64), right[n_views - 1, :, turns].ravel()
         )
-        rows += [(looks, i, sure[i], share[i], count[i]) for i in np.flatnonzero(count)]
-    return pd.DataFrame(rows, columns=["looks", "bin", "confidence", "accuracy", "answers"])
+        rows += [(n_views, i, sure[i], share[i], count[i]) for i in np.flatnonzero(count)]
+    return pd.DataFrame(rows, columns=["n_views", "bin", "confidence", "accuracy", "answers"])
 
 
 def judged_objects(p: Predictions, name: str) -> NDArray[np.int64]:
@@ -220,7 +220,7 @@ def judged_objects(p: Predictions, name: str) -> NDArray[np.int64]:
     return np.flatnonzero(right.any(1)) if name == "lcm" else np.arange(len(p))
 
 
-def yardsticks(true: NDArray[np.floating], labels: NDArray[np.int64]) -> dict[str, NDArray[np.floating]]:
+def baselines(true: NDArray[np.floating], labels: NDArray[np.int64]) -> dict[str, NDArray[np.floating]]:
     """Maps to be measured against: the mean map, and the mean map of the class at the view, each as ``true`` is.
 
     Args:
@@ -248,7 +248,7 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
         if len(kept) < len(p):
             left_out[name] = f"without the objects that are recognised from no view: {len(p) - len(kept)} of {len(p)}"
         true, labels = TRUTHS[name](p)[kept], p.labels[kept]
-        for by, maps in {"network": predicted[kept], **yardsticks(true, labels)}.items():
+        for by, maps in {"network": predicted[kept], **baselines(true, labels)}.items():
             window = true.shape[2:]
             errors = map_errors(maps.reshape(-1, *window), true.reshape(-1, *window))
             top = np.stack([values.reshape(len(kept), -1).mean(1) for values in errors.values()], 1)

@@ -39,7 +39,7 @@ def overview(results: Results, threshold: float) -> str:
         )
     )
     measures = {"accuracy": 3, "clean_accuracy": 3, "class_accuracy": 3}
-    measures |= {"looks": 2, "travel_all": 2, "travel_moved": 2, "arc_all": 2}
+    measures |= {"n_views": 2, "travel_all": 2, "travel_moved": 2, "arc_all": 2}
     rows = []
     for policy in results.tables.sweep["policy"].unique():
         row = [named(policy)]
@@ -52,7 +52,7 @@ def overview(results: Results, threshold: float) -> str:
             row += ["reference", NONE, NONE]
         rows.append(row)
     head = [
-        "policy", "accuracy", "without duplicates", "class accuracy", "looks", "travel, all", "travel, moved",
+        "policy", "accuracy", "without duplicates", "class accuracy", "n_views", "travel, all", "travel, moved",
         "arc, rad", "points over reference", "p, boot&shy;strap", "p, Mc&shy;Nemar",
     ]  # fmt: skip
     return table(
@@ -67,11 +67,11 @@ def calibration(results: Results, policies: Sequence[str]) -> str:
     found = numbers(results.tables.summary, "policy", "threshold", "measure")
     thresholds = results.settings["thresholds"]
 
-    def worth(policy: str, threshold: float) -> str:
+    def value(policy: str, threshold: float) -> str:
         share = found[policy, threshold, "confident"].value
         return cell(found[policy, threshold, "confident_accuracy"]) + f"<small>of {100 * share:.0f}&nbsp;%</small>"
 
-    rows = [[named(policy), *(worth(policy, threshold) for threshold in thresholds)] for policy in policies]
+    rows = [[named(policy), *(value(policy, threshold) for threshold in thresholds)] for policy in policies]
     caption = "Share of right answers among the episodes that reached the threshold, and how many did."
     return table(["policy", *(f"{t:g}" for t in thresholds)], rows, caption)
 
@@ -116,7 +116,7 @@ def five_views(results: Results) -> str:
     for heading, measure, digits in (
         ("mean of classes", "class_accuracy", 3),
         ("mean of objects", "accuracy", 3),
-        ("looks", "looks", 0),
+        ("n_views", "n_views", 0),
         ("travel, cells", "travel_all", 1),
     ):
         rows.append([heading, *(cell(overall[name, None, measure], digits) for name in policies)])

@@ -61,9 +61,9 @@ def render_object(mesh: Mesh, sphere: ViewSphere, size: int) -> dict[str, np.nda
     depth = np.empty((len(sphere), size, size), np.uint16)
     points = np.empty((len(sphere), POINTS, 3), np.float32)
     for view, pose in enumerate(sphere.poses):
-        look = camera.observe(pose)
-        image[view], points[view] = look.image, look.points
-        depth[view] = np.rint(look.depth / DEPTH_UNIT)
+        observation = camera.observe(pose)
+        image[view], points[view] = observation.image, observation.points
+        depth[view] = np.rint(observation.depth / DEPTH_UNIT)
     return {
         "image": image,
         "depth": depth,

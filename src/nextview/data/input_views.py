@@ -1,4 +1,4 @@
-"""What a network sees of an object in a store: the same as it sees of a look in live use."""
+"""What a network sees of an object in a store: the same as it sees of a view in live use."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nextview.models.geometry_input import geometry_input
 from nextview.models.image_input import image_input
 
 
-def seen_views(store: ViewStore, i: int, sees: str, size: int) -> NDArray[Any]:
+def input_views(store: ViewStore, i: int, sees: str, size: int) -> NDArray[Any]:
     """What a network sees of all views of object i.
 
     Args:

