@@ -164,7 +164,7 @@ def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(fold
         ({"valley_classes": ("sofa",)}, "no class 'sofa'"),
         ({"risks": (0.05,)}, "promises no error rate"),
         ({"risks": (0.05,), "threshold_decay": 0.5}, "without a threshold decay"),
-        ({"threshold_decay": -1.0}, "threshold_decay"),
+        ({"threshold_decay": -1.0}, "threshold decay"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(folder, wrong, sentence):

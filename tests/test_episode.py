@@ -43,7 +43,7 @@ def walk(table: Table, policy, episode: int, start: int, stopping: Stopping, cal
     """One episode as one would write it for one object: views, beliefs."""
     views, beliefs = [start], []
     while True:
-        beliefs.append(softmax(table.logits[episode, views].sum(0) / calibration.temperature(len(views))))
+        beliefs.append(softmax(table.logits[episode, views].sum(0) / calibration.temperature_after(len(views))))
         if beliefs[-1].max() >= stopping.threshold or len(views) in (stopping.max_views, len(sphere)):
             return views, beliefs
         visited = np.zeros((1, len(sphere)), bool)
@@ -270,10 +270,10 @@ def test_no_outcome_before_the_end():
     episodes = Episodes(SPHERE, MapPeak(SPHERE), np.array([0, 1]), Stopping(1.0, 2), np.random.default_rng(0))
     with pytest.raises(ValueError, match="still running"):
         _ = episodes.outcome
-    episodes.tell(table.observe(episodes.running, episodes.current))
+    episodes.update(table.observe(episodes.running, episodes.current))
     with pytest.raises(ValueError, match="still running"):
         _ = episodes.outcome
-    episodes.tell(table.observe(episodes.running, episodes.current))
+    episodes.update(table.observe(episodes.running, episodes.current))
     assert (episodes.outcome.n_views == 2).all()
 
 
@@ -291,12 +291,12 @@ def test_a_look_that_fails_is_not_taken_in():
     episodes = Episodes(sphere, policy, np.array([3]), Stopping(1.0, 3), np.random.default_rng(0))
     observation = Evidence(np.array([[1.0, 0.0]]))
     with pytest.raises(PolicyError, match="not now"):
-        episodes.tell(observation)
+        episodes.update(observation)
     with pytest.raises(ValueError, match="finite"):
-        episodes.tell(Evidence(np.array([[np.nan, 0.0]])))
+        episodes.update(Evidence(np.array([[np.nan, 0.0]])))
     with pytest.raises(ValueError, match="2 views for 1"):
-        episodes.tell(Evidence(np.zeros((2, 2))))
+        episodes.update(Evidence(np.zeros((2, 2))))
     policy.fail = False
-    step = episodes.tell(observation)
+    step = episodes.update(observation)
     assert step.belief[0, 0] == pytest.approx(1 / (1 + np.exp(-1)))
     assert step.next_views.tolist() == [4]

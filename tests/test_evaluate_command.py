@@ -95,16 +95,16 @@ def test_the_same_seed_gives_the_same_bytes(made):
 
 
 def test_the_terminal_tells_the_numbers_of_another_seed(made, capsys):
-    main(["evaluate", str(made / "p.npz"), "--out", str(made / "features"), "--samples", "50", "--seed", "1"])
+    main(["evaluate", str(made / "p.npz"), "--out", str(made / "told"), "--samples", "50", "--seed", "1"])
     printed = capsys.readouterr().out
-    results = json.loads((made / "features" / "results.json").read_text())
+    results = json.loads((made / "told" / "results.json").read_text())
     for row in results["accuracy"]:
         if row["measure"] == "class_accuracy" or row["label"] == "ball":
             assert f"{row['value']:.3f}" in printed
     assert "LEM" in printed
     assert "LCM" in printed
     for name in ("fusion.csv", "lem_examples.png"):
-        assert (made / "out" / name).read_bytes() != (made / "features" / name).read_bytes()
+        assert (made / "out" / name).read_bytes() != (made / "told" / name).read_bytes()
 
 
 def test_other_spheres_and_no_maps(tmp_path, capsys):

@@ -100,7 +100,7 @@ def test_promises_are_kept_as_often_as_promised():
     )
     total = np.cumsum(whole.logits[np.arange(len(whole))[:, None], walks], axis=1)
     sure = np.stack(
-        [np.exp(log_softmax(total[:, k] / calibration.temperature(k + 1), 1)).max(1) for k in range(n_views)], 1
+        [np.exp(log_softmax(total[:, k] / calibration.temperature_after(k + 1), 1)).max(1) for k in range(n_views)], 1
     )
     wrong = total.argmax(2) != whole.labels[:, None]
 
@@ -235,7 +235,7 @@ def test_each_move_of_a_sequence_is_the_best_there_is(anywhere):
         for i, label in enumerate(labels):
             for steps in range(4):
                 total = data.logits[i, [turned(v, steps) for v in path]].astype(float).sum(0)
-                by_class[label].append(log_softmax(total / calibration.temperature(len(path)))[label])
+                by_class[label].append(log_softmax(total / calibration.temperature_after(len(path)))[label])
         return np.mean([np.mean(values) for values in by_class.values()])
 
     for ring in range(3):

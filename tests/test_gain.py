@@ -65,7 +65,7 @@ def some_state(sphere=SPHERE, episodes=60, seed=0):
 @pytest.mark.parametrize("anywhere", [True, False])
 @pytest.mark.parametrize(
     ("inputs", "frame"),
-    [(INPUTS, "camera"), (INPUTS, "object"), (("belief",), "camera"), (("look", "place"), "object")],
+    [(INPUTS, "camera"), (INPUTS, "object"), (("belief",), "camera"), (("view", "place"), "object")],
 )
 def test_an_unvisited_view_is_chosen_in_each_episode_by_itself(anywhere, inputs, frame):
     state, policy = some_state(), some_gain(inputs=inputs, frame=frame, anywhere=anywhere)
@@ -122,12 +122,12 @@ def test_in_the_objects_frame_it_does_not_matter_from_which_azimuth_the_object_i
     np.testing.assert_allclose(*(features(SPHERE, state, inputs, "object") for state in states))
     assert not np.allclose(*(features(SPHERE, state, inputs, "camera") for state in states))
     for state in states:  # and the networks are told on which side the camera is
-        assert features(SPHERE, state, ("side",), "object")[0, :8].argmax() == (state.current[0] % 8 - zero) % 8
+        assert features(SPHERE, state, ("azimuth_bin",), "object")[0, :8].argmax() == (state.current[0] % 8 - zero) % 8
 
 
 @pytest.mark.parametrize("frame", ["camera", "object"])
 def test_a_recogniser_that_does_not_know_the_sides_is_refused(frame):
-    state, policy = some_state(), some_gain(inputs=("side",), frame=frame)
+    state, policy = some_state(), some_gain(inputs=("azimuth_bin",), frame=frame)
     assert policy.needs == ("azimuth_bins",)
     for azimuth_bins in (None, np.ones((60, CLASSES, 4)) / 4):
         with pytest.raises(ValueError, match="tells 8 azimuth bins of an object apart"):
@@ -289,7 +289,7 @@ def test_a_mirrored_object_gets_the_mirrored_choice(travel_weight, tmp_path):
 
 
 @pytest.mark.parametrize("anywhere", [True, False])
-@pytest.mark.parametrize("inputs", [INPUTS, ("belief",), ("look", "place")])
+@pytest.mark.parametrize("inputs", [INPUTS, ("belief",), ("view", "place")])
 def test_the_file_chooses_as_the_networks_do(anywhere, inputs, tmp_path):
     state, policy = some_state(episodes=300), some_gain(inputs=inputs, anywhere=anywhere, travel_weight=0.1)
     other = shipped(tmp_path, policy)
@@ -386,8 +386,8 @@ from nextview.policies.registry import make_policy
 from nextview.viewsphere import ViewSphere
 sphere = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
 evidence = Evidence(np.zeros((1, 10)), {"lem": np.zeros((1, 5, 3)), "lem-sphere": np.zeros((1, 5, 8))})
-visited, belief, azimuth bins = np.arange(40)[None] == 3, np.full((1, 10), 0.1), np.full((1, 10, 8), 0.125)
-state = EpisodeState(np.array([3]), visited, belief, evidence, 1, azimuth bins=azimuth bins)
+visited, belief, azimuth_bins = np.arange(40)[None] == 3, np.full((1, 10), 0.1), np.full((1, 10, 8), 0.125)
+state = EpisodeState(np.array([3]), visited, belief, evidence, 1, azimuth_bins=azimuth_bins)
 print(*make_policy("gain", sphere).next_views(state, np.random.default_rng(0)))
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
@@ -426,7 +426,7 @@ def test_training_finds_the_views_that_tell_the_class_believed():
     """Every class is told on one ring alone, and each view hints at the class: go to the ring of the class believed."""
     learned = ReplayTable(telling(SMALL, [[0], [1], [2]], 240), {}, PLAIN_SUM)
     fresh = ReplayTable(telling(SMALL, [[0], [1], [2]], 90, seed=1), {}, PLAIN_SUM)
-    recipe = replace(QUICK, inputs=("belief", "look", "place"), frame="camera", epochs=20)
+    recipe = replace(QUICK, inputs=("belief", "view", "place"), frame="camera", epochs=20)
     *_, ((policy,), value) = best_epoch([train(learned, recipe)], [fresh], recipe)
     first, second = (SMALL.ring[m.state.current] for m in rollout(fresh, policy, 2, np.random.default_rng(5)))
     not_told_yet = first != fresh.data.labels
@@ -468,7 +468,7 @@ def test_folds_judge_policies_that_have_not_seen_them_and_are_averaged(monkeypat
         asked.append((table, policy))
         return judge(table, policy, *rest, **options)
 
-    monkeypatch.setattr("nextview.training.gain.judge", listen)
+    monkeypatch.setattr("nextview.training.gain_training.judge", listen)
     trainings = [train(parts[0], recipe, k) for k in range(2)]
     *_, (policies, value) = best_epoch(trainings, parts[1:], recipe)
     assert [table is parts[1 + k % 2] for k, (table, _) in enumerate(asked)] == [True] * 4
@@ -514,7 +514,7 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
         make_policy(str(card), SPHERE, classes=("ball", "box"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.json", "mine.onnx", "unseen.npz"]
     assert "its answers differ from the networks' by" in " ".join(capsys.readouterr().err.split())
-    main(["train", "gain", str(unseen), str(card), "--epochs", "1", "--local", "--travel weight", "0.2"])
+    main(["train", "gain", str(unseen), str(card), "--epochs", "1", "--local", "--travel-weight", "0.2"])
     policy = make_policy(str(card), SPHERE)
     assert (policy.anywhere, policy.travel_weight, policy.needs) == (False, 0.2, ("lem-sphere", "azimuth_bins"))
     assert policy.frame == "object"

@@ -61,7 +61,7 @@ def test_calibrated_belief_is_the_posterior_of_equally_correlated_looks(correlat
         seen = rng.multivariate_normal(np.ones(n_views), noise, size=6)
         likelihood = np.stack([multivariate_normal(np.full(n_views, m), noise).logpdf(seen) for m in (-1, 1)], -1)
         of_each = np.stack([-((seen - m) ** 2) / (2 * spread**2) for m in (-1, 1)], -1)
-        belief = fuse(of_each, Calibration(1.0, correlation).temperature(n_views))
+        belief = fuse(of_each, Calibration(1.0, correlation).temperature_after(n_views))
         np.testing.assert_allclose(belief, softmax(likelihood, -1), atol=1e-9)
 
 
@@ -119,7 +119,7 @@ def test_a_threshold_is_a_probability(threshold):
 
 @pytest.mark.parametrize("threshold_decay", [-0.1, np.nan, np.inf])
 def test_a_bar_comes_down_or_stays(threshold_decay):
-    with pytest.raises(ValueError, match="threshold_decay"):
+    with pytest.raises(ValueError, match="threshold decay"):
         Stopping(0.9, 5, threshold_decay)
 
 
@@ -130,7 +130,7 @@ def test_with_a_decline_of_its_correlation_a_calibrated_belief_stops_where_the_p
     # Of two classes, where the peak of the belief is one to one with the difference of the logits.
     logits = np.random.default_rng(seed).normal(size=(50, n_views, 2))
     plain = fuse(logits).max(-1) >= Stopping(threshold_at).threshold_at(n_views)
-    belief = fuse(logits, Calibration(1.0, c).temperature(n_views)).max(-1)
+    belief = fuse(logits, Calibration(1.0, c).temperature_after(n_views)).max(-1)
     near = np.abs(belief - Stopping(threshold_at, 8, c).threshold_at(n_views)) < 1e-9
     np.testing.assert_array_equal((belief >= Stopping(threshold_at, 8, c).threshold_at(n_views)) | near, plain | near)
 
@@ -208,7 +208,7 @@ def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
     logits, azimuth_bins, azimuth = some_views(3)
     total = log_evidence_of(logits, azimuth_bins, azimuth / 8).sum(0)
     for calibration in (Calibration(), Calibration(0.7, 0.5)):
-        np.testing.assert_allclose(calibration.belief(total, 3, 3), fuse(logits, calibration.temperature(3)))
+        np.testing.assert_allclose(calibration.belief(total, 3, 3), fuse(logits, calibration.temperature_after(3)))
     np.testing.assert_array_equal(log_evidence_of(logits, None, azimuth / 8), logits)
     with pytest.raises(ValueError, match="not a finite number"):
         Calibration().belief(total + np.nan, 3, 3)

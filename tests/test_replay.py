@@ -341,7 +341,7 @@ def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(meshes, 
             mesh = load_mesh(tmp_path / "meshes" / label / "test" / f"{p.names[i]}.off")
             camera = SimulatedCamera(mesh, 64, sphere.distance)
             live = recognise(camera, models, policy, sphere, int(start), Stopping(threshold))
-            assert [observation.view for observation in live.n_views] == paths.views[e, : ends.n_views[e]].tolist()
+            assert [view.index for view in live.views] == paths.views[e, : ends.n_views[e]].tolist()
             assert live.answer == classes[ends.answer[e]]
             assert live.confident == ends.confident[e]
             assert live.confidence == pytest.approx(ends.confidence[e], abs=0.01)  # the store rounds

@@ -7,6 +7,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from nextview.models.inference import BINS_OUTPUT
 from nextview.models.model_card import file_hash
 
 
@@ -29,10 +30,10 @@ def make_recogniser(folder: Path, classes: list[str], size: int = 16, seed: int 
         nodes += [
             helper.make_node("MatMul", ["features", "side_weights"], ["flat"]),
             helper.make_node("Reshape", ["flat", "side_shape"], ["shaped"]),
-            helper.make_node("LogSoftmax", ["shaped"], ["azimuth_bins"], axis=2),
+            helper.make_node("LogSoftmax", ["shaped"], [BINS_OUTPUT], axis=2),
         ]
         shape = ["batch", len(classes), azimuth_bins]
-        outputs += [helper.make_tensor_value_info("azimuth_bins", TensorProto.FLOAT, shape)]
+        outputs += [helper.make_tensor_value_info(BINS_OUTPUT, TensorProto.FLOAT, shape)]
         side_weights = np.random.default_rng(seed + 1).normal(size=(4, len(classes) * azimuth_bins)).astype(np.float32)
         constants |= {"side_weights": side_weights / 16, "side_shape": np.array([-1, *shape[1:]])}
         facts["azimuth_bins"] = azimuth_bins

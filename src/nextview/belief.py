@@ -169,7 +169,7 @@ class Calibration:
                 f"{self.bin_correlation}"
             )
 
-    def temperature(self, n_views: int) -> float:
+    def temperature_after(self, n_views: int) -> float:
         """What the sum of the logits of so many views is divided by."""
         return self.temperature * (1 + self.correlation * (n_views - 1))
 

@@ -61,7 +61,7 @@ class Outcome:
 
 
 class Episodes:
-    """B episodes side by side. Give ``tell`` what was seen from ``current``, until ``running`` is empty.
+    """B episodes side by side. Give ``update`` what was seen from ``current``, until ``running`` is empty.
 
     Args:
         sphere: the viewpoints.
@@ -91,7 +91,7 @@ class Episodes:
         self._visited = np.zeros((len(starts), len(sphere)), bool)
         self._total: NDArray[np.float64] = np.zeros((len(starts), 0))
 
-    def tell(self, evidence: Evidence) -> Step:
+    def update(self, evidence: Evidence) -> Step:
         """Take in the evidence of one view in every running episode; stop or choose its next view.
 
         Where this raises, nothing is taken in: the same view can be told again.
@@ -102,7 +102,7 @@ class Episodes:
         """
         now, views = self.running, self.current[self.running]
         if len(evidence.logits) != len(now):
-            raise UsageError(f"evidence of {len(evidence.logits)} looks for {len(now)} running episodes")
+            raise UsageError(f"evidence of {len(evidence.logits)} views for {len(now)} running episodes")
         before = self._total[now] if self.steps else 0.0
         azimuth = self.sphere.turn[views]
         total = before + np.asarray(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64)
@@ -235,5 +235,5 @@ def run_episodes(
     """
     episodes = Episodes(sphere, policy, starts, stopping, rng, calibration)
     while len(episodes.running):
-        episodes.tell(observe(episodes.running, episodes.current[episodes.running]))
+        episodes.update(observe(episodes.running, episodes.current[episodes.running]))
     return episodes

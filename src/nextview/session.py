@@ -21,9 +21,9 @@ class View:
     """One view and what followed from it.
 
     Attributes:
-        view: where it was taken from.
+        index: the candidate viewpoint it was taken from.
         observation: what was seen.
-        guess: what this image alone says, (classes,) float64.
+        alone: belief by this view alone, (classes,) float64.
         belief: fused over all views so far, (classes,) float64.
         maps: predicted local maps by name, each (rings, 3).
         next_view: where to look next; None where the episode ends.
@@ -33,9 +33,9 @@ class View:
             azimuth bins), in even steps of azimuth; None if the recogniser was not taught them.
     """
 
-    view: int
+    index: int
     observation: Observation
-    guess: NDArray[np.float64]
+    alone: NDArray[np.float64]
     belief: NDArray[np.float64]
     maps: dict[str, NDArray[np.floating]]
     next_view: int | None
@@ -79,7 +79,7 @@ class Session:
 
     >>> session = Session(models, policy, sphere, start=0)                      # doctest: +SKIP
     >>> while not session.done:                                                 # doctest: +SKIP
-    ...     look = session.tell(my_camera.observe(session.pose))
+    ...     look = session.update(my_camera.observe(session.pose))
 
     Args:
         models: recogniser and map networks.
@@ -127,7 +127,7 @@ class Session:
         """Where to look now, as a camera-to-world pose (4, 4), OpenCV axes, object radii."""
         return self.sphere.poses[self.view]
 
-    def tell(self, observation: Observation) -> View:
+    def update(self, observation: Observation) -> View:
         """Take in what was seen from ``pose``.
 
         Raises:
@@ -135,18 +135,18 @@ class Session:
         """
         if self.done:
             raise SessionError("this session has ended; begin another one")
-        step = self._episodes.tell(self.models.evidence([observation]))
-        view, to = int(step.views[0]), int(step.next_views[0])
+        step = self._episodes.update(self.models.evidence([observation]))
+        here, to = int(step.views[0]), int(step.next_views[0])
         travel, arc = (self.views[-1].travel, self.views[-1].arc) if self.views else (0.0, 0.0)
         if self.views:
-            travel += float(self.sphere.travel[self.views[-1].view, view])
-            arc += float(self.sphere.arc[self.views[-1].view, view])
+            travel += float(self.sphere.travel[self.views[-1].index, here])
+            arc += float(self.sphere.arc[self.views[-1].index, here])
         calibration, azimuth = self._episodes.calibration, self.sphere.turn[step.views]
         azimuth_bins = calibration.azimuth_bins(step.total, len(self.views) + 1, len(self.models.classes), azimuth)
         view = View(
-            view,
+            here,
             observation,
-            fuse(step.evidence.logits[:, None], self._episodes.calibration.temperature(1))[0],
+            fuse(step.evidence.logits[:, None], self._episodes.calibration.temperature_after(1))[0],
             step.belief[0],
             {name: values[0] for name, values in step.evidence.maps.items()},
             None if to < 0 else to,
@@ -179,5 +179,5 @@ def recognise(
     """Look at an object until its class is believed or the views run out. Arguments as for ``Session``."""
     session = Session(models, policy, sphere, start, stopping, rng)
     while not session.done:
-        session.tell(camera.observe(session.pose))
+        session.update(camera.observe(session.pose))
     return session.result

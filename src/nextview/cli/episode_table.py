@@ -23,7 +23,7 @@ def _peak(sphere: ViewSphere, view: View) -> tuple[int, float] | None:
     """View and value of the highest cell of the view's predicted map."""
     for predicted in view.maps.values():
         cell = int(predicted.argmax())
-        return int(sphere.window(view.view).flat[cell]), float(predicted.flat[cell])
+        return int(sphere.window(view.index).flat[cell]), float(predicted.flat[cell])
     return None
 
 
@@ -37,16 +37,16 @@ def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: 
         title=f"Looking at {name}",
         caption="view: number, elevation, azimuth; travel: grid cells",
     )
-    for column in ("step", "view", "image says", "belief, top 3", "map's peak", "next", "travel"):
+    for column in ("step", "view", "this view alone", "belief, top 3", "map's peak", "next", "travel"):
         table.add_column(column, justify="right" if column in ("step", "travel") else "left", no_wrap=True)
     for step, view in enumerate(result.views, 1):
         top = np.argsort(-view.belief)[:3]
-        own = int(view.guess.argmax())
+        own = int(view.alone.argmax())
         peak = _peak(sphere, view)
         table.add_row(
             str(step),
-            _angles(sphere, view.view),
-            f"{result.classes[own]}\n{view.guess[own]:.3f}",
+            _angles(sphere, view.index),
+            f"{result.classes[own]}\n{view.alone[own]:.3f}",
             "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top),
             "-" if peak is None else f"{_angles(sphere, peak[0])}\n{peak[1]:.2f}",
             "stop" if view.next_view is None else _angles(sphere, view.next_view),
@@ -54,11 +54,11 @@ def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: 
         )
     console = Console()
     console.print(table)
-    threshold_at = float(stopping.threshold_at(len(result.views)))
-    reason = f"threshold {threshold_at:.3g} reached" if result.confident else "no views left"
+    threshold = float(stopping.threshold_at(len(result.views)))
+    reason = f"threshold {threshold:.3g} reached" if result.confident else "no views left"
     console.print(
         f"It is a [bold]{result.answer}[/bold], belief {result.confidence:.3f}, after {len(result.views)} "
-        f"look{'s' * (len(result.views) > 1)} and {result.travel:.2f} cells of travel ({reason})."
+        f"view{'s' * (len(result.views) > 1)} and {result.travel:.2f} cells of travel ({reason})."
     )
 
 
@@ -71,17 +71,17 @@ def as_json(result: Recognition, sphere: ViewSphere) -> str:
     views = []
     for view in result.views:
         peak = _peak(sphere, view)
-        side = None if view.azimuth_bins is None else view.azimuth_bins[view.belief.argmax()]
+        bins = None if view.azimuth_bins is None else view.azimuth_bins[view.belief.argmax()]
         views.append(
             {
-                "view": view.view,
-                "elevation": sphere.angles(view.view)[0],
-                "azimuth": sphere.angles(view.view)[1],
-                "image_says": dict(zip(result.classes, rounded(view.guess), strict=True)),
+                "view": view.index,
+                "elevation": sphere.angles(view.index)[0],
+                "azimuth": sphere.angles(view.index)[1],
+                "alone": dict(zip(result.classes, rounded(view.alone), strict=True)),
                 "belief": dict(zip(result.classes, rounded(view.belief), strict=True)),
-                "side": None
-                if side is None
-                else {"degrees": 360 * int(side.argmax()) / len(side), "belief": round(float(side.max()), 6)},
+                "azimuth_bin": None
+                if bins is None
+                else {"degrees": 360 * int(bins.argmax()) / len(bins), "belief": round(float(bins.max()), 6)},
                 "maps": {name: rounded(values) for name, values in view.maps.items()},
                 "map_peak": None if peak is None else peak[0],
                 "next_view": view.next_view,
@@ -94,7 +94,7 @@ def as_json(result: Recognition, sphere: ViewSphere) -> str:
             "answer": result.answer,
             "confidence": round(result.confidence, 6),
             "threshold_reached": result.confident,
-            "n_views": views,
+            "views": views,
         },
         indent=1,
     )

@@ -104,7 +104,7 @@ def show(
     while not session.done:
         seen = camera.observe(session.pose)
         watch.lap("looking")
-        session.tell(seen)
+        session.update(seen)
         watch.lap("thinking")
     result = session.result
 

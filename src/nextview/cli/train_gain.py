@@ -60,7 +60,7 @@ def train_gain(
         lacking = [name for name in recipe.inputs if name in MAPS and name not in source.maps]
         if lacking:
             raise PredictionsError(f"{path}: holds no map {lacking[0]!r}; predict it, or choose other --inputs")
-        if source.azimuth_bins is None and (recipe.frame == "object" or "side" in recipe.inputs):
+        if source.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
             raise PredictionsError(
                 f"{path}: says nothing of azimuth bins; teach the recogniser (--side), or do without"
             )

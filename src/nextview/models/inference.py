@@ -23,6 +23,8 @@ from nextview.observation import Observation
 from nextview.policies.base import Evidence, maps_among
 
 RECOGNISER = "recogniser-modelnet10"
+BINS_OUTPUT = "sides"
+"""The name that the azimuth bins have in a recogniser's ONNX file."""
 MAPS = {"lem": "lem-modelnet10", "lcm": "lcm-modelnet10"}
 
 
@@ -122,7 +124,7 @@ class Recogniser:
     def from_inputs(self, inputs: NDArray[Any]) -> Evidence:
         """The same by what is seen alone, see ``see``."""
         logits, features, *azimuth_bins = self._session.run(
-            ["logits", "features", *(["azimuth_bins"] if self.azimuth_bins else [])], {"input": inputs}
+            ["logits", "features", *([BINS_OUTPUT] if self.azimuth_bins else [])], {"input": inputs}
         )
         return Evidence(logits, features=features, azimuth_bins=azimuth_bins[0] if azimuth_bins else None)
 

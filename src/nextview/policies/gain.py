@@ -24,7 +24,7 @@ Float = NDArray[np.float64]
 MAPS = ("lem", "lcm", "lem-sphere", "lcm-sphere")
 """Predicted maps that a network may be told, of the local window or of the whole sphere."""
 
-INPUTS = ("belief", "look", "place", *MAPS, "side")
+INPUTS = ("belief", "view", "place", *MAPS, "azimuth_bin")
 """What a network may be told: the belief over all views; what the last view alone says; the ring and the views that are
 visited; the maps that were predicted from the last view; and which side of the object is seen, if it is of the class
 that is believed most, and over all classes."""
@@ -91,7 +91,7 @@ def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], fra
     parts: list[NDArray] = []
     if "belief" in inputs:
         parts += _facets(state.belief)
-    if "look" in inputs:
+    if "view" in inputs:
         shifted = state.evidence.logits - state.evidence.logits.max(1, keepdims=True)
         alone = np.exp(shifted.astype(np.float64))
         parts += _facets(alone / alone.sum(1, keepdims=True))
@@ -105,7 +105,7 @@ def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], fra
                 columns = (np.arange(n) - ahead[:, None]) % n
                 values = np.take_along_axis(values, columns[:, None], 2)
             parts.append(values)
-    if "side" in inputs:
+    if "azimuth_bin" in inputs:
         parts += [np.eye(n)[ahead]] if frame == "object" else []
         azimuth_bins = _bin_belief(sphere, state)
         for believed in (_own(state.belief, azimuth_bins), (state.belief[:, :, None] * azimuth_bins).sum(1)):
@@ -126,13 +126,13 @@ def mirrored_features(
     facets = 2 * classes + min(3, classes)
     blocks = {
         "belief": np.arange(facets),
-        "look": np.arange(facets),
+        "view": np.arange(facets),
         "place": np.concatenate([np.arange(sphere.rings), sphere.rings + mirrored(sphere)]),
     }
     window = np.arange(sphere.rings * 3).reshape(-1, 3)[:, ::-1].ravel()
     blocks |= {name: mirrored(sphere) if name.endswith("-sphere") else window for name in MAPS}
     n = sphere.azimuths
-    blocks["side"] = np.concatenate([k * n + -np.arange(n) % n for k in range(2 if frame == "camera" else 3)])
+    blocks["azimuth_bin"] = np.concatenate([k * n + -np.arange(n) % n for k in range(2 if frame == "camera" else 3)])
     found, begin = [], 0
     for name in [name for name in INPUTS if name in inputs]:
         found.append(begin + blocks[name])
@@ -174,7 +174,7 @@ class Gain:
     @property
     def needs(self) -> tuple[str, ...]:
         """The maps that the score is told, and the azimuth bins."""
-        azimuth_bins = "side" in self.inputs or self.frame == "object"
+        azimuth_bins = "azimuth_bin" in self.inputs or self.frame == "object"
         return (*(name for name in MAPS if name in self.inputs), *(["azimuth_bins"] if azimuth_bins else []))
 
     def facts(self) -> dict[str, Any]:

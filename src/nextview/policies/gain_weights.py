@@ -13,6 +13,9 @@ from nextview.models.onnx_file import open_onnx
 from nextview.policies.gain import Gain, mirrored_features
 from nextview.viewsphere import ViewSphere
 
+FEATURES_INPUT = "told"
+"""The name that the features have in the ONNX file."""
+
 
 def read_gain(sphere: ViewSphere, facts: dict[str, Any], weights: Path) -> Gain:
     """The policy that a card describes.
@@ -30,7 +33,7 @@ def read_gain(sphere: ViewSphere, facts: dict[str, Any], weights: Path) -> Gain:
     session = open_onnx(weights, facts["sha256"], threads=1)
 
     def score(features: NDArray[np.float32]) -> NDArray[np.float32]:
-        return session.run(["cells"], {"features": features})[0]
+        return session.run(["cells"], {FEATURES_INPUT: features})[0]
 
     policy = Gain(
         sphere,
@@ -42,12 +45,14 @@ def read_gain(sphere: ViewSphere, facts: dict[str, Any], weights: Path) -> Gain:
         table.get("frame", "camera"),
     )
     width = len(mirrored_features(sphere, policy.classes, policy.inputs, policy.frame))
-    wanted = [("features", "tensor(float)", [width]), ("cells", "tensor(float)", [len(sphere)])]
+    wanted = [(FEATURES_INPUT, "tensor(float)", [width]), ("cells", "tensor(float)", [len(sphere)])]
     ends = [*session.get_inputs(), *session.get_outputs()]
     found = [(end.name, end.type, list(end.shape[1:])) for end in ends]
     if found != wanted or any(isinstance(end.shape[0], int) for end in ends):
         shapes = ", ".join(f"{end.name} {tuple(end.shape)}" for end in ends)
-        raise ModelError(f"{weights}: has {shapes}, not told (batch, {width}) and cells (batch, {len(sphere)})")
+        raise ModelError(
+            f"{weights}: has {shapes}, not {FEATURES_INPUT} (batch, {width}) and cells (batch, {len(sphere)})"
+        )
     # The graph answers with what is not a number if any weight is not finite, whatever it is told.
     if not np.isfinite(score(np.zeros((1, width), np.float32))).all():
         raise ModelError(f"{weights}: a weight is not a finite number")

@@ -55,23 +55,23 @@ def draw_episode(result: Recognition, sphere: ViewSphere, title: str) -> Figure:
 
 
 def _draw_image(axis: Axes, view: View, sphere: ViewSphere, step: int) -> None:
-    elevation, azimuth = sphere.angles(view.view)
+    elevation, azimuth = sphere.angles(view.index)
     axis.imshow(view.observation.image, cmap="gray", vmin=0, vmax=255)
-    axis.set_title(f"look {step}: view {view.view}\n{elevation:.0f}° up, {azimuth:.0f}° round", color=INK, fontsize=10)
+    axis.set_title(f"step {step}: view {view.index}\n{elevation:.0f}° up, {azimuth:.0f}° round", color=INK, fontsize=10)
     axis.axis("off")
 
 
 def _draw_map(axis: Axes, view: View, sphere: ViewSphere, first: bool) -> None:
     name, predicted = next(iter(view.maps.items()))
     axis.imshow(predicted, cmap="viridis", vmin=0, vmax=1, origin="lower", aspect="auto")
-    window = sphere.window(view.view)
+    window = sphere.window(view.index)
     for ring, column in np.ndindex(window.shape):
         value = predicted[ring, column]
         axis.text(
             column, ring, f"{value:.2f}", ha="center", va="center", fontsize=8, color="white" if value < 0.7 else INK
         )
-    for view, colour, label in ((view.view, "white", "here"), (view.next_view, ACCENT, "next")):
-        for ring, column in np.argwhere(window == view)[:1] if view is not None else ():
+    for index, colour, label in ((view.index, "white", "here"), (view.next_view, ACCENT, "next")):
+        for ring, column in np.argwhere(window == index)[:1] if index is not None else ():
             corner = (column - 0.46, ring - 0.46)
             axis.add_patch(Rectangle(corner, 0.92, 0.92, fill=False, edgecolor=colour, linewidth=2.2))
             axis.text(column, ring - 0.33, label, ha="center", va="center", fontsize=7, color=colour, weight="bold")
@@ -86,7 +86,7 @@ def _draw_map(axis: Axes, view: View, sphere: ViewSphere, first: bool) -> None:
 def _draw_belief(axis: Axes, view: View, classes: tuple[str, ...], shown: np.ndarray, first: bool) -> None:
     rows = np.arange(len(shown))[::-1]
     axis.barh(rows + 0.18, view.belief[shown], 0.36, color=ACCENT, label="belief after this view")
-    axis.barh(rows - 0.18, view.guess[shown], 0.36, color=FAINT, label="this image alone")
+    axis.barh(rows - 0.18, view.alone[shown], 0.36, color=FAINT, label="this image alone")
     axis.set_xlim(0, 1)
     axis.set_yticks(rows, [classes[c].replace("_", " ") for c in shown] if first else [])
     axis.spines[["top", "right"]].set_visible(False)
@@ -105,15 +105,15 @@ def _draw_path(axis: Axes3D, views: tuple[View, ...], sphere: ViewSphere) -> Non
         axis.plot(*ring, color=FAINT, linewidth=0.6)
     cloud = np.concatenate([view.observation.points[::3] for view in views])
     axis.scatter(*cloud.T, s=1, color=INK, alpha=0.35, depthshade=False)
-    views = [view.view for view in views]
-    for a, b in itertools.pairwise(d[views]):
+    path = [view.index for view in views]
+    for a, b in itertools.pairwise(d[path]):
         arc = _great_circle(a, b)
         axis.plot(*arc.T, color=ACCENT, linewidth=2)
-    axis.scatter(*d[views].T, s=46, color=ACCENT, depthshade=False)
-    for step, view in enumerate(views, 1):
-        axis.text(*(d[view] * 1.16), str(step), color=ACCENT, fontsize=12, weight="bold", ha="center")
+    axis.scatter(*d[path].T, s=46, color=ACCENT, depthshade=False)
+    for step, index in enumerate(path, 1):
+        axis.text(*(d[index] * 1.16), str(step), color=ACCENT, fontsize=12, weight="bold", ha="center")
     # Look from the side where the path is, a little from above.
-    middle = d[views].sum(0)
+    middle = d[path].sum(0)
     axis.view_init(elev=24, azim=float(np.degrees(np.arctan2(middle[1], middle[0]))) - 25)
     axis.set_box_aspect((1, 1, 0.75), zoom=1.2)  # room for the numbers at its rim
     axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-0.5, 1))

@@ -14,6 +14,7 @@ from nextview.errors import ModelError
 from nextview.models.model_card import file_hash
 from nextview.models.onnx_file import open_onnx
 from nextview.policies.gain import Gain
+from nextview.policies.gain_weights import FEATURES_INPUT
 from nextview.policies.policy_card import write_policy
 from nextview.training.perceptrons import Perceptrons
 
@@ -53,7 +54,7 @@ def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
         "half": np.array(0.5, np.float32),
         "nothing": np.array(0, np.float32),
     }
-    nodes = [helper.make_node("Gather", ["features", "faces"], ["values0"], axis=1)]
+    nodes = [helper.make_node("Gather", [FEATURES_INPUT, "faces"], ["values0"], axis=1)]
     for i, layer in enumerate(zip(*p.networks, strict=True)):
         constants[f"weights{i}"] = np.stack([weights for weights, _ in layer])[None].astype(np.float32)
         constants[f"bias{i}"] = np.stack([bias for _, bias in layer])[:, None].astype(np.float32)
@@ -77,7 +78,7 @@ def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
         helper.make_node("Mul", ["total", "nothing"], ["fault"]),
         helper.make_node("Add", ["worth", "fault"], ["cells"]),
     ]
-    inputs = [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["batch", d])]
+    inputs = [helper.make_tensor_value_info(FEATURES_INPUT, TensorProto.FLOAT, ["batch", d])]
     outputs = [helper.make_tensor_value_info("cells", TensorProto.FLOAT, ["batch", v])]
     initial = [numpy_helper.from_array(np.ascontiguousarray(values), name) for name, values in constants.items()]
     graph = helper.make_graph(nodes, "gain", inputs, outputs, initial)
@@ -109,7 +110,7 @@ def write_gain(card: Path, policy: Gain, facts: dict[str, Any], features: NDArra
     part = weights.with_name(weights.name + ".part")
     onnx.save(gain_graph(policy.score), part)
     sha256 = file_hash(part)
-    answers = open_onnx(part, sha256, threads=1).run(["cells"], {"features": features.astype(np.float32)})[0]
+    answers = open_onnx(part, sha256, threads=1).run(["cells"], {FEATURES_INPUT: features.astype(np.float32)})[0]
     difference = float(np.abs(answers - policy.score(features.astype(np.float64))).max())
     if not difference <= BOUND:
         part.unlink()

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
+from nextview.models.inference import BINS_OUTPUT
+
 OPSET = 18
 SMALL = 2**17
 
@@ -37,7 +39,7 @@ class CalibratedRecogniser(nn.Module):
     @property
     def outputs(self) -> list[str]:
         """Names of what it gives."""
-        return ["logits", "features", *(["azimuth_bins"] if self.azimuth_bins else [])]
+        return ["logits", "features", *([BINS_OUTPUT] if self.azimuth_bins else [])]
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         x = x.float() / 255

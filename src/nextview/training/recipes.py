@@ -173,12 +173,12 @@ class GainRecipe:
         seed: of everything random.
     """
 
-    inputs: tuple[Literal["belief", "look", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "side"], ...] = (
+    inputs: tuple[Literal["belief", "view", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "azimuth_bin"], ...] = (
         "belief",
-        "look",
+        "view",
         "place",
         "lem-sphere",
-        "side",
+        "azimuth_bin",
     )
     frame: Literal["camera", "object"] = "object"
     outcome: Literal["belief", "log-belief", "right"] = "log-belief"
