@@ -357,7 +357,8 @@ def test_map_peak_goes_from_peak_to_peak_then_to_the_highest_rest():
         chosen = policy.next_views(state, np.random.default_rng(0))
         state.visited[0, chosen] = True
         taken.append(int(chosen[0]))
-    # 3 is below, 34 and 36 are at the azimuth bins of the top ring; no peak left, the highest rest is 35 between them (0.6).
+    # 3 is below, 34 and 36 are at the azimuth bins of the top ring; no peak left, the highest rest is 35 between them
+    # (0.6).
     assert taken == [3, 34, 36, 35]
 
 

@@ -44,12 +44,12 @@ def _pointing(total: NDArray[np.floating], classes: int) -> NDArray[np.floating]
 
 
 def reorient(azimuth_bins: NDArray[np.floating], azimuth: NDArray[np.floating]) -> NDArray[np.floating]:
-    """What is said of the azimuth bins seen from an azimuth, said of the azimuths to which azimuth bin 0 points; or the way back.
+    """Log-evidence of the bins seen from an azimuth as log-evidence of the azimuths to which bin 0 points; or back.
 
     From azimuth a side s is seen if azimuth bin 0 points to a - s: the same sum turns either into the other.
 
     Args:
-        azimuth bins: (..., classes, azimuth bins), in even steps of azimuth.
+        azimuth_bins: (..., classes, azimuth bins), in even steps of azimuth.
         azimuth: of the views, parts of a full turn, (...). Between two steps it is interpolated.
 
     Returns:
@@ -74,12 +74,13 @@ def log_evidence_of(
 
     Args:
         logits: (..., classes).
-        azimuth bins: log-likelihoods of the azimuth bins that are seen, (..., classes, azimuth bins); None if they are not told.
+        azimuth_bins: log-likelihoods of the azimuth bins that are seen, (..., classes, azimuth bins); None if they are
+            not told.
         azimuth: of the views, parts of a full turn, (...).
 
     Returns:
-        The logits, then for each azimuth how likely it is that azimuth bin 0 points there, for each class: (..., (1 + azimuth bins) *
-        classes). The logits alone if no azimuth bins are told.
+        The logits, then for each azimuth how likely it is that azimuth bin 0 points there, for each class: (..., (1 +
+        azimuth bins) * classes). The logits alone if no azimuth bins are told.
     """
     if azimuth_bins is None:
         return logits
@@ -141,10 +142,10 @@ class Calibration:
     The sum over k views is divided by ``temperature * (1 + correlation * (k - 1))``: what the variance of a sum of k
     equally correlated terms grows by, beyond k. Correlation 0 trusts the sum, 1 the mean.
 
-    What views say of the azimuth bins counts too, if the recogniser tells: an object stands still, so views from different
-    azimuths that are to be of one class have to agree on where its azimuth bin 0 points. The belief in a class is multiplied
-    by how likely it is that they would say what they say, over all azimuths to which it may point. Views err together
-    about this as well, though less.
+    What views say of the azimuth bins counts too, if the recogniser tells: an object stands still, so views from
+    different azimuths that are to be of one class have to agree on where its azimuth bin 0 points. The belief in a
+    class is multiplied by how likely it is that they would say what they say, over all azimuths to which it may point.
+    Views err together about this as well, though less.
 
     Attributes:
         temperature: temperature of a single view.
@@ -177,7 +178,8 @@ class Calibration:
         """Logarithm of the belief in each class, up to a constant for all classes.
 
         Args:
-            total: sum over views of what they say, see ``log_evidence_of``, (..., classes) or (..., (1 + azimuth bins) * classes).
+            total: sum over views of what they say, see ``log_evidence_of``, (..., classes) or (..., (1 + azimuth bins)
+                * classes).
             n_views: how many, one number or (...).
             classes: how many.
 
@@ -271,14 +273,15 @@ PLAIN_SUM = Calibration()
 class Stopping:
     """Stop when the belief's peak reaches a threshold, or after ``max_views`` views.
 
-    The threshold is ``threshold`` at the first view. With a ``threshold decay`` it comes down after that: its log-odds are divided by
-    ``1 + threshold decay * (views - 1)``, because what is unclear after several views is seldom cleared up by another one. The
-    plain sum of logits does so unawares: a calibrated belief whose threshold decay is its correlation stops where the sum does.
+    The threshold is ``threshold`` at the first view. With a ``threshold_decay`` it comes down after that: its log-odds
+    are divided by ``1 + threshold_decay * (views - 1)``, because what is unclear after several views is seldom cleared
+    up by another one. The plain sum of logits does so unawares: a calibrated belief whose threshold decay is its
+    correlation stops where the sum does.
 
     Attributes:
         threshold: of the belief.
         max_views: views at most.
-        threshold decay: how fast the threshold comes down; 0 keeps it.
+        threshold_decay: how fast the threshold comes down; 0 keeps it.
 
     Raises:
         UsageError: a threshold outside 0 .. 1, fewer than one view, or a negative threshold decay.

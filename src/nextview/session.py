@@ -29,8 +29,8 @@ class View:
         next_view: where to look next; None where the episode ends.
         travel: so far, in grid cells.
         arc: so far, in radians.
-        azimuth bins: belief, over all views, in the side of the object that is seen from here, for each class, (classes,
-            azimuth bins), in even steps of azimuth; None if the recogniser was not taught them.
+        azimuth_bins: belief, over all views, in the side of the object that is seen from here, for each class,
+            (classes, azimuth bins), in even steps of azimuth; None if the recogniser was not taught them.
     """
 
     index: int

@@ -145,7 +145,7 @@ def _moved(sphere: ViewSphere, views: NDArray[np.int64]) -> tuple[NDArray[np.flo
 
 
 def truncate(paths: Trajectories, threshold: float | None, threshold_decay: float = 0.0) -> Outcomes:
-    """The episodes under a threshold, None for one that is never reached, and its threshold decay (see ``Stopping``)."""
+    """The episodes under a threshold (None: never reached) and its decay, see ``Stopping``."""
     e, last = np.arange(len(paths.views)), (paths.views >= 0).sum(1) - 1
     n_views = np.arange(1, paths.views.shape[1] + 1)
     threshold_at = (

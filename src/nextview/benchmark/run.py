@@ -26,7 +26,7 @@ class Grid:
         thresholds: of the belief, ascending.
         max_views: views at most.
         seed: of everything random.
-        threshold decay: how fast the threshold of each threshold comes down with the views, see ``Stopping``.
+        threshold_decay: how fast the threshold of each threshold comes down with the views, see ``Stopping``.
         paths: of each entry that came to its end, by name.
         failures: a sentence for each that did not.
     """

@@ -26,7 +26,8 @@ class FittingSet:
         labels: (N,) int64.
         sphere: the viewpoints.
         classes: names, in the order of the logits.
-        azimuth bins: what it says of the azimuth bins, (N, V, C, azimuth bins) float32, see ``Evidence``; None if it cannot tell.
+        azimuth_bins: what it says of the azimuth bins, (N, V, C, azimuth bins) float32, see ``Evidence``; None if it
+            cannot tell.
     """
 
     logits: NDArray[np.float32]
@@ -68,7 +69,7 @@ class FittingSet:
 
 
 def held_out_by(card: Card, predictions: Predictions) -> NDArray[np.int64]:
-    """The objects on which a network was not trained, as its card says, duplicates left out: their indices, maybe none."""
+    """Objects on which a network was not trained, as its card says, duplicates left out: their indices."""
     once = deduplicated(predictions.labels, predictions.depth_entropy)
     return once[np.isin(np.array(predictions.names)[once], card.facts.get("unseen", []))]
 

@@ -31,7 +31,7 @@ def fit_sequence(
         anywhere: choose among all views; otherwise in the local window.
         length: moves.
         calibration: of the belief.
-        travel weight: of one cell of travel, in the measure.
+        travel_weight: of one cell of travel, in the measure.
 
     Returns:
         (rings, length) int64, cells as in ``FixedSequence``.
@@ -58,7 +58,7 @@ def greedy_path(
         anywhere: choose among all views; otherwise in the local window.
         length: moves.
         calibration: of the belief.
-        travel weight: of one cell of travel, in the measure.
+        travel_weight: of one cell of travel, in the measure.
 
     Returns:
         (length + 1,) int64: the cell of each view, seen from the start, the start's own first.

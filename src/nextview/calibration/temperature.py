@@ -50,7 +50,7 @@ def fit_temperature(data: FittingSet, rng: np.random.Generator, n_views: int = 5
 def loss(
     data: FittingSet, calibration: Calibration, rng: np.random.Generator, n_views: int = 5, walks: int = 4
 ) -> float:
-    """Mean negative log-likelihood of the true class over 1 to ``n_views`` looks; arguments as of ``fit_temperature``."""
+    """Mean negative log-likelihood of the true class over 1 to ``n_views`` views; see ``fit_temperature``."""
     return _loss(data, rng, n_views, walks)(calibration)
 
 

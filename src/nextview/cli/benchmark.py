@@ -35,8 +35,8 @@ def benchmark(
         policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
         thresholds: of the belief.
         risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too.
-        threshold decay: how fast a threshold comes down with the views; by default with the recogniser's correlation, as in
-            nextview recognise, or not at all with --risks, which are promised for thresholds that stay.
+        threshold_decay: how fast a threshold comes down with the views; by default with the recogniser's correlation,
+            as in nextview recognise, or not at all with --risks, which are promised for thresholds that stay.
         uncalibrated: believe the plain sum of the logits, as published, whatever the recogniser's card says.
         split: take only the objects of this one; needed where the predictions hold several.
         runs: random first views of each object.

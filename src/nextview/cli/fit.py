@@ -181,7 +181,7 @@ def fit_policies(
         length: moves of the fixed sequence.
         n_views: over which the ring and the class table are chosen.
         shrinkage: objects by whose weight the gains of one believed class are drawn towards those of all.
-        travel weight: of one cell of travel for NAME-near, in units of the logarithm of the belief in the true class.
+        travel_weight: of one cell of travel for NAME-near, in units of the logarithm of the belief in the true class.
         seed: decides the walks behind the class table.
     """
     import numpy as np

@@ -35,9 +35,9 @@ def recognise(
 
     Args:
         mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
-        policy: how the next view is chosen: gain (what a view is worth less its travel weight), lem, lem-peak, lcm, lcm-peak,
-            random, random-all, furthest, unidirectional, spread, spread-local, another learned one that is bundled, or
-            the card of one (.json).
+        policy: how the next view is chosen: gain (what a view is worth less its travel weight), lem, lem-peak, lcm,
+            lcm-peak, random, random-all, furthest, unidirectional, spread, spread-local, another learned one that is
+            bundled, or the card of one (.json).
         threshold: stop when the belief in one class reaches this after one view, less after several.
         risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
         max_views: stop after so many views.

@@ -27,12 +27,12 @@ def train_gain(
             those that were kept from it in folds (nextview predict --unseen).
         out: card of the policy (.json), the weights beside it (.onnx); run it with --policy OUT, or OUT@PRICE for
             another travel weight.
-        validation: predictions of other objects of the training split, which choose the epoch and the travel weight; those
-            among them are left out of the training. By default PREDICTIONS choose them, in folds.
+        validation: predictions of other objects of the training split, which choose the epoch and the travel weight;
+            those among them are left out of the training. By default PREDICTIONS choose them, in folds.
         folds: without VALIDATION, so many policies are trained, each without its share of the objects, which judge it;
             the result is the mean of all.
-        travel weight: of a grid cell of travel; by default the lowest at which the policy travels no farther than a random walk
-            in the local window.
+        travel_weight: of a grid cell of travel; by default the lowest at which the policy travels no farther than a
+            random walk in the local window.
         local: let it choose in the local window only.
         recipe: how to train.
     """
@@ -98,8 +98,8 @@ def train_gain(
         "elevations": table.sphere.elevations,
         "azimuths": table.sphere.azimuths,
         "classes": table.classes,
-        "learned_from": f"{learners} objects of the training split, classes weighted evenly; epoch and travel weight chosen on "
-        f"{chosen}",
+        "learned_from": f"{learners} objects of the training split, classes weighted evenly; epoch and travel weight "
+        f"chosen on {chosen}",
         "predictions": [{"sha256": file_hash(path), "models": source.models} for path, source in sources],
         "calibration": [[c.temperature, c.correlation] for c in (part.calibration for part in learned)],
         "settings": asdict(recipe),

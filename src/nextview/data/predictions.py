@@ -39,8 +39,8 @@ class Predictions:
         models: name and SHA-256 of the recogniser ("recogniser") and of each map network ("lem").
         valley_classes: for each map, the classes for which its card says that the valley is the better view.
         calibration: how far the recogniser's card says that a sum of its logits is to be trusted.
-        azimuth bins: what the recogniser says of the azimuth bins of the object, (N, V, C, azimuth bins) float32, see ``Evidence``; None if
-            it cannot tell them.
+        azimuth_bins: what the recogniser says of the azimuth bins of the object, (N, V, C, azimuth bins) float32, see
+            ``Evidence``; None if it cannot tell them.
         of_size: what the size of the object has added to the logits of each of its views, (N, C) float32; None if the
             recogniser knows nothing of sizes.
 

@@ -114,7 +114,7 @@ class Recogniser:
         self._session = open_weights(self.card, threads)
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
-        """What it says of B views from one camera: calibrated logits, pooled features, and azimuth bins if it knows them."""
+        """Evidence of B views from one camera: logits, pooled features, and azimuth bins if it knows them."""
         evidence = self.from_inputs(see(observations, *self.sees))
         if self._size is None:
             return evidence

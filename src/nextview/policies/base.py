@@ -21,9 +21,9 @@ class Evidence:
         maps: those that the policy needs, by name: predicted local maps ("lem"), each (B, rings, 3) float, and maps of
             the whole sphere ("lem-sphere"), (B, rings, azimuths), columns once round from the view.
         features: pooled image features, (B, D) float.
-        azimuth bins: logarithms of how likely each side of the object is the one that is seen, if it is of each class,
-            (B, classes, azimuth bins) float: azimuth bins in even steps of azimuth from one that the recogniser has settled on for
-            the class. None if the recogniser cannot tell.
+        azimuth_bins: logarithms of how likely each side of the object is the one that is seen, if it is of each class,
+            (B, classes, azimuth bins) float: azimuth bins in even steps of azimuth from one that the recogniser has
+            settled on for the class. None if the recogniser cannot tell.
     """
 
     logits: NDArray[np.floating]
@@ -43,9 +43,9 @@ class EpisodeState:
         evidence: of the current view.
         step: views taken so far, 1 or more.
         episodes: which episodes these are, (B,) int64: where an oracle looks up its truth. Live there is one, 0.
-        azimuth bins: belief, over all views, in the azimuth bin that is seen from the current view, if the object is of each class,
-            (B, classes, azimuth bins) float64, sums to 1 over the azimuth bins. None if the recogniser cannot tell, or "azimuth bins" is not
-            among the policy's needs.
+        azimuth_bins: belief, over all views, in the azimuth bin that is seen from the current view, if the object is
+            of each class, (B, classes, azimuth bins) float64, sums to 1 over the azimuth bins. None if the recogniser
+            cannot tell, or "azimuth bins" is not among the policy's needs.
     """
 
     current: NDArray[np.int64]

@@ -150,7 +150,7 @@ class Gain:
         score: from what is told, (B, D) float32, to what each cell is worth, (B, V) float32: the mean over some
             networks and over the object and its mirror image. Each row by itself, to the last bit.
         inputs: what the score is told, some of INPUTS.
-        travel weight: of a grid cell of travel, in what the networks were trained to predict.
+        travel_weight: of a grid cell of travel, in what the networks were trained to predict.
         anywhere: among all views; otherwise among those of the local window.
         frame: in which cells are counted.
     """

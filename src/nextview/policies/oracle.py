@@ -47,7 +47,8 @@ class OracleGain:
 
     Attributes:
         sphere: the viewpoints.
-        log_evidence: by the recogniser of every view of every object, so that it adds up, (N, V, D); see ``log_evidence_of``.
+        log_evidence: by the recogniser of every view of every object, so that it adds up, (N, V, D); see
+            ``log_evidence_of``.
         classes: how many.
         labels: true class of each object, (N,) int64.
         objects: the object of each episode, (E,) int64.

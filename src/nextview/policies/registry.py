@@ -37,8 +37,8 @@ def make_policy(
 
     Args:
         name: one of POLICIES, a learned one that is bundled, the path of a learned one's card (.json), or
-            "module:Class" for one of your own, which is called with the sphere alone. A learned one that pays a travel weight
-            for travel is had at another travel weight as NAME@PRICE.
+            "module:Class" for one of your own, which is called with the sphere alone. A learned one that weighs
+            travel takes another travel weight as NAME@WEIGHT.
         sphere: the viewpoints.
         valley_classes: classes (indices) whose believers go to the map's valley; only "lem" and "lcm" use it.
         classes: names of the recogniser's classes; a learned policy for others is refused.

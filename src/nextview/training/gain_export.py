@@ -23,8 +23,8 @@ IR_VERSION = 8
 """That of the ONNX releases with this opset: older ONNX Runtimes read it too."""
 
 BOUND = 1e-5
-"""How far the file's answers may be from those of the networks in double precision. A fiftieth of the lowest travel weight of a
-cell of travel that is tried."""
+"""How far the file's answers may be from those of the networks in double precision. A fiftieth of the
+lowest travel weight that is tried."""
 
 
 def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:

@@ -22,7 +22,8 @@ SMALL = 2**17
 class CalibratedRecogniser(nn.Module):
     """The recogniser as it ships: raw input bytes in, logits over a temperature and pooled features out.
 
-    Where all networks know the azimuth bins of objects, a third output is what they say of them, see ``networks.ResNet``.
+    Where all networks know the azimuth bins of objects, a third output is what they say of them, see
+    ``networks.ResNet``.
 
     Args:
         networks: their logits are averaged, and what they say of the azimuth bins; their features are set side by side.

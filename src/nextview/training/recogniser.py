@@ -32,7 +32,8 @@ class Source:
     Attributes:
         inputs: (rows, V, C, S, S) uint8.
         row: of each object in them, (N,).
-        azimuth bins: that each view sees of its object, (rows, V), see ``azimuth bins.azimuth bins``; None if they are not to be learned.
+        azimuth_bins: that each view sees of its object, (rows, V), see ``azimuth_bins.azimuth_bins``; None if they are
+            not to be learned.
     """
 
     inputs: NDArray[np.uint8] | PackedViews
