@@ -28,7 +28,7 @@ VIEW_COUNTS, WALKS = 5, 20
 
 
 def averaged(paths: list[Path]) -> Predictions:
-    """The mean of the logits, and of the log-evidence of azimuth bins, over predictions of the same objects; duplicates left out."""
+    """The mean of logits and azimuth bins over predictions of the same objects; duplicates left out."""
     tables = [p.by_shape() for p in of_the_same(paths)]
     features = [p.azimuth_bins for p in tables if p.azimuth_bins is not None]
     azimuth_bins = log_softmax(np.mean(features, 0), axis=-1) if len(features) == len(tables) else None

@@ -14,7 +14,7 @@ L = pytest.importorskip("lightning")
 
 from nextview.models.model_card import ModelError  # noqa: E402
 from nextview.report.training_curves import read_log, training_curves  # noqa: E402
-from nextview.training import fit as fitting  # noqa: E402
+from nextview.training import loop as fitting  # noqa: E402
 from nextview.training import recogniser  # noqa: E402
 from nextview.training.ahead import Ahead  # noqa: E402
 from nextview.training.hardware import Hardware  # noqa: E402

@@ -16,7 +16,7 @@ from nextview.errors import ModelError  # noqa: E402
 from nextview.mesh import make_mesh  # noqa: E402
 from nextview.models.inference import RECOGNISER, MapNetwork, Recogniser  # noqa: E402
 from nextview.models.model_card import find_card  # noqa: E402
-from nextview.training import maps  # noqa: E402
+from nextview.training import map_training as maps  # noqa: E402
 from nextview.training.architectures import ResNet, ViewMap  # noqa: E402
 from nextview.training.azimuth_bins import azimuth_bins, mirror_planes, side_loss  # noqa: E402
 from nextview.training.checkpoints import exported_networks, load_exported, refuse_seen  # noqa: E402

@@ -17,7 +17,7 @@ from tests.test_readme import write_off
 
 from nextview.calibration.valleys import valley_gains
 from nextview.cli.main import main
-from nextview.data import splits as split
+from nextview.data import splits
 from nextview.data.input_views import input_views
 from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
@@ -145,23 +145,23 @@ def trained(tmp_path_factory):
 def test_split_keeps_twins_together_and_test_objects_out(trained):
     store = ViewStore.open(trained / "views.zarr")
     for seed in range(6):
-        training, validation = split.split_training(store, 0.25, seed)
+        training, validation = splits.split_training(store, 0.25, seed)
         assert not set(training) & set(validation)
-        assert set(training) | set(validation) | set(split.test_objects(store)) == set(range(len(store)))
+        assert set(training) | set(validation) | set(splits.test_objects(store)) == set(range(len(store)))
         assert (store.splits[[*training, *validation]] == "train").all()
         duplicates = [store.names.index(name) for name in ("table_0", "monitor_twin")]
         assert np.isin(duplicates, validation).sum() in (0, 2)
         assert set(store.labels[validation]) == {0, 1}
         copies = np.isin([store.names.index(name) for name in ("table_small", "table_larger")], validation)
         assert copies.all() == copies.any()
-        judging = split.deduplicate(store, validation)  # the twin has another label
+        judging = splits.deduplicate(store, validation)  # the twin has another label
         assert len(judging) == len(validation) - copies.all()
 
 
 def test_a_shape_that_was_copied_judges_training_once(trained, tmp_path, monkeypatch):
     store = ViewStore.open(trained / "views.zarr")
     copy = store.names.index("table_larger")
-    seed = next(s for s in range(99) if copy in split.split_training(store, 0.25, s)[1])
+    seed = next(s for s in range(99) if copy in splits.split_training(store, 0.25, s)[1])
 
     class Judged(Exception):
         pass
@@ -272,7 +272,7 @@ def test_two_devices_train_one_map_network(trained, tmp_path):
     assert "MEMBER: 2/2" in done.stderr
     assert (run / "network.pt").exists()
     state = torch.load(run / "last.ckpt", weights_only=True)
-    training, _ = split.split_training(ViewStore.open(trained / "views.zarr"), 0.25, 0)
+    training, _ = splits.split_training(ViewStore.open(trained / "views.zarr"), 0.25, 0)
     assert state["global_step"] == 2 * (len(training) * 4 // 8)  # the batch is that of both together
     assert len((run / "log/metrics.csv").read_text().splitlines()) == 3
 
@@ -316,7 +316,7 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
         main(["export", "recogniser", str(runs / f"folds/fold{k}"), str(store), str(models), "--name", f"fold{k}"])
         unseen.append(set(json.loads((models / f"fold{k}.json").read_text())["unseen"]))
     views = ViewStore.open(store)
-    training, validation = split.split_training(views, 0.25, 0)
+    training, validation = splits.split_training(views, 0.25, 0)
     assert unseen[0] | unseen[1] == {views.names[i] for i in [*training, *validation]}
     assert unseen[0] & unseen[1] == {views.names[i] for i in validation}
     out = trained / "unseen.npz"

@@ -79,7 +79,7 @@ class Session:
 
     >>> session = Session(models, policy, sphere, start=0)                      # doctest: +SKIP
     >>> while not session.done:                                                 # doctest: +SKIP
-    ...     look = session.update(my_camera.observe(session.pose))
+    ...     view = session.update(my_camera.observe(session.pose))
 
     Args:
         models: recogniser and map networks.

@@ -33,14 +33,14 @@ class Evaluation:
     """The results, each a long table; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``.
 
     Attributes:
-        accuracy: looks (1, or V: the logits of all views summed), label (empty: all classes), measure, objects, value,
+        accuracy: n_views (1, or V: all logits summed), label (empty: all classes), measure, objects, value,
             low, high, published. The measures: ``accuracy``; ``clean_accuracy``, without the objects whose very mesh
             also has another label; ``shape_accuracy``, where the recogniser takes how large the objects are, when it
             is not; with ``class_`` before it the mean over classes.
-        fusion: looks, accuracy, low, high, class_accuracy, confidence (its mean), calibration_error: that many random
+        fusion: n_views, accuracy, low, high, class_accuracy, confidence (its mean), calibration_error: that many random
             views fused, calibrated as the recogniser's card says.
-        confusion: looks, label, answer, answers: how many; a view is an answer, or a whole object.
-        reliability: looks, bin, confidence, accuracy, answers: after one view and a few more, in random order.
+        confusion: n_views, label, answer, answers: how many; a view is an answer, or a whole object.
+        reliability: n_views, bin, confidence, accuracy, answers: after one view and a few more, in random order.
         maps: map, by, label, measure, value, low, high, published; the measures are those of ``scores.map_errors``.
             ``by`` is the network or a baselines made from the true maps of these very objects, which flatters it:
             their mean, the same for every view; or their mean for the object's true class at the view.

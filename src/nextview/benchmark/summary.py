@@ -19,7 +19,7 @@ Cell = tuple[str, float | None, Outcomes]
 
 TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
 SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)
-"""Thresholds of the curves of accuracy against looks and travel: from the first view for all to the last for most."""
+"""Thresholds of the curves of accuracy against views and travel: from the first view for all to the last for most."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Tables:
         per_class: policy, threshold, label, measure (accuracy, travel_moved), value, low, high, published.
         tests: policy, threshold, measure, difference to the reference, low, high, p (paired bootstrap), p_holm, and
             for accuracy mcnemar, mcnemar_holm. Holm's correction is over all rows of a measure.
-        sweep: policy, threshold, accuracy, looks, travel_all, arc_all: the points of the curves.
-        areas: policy, budget (looks or travel_all), value: mean accuracy over all budgets, low, high, and the
+        sweep: policy, threshold, accuracy, views, travel_all, arc_all: the points of the curves.
+        areas: policy, budget (n_views or travel_all), value: mean accuracy over all budgets, low, high, and the
             difference to the reference with difference_low, difference_high, p and p_holm.
         reliability: policy, threshold, bin, confidence, accuracy, episodes.
     """

@@ -98,7 +98,7 @@ def fitting_set(predictions: Predictions, validation: float, seed: int) -> Fitti
 def blind_walks(
     sphere: ViewSphere, policy: Policy, starts: NDArray[np.int64], n_views: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Where a policy goes that looks at nothing but where it has been.
+    """Where a policy goes that views at nothing but where it has been.
 
     Args:
         sphere: the viewpoints.
@@ -108,7 +108,7 @@ def blind_walks(
         rng: for policies that draw.
 
     Returns:
-        Views in order, (E, looks) int64.
+        Views in order, (E, views) int64.
     """
     rows, nothing = np.arange(len(starts)), np.zeros((len(starts), 1))
     visited = np.zeros((len(starts), len(sphere)), bool)

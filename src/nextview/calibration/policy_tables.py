@@ -82,7 +82,7 @@ def greedy_path(
 
 
 def fit_ring(data: FittingSet, anywhere: bool, n_views: int, calibration: Calibration) -> tuple[int, int]:
-    """The best ring to go to, and in which steps to walk it, over all starts, after 2 to ``n_views`` looks.
+    """The best ring to go to, and in which steps to walk it, over all starts, after 2 to ``n_views`` views.
 
     Args:
         data: what the recogniser says.

@@ -24,7 +24,7 @@ THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
 
 
 def fit_temperature(data: FittingSet, rng: np.random.Generator, n_views: int = 5, walks: int = 4) -> Calibration:
-    """Temperature of one view and correlations of several, by maximum likelihood over 1 to ``n_views`` looks.
+    """Temperature of one view and correlations of several, by maximum likelihood over 1 to ``n_views`` views.
 
     Args:
         data: what the recogniser says.
@@ -105,7 +105,7 @@ def fit_risk(
 
 
 def _promise(sure: Float, wrong: NDArray[np.bool_], weights: Float, delta: float) -> Float:
-    """Promised error rate of each threshold, (T,), from confidences and mistakes (walks * N, looks)."""
+    """Promised error rate of each threshold, (T,), from confidences and mistakes (walks * N, views)."""
     promised, worst = np.ones(len(THRESHOLDS)), 0.0
     for t in reversed(range(len(THRESHOLDS))):
         reached = sure >= THRESHOLDS[t]
@@ -146,7 +146,7 @@ def error_bound(failed: Float, stopped: Float, weights: Float, delta: float) -> 
 def _walks(
     data: FittingSet, n_views: int, walks: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Objects (2 * walks * N,) and views (2 * walks * N, looks): the first half local, the second over the sphere."""
+    """Objects (2 * walks * N,) and views (2 * walks * N, views): the first half local, the second over the sphere."""
     objects, views = np.tile(np.arange(len(data)), 2 * walks), []
     for policy in (Random(data.sphere), RandomAll(data.sphere)):
         starts = rng.integers(len(data.sphere), size=walks * len(data))

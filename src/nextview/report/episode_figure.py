@@ -46,7 +46,7 @@ def draw_episode(result: Recognition, sphere: ViewSphere, title: str) -> Figure:
         _draw_belief(axes[-1, k], view, result.classes, shown, first=k == 0)
     _draw_path(right.add_subplot(projection="3d"), views, sphere)
     figure.suptitle(
-        f"{title}: {result.answer}, belief {result.confidence:.3f}, {len(views)} look{'s' * (len(views) > 1)}, "
+        f"{title}: {result.answer}, belief {result.confidence:.3f}, {len(views)} view{'s' * (len(views) > 1)}, "
         f"{result.travel:.2f} cells of travel",
         color=INK,
         fontsize=14,

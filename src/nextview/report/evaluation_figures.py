@@ -57,7 +57,7 @@ def fusion_curve(e: Evaluation) -> Figure:
     axes.fill_between(table["n_views"], table["low"], table["high"], color=ALL, alpha=0.15, linewidth=0)
     axes.plot(table["n_views"], table["accuracy"], color=ALL, label="over objects, 95 % interval")
     axes.plot(table["n_views"], table["class_accuracy"], color=INK, linestyle="--", linewidth=1.1, label="over classes")
-    published = e.accuracy.query("looks == 1 and label == '' and measure == 'accuracy'")["published"].iloc[0]
+    published = e.accuracy.query("n_views == 1 and label == '' and measure == 'accuracy'")["published"].iloc[0]
     if np.isfinite(published):
         axes.plot(1, published, "D", color=PUBLISHED, markersize=5, clip_on=False, label="published, one view")
     axes.set_ylabel("accuracy")
@@ -110,7 +110,7 @@ def reliability(e: Evaluation) -> Figure:
     figure, axes = reliability_figure("in the answer")
     errors = e.fusion.set_index("n_views")["calibration_error"]
     for n_views, colour in zip(e.reliability["n_views"].unique().tolist(), BLUES, strict=False):
-        rows = e.reliability.query("looks == @looks and answers >= 20")
+        rows = e.reliability.query("n_views == @n_views and answers >= 20")
         name = f"{n_views} view{'s' * (n_views > 1)}"
         draw_reliability(axes, rows, rows["answers"], f"{name}  {errors[n_views]:.3f}", colour)
     legend(axes, "calibration error")

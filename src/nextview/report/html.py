@@ -11,7 +11,8 @@ import numpy as np
 
 from nextview.benchmark.results import Results
 from nextview.errors import ResultsError
-from nextview.report import curves, tables
+from nextview.report import curves
+from nextview.report import html_tables as tables
 from nextview.report.elements import asset, card, description, document, numbers, picture, side_by_side, write
 from nextview.report.trajectories import Pictures, gains, trajectories, worst_failures
 
@@ -70,7 +71,7 @@ def _headline(results: Results, best: str, at: float) -> str:
         n_views, travel = found[policy, at, "n_views"].value, found[policy, at, "travel_all"].value
         return card(
             escape(policy), f"{100 * n.value:.1f} %",
-            f"{100 * n.low:.1f} &ndash; {100 * n.high:.1f} %; {n_views:.2f} looks, {travel:.2f} cells",
+            f"{100 * n.low:.1f} &ndash; {100 * n.high:.1f} %; {n_views:.2f} views, {travel:.2f} cells",
         )  # fmt: skip
 
     cards = [card("one view", f"{100 * first['accuracy']:.1f} %", "no travel")]
@@ -81,7 +82,7 @@ def _headline(results: Results, best: str, at: float) -> str:
     return (
         f"{_verdict(results, best, at)}"
         f"<p>{len(p):,} objects of {len(set(p.labels.tolist()))} classes, {settings['runs']} first views each, "
-        f"threshold {at:g}, at most {settings['max_views']} looks. All intervals are 95&nbsp;% bootstrap intervals "
+        f"threshold {at:g}, at most {settings['max_views']} views. All intervals are 95&nbsp;% bootstrap intervals "
         f'over objects.</p><div class="cards">{"".join(cards)}</div>'
     )
 
@@ -254,7 +255,7 @@ def _viewer(results: Results, best: str, at: float, failures: list, pictures: Pi
         '<button id="back" aria-label="one view back">&#9664;</button>'
         '<button id="next" aria-label="next view">&#9654;</button></div>'
         '<div class="stage"><canvas id="sphere" tabindex="0" role="img"></canvas></div></div>'
-        '<div><p id="why" class="soft"></p><p id="verdict" aria-live="polite"></p><ol id="looks"></ol></div></div>'
+        '<div><p id="why" class="soft"></p><p id="verdict" aria-live="polite"></p><ol id="steps"></ol></div></div>'
         f'<script type="application/json" id="trajectories">{data}</script>'
     )
 

@@ -136,7 +136,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
 def best_epoch(
     folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], recipe: GainRecipe
 ) -> Iterator[tuple[tuple[Gain, ...], Value]]:
-    """After every epoch, the policies of the best epoch so far by their outcome over 2 to ``recipe.n_views`` looks.
+    """After every epoch, the policies of the best epoch so far by their outcome over 2 to ``recipe.n_views`` views.
 
     Args:
         folds: trainings side by side, each a policy an epoch.
