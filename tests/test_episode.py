@@ -36,7 +36,7 @@ class Table:
         return cls(logits, rng.random((objects, len(sphere), sphere.rings, 3)))
 
     def observe(self, episodes: np.ndarray, views: np.ndarray) -> Evidence:
-        return Evidence(self.logits[episodes, views], {"lem": self.lem[episodes, views]}, self.lem[episodes, views, 0])
+        return Evidence(self.logits[episodes, views], {"lem": self.lem[episodes, views]})
 
 
 def walk(table: Table, policy, episode: int, start: int, stopping: Stopping, calibration, sphere=SPHERE):
@@ -181,13 +181,13 @@ def test_another_sphere():
 
 def test_select_keeps_rows_of_everything():
     evidence = Table.random(6).observe(np.arange(6), np.arange(6))
+    evidence = replace(evidence, azimuth_bins=np.random.default_rng(1).normal(size=(6, CLASSES, 8)))
     keep = np.array([True, False, True, True, False, False])
     kept = select(evidence, keep)
     np.testing.assert_array_equal(kept.logits, evidence.logits[[0, 2, 3]])
     np.testing.assert_array_equal(kept.maps["lem"], evidence.maps["lem"][[0, 2, 3]])
-    assert kept.features is not None
-    assert len(kept.features) == 3
-    assert select(Evidence(evidence.logits), keep).features is None
+    np.testing.assert_array_equal(kept.azimuth_bins, evidence.azimuth_bins[[0, 2, 3]])
+    assert select(Evidence(evidence.logits), keep).azimuth_bins is None
 
 
 # Refusing

@@ -419,7 +419,7 @@ def test_what_ships_says_what_torch_says(tmp_path):
     np.testing.assert_allclose(policy.score(features(SPHERE, state, INPUTS).astype(np.float32)), expected, atol=1e-5)
 
 
-QUICK = GainRecipe(epochs=6, walks=2, batch=128, networks=2, n_views=3, rate=1e-2)
+QUICK = GainRecipe(epochs=6, walks=2, batch=128, networks=2, n_views=3, lr=1e-2)
 
 
 def test_training_finds_the_views_that_tell_the_class_believed():

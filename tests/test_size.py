@@ -1,7 +1,6 @@
 """How large an object is counts for its class where it is known, and nowhere else."""
 
 import json
-import runpy
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -30,7 +29,6 @@ from nextview.models.size_evidence import SizeEvidence
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("40")
-BENCHMARK = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "size.py"))
 CLASSES = ["big", "small"]
 
 
@@ -183,17 +181,3 @@ def test_predictions_keep_what_the_size_said(tmp_path):
     np.testing.assert_allclose(p.by_shape().logits, p.logits - of_size[:, None])
     with pytest.raises(PredictionsError, match="of_size"):
         replace(p, of_size=of_size[:5])
-
-
-def test_the_benchmark_compares_with_and_without(tmp_path, capsys):
-    p = some_predictions(40)
-    of_size = (100.0 * np.eye(3)[p.labels]).astype(np.float32)
-    rows = list(BENCHMARK["lines"](replace(p, logits=p.logits + of_size[:, None], of_size=of_size)))
-    assert all("| 1.000 (1.000) |" in row for row in rows[2:9])
-    share = (p.logits.argmax(2) == p.labels[:, None]).mean()
-    assert rows[2].startswith(f"| 1 | {share:.3f} (")
-    assert f"| {100 * (1 - share):+.1f} (" in rows[2]
-    assert rows[-1].startswith("| pillar | ")
-    p.save(tmp_path / "p.npz")
-    with pytest.raises(ValueError, match="nothing is said of sizes"):
-        BENCHMARK["main"](tmp_path / "p.npz")

@@ -12,7 +12,7 @@ import numpy as np
 import onnxruntime as ort
 import pytest
 from scipy.special import softmax
-from tests.test_lite import LITE2, checkpoint
+from tests.test_lite import checkpoint
 from tests.test_readme import write_off
 
 from nextview.calibration.valleys import valley_gains
@@ -37,7 +37,6 @@ from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.lite import LiteNet  # noqa: E402
 from nextview.training.map_training import MapModule, Windows  # noqa: E402
-from nextview.training.merge import merge  # noqa: E402
 from nextview.training.onnx_export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
 
@@ -72,7 +71,7 @@ def test_export_keeps_the_answers(tmp_path):
     torch.manual_seed(0)
     network = ResNet(18, 5, 4).eval()
     x = torch.rand(2, 4, 64, 64)
-    export_onnx(network, x.numpy(), "input", ["logits", "features"], tmp_path / "net.onnx")
+    export_onnx(network, x.numpy(), "input", ["logits"], tmp_path / "net.onnx")
     assert [p.name for p in tmp_path.iterdir()] == ["net.onnx"]
     session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
     more = torch.rand(3, 4, 64, 64)  # another batch size than the example's
@@ -135,7 +134,7 @@ def trained(tmp_path_factory):
     store, runs, models = root / "views.zarr", root / "runs", root / "models"
     small = ["--epochs", "2", "--views", "4", "--batch", "8", "--validation", "0.25"]
     main(["render", str(root / "meshes"), str(store), "--workers", "1"])
-    main(["train", "recogniser", str(store), str(runs / "recogniser"), *small, "--side", "0.3"])
+    main(["train", "recogniser", str(store), str(runs / "recogniser"), *small, "--azimuth-bins-weight", "0.3"])
     main(["export", "recogniser", str(runs / "recogniser"), str(store), str(models), "--name", "tiny"])
     main(["train", "lem", str(store), str(runs / "lem"), *small])
     main(["export", "lem", str(runs / "lem"), str(store), str(models), "--name", "tiny-lem"])
@@ -185,25 +184,12 @@ def test_trained_models_have_cards_and_run(trained):
     recogniser = Recogniser(trained / "models/tiny.json")
     output = recogniser.from_inputs(np.zeros((3, 4, 112, 112), np.uint8))
     assert output.logits.shape == (3, 2)
-    assert output.features.shape == (3, 512)
     assert card["azimuth_bins"] == recogniser.azimuth_bins == 8
     assert np.exp(output.azimuth_bins).sum(2) == pytest.approx(np.ones((3, 2)), abs=1e-4)
     lem = MapNetwork(trained / "models/tiny-lem.json").from_inputs(np.zeros((2, 4, 56, 56), np.uint8))
     assert lem["lem"].shape == (2, 5, 3)
     assert lem["lem-sphere"].shape == (2, 5, 8)
     assert (lem["lem"] == lem["lem-sphere"][:, :, [-1, 0, 1]]).all()
-
-
-def test_a_mirrored_view_has_the_mirrored_map(trained):
-    run, store = trained / "runs/lem", trained / "views.zarr"
-    options = ["--mirror", "--bits", "8", "--name", "both"]
-    main(["export", "lem", str(run), str(store), str(trained / "models"), *options])
-    network = MapNetwork(trained / "models/both.json")
-    seen = input_views(ViewStore.open(store), 0, "geometry", 56)
-    maps, flipped = (network.from_inputs(np.ascontiguousarray(views)) for views in (seen, seen[..., ::-1]))
-    assert np.abs(maps["lem"] - flipped["lem"][..., ::-1]).max() < 1e-5
-    assert np.abs(maps["lem"] - maps["lem"][..., ::-1]).max() > 1e-4  # or nothing would be tested
-    assert np.abs(maps["lem-sphere"] - flipped["lem-sphere"][..., -np.arange(8) % 8]).max() < 1e-5
 
 
 def test_the_published_map_network_trains_on_clouds_and_predicts_the_window(trained):
@@ -310,7 +296,7 @@ def test_a_finished_run_is_not_trained_again(trained):
 def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
     store, runs, models = trained / "views.zarr", trained / "runs", trained / "models"
     small = ["--epochs", "1", "--views", "2", "--batch", "8", "--validation", "0.25"]
-    main(["train", "recogniser", str(store), str(runs / "folds"), "--folds", "2", "--small-epochs", "1", *small])
+    main(["train", "recogniser", str(store), str(runs / "folds"), "--folds", "2", *small])
     unseen = []
     for k in range(2):
         main(["export", "recogniser", str(runs / f"folds/fold{k}"), str(store), str(models), "--name", f"fold{k}"])
@@ -402,43 +388,6 @@ def test_what_is_no_finished_run_is_not_exported(trained, tmp_path, capsys):
     assert not (tmp_path / "models").exists()
 
 
-def test_several_networks_are_exported_as_their_mean(trained):
-    runs, models = trained / "runs", trained / "models"
-    both = ["--also", str(runs / "recogniser"), "--mirror", "--name", "both"]
-    main(["export", "recogniser", str(runs / "recogniser"), str(trained / "views.zarr"), str(models), *both])
-    alone, jury = Recogniser(models / "tiny.json"), Recogniser(models / "both.json")
-    x = np.random.default_rng(0).integers(0, 256, (3, 4, 112, 112), dtype=np.uint8)
-    mean = (alone.from_inputs(x).logits + alone.from_inputs(x[..., ::-1].copy()).logits) / 2
-    scale = alone.card.facts["temperature"] / jury.card.facts["temperature"]
-    together = jury.from_inputs(x)
-    assert together.logits == pytest.approx(mean * scale, abs=2e-2)
-    assert together.features.shape == (3, 1024)
-    mirrored = jury.from_inputs(x[..., ::-1].copy())  # what was side 1 is side -1 in the mirror
-    assert together.azimuth_bins == pytest.approx(mirrored.azimuth_bins[..., -np.arange(8) % 8], abs=1e-3)
-
-
-def test_a_network_that_sees_blocks_of_pixels(trained, capsys):
-    run, store, models = str(trained / "runs/blocks"), str(trained / "views.zarr"), str(trained / "models")
-    small = ["--epochs", "1", "--views", "2", "--batch", "8", "--validation", "0.25", "--blocks", "2"]
-    main(["train", "recogniser", store, run, *small])
-    main(["export", "recogniser", run, store, models, "--name", "blocks"])
-    facts = find_card(trained / "models/blocks.json").facts
-    assert (facts["input_size"], facts["blocks"]) == (112, 2)
-    main(["export", "recogniser", str(trained / "models/blocks.json"), store, models, "--name", "again"])
-    once, again = (Recogniser(trained / f"models/{name}.json") for name in ("blocks", "again"))
-    x = input_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
-    once, again = (model.from_inputs(x).logits * model.card.facts["temperature"] for model in (once, again))
-    assert once == pytest.approx(again, abs=2e-2)
-    with pytest.raises(SystemExit):
-        main(
-            ["export", "recogniser", run, store, models, "--name", "mixed", "--also", str(trained / "models/tiny.json")]
-        )
-    assert "pixels in blocks of [1, 2]" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["train", "recogniser", store, str(trained / "runs/odd"), *small, "--size", "7"])
-    assert "images of 7 pixels, and small ones, must be whole blocks of 2" in capsys.readouterr().err
-
-
 def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
     run, store, models = trained / "runs/recogniser", trained / "views.zarr", trained / "models"
     command = ["export", "recogniser", str(run), str(store), str(models)]
@@ -450,7 +399,6 @@ def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
     assert facts["unseen"] == alone.card.facts["unseen"]
     assert len(facts["training"]["recipes"]) == 2
     raw, output = alone.from_inputs(x).logits * alone.card.facts["temperature"], joined.from_inputs(x)
-    assert output.features.shape == (3, 1024)
     assert output.logits * facts["temperature"] == pytest.approx(raw, abs=2e-2)
     with pytest.raises(SystemExit):
         main([*command, "--name", "three", "--also", str(models / "two.json")])
@@ -486,28 +434,6 @@ def test_folds_divide_every_class_evenly_and_keep_twins_together(tmp_path):
         hold_out(labels, measured, 1, seed=0)
 
 
-def test_merged_runs_ship_as_one_network_that_training_goes_on_from(trained, capsys):
-    runs, store, models = trained / "runs", trained / "views.zarr", trained / "models"
-    command = [
-        "export",
-        "recogniser",
-        str(runs / "recogniser"),
-        str(store),
-        str(models),
-        "--name",
-        "merged",
-        "--merged",
-    ]
-    with pytest.raises(SystemExit):
-        main(command)
-    assert "name the others with --also" in capsys.readouterr().err
-    main([*command, "--also", str(runs / "recogniser")])
-    assert json.loads((models / "merged.json").read_text())["network"] == "ResNet-18, the mean of 2 runs"
-    views = input_views(ViewStore.open(store), 0, "geometry", 112)
-    assert np.isfinite(Recogniser(models / "merged.json").from_inputs(views).logits).all()
-    load_exported(ResNet(18, 2, 4, 8), models / "merged.json", torch.from_numpy(views).float() / 255)
-
-
 def test_eight_bits_a_weight_are_enough_for_the_answers_and_nearly_halve_the_file_again(tmp_path):
     torch.manual_seed(0)
     network = ResNet(18, 10, 4).eval()
@@ -516,47 +442,33 @@ def test_eight_bits_a_weight_are_enough_for_the_answers_and_nearly_halve_the_fil
     x = np.random.default_rng(0).random((2, 4, 64, 64)).astype(np.float32)
     output = {}
     for bits in (16, 8):
-        export_onnx(network, x, "input", ["logits", "features"], tmp_path / f"{bits}.onnx", bits)
+        export_onnx(network, x, "input", ["logits"], tmp_path / f"{bits}.onnx", bits)
         session = ort.InferenceSession(tmp_path / f"{bits}.onnx", providers=["CPUExecutionProvider"])
-        output[bits] = session.run(["features"], {"input": x})[0]
-    true = network(torch.from_numpy(x))[1].detach().numpy()
+        output[bits] = session.run(["logits"], {"input": x})[0]
+    true = network(torch.from_numpy(x))[0].detach().numpy()
     assert np.abs(output[8] - true).max() < 0.02 * np.abs(true).max()
     assert np.abs(output[8] - true).max() > np.abs(output[16] - true).max()  # so they do have fewer
     assert (tmp_path / "8.onnx").stat().st_size < 0.55 * (tmp_path / "16.onnx").stat().st_size
 
 
-def test_merged_networks_have_the_mean_weights_and_norms_that_know_what_they_see():
-    torch.manual_seed(0)
-    networks = [ResNet(18, 3, 4) for _ in range(2)]
-    views = [torch.rand(8, 4, 32, 32) for _ in range(3)]
-    one = merge(networks, views)
-    for name, value in one.named_parameters():
-        expected = sum(dict(network.named_parameters())[name] for network in networks) / 2
-        assert torch.equal(value, expected)
-    with torch.no_grad():
-        before = torch.cat([one.conv1(x) for x in views])
-    assert torch.allclose(one.bn1.running_mean, before.mean((0, 2, 3)), atol=1e-5)
-    assert not one.training
-    with pytest.raises(ModelError, match="cannot be merged"):
-        merge([networks[0], ResNet(34, 3, 4)], views)
-
-
 def test_a_lite_network_goes_from_a_checkpoint_to_a_card_that_it_shares(trained, tmp_path, capsys):
-    checkpoint(tmp_path / "imagenet.pth", plan=LITE2)
+    checkpoint(tmp_path / "imagenet.pth")
     run, store, models = trained / "runs/lite", str(trained / "views.zarr"), trained / "models"
-    small = ["--epochs", "1", "--views", "4", "--batch", "8", "--validation", "0.25", "--side", "0.3"]
-    command = ["train", "recogniser", store, str(run), *small, "--network", "lite2", "--drop", "0.2"]
+    small = ["--epochs", "1", "--views", "4", "--batch", "8", "--validation", "0.25", "--azimuth-bins-weight", "0.3"]
+    command = ["train", "recogniser", store, str(run), *small, "--network", "lite0", "--dropout", "0.2"]
     main([*command, "--weights", str(tmp_path / "imagenet.pth")])
     main(["export", "recogniser", str(run), store, str(models), "--name", "pair", "--also", str(models / "tiny.json")])
     facts = find_card(models / "pair.json").facts
-    assert facts["network"] == "EfficientNet-Lite2 + ResNet-18"
-    assert [recipe["network"] for recipe in facts["training"]["recipes"]] == ["lite2", "resnet"]
+    assert facts["network"] == "EfficientNet-Lite0 + ResNet-18"
+    assert [recipe["network"] for recipe in facts["training"]["recipes"]] == ["lite0", "resnet"]
     x = input_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
     alone, pair = Recogniser(models / "tiny.json"), Recogniser(models / "pair.json")
     with torch.no_grad():
-        output = load_run(LiteNet(2, 4, 8, scale=2), run)(torch.from_numpy(x).float() / 255)[0].numpy()
-    mean = (output + alone.from_inputs(x).logits * alone.card.facts["temperature"]) / 2
+        logits, bins = (output.numpy() for output in load_run(LiteNet(2, 4, 8), run)(torch.from_numpy(x).float() / 255))
+    mean = (logits + alone.from_inputs(x).logits * alone.card.facts["temperature"]) / 2
     assert pair.from_inputs(x).logits * facts["temperature"] == pytest.approx(mean, abs=2e-2)
+    both = np.exp((bins + alone.from_inputs(x).azimuth_bins) / 2)
+    assert np.exp(pair.from_inputs(x).azimuth_bins) == pytest.approx(both / both.sum(2, keepdims=True), abs=2e-2)
     main([*command[:3], str(trained / "runs/on"), *command[4:], "--weights", str(models / "pair.json")])
     with pytest.raises(SystemExit):
         main([*command[:3], str(trained / "runs/wrong"), *small, "--weights", str(tmp_path / "imagenet.pth")])

@@ -208,9 +208,8 @@ class Episodes:
 
 def select(evidence: Evidence, keep: NDArray[np.bool_]) -> Evidence:
     """The evidence of some of the episodes."""
-    features = None if evidence.features is None else evidence.features[keep]
     azimuth_bins = None if evidence.azimuth_bins is None else evidence.azimuth_bins[keep]
-    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, features, azimuth_bins)
+    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, azimuth_bins)
 
 
 def run_episodes(

@@ -60,21 +60,17 @@ def train_recogniser(
 
     if fold is not None and not 0 <= fold < folds:
         raise ModelError(f"there is no fold {fold} of {folds}: they are counted from 0")
-    if recipe.network != "resnet" and recipe.blocks > 1:
-        raise ModelError("only a ResNet sees pixels in blocks: leave --blocks, or take --network resnet")
     if recipe.network != "resnet" and recipe.depth != RecogniserRecipe.depth:
         raise ModelError(f"only a ResNet has a --depth: {recipe.network} is as deep as it is")
-    if recipe.network == "resnet" and recipe.drop:
-        raise ModelError("only an EfficientNet-Lite drops features and blocks: leave --drop, or take --network lite0")
-    if not 0 <= recipe.drop < 1:
-        raise ModelError(f"--drop is a chance, 0 or more and less than 1, not {recipe.drop}")
-    if recipe.size % recipe.blocks or (recipe.small_epochs and recipe.small % recipe.blocks):
-        raise ModelError(f"images of {recipe.size} pixels, and small ones, must be whole blocks of {recipe.blocks}")
+    if recipe.network == "resnet" and recipe.dropout:
+        raise ModelError("only EfficientNet-Lite0 drops features and blocks: leave --dropout, or take --network lite0")
+    if not 0 <= recipe.dropout < 1:
+        raise ModelError(f"--dropout is a chance, 0 or more and less than 1, not {recipe.dropout}")
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation, recipe.seed)
     judging = deduplicate(views, validation)
-    azimuths = views.sphere.azimuths if recipe.side else 0
-    planes = mirror_planes(views, training) if recipe.side else None
+    azimuths = views.sphere.azimuths if recipe.azimuth_bins_weight else 0
+    planes = mirror_planes(views, training) if recipe.azimuth_bins_weight else None
     sources = [_source(path, views, training, recipe, planes) for path in (store, *deformed)]
     runs = {out: training[:0]}
     if folds:

@@ -62,7 +62,7 @@ def train_gain(
             raise PredictionsError(f"{path}: holds no map {lacking[0]!r}; predict it, or choose other --inputs")
         if source.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
             raise PredictionsError(
-                f"{path}: says nothing of azimuth bins; teach the recogniser (--side), or do without"
+                f"{path}: says nothing of azimuth bins; teach the recogniser (--azimuth-bins-weight), or do without"
             )
     everything = np.arange(len(table))
     if validation is None:

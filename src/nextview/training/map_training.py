@@ -135,11 +135,11 @@ class MapModule(L.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         r = self.recipe
-        optimizer = torch.optim.AdamW(self.parameters(), lr=r.rate, weight_decay=r.decay)
+        optimizer = torch.optim.AdamW(self.parameters(), lr=r.lr, weight_decay=r.weight_decay)
         if r.schedule == "tenth":
             tenth = torch.optim.lr_scheduler.StepLR(optimizer, step_size=5, gamma=0.1)
             return {"optimizer": optimizer, "lr_scheduler": {"scheduler": tenth, "interval": "epoch"}}
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, r.rate, self.steps, pct_start=0.2)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, r.lr, self.steps, pct_start=0.2)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 

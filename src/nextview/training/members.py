@@ -93,5 +93,5 @@ def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) ->
 
 def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet | LiteNet:
     """The recogniser of a finished run, in evaluation mode."""
-    azimuths = views.sphere.azimuths if recipe.side else 0
+    azimuths = views.sphere.azimuths if recipe.azimuth_bins_weight else 0
     return load_run(recogniser_network(recipe, len(views.classes), azimuths), run)

@@ -20,63 +20,50 @@ SMALL = 2**17
 
 
 class CalibratedRecogniser(nn.Module):
-    """The recogniser as it ships: raw input bytes in, logits over a temperature and pooled features out.
+    """The recogniser as it ships: raw input bytes in, logits over a temperature out.
 
-    Where all networks know the azimuth bins of objects, a third output is what they say of them, see
+    Where all networks know the azimuth bins of objects, a second output is what they say of them, see
     ``networks.ResNet``.
 
     Args:
-        networks: their logits are averaged, and what they say of the azimuth bins; their features are set side by side.
+        networks: their logits are averaged, and what they say of the azimuth bins.
         temperature: what the logits are divided by.
-        mirror: whether every network also sees the mirrored view, and what it says of either is averaged.
     """
 
-    def __init__(self, networks: Sequence[nn.Module], temperature: float, mirror: bool = False) -> None:
+    def __init__(self, networks: Sequence[nn.Module], temperature: float) -> None:
         super().__init__()
-        self.networks, self.temperature, self.mirror = nn.ModuleList(networks), temperature, mirror
+        self.networks, self.temperature = nn.ModuleList(networks), temperature
         bins = {getattr(network, "azimuths", 0) for network in networks}
         self.azimuth_bins = bins.pop() if len(bins) == 1 else 0
 
     @property
     def outputs(self) -> list[str]:
         """Names of what it gives."""
-        return ["logits", "features", *([BINS_OUTPUT] if self.azimuth_bins else [])]
+        return ["logits", BINS_OUTPUT] if self.azimuth_bins else ["logits"]
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         x = x.float() / 255
-        logits, features, azimuth_bins = [], [], []
-        for network in self.networks:
-            outputs = [network(x), network(x.flip(3))] if self.mirror else [network(x)]
-            logits += [each[0] for each in outputs]
-            features.append(torch.stack([each[1] for each in outputs]).mean(0))
-            if self.azimuth_bins:
-                back = [-side % self.azimuth_bins for side in range(self.azimuth_bins)]
-                azimuth_bins += [each[2][..., back] if k else each[2] for k, each in enumerate(outputs)]
-        found = torch.stack(logits).mean(0) / self.temperature, torch.cat(features, 1)
-        return (*found, torch.stack(azimuth_bins).mean(0).log_softmax(2)) if self.azimuth_bins else found
+        outputs = [network(x) for network in self.networks]
+        logits = torch.stack([each[0] for each in outputs]).mean(0) / self.temperature
+        if not self.azimuth_bins:
+            return (logits,)
+        return logits, torch.stack([each[1] for each in outputs]).mean(0).log_softmax(2)
 
 
 class ShippedMap(nn.Module):
-    """A map network as it ships: the map of the window and, if it knows it, of the sphere, (B, rings, azimuths).
+    """A map network as it ships, a ``PointNet`` or a ``ViewMap``.
 
-    Args:
-        network: a ``PointNet`` or a ``ViewMap``.
-        mirror: whether it also sees the mirrored view, and what it says of either, mirrored back, is averaged.
+    It gives the map of the window and, if it knows it, that of the sphere, (B, rings, azimuths).
     """
 
-    def __init__(self, network: nn.Module, mirror: bool = False) -> None:
+    def __init__(self, network: nn.Module) -> None:
         super().__init__()
-        self.network, self.mirror = network, mirror
-        columns = network.shape[1]
-        self.whole = columns > 3
-        self.flipped = [-step % columns for step in range(columns)] if self.whole else [2, 1, 0]
+        self.network, self.whole = network, network.shape[1] > 3
 
     def forward(self, seen: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         if seen.dtype == torch.uint8:
             seen = seen.float() / 255
         outputs = self.network(seen)[0]
-        if self.mirror:
-            outputs = (outputs + self.network(seen.flip(3))[0][..., self.flipped]) / 2
         return (outputs[..., [-1, 0, 1]], outputs) if self.whole else outputs
 
 

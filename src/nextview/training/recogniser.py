@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +66,7 @@ class Views(IterableDataset):
         return len(self.objects) * views // self.recipe.batch
 
     def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
-        rng = np.random.default_rng([self.recipe.seed, self.epoch, self.recipe.member])
+        rng = np.random.default_rng([self.recipe.seed, self.epoch, self.recipe.ensemble_seed])
         n, v = len(self) * self.recipe.batch, self.sources[0].inputs.shape[1]
         if self.recipe.balanced:
             objects = rng.choice(self.objects, n, p=self.weights)
@@ -94,13 +93,13 @@ class Views(IterableDataset):
             yield tuple(map(torch.from_numpy, drawn))
 
 
-def augment(x: Tensor, s: int) -> tuple[Tensor, Tensor]:
+def augment(x: Tensor) -> tuple[Tensor, Tensor]:
     """Vary inputs (B, C, S, S) in 0 .. 1: mirror, shift, scale and stretch, roll a little, hide a rectangle, add noise.
 
-    A mirrored object is of the same class, and none of the channels changes its sign under the mirror. The result is
-    (B, C, s, s) and which of them are mirrored, (B,) bool.
+    A mirrored object is of the same class, and none of the channels changes its sign under the mirror. The result has
+    the same shape; with it comes which of the inputs are mirrored, (B,) bool.
     """
-    (b, channels), on = x.shape[:2], {"device": x.device}
+    (b, _, _, s), on = x.shape, {"device": x.device}
     scale = torch.empty(b, 2, **on).uniform_(0.8, 1.25)
     mirrored = torch.randint(0, 2, (b,), **on) == 0
     scale[:, 0] *= torch.where(mirrored, -1.0, 1.0)
@@ -109,7 +108,7 @@ def augment(x: Tensor, s: int) -> tuple[Tensor, Tensor]:
     theta[:, 0, 0], theta[:, 0, 1] = scale[:, 0] * roll.cos(), -scale[:, 0] * roll.sin()
     theta[:, 1, 0], theta[:, 1, 1] = scale[:, 1] * roll.sin(), scale[:, 1] * roll.cos()
     theta[:, :, 2] = torch.empty(b, 2, **on).uniform_(-0.1, 0.1)
-    x = F.grid_sample(x, F.affine_grid(theta, [b, channels, s, s], align_corners=False), align_corners=False)
+    x = F.grid_sample(x, F.affine_grid(theta, list(x.shape), align_corners=False), align_corners=False)
     # A rectangle of background, in half of the images, as if something stood in front.
     side = torch.empty(b, 2, **on).uniform_(0.1, 0.4)
     corner = torch.rand(b, 2, **on) * (1 - side)
@@ -119,27 +118,6 @@ def augment(x: Tensor, s: int) -> tuple[Tensor, Tensor]:
     hidden = (rows[:, :, None] & columns[:, None, :] & (torch.rand(b, 1, 1, **on) < 0.5))[:, None]
     seen = (x > 0) & ~hidden
     return torch.where(seen, x + 0.02 * torch.randn_like(x), 0.0), mirrored
-
-
-def drawn_views(
-    inputs: NDArray[np.uint8] | PackedViews,
-    objects: NDArray[np.int64],
-    labels: NDArray[np.int64],
-    recipe: RecogniserRecipe,
-    most: int,
-) -> Iterator[Tensor]:
-    """At most so many batches of views as they are trained on, (B, C, S, S) in 0 .. 1, from the store itself.
-
-    Args:
-        inputs: (N, V, C, S, S).
-        objects: from which is drawn.
-        labels: class of each object, (N,).
-        recipe: how.
-        most: batches.
-    """
-    for batch in islice(Views([Source(inputs, np.arange(len(inputs)))], objects, labels, recipe), most):
-        x = batch[0].float() / 255
-        yield augment(x, recipe.size)[0] if recipe.augment else x
 
 
 class RecogniserModule(L.LightningModule):
@@ -156,21 +134,18 @@ class RecogniserModule(L.LightningModule):
             self.register_buffer(name, torch.zeros(classes), persistent=False)
 
     def training_step(self, batch: tuple[Tensor, ...], _: int) -> Tensor:
-        size = self.recipe.small if self.current_epoch < self.recipe.small_epochs else self.recipe.size
         x, label = batch[0].float() / 255, batch[1]
         mirrored = torch.zeros_like(label, dtype=torch.bool)
         if self.recipe.augment:
-            x, mirrored = augment(x, size)
-        elif size < x.shape[2]:
-            x = F.interpolate(x, size=(size, size), mode="area")
+            x, mirrored = augment(x)
         x = x.to(memory_format=torch.channels_last)
-        logits, _features, *likely = self.net(x)
+        logits, *likely = self.net(x)
         loss = F.cross_entropy(logits.float(), label, label_smoothing=self.recipe.smoothing)
         if likely:
             side = torch.where(mirrored, -batch[2] % likely[0].shape[2], batch[2])
             lost = side_loss(likely[0].float(), label, side)
             self.log("side_loss", lost, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))
-            loss = loss + self.recipe.side * lost
+            loss = loss + self.recipe.azimuth_bins_weight * lost
         self.log("loss", loss, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))
         return loss
 
@@ -194,13 +169,13 @@ class RecogniserModule(L.LightningModule):
         decayed = [p for p in self.net.parameters() if p.ndim > 1]
         plain = [p for p in self.net.parameters() if p.ndim <= 1]
         optimizer = torch.optim.AdamW(
-            [{"params": decayed, "weight_decay": self.recipe.decay}, {"params": plain, "weight_decay": 0.0}],
-            lr=self.recipe.rate,
+            [{"params": decayed, "weight_decay": self.recipe.weight_decay}, {"params": plain, "weight_decay": 0.0}],
+            lr=self.recipe.lr,
         )
         if self.recipe.schedule == "halving":
             schedule = torch.optim.lr_scheduler.StepLR(optimizer, step_size=5, gamma=0.5)
             return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "epoch"}}
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, self.recipe.rate, self.steps, pct_start=0.2)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, self.recipe.lr, self.steps, pct_start=0.2)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
@@ -247,13 +222,13 @@ def train(
     Raises:
         ModelError: the weights or a checkpoint in ``out`` cannot be used.
     """
-    own = np.random.SeedSequence([recipe.seed, recipe.member])
+    own = np.random.SeedSequence([recipe.seed, recipe.ensemble_seed])
     L.seed_everything(int(own.generate_state(1)[0]), verbose=False)
     views = Views(sources, training, labels, recipe)
     module = RecogniserModule(recipe, int(labels.max()) + 1, recipe.epochs * len(views), azimuths)
     if weights and weights.suffix == ".json":
-        sample = next(drawn_views(sources[0].inputs, training, labels, recipe, 1))
-        load_exported(module.net, weights, sample)
+        sample = next(iter(Views(sources[:1], training, labels, recipe)))[0].float() / 255
+        load_exported(module.net, weights, augment(sample)[0] if recipe.augment else sample)
     elif weights:
         load_checkpoint(module.net, weights)
     validation_views = ValidationViews(sources[0].inputs, validation, labels)
