@@ -113,9 +113,7 @@ def main(predictions: Path | None = None, meshes: list[Path] | None = None) -> N
         grid = Grid(make_specs(table, 10, 0), 10, THRESHOLDS, 5, 0)
         list(run_grid(grid, TEN))
         n_views = sum(int(ends.n_views.sum()) for _, _, ends in grid.cells())
-        print(
-            f"\nWith the networks: {1000 * observation:.1f} ms a view over {len(meshes)} meshes; {n_views:,} views"
-        )
+        print(f"\nWith the networks: {1000 * observation:.1f} ms a view over {len(meshes)} meshes; {n_views:,} views")
         print(f"would take {observation * n_views / 3600:.1f} hours.")
 
 

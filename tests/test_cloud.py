@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from nextview.cloud import pixel_order, visible_points
+from nextview.cloud import POINTS, pixel_order, visible_points
 from nextview.models.cloud_input import cloud_input
-from nextview.observation import POINTS, pinhole
+from nextview.observation import pinhole
 from nextview.viewsphere import ViewSphere, look_at_origin
 
 POSES = ViewSphere.named("40").poses

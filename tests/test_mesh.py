@@ -236,13 +236,13 @@ coordinates = npst.arrays(np.float64, (8, 3), elements=st.floats(-1, 1, allow_su
 
 @settings(deadline=None)
 @given(
-    coordinates.filter(lambda v: np.ptp(v, axis=0).max() > 1e-3),
+    coordinates,
     st.sampled_from([1e-200, 1e-30, 1e-6, 1.0, 1e6, 1e30, 1e200]),
     st.sampled_from([0.0, 1.0, -100.0, 1e5]),
 )
 def test_the_object_frame(shape, scale, offset):
-    positions = (shape + offset) * scale
-    mesh = make_mesh(positions, [[0, 1, 2], [2, 3, 4], [4, 5, 6], [6, 7, 0]])
+    positions = (np.vstack([shape, np.eye(3)]) + offset) * scale  # one face at least has an area
+    mesh = make_mesh(positions, [[0, 1, 2], [2, 3, 4], [4, 5, 6], [6, 7, 0], [8, 9, 10]])
     np.testing.assert_allclose(mesh.vertices.min(0), -mesh.vertices.max(0), atol=1e-7)
     assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(1)
     rounding = 1e-12 * scale * max(abs(offset), 1)
@@ -305,6 +305,9 @@ def broken_files() -> dict[str, tuple[str, bytes | str, str]]:
         "overflow": ("a.off", off("0 0 1e999\n1 0 0\n0 1 0", "3 0 1 2"), "1 vertices are NaN or infinite"),
         "too large": ("a.off", off("-1.7e308 -1.7e308 0\n1.7e308 0 0\n0 1.7e308 0", "3 0 1 2"), "too large"),
         "one place": ("a.off", off("5 5 5\n5 5 5\n5 5 5", "3 0 1 2"), "no extent"),
+        "a line": ("a.off", off("0 0 0\n1 2 3\n3 6 9", "3 0 1 2"), "no area"),
+        "a slanted line": ("a.off", off("0.1 0.1 0.1\n0.2 0.3 0.4\n0.3 0.5 0.7", "3 0 1 2"), "no area"),
+        "corners in one place": ("a.off", off("0 0 0\n1 2 3", "3 0 1 1"), "no area"),
         "rounding apart": ("a.off", off("1e6 1 0\n1e6 1.0000001 0\n1000000.0000001 1 0", "3 0 1 2"), "no extent"),
         "no counts": ("a.off", "OFF\nhello\n", "counts"),
         "binary OFF": ("a.off", b"OFF BINARY\n\0\0\0\3\0\0\0\1", "counts"),

@@ -151,14 +151,13 @@ def test_predictions_are_what_the_networks_say_of_each_look(shop):
     assert found.models["lem"] == ("tiny-lem", maps["lem"].sha256)
     assert found.valley_classes == {"lem": ("box",)}
     i, v = 3, 17
-    observation = Observation(
-        store.image(i)[v], store.depth(i)[v], store.points(i)[v], store.sphere.poses[v], store.intrinsics
-    )
+    observation = Observation(store.depth(i)[v], store.sphere.poses[v], store.intrinsics)
     evidence = Recogniser(shop / "tiny.json")([observation])
     np.testing.assert_allclose(found.logits[i, v], evidence.logits[0], atol=1e-5)
     np.testing.assert_allclose(found.azimuth_bins[i, v], evidence.azimuth_bins[0], atol=1e-5)
+    # Here the points come from the stored depth, which is rounded; those in the store are from the depth as rendered.
     np.testing.assert_allclose(
-        found.maps["lem"][i, v], MapNetwork(shop / "tiny-lem.json")([observation])["lem"][0], atol=1e-5
+        found.maps["lem"][i, v], MapNetwork(shop / "tiny-lem.json")([observation])["lem"][0], atol=2e-4
     )
 
 

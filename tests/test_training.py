@@ -354,9 +354,7 @@ def test_a_recogniser_of_images_sees_images_live_and_in_predictions(trained):
     out = trained / "images.npz"
     main(["predict", str(store), str(out), "--maps", "--recogniser", str(models / "of-images.json"), "--workers", "1"])
     views, predictions = ViewStore.open(store), Predictions.load(out)
-    observation = Observation(
-        views.image(3)[7], views.depth(3)[7], views.points(3)[7], views.sphere.poses[7], views.intrinsics
-    )
+    observation = Observation(views.depth(3)[7], views.sphere.poses[7], views.intrinsics, image=views.image(3)[7])
     at = predictions.names.index(views.names[3])
     live = Recogniser(models / "of-images.json")([observation]).logits
     assert predictions.logits[at, 7] == pytest.approx(live[0], abs=1e-4)

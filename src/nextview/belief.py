@@ -206,13 +206,13 @@ class Calibration:
         return _softmax(self.log_belief(total, n_views, classes))
 
     def azimuth_bins(
-        self, total: NDArray[np.floating], n_views: int, classes: int, azimuth: NDArray[np.floating]
+        self, total: NDArray[np.floating], n_views: NDArray[np.int64] | int, classes: int, azimuth: NDArray[np.floating]
     ) -> Float | None:
         """Belief in the azimuth bin that is seen from an azimuth, if the object is of each class.
 
         Args:
             total: sum over views of what they say, see ``log_evidence_of``, (..., (1 + azimuth bins) * classes).
-            n_views: how many.
+            n_views: how many, one number or (...).
             classes: how many.
             azimuth: parts of a full turn, (...).
 
@@ -222,7 +222,8 @@ class Calibration:
         if total.shape[-1] == classes:
             return None
         correlation = self.correlation if self.bin_correlation is None else self.bin_correlation
-        pointing = _pointing(np.asarray(total, np.float64), classes) / (1 + correlation * (n_views - 1))
+        more = np.asarray(n_views)[..., None, None] - 1
+        pointing = _pointing(np.asarray(total, np.float64), classes) / (1 + correlation * more)
         return _softmax(reorient(pointing.swapaxes(-1, -2), azimuth))
 
     def threshold(self, risk: float, max_views: int) -> float:

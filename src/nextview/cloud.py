@@ -7,7 +7,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.observation import POINTS, object_depth
+from nextview.depth import object_depth
+
+POINTS = 1024
+"""Points in the partial cloud of one view (thesis, section 4.1.2)."""
 
 
 @lru_cache(maxsize=8)

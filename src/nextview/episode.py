@@ -26,6 +26,7 @@ class Step:
         stopped: whether the episode ended here, (A,) bool.
         next_views: where it goes next, (A,) int64; -1 where it ended.
         total: sum of the log-evidence in it and before, (A, D), see ``recognition.log_evidence_of``.
+        seen: views so far in which anything was seen, (A,) int64.
     """
 
     episodes: NDArray[np.int64]
@@ -35,6 +36,7 @@ class Step:
     stopped: NDArray[np.bool_]
     next_views: NDArray[np.int64]
     total: NDArray[np.float64]
+    seen: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Outcome:
         answer: most believed class, (B,) int64.
         confidence: its belief, (B,) float64.
         n_views: views taken, (B,) int64.
-        confident: whether the threshold was reached (else the views ran out), (B,) bool.
+        confident: whether the threshold was reached (else the views ran out), (B,) bool; never where nothing was seen.
         travel: sum over the moves in grid cells, (B,) float64.
         arc: sum over the moves in radians, (B,) float64.
         views: the views in order, (B, max views) int64, -1 after the end.
@@ -90,11 +92,13 @@ class Episodes:
         self.steps: list[Step] = []
         self._visited = np.zeros((len(starts), len(sphere)), bool)
         self._total: NDArray[np.float64] = np.zeros((len(starts), 0))
+        self._seen = np.zeros(len(starts), np.int64)
 
     def update(self, evidence: Evidence) -> Step:
         """Take in the evidence of one view in every running episode; stop or choose its next view.
 
-        Where this raises, nothing is taken in: the same view can be told again.
+        A view in which nothing was seen is taken, but changes no belief and ends no episode as a confident one. Where
+        this raises, nothing is taken in: the same view can be told again.
 
         Raises:
             UsageError: the evidence is of another number of episodes, or a logit is not finite.
@@ -103,14 +107,17 @@ class Episodes:
         now, views = self.running, self.current[self.running]
         if len(evidence.logits) != len(now):
             raise UsageError(f"evidence of {len(evidence.logits)} views for {len(now)} running episodes")
+        evidence, seen = _without_unseen(evidence)
         before = self._total[now] if self.steps else 0.0
         azimuth = self.sphere.turn[views]
         total = before + np.asarray(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64)
         n_views, classes = len(self.steps) + 1, evidence.logits.shape[1]
-        belief = self.calibration.belief(total, n_views, classes)
+        counted = self._seen[now] + seen
+        weighed = np.maximum(counted, 1)  # before anything is seen the total is zero, whatever it is divided by
+        belief = self.calibration.belief(total, weighed, classes)
         visited = self._visited[now]
         visited[np.arange(len(now)), views] = True
-        stopped = belief.max(1) >= self.stopping.threshold_at(n_views)
+        stopped = (belief.max(1) >= self.stopping.threshold_at(weighed)) & seen
         if n_views >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
         going = ~stopped
@@ -118,7 +125,7 @@ class Episodes:
         if going.any():
             left, azimuth_bins = now[going], None
             if "azimuth_bins" in self.policy.needs:
-                azimuth_bins = self.calibration.azimuth_bins(total[going], n_views, classes, azimuth[going])
+                azimuth_bins = self.calibration.azimuth_bins(total[going], weighed[going], classes, azimuth[going])
             state = EpisodeState(
                 views[going],
                 visited[going],
@@ -129,10 +136,10 @@ class Episodes:
                 azimuth_bins,
             )
             next_views[going] = self._choose(state)
-        step = Step(now, views, evidence, belief, stopped, next_views, total)
+        step = Step(now, views, evidence, belief, stopped, next_views, total, counted)
         if not self.steps:
             self._total = np.zeros((len(self.current), total.shape[1]))
-        self._total[now], self._visited[now] = total, visited
+        self._total[now], self._visited[now], self._seen[now] = total, visited, counted
         self.current[now[going]] = next_views[going]
         self.steps.append(step)
         self.running = now[going]
@@ -199,7 +206,7 @@ class Episodes:
             answer,
             confidence,
             n_views,
-            confidence >= self.stopping.threshold_at(n_views),
+            (confidence >= self.stopping.threshold_at(np.maximum(self._seen, 1))) & (self._seen > 0),
             (self.sphere.travel[legs] * moved).sum(1),
             (self.sphere.arc[legs] * moved).sum(1),
             views,
@@ -209,7 +216,22 @@ class Episodes:
 def select(evidence: Evidence, keep: NDArray[np.bool_]) -> Evidence:
     """The evidence of some of the episodes."""
     azimuth_bins = None if evidence.azimuth_bins is None else evidence.azimuth_bins[keep]
-    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, azimuth_bins)
+    seen = None if evidence.seen is None else evidence.seen[keep]
+    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, azimuth_bins, seen)
+
+
+def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
+    """The evidence with zeros where nothing was seen, and where anything was, (B,) bool."""
+    seen = evidence.seen
+    if seen is None or seen.all():
+        return evidence, np.ones(len(evidence.logits), bool)
+
+    def kept(values: NDArray[np.floating]) -> NDArray[np.floating]:
+        return np.where(seen.reshape(-1, *[1] * (values.ndim - 1)), values, 0)
+
+    azimuth_bins = None if evidence.azimuth_bins is None else kept(evidence.azimuth_bins)
+    maps = {name: kept(values) for name, values in evidence.maps.items()}
+    return Evidence(kept(evidence.logits), maps, azimuth_bins, seen), seen
 
 
 def run_episodes(

@@ -18,6 +18,10 @@ UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}
 """What a file's unit of length may be, and how many metres it is."""
 
 
+FLAT = 1e-12
+"""Twice the area of a face below which it counts as a line, square object radii: rounding makes up to 1e-15."""
+
+
 @dataclass(frozen=True)
 class Mesh:
     """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex at radius 1.
@@ -59,7 +63,7 @@ def make_mesh(
         The mesh in the object frame, without the vertices that no face uses.
 
     Raises:
-        MeshError: no faces, not triangles, an index out of range, a position that is not finite, or no extent.
+        MeshError: no faces, not triangles, an index out of range, a position that is not finite, no extent, or no area.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     for array, what in ((vertices, "vertices"), (faces, "faces")):
@@ -88,7 +92,19 @@ def make_mesh(
     radius = np.sqrt((vertices**2).sum(1).max())
     if reach > np.finfo(float).max / radius:
         raise MeshError(f"{name}: the mesh is too large, its radius is not a finite number")
-    return Mesh(vertices / radius, faces.astype(np.int32), centre, float(radius * reach), name, unit)
+    normalised: NDArray[np.float64] = vertices / radius
+    if not _has_area(normalised, faces):
+        raise MeshError(f"{name}: the mesh has no area, all its faces are lines or points")
+    return Mesh(normalised, faces.astype(np.int32), centre, float(radius * reach), name, unit)
+
+
+def _has_area(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> bool:
+    """Whether any face is more than a line; most often the first few tell."""
+    for first in range(0, len(faces), 4096):
+        a, b, c = (vertices[faces[first : first + 4096, k]] for k in range(3))
+        if np.abs(np.cross(b - a, c - a)).max() > FLAT:
+            return True
+    return False
 
 
 def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None) -> Mesh:

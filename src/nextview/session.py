@@ -23,7 +23,7 @@ class View:
     Attributes:
         index: the candidate viewpoint it was taken from.
         observation: what was seen.
-        alone: belief by this view alone, (classes,) float64.
+        alone: belief by this view alone, (classes,) float64; the same for all classes if nothing is seen in it.
         belief: fused over all views so far, (classes,) float64.
         maps: predicted local maps by name, each (rings, 3).
         next_view: where to look next; None where the episode ends.
@@ -51,7 +51,7 @@ class Recognition:
     Attributes:
         views: in order.
         classes: their names.
-        confident: whether the threshold was reached (else the views ran out).
+        confident: whether the threshold was reached (else the views ran out); never if nothing was seen.
     """
 
     views: tuple[View, ...]
@@ -59,14 +59,21 @@ class Recognition:
     confident: bool
 
     @property
-    def answer(self) -> str:
-        """The class believed most."""
+    def seen(self) -> bool:
+        """Whether the object was seen from any of the views."""
+        return any(view.observation.seen for view in self.views)
+
+    @property
+    def answer(self) -> str | None:
+        """The class believed most; None if nothing was seen."""
+        if not self.seen:
+            return None
         return self.classes[int(self.views[-1].belief.argmax())]
 
     @property
     def confidence(self) -> float:
-        """The belief in the answer."""
-        return float(self.views[-1].belief.max())
+        """The belief in the answer; 0 if there is none."""
+        return float(self.views[-1].belief.max()) if self.seen else 0.0
 
     @property
     def travel(self) -> float:
@@ -128,10 +135,11 @@ class Session:
         return self.sphere.poses[self.view]
 
     def update(self, observation: Observation) -> View:
-        """Take in what was seen from ``pose``.
+        """Take in what was seen from ``pose``. Where this raises, nothing is taken in: the same view can be told again.
 
         Raises:
             SessionError: the episode has ended.
+            ObservationError: the image does not suit the networks.
         """
         if self.done:
             raise SessionError("this session has ended; begin another one")
@@ -142,7 +150,7 @@ class Session:
             travel += float(self.sphere.travel[self.views[-1].index, here])
             arc += float(self.sphere.arc[self.views[-1].index, here])
         calibration, azimuth = self._episodes.calibration, self.sphere.turn[step.views]
-        azimuth_bins = calibration.azimuth_bins(step.total, len(self.views) + 1, len(self.models.classes), azimuth)
+        azimuth_bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), len(self.models.classes), azimuth)
         view = View(
             here,
             observation,

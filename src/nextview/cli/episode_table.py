@@ -20,7 +20,9 @@ def _angles(sphere: ViewSphere, view: int) -> str:
 
 
 def _peak(sphere: ViewSphere, view: View) -> tuple[int, float] | None:
-    """View and value of the highest cell of the view's predicted map."""
+    """View and value of the highest cell of the view's predicted map; None without a map, or if nothing is seen."""
+    if not view.observation.seen:
+        return None
     for predicted in view.maps.values():
         cell = int(predicted.argmax())
         return int(sphere.window(view.index).flat[cell]), float(predicted.flat[cell])
@@ -46,7 +48,7 @@ def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: 
         table.add_row(
             str(step),
             _angles(sphere, view.index),
-            f"{result.classes[own]}\n{view.alone[own]:.3f}",
+            f"{result.classes[own]}\n{view.alone[own]:.3f}" if view.observation.seen else "nothing\nis seen",
             "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top),
             "-" if peak is None else f"{_angles(sphere, peak[0])}\n{peak[1]:.2f}",
             "stop" if view.next_view is None else _angles(sphere, view.next_view),
@@ -71,12 +73,15 @@ def as_json(result: Recognition, sphere: ViewSphere) -> str:
     views = []
     for view in result.views:
         peak = _peak(sphere, view)
-        bins = None if view.azimuth_bins is None else view.azimuth_bins[view.belief.argmax()]
+        bins = (
+            None if view.azimuth_bins is None or not view.observation.seen else view.azimuth_bins[view.belief.argmax()]
+        )
         views.append(
             {
                 "view": view.index,
                 "elevation": sphere.angles(view.index)[0],
                 "azimuth": sphere.angles(view.index)[1],
+                "seen": view.observation.seen,
                 "alone": dict(zip(result.classes, rounded(view.alone), strict=True)),
                 "belief": dict(zip(result.classes, rounded(view.belief), strict=True)),
                 "azimuth_bin": None

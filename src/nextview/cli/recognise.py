@@ -79,6 +79,7 @@ def show(
 
     from nextview.belief import Stopping
     from nextview.cameras.simulated import SimulatedCamera
+    from nextview.errors import ObservationError
     from nextview.models.inference import load_models
     from nextview.policies.registry import make_policy
     from nextview.session import Session
@@ -107,6 +108,11 @@ def show(
         session.update(seen)
         watch.lap("thinking")
     result = session.result
+    if result.answer is None:
+        raise ObservationError(
+            f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.n_views)} views; "
+            "is it made of a few small parts far apart?"
+        )
 
     from nextview.cli.episode_table import as_json, print_episode
 

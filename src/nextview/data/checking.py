@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from nextview.cloud import visible_points
+from nextview.cloud import POINTS, visible_points
 from nextview.data.correspond import ARRAY, correspondence
 from nextview.data.lock import only_one
 from nextview.data.pool import each
 from nextview.data.rendering import writing
 from nextview.data.store import DEPTH_UNIT, PENDING, POINT_UNIT, RENDERED, ViewStore
 from nextview.measures.registry import MEASURES
-from nextview.observation import POINTS
 
 
 def check(

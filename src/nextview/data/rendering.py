@@ -16,6 +16,7 @@ import zarr
 from numpy.typing import NDArray
 
 from nextview.cameras.simulated import SimulatedCamera
+from nextview.cloud import POINTS
 from nextview.data.folders import Entry, list_dataset
 from nextview.data.lock import only_one
 from nextview.data.pool import each
@@ -23,7 +24,6 @@ from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, RENDERED, 
 from nextview.errors import DatasetError, MeshError
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.mesh import Mesh, load_mesh, make_mesh
-from nextview.observation import POINTS
 from nextview.viewsphere import ViewSphere
 
 
@@ -62,7 +62,7 @@ def render_object(mesh: Mesh, sphere: ViewSphere, size: int) -> dict[str, np.nda
     points = np.empty((len(sphere), POINTS, 3), np.float32)
     for view, pose in enumerate(sphere.poses):
         observation = camera.observe(pose)
-        image[view], points[view] = observation.image, observation.points
+        image[view], points[view] = observation.picture, observation.points
         depth[view] = np.rint(observation.depth / DEPTH_UNIT)
     return {
         "image": image,

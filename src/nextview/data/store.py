@@ -11,10 +11,11 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
+from nextview.cloud import POINTS
 from nextview.data.folders import Entry
 from nextview.errors import DatasetError
 from nextview.mesh import UNITS
-from nextview.observation import POINTS, pinhole
+from nextview.observation import pinhole
 from nextview.viewsphere import ViewSphere
 
 FORMAT = 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.observation import object_depth
+from nextview.depth import object_depth
 
 
 def silhouette_area(depth: NDArray[np.floating]) -> float:

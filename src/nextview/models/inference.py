@@ -12,7 +12,7 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from nextview.belief import Calibration
-from nextview.errors import ModelError
+from nextview.errors import ModelError, ObservationError
 from nextview.models.cloud_input import cloud_input
 from nextview.models.geometry_input import geometry_input
 from nextview.models.image_input import image_input
@@ -67,13 +67,20 @@ def see(observations: Sequence[Observation], sees: str, size: int) -> NDArray[An
 
     Returns:
         Geometry (B, 4, size, size) or image (B, 1, size, size), uint8; or clouds (B, 1024, 3) float32.
+
+    Raises:
+        ObservationError: they are not from one camera, or their image does not suit the network.
     """
+    first = observations[0]
+    for other in observations[1:]:
+        if other.depth.shape != first.depth.shape or not np.array_equal(other.intrinsics, first.intrinsics):
+            raise ObservationError("views that are handed in together are from one camera: of one size and one pinhole")
     poses = np.stack([o.pose for o in observations])
     if sees == "cloud":
         return cloud_input(np.stack([o.points for o in observations]), poses)
     if sees == "image":
-        return image_input(np.stack([o.image for o in observations]), size)
-    return geometry_input(np.stack([o.depth for o in observations]), poses, observations[0].intrinsics, size)
+        return image_input(np.stack([o.picture for o in observations]), size)
+    return geometry_input(np.stack([o.depth for o in observations]), poses, first.intrinsics, size)
 
 
 def size_evidence(card: Card) -> SizeEvidence | None:
@@ -114,8 +121,13 @@ class Recogniser:
         self._session = open_weights(self.card, threads)
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
-        """What it says of B views from one camera: calibrated logits, and azimuth bins if it knows them."""
-        evidence = self.from_inputs(see(observations, *self.sees))
+        """Evidence of B views from one camera: logits, and azimuth bins if it knows them.
+
+        Views in which nothing is seen are marked and carry none, see ``Evidence.seen``.
+        """
+        evidence = replace(
+            self.from_inputs(see(observations, *self.sees)), seen=np.array([o.seen for o in observations])
+        )
         if self._size is None:
             return evidence
         radii = np.array([np.nan if o.radius is None else o.radius for o in observations])

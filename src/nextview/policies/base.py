@@ -23,11 +23,14 @@ class Evidence:
         azimuth_bins: logarithms of how likely each side of the object is the one that is seen, if it is of each class,
             (B, classes, azimuth bins) float: azimuth bins in even steps of azimuth from one that the recogniser has
             settled on for the class. None if the recogniser cannot tell.
+        seen: whether anything was seen, (B,) bool; None if something was in all. A view without is no evidence: in
+            episodes all the above counts as zero there.
     """
 
     logits: NDArray[np.floating]
     maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
     azimuth_bins: NDArray[np.floating] | None = None
+    seen: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,8 @@ def draw_episode(result: Recognition, sphere: ViewSphere, title: str) -> Figure:
         _draw_belief(axes[-1, k], view, result.classes, shown, first=k == 0)
     _draw_path(right.add_subplot(projection="3d"), views, sphere)
     figure.suptitle(
-        f"{title}: {result.answer}, belief {result.confidence:.3f}, {len(views)} view{'s' * (len(views) > 1)}, "
-        f"{result.travel:.2f} cells of travel",
+        f"{title}: {result.answer or 'nothing is seen'}, belief {result.confidence:.3f}, "
+        f"{len(views)} view{'s' * (len(views) > 1)}, {result.travel:.2f} cells of travel",
         color=INK,
         fontsize=14,
     )
@@ -56,7 +56,7 @@ def draw_episode(result: Recognition, sphere: ViewSphere, title: str) -> Figure:
 
 def _draw_image(axis: Axes, view: View, sphere: ViewSphere, step: int) -> None:
     elevation, azimuth = sphere.angles(view.index)
-    axis.imshow(view.observation.image, cmap="gray", vmin=0, vmax=255)
+    axis.imshow(view.observation.picture, cmap="gray", vmin=0, vmax=255)
     axis.set_title(f"step {step}: view {view.index}\n{elevation:.0f}° up, {azimuth:.0f}° round", color=INK, fontsize=10)
     axis.axis("off")
 
