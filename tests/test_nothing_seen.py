@@ -55,7 +55,7 @@ def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibr
     sure = Stopping(1.0, k)
     together = Episodes(SPHERE, Unidirectional(SPHERE), np.arange(b), sure, np.random.default_rng(0), calibration)
     for observation in range(k):
-        step = together.tell(
+        step = together.update(
             features(
                 np.where(empty[:, observation, None], np.nan, logits[:, observation]),
                 ~empty[:, observation],
@@ -86,11 +86,11 @@ def test_an_empty_view_is_taken_but_never_confident(threshold):
     episodes = Episodes(
         SPHERE, Unidirectional(SPHERE), np.array([0, 0]), Stopping(threshold, 3), np.random.default_rng(0)
     )
-    episodes.tell(features([[9, 0, 0], [9, 0, 0]], [False, True]))
+    episodes.update(features([[9, 0, 0], [9, 0, 0]], [False, True]))
     assert episodes.running.tolist() == [0]
-    episodes.tell(features([[9, 0, 0]], [False]))
+    episodes.update(features([[9, 0, 0]], [False]))
     assert episodes.current[0] == 2  # it went on
-    episodes.tell(features([[9, 0, 0]], [False]))
+    episodes.update(features([[9, 0, 0]], [False]))
     end = episodes.outcome
     assert end.n_views.tolist() == [3, 1]
     assert end.confident.tolist() == [False, True]
@@ -102,8 +102,8 @@ def test_a_threshold_that_comes_down_does_not_come_down_by_empty_views():
     logits = np.array([[1.5, 0.0]])
     assert softmax(logits[0]).max() > stopping.threshold_at(2)
     for seen in (True, False, False, False):
-        assert not episodes.tell(features(logits, [seen])).stopped[0]
-    assert episodes.tell(features(logits, [True])).stopped[0]
+        assert not episodes.update(features(logits, [seen])).stopped[0]
+    assert episodes.update(features(logits, [True])).stopped[0]
 
 
 class Asked:
@@ -123,14 +123,14 @@ def test_policies_are_shown_zeros_and_an_even_belief(tiny):
     policy = Asked()
     session = Session(tiny, policy, SPHERE, 5, Stopping(1.0, 3))
     empty = Observation(np.zeros((16, 16)), session.pose, pinhole(16, 3.0))
-    view = session.tell(empty)
+    view = session.update(empty)
     state = policy.states[0]
     np.testing.assert_array_equal(state.belief, np.full((1, 3), 1 / 3))
     np.testing.assert_array_equal(state.evidence.logits, np.zeros((1, 3)))
     np.testing.assert_array_equal(state.evidence.maps["lem"], np.zeros((1, 5, 3)))
     np.testing.assert_array_equal(state.azimuth_bins, np.full((1, 3, 8), 1 / 8))
     assert state.visited[0].nonzero()[0].tolist() == [5]
-    np.testing.assert_array_equal(view.guess, np.full(3, 1 / 3))
+    np.testing.assert_array_equal(view.alone, np.full(3, 1 / 3))
     np.testing.assert_array_equal(view.azimuth_bins, np.full((3, 8), 1 / 8))
 
 
@@ -168,7 +168,7 @@ def view_of(depth, pose) -> Observation:
 def test_nothing_seen_is_no_answer(tiny):
     session = Session(tiny, Unidirectional(SPHERE), SPHERE, 0, Stopping(0.0, 3))
     while not session.done:
-        session.tell(view_of(np.zeros((16, 16)), session.pose))
+        session.update(view_of(np.zeros((16, 16)), session.pose))
     result = session.result
     assert len(result.n_views) == 3
     assert (result.answer, result.confidence, result.confident, result.seen) == (None, 0.0, False, False)
@@ -178,7 +178,7 @@ def test_nothing_seen_is_no_answer(tiny):
 def test_one_view_that_shows_something_is_an_answer(tiny):
     session = Session(tiny, Unidirectional(SPHERE), SPHERE, 0, Stopping(1.0, 3))
     for depth in (np.zeros((16, 16)), np.full((16, 16), 3.0), np.zeros((16, 16))):
-        session.tell(view_of(depth, session.pose))
+        session.update(view_of(depth, session.pose))
     result = session.result
     np.testing.assert_array_equal(result.n_views[0].belief, np.full(3, 1 / 3))
     np.testing.assert_array_equal(result.n_views[1].belief, result.n_views[2].belief)
@@ -196,9 +196,9 @@ def test_after_a_wrong_observation_the_same_view_can_be_told(tiny):
                 before = session.view
                 for depth in (np.full((15, 15), 3.0), np.full((16, 32), 3.0)):
                     with pytest.raises(ObservationError):
-                        session.tell(view_of(depth, session.pose))
+                        session.update(view_of(depth, session.pose))
                 assert session.view == before
-            session.tell(camera.observe(session.pose))
+            session.update(camera.observe(session.pose))
         done.append(session.result)
     assert [observation.view for observation in done[0].n_views] == [
         observation.view for observation in done[1].n_views
@@ -217,7 +217,7 @@ def test_after_a_wrong_observation_the_same_view_can_be_told(tiny):
 def test_any_finite_depth_is_refused_or_believed_in_no_more_than_all(tiny, depth):
     session = Session(tiny, make_policy("lem", SPHERE), SPHERE, 20, Stopping(0.99, 2))
     try:
-        view = session.tell(view_of(depth, session.pose))
+        view = session.update(view_of(depth, session.pose))
     except ObservationError:
         assert not session.n_views
         return

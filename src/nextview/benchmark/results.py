@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +18,10 @@ from nextview.benchmark.run import Grid
 from nextview.benchmark.summary import Tables
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError
+from nextview.outputs import left_by_a_cut
+
+KIND = "benchmark"
+"""Of these results, in their manifest."""
 
 
 @dataclass(frozen=True)
@@ -46,42 +47,12 @@ class Results:
 
 
 def save(folder: Path, grid: Grid, tables: Tables, settings: dict[str, Any]) -> None:
-    """Write results aside and put them in place when they are whole. Earlier results of that name are replaced.
-
-    Raises:
-        ResultsError: the folder is there and holds something else.
-    """
-    check_target(folder)
-    with written_whole(folder) as part:
-        _write_episodes(part / "episodes.parquet", grid)
-        for name, table in tables.named().items():
-            table.to_csv(part / f"{name}.csv", index=False)
-        grid.specs.predictions.save(part / "predictions.npz")
-        (part / "benchmark.json").write_text(json.dumps(settings, indent=1) + "\n")
-
-
-def check_target(folder: Path, mark: str = "benchmark.json", what: str = "benchmark") -> None:
-    """Refuse to replace anything but earlier results, which are known by a file among them."""
-    if folder.exists() and not (folder / mark).exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ResultsError(f"{folder}: is there and holds no {what} results; give another folder")
-
-
-@contextmanager
-def written_whole(folder: Path) -> Iterator[Path]:
-    """A new folder to write into, which takes the place of ``folder`` when all is written.
-
-    Raises:
-        ResultsError: it cannot be made.
-    """
-    part = folder.with_name(folder.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        part.mkdir(parents=True)
-    except OSError as error:
-        raise ResultsError(f"{folder}: cannot be written ({error.strerror})") from None
-    yield part
-    shutil.rmtree(folder, ignore_errors=True)
-    part.rename(folder)
+    """Write results into a new folder, such as ``outputs.written_results`` makes."""
+    _write_episodes(folder / "episodes.parquet", grid)
+    for name, table in tables.named().items():
+        table.to_csv(folder / f"{name}.csv", index=False)
+    grid.specs.predictions.save(folder / "predictions.npz")
+    (folder / "benchmark.json").write_text(json.dumps(settings, indent=1) + "\n")
 
 
 def load(folder: Path) -> Results:
@@ -96,6 +67,11 @@ def load(folder: Path) -> Results:
         if not (folder / "episodes.parquet").exists():
             raise FileNotFoundError
     except FileNotFoundError:
+        left = left_by_a_cut(folder, KIND)
+        if left is not None:
+            raise ResultsError(
+                f"{folder}: a run was killed while it put its results there; rename {left} to it"
+            ) from None
         raise ResultsError(f"{folder}: holds no benchmark results; make some with nextview benchmark") from None
     except ValueError as error:
         raise ResultsError(f"{folder}: these benchmark results are damaged ({error})") from None

@@ -31,7 +31,7 @@ def benchmark(
 
     Args:
         predictions: made by nextview predict.
-        out: folder for the results; earlier results there are replaced.
+        out: folder for the results; earlier results there are replaced, anything else is refused.
         policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
         thresholds: of the belief.
         risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too.
@@ -58,14 +58,15 @@ def benchmark(
     from nextview.cli.progress import console, track
     from nextview.data.predictions import Predictions
     from nextview.models.model_card import file_hash
+    from nextview.outputs import check_folder, written_results
 
     with needs_extra("benchmark"):
-        from nextview.benchmark.results import check_target, save
+        from nextview.benchmark.results import KIND, save
         from nextview.benchmark.summary import summarise
     import numpy as np
 
     began = time.perf_counter()
-    check_target(out)
+    check_folder(out, KIND)
     if not thresholds:
         raise UsageError("at least one threshold is needed")
     table = Predictions.load(predictions)
@@ -90,8 +91,10 @@ def benchmark(
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
     names = list(dict.fromkeys([*([reference] if policies else []), *(policies or default_entries(specs))]))
     grid = Grid(specs, runs, tuple(sorted({*thresholds, *promised.values()})), max_views, seed, threshold_decay)
-    track(run_grid(grid, names), len(names), "replaying policies")
-    if grid.paths:
+    with written_results(out, KIND) as part:
+        track(run_grid(grid, names), len(names), "replaying policies")
+        if not grid.paths:
+            raise EntryError("\n".join(grid.failures.values()))
         tables = summarise(grid, reference, samples, np.random.default_rng([seed, 1]))
         settings = {
             "predictions": predictions.name,
@@ -111,8 +114,8 @@ def benchmark(
             "samples": samples,
             "seed": seed,
         }
-        save(out, grid, tables, settings)
-        episodes = runs * len(table) * len(list(grid.cells()))
-        console.print(f"{episodes:,} episodes in {time.perf_counter() - began:.1f} s; results in {out}")
+        save(part, grid, tables, settings)
+    episodes = runs * len(table) * len(list(grid.cells()))
+    console.print(f"{episodes:,} episodes in {time.perf_counter() - began:.1f} s; results in {out}")
     if grid.failures:
         raise EntryError("\n".join(grid.failures.values()))

@@ -31,7 +31,8 @@ def evaluate(
 
     Args:
         predictions: made by nextview predict.
-        out: folder for numbers, tables, figures and evaluate.html; an earlier evaluation there is replaced.
+        out: folder for numbers, tables, figures and evaluate.html; an earlier evaluation there is replaced, anything
+            else is refused.
         split: take only the objects of this one; needed where the predictions hold several.
         deduplicate: of objects with the same label that look the same from every view, copies of one mesh, judge
             only the first; the published numbers count them all.
@@ -45,13 +46,14 @@ def evaluate(
     from nextview.cli.progress import track
     from nextview.data.predictions import Predictions
     from nextview.models.model_card import file_hash, find_card, write_card
+    from nextview.outputs import check_folder, written_results
 
     with needs_extra("benchmark"):
         from nextview.benchmark import evaluation as judge
         from nextview.report import evaluation_page as evaluation
     import numpy as np
 
-    evaluation.check_folder(out)
+    check_folder(out, evaluation.KIND)
     table = Predictions.load(predictions)
     if split:
         table = table.of_split(split)
@@ -68,19 +70,20 @@ def evaluate(
         noted[card.path] = card.facts | {
             "scores": card.facts.get("scores", {}) | {of: judge.scores_for_card(card, table)}
         }
-    found = judge.evaluate(table, samples, np.random.default_rng([seed, 0]))
-    settings = {
-        "predictions": predictions.name,
-        "predictions_sha256": file_hash(predictions),
-        "models": table.models,
-        "split": split,
-        "deduplicate": deduplicate,
-        "objects": len(table),
-        "samples": samples,
-        "seed": seed,
-    }
-    figures = evaluation.all_figures(found, table, np.random.default_rng([seed, 1]))
-    track(evaluation.save(out, found, table, settings, figures), len(figures) + 1, "writing figures")
+    with written_results(out, evaluation.KIND) as part:
+        found = judge.evaluate(table, samples, np.random.default_rng([seed, 0]))
+        settings = {
+            "predictions": predictions.name,
+            "predictions_sha256": file_hash(predictions),
+            "models": table.models,
+            "split": split,
+            "deduplicate": deduplicate,
+            "objects": len(table),
+            "samples": samples,
+            "seed": seed,
+        }
+        figures = evaluation.all_figures(found, table, np.random.default_rng([seed, 1]))
+        track(evaluation.save(part, found, table, settings, figures), len(figures) + 1, "writing figures")
     for path, facts in noted.items():
         write_card(path.with_suffix(".json"), facts)
     console = Console()

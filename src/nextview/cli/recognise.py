@@ -110,7 +110,7 @@ def show(
     result = session.result
     if result.answer is None:
         raise ObservationError(
-            f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.n_views)} views; "
+            f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.views)} views; "
             "is it made of a few small parts far apart?"
         )
 

@@ -15,6 +15,7 @@ from urllib.error import HTTPError, URLError
 
 from nextview.data.lock import only_one
 from nextview.errors import DatasetError
+from nextview.outputs import written_whole
 
 CHUNK = 1 << 18
 PATIENCE = 5
@@ -141,10 +142,8 @@ def _verify(archive: Archive, part: Path) -> Iterator[int]:
 
 def _unpack(archive: Archive, part: Path, folder: Path) -> Iterator[tuple[int, int]]:
     """Unpack the archive's folder beside its place, then rename it there; yields bytes done and in all."""
-    aside = folder.with_name(folder.name + ".part")
-    shutil.rmtree(aside, ignore_errors=True)
     try:
-        with zipfile.ZipFile(part) as file:
+        with written_whole(folder) as aside, zipfile.ZipFile(part) as file:
             members = [m for m in file.infolist() if not m.is_dir()]
             for member in members:
                 path = PurePosixPath(member.filename)
@@ -166,8 +165,5 @@ def _unpack(archive: Archive, part: Path, folder: Path) -> Iterator[tuple[int, i
                     shutil.copyfileobj(source, out)  # no more than file_size, and its CRC is checked
                 done += member.file_size
                 yield done, total
-        aside.rename(folder)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise DatasetError(f"{archive.url}: cannot be unpacked ({error})") from None
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)

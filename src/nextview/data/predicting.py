@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -23,7 +24,11 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, PredictionsError
 from nextview.models.inference import MapNetwork, Recogniser, knows_sphere, size_evidence
 from nextview.models.model_card import Card
+from nextview.outputs import check_file, written_whole
 from nextview.viewsphere import ViewSphere
+
+RECIPE = "recipe.json"
+"""In the folder of unfinished predictions: which these are."""
 
 
 def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
@@ -71,8 +76,10 @@ def predict(
             writing ``out``.
         PredictionsError: ``out`` is there and comes from another store or other models, or an object kills its process.
             Where it comes from the same, only what the cards say beside the networks (valley classes, sizes,
-            calibration) is brought up to date.
+            calibration) is brought up to date. Or what lies in the folder beside it is not of such a run.
+        ResultsError: ``out`` cannot be written.
     """
+    check_file(out)
     store = ViewStore.open(path)
     chosen = np.flatnonzero(store.done & (True if split is None else store.splits == split))
     if len(chosen) == 0:
@@ -150,7 +157,7 @@ def predict(
             np.array(arrays["azimuth_bins"]) if azimuth_bins else None,
             of_size,
         ).save(out)
-        shutil.rmtree(out.with_name(out.name + ".part"))
+        _end(out.with_name(out.name + ".part"), shapes)
 
 
 def sizes_say(
@@ -201,19 +208,38 @@ def identity(cards: Sequence[Card]) -> tuple[str, str]:
 
 
 def _begin(part: Path, recipe: dict, shapes: dict[str, tuple[int, ...]]) -> dict[str, np.memmap]:
-    """Open the files of a run that was cut off, or begin them full of NaN: logits before maps, recipe last."""
+    """Open the files of a run that was cut off, or begin them full of NaN.
+
+    Raises:
+        PredictionsError: something else has the name of their folder.
+    """
     recipe = json.loads(json.dumps(recipe))
-    note = part / "recipe.json"
-    if note.exists() and json.loads(note.read_text()) == recipe:
+    if not os.path.lexists(part):
+        with written_whole(part) as begun:
+            begun.mkdir()
+            for name, shape in shapes.items():
+                np.lib.format.open_memmap(begun / f"{name}.npy", "w+", np.float32, shape)[:] = np.nan
+            (begun / RECIPE).write_text(json.dumps(recipe))
+    try:
+        same = not part.is_symlink() and json.loads((part / RECIPE).read_bytes()) == recipe
+    except (OSError, ValueError):
+        same = False
+    if not same:
+        raise PredictionsError(
+            f"{part}: is there and is not the unfinished work of this very run; remove it or give another name"
+        )
+    try:
         return {name: np.lib.format.open_memmap(part / f"{name}.npy", "r+") for name in shapes}
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    arrays = {}
-    for name, shape in shapes.items():
-        arrays[name] = np.lib.format.open_memmap(part / f"{name}.npy", "w+", np.float32, shape)
-        arrays[name][:] = np.nan
-    note.write_text(json.dumps(recipe))
-    return arrays
+    except (OSError, ValueError) as error:
+        raise PredictionsError(f"{part}: is damaged ({error}); remove it, and it is begun anew") from None
+
+
+def _end(part: Path, names: Iterable[str]) -> None:
+    """Remove the files of a run that is done, and their folder if nothing else is in it."""
+    for file in [part / RECIPE, *(part / f"{name}.npy" for name in names)]:
+        file.unlink()
+    with suppress(OSError):
+        part.rmdir()
 
 
 @lru_cache(maxsize=1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from nextview.belief import PLAIN_SUM, Calibration, log_evidence_of
 from nextview.data.splits import deduplicated
 from nextview.errors import PredictionsError
+from nextview.outputs import written_whole
 from nextview.viewsphere import ViewSphere
 
 FORMAT = 1
@@ -152,9 +152,8 @@ class Predictions:
             arrays["azimuth_bins"] = self.azimuth_bins
         if self.of_size is not None:
             arrays["of_size"] = self.of_size
-        part = path.with_name(path.name + ".part.npz")
-        np.savez_compressed(part, **arrays)
-        os.replace(part, path)
+        with written_whole(path) as part, part.open("wb") as file:
+            np.savez_compressed(file, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Predictions:

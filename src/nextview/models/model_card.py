@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from nextview.errors import ModelError
+from nextview.outputs import written_whole
 
 BUNDLED = Path(__file__).parent / "bundled"
 
@@ -71,9 +72,8 @@ def find_card(model: str | Path) -> Card:
 
 def write_card(path: Path, facts: dict[str, Any]) -> None:
     """Write a card, aside and then renamed, with the hash of the weights beside it."""
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(facts | {"sha256": file_hash(path.with_suffix(".onnx"))}, indent=1) + "\n")
-    part.rename(path)
+    with written_whole(path) as part:
+        part.write_text(json.dumps(facts | {"sha256": file_hash(path.with_suffix(".onnx"))}, indent=1) + "\n")
 
 
 def file_hash(path: Path) -> str:

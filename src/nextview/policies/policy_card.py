@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from nextview.errors import ModelError, OtherUseError, PolicyError
+from nextview.outputs import written_whole
 from nextview.policies.base import Policy
 from nextview.policies.gain_weights import read_gain
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence
@@ -37,9 +38,8 @@ def bundled_policies() -> dict[str, Path]:
 
 def write_policy(path: Path, facts: dict[str, Any]) -> None:
     """Write a card aside, then rename it."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(facts) + "\n")
-    part.rename(path)
+    with written_whole(path) as part:
+        part.write_text(json.dumps(facts) + "\n")
 
 
 def read_policy(path: Path, sphere: ViewSphere, classes: Sequence[str] | None = None) -> Policy:

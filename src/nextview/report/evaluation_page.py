@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 
 from nextview.benchmark.evaluation import Evaluation
 from nextview.benchmark.published import published_recognisers
-from nextview.benchmark.results import check_target, written_whole
 from nextview.data.predictions import Predictions
 from nextview.report import evaluation_figures as drawn
 from nextview.report.elements import (
@@ -31,20 +30,17 @@ from nextview.report.elements import (
 from nextview.report.style import to_png
 
 PAGE = "evaluate.html"
-
-
-def check_folder(folder: Path) -> None:
-    """Refuse to replace anything but an earlier evaluation."""
-    check_target(folder, PAGE, "evaluation")
+KIND = "evaluation"
+"""Of these results, in their manifest."""
 
 
 def save(
     folder: Path, e: Evaluation, p: Predictions, settings: dict[str, Any], figures: dict[str, Figure]
 ) -> Iterator[int]:
-    """Write results.json, a CSV of each table, a PNG of each figure and evaluate.html, whole or not at all.
+    """Write results.json, a CSV of each table, a PNG of each figure and evaluate.html.
 
     Args:
-        folder: an earlier evaluation there is replaced.
+        folder: a new one, such as ``outputs.written_results`` makes.
         e: the numbers.
         p: from which.
         settings: how they were made.
@@ -52,21 +48,16 @@ def save(
 
     Yields:
         How many figures are written; the page counts as one.
-
-    Raises:
-        ResultsError: the folder is there and holds something else.
     """
-    check_folder(folder)
-    with written_whole(folder) as part:
-        for name, frame in e.tables().items():
-            frame.to_csv(part / f"{name}.csv", index=False)
-        records = {name: _records(frame) for name, frame in e.tables().items()}
-        results = {"settings": settings, "left_out": e.left_out, **records}
-        (part / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
-        for done, (name, figure) in enumerate(figures.items()):
-            to_png(figure, part / f"{name}.png")
-            yield done + 1
-        (part / PAGE).write_text(page(e, p, settings, figures), encoding="utf-8")
+    for name, frame in e.tables().items():
+        frame.to_csv(folder / f"{name}.csv", index=False)
+    records = {name: _records(frame) for name, frame in e.tables().items()}
+    results = {"settings": settings, "left_out": e.left_out, **records}
+    (folder / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
+    for done, (name, figure) in enumerate(figures.items()):
+        to_png(figure, folder / f"{name}.png")
+        yield done + 1
+    (folder / PAGE).write_text(page(e, p, settings, figures), encoding="utf-8")
     yield len(figures) + 1
 
 

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from nextview.benchmark.results import Results
+from nextview.benchmark.results import KIND, Results
 from nextview.errors import ResultsError
+from nextview.outputs import added_file, check_added, check_file, written_whole
 from nextview.report import curves
 from nextview.report import html_tables as tables
-from nextview.report.elements import asset, card, description, document, numbers, picture, side_by_side, write
+from nextview.report.elements import GENERATOR, asset, card, description, document, numbers, picture, side_by_side
 from nextview.report.trajectories import Pictures, gains, trajectories, worst_failures
 
 
@@ -25,8 +26,12 @@ def headline_policy(results: Results, threshold: float) -> str:
     return max(names, key=lambda n: found[n, threshold, "accuracy"].value, default=reference)
 
 
+PAGE = "report.html"
+"""Beside the results that it shows."""
+
+
 def write_report(results: Results, path: Path, pictures: Pictures) -> None:
-    """Write the page, aside and then renamed.
+    """Write the page, whole or not at all. In the folder of the results it counts as one of their files.
 
     Args:
         results: of a benchmark, with at least one policy that chooses its views.
@@ -34,11 +39,38 @@ def write_report(results: Results, path: Path, pictures: Pictures) -> None:
         pictures: of the objects, for the failures and the viewer.
 
     Raises:
-        ResultsError: there are fixed views only.
+        ResultsError: there are fixed views only, or see ``check_page``.
     """
+    check_page(path, results.folder)
     if results.tables.sweep.empty:
         raise ResultsError(f"{results.folder}: holds fixed views only; a report needs a policy that chooses")
-    write(page(results, pictures), path)
+    text = page(results, pictures)
+    beside = _is_beside(path, results.folder)
+    with added_file(results.folder, path.name, KIND) if beside else written_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def check_page(path: Path, results: Path) -> None:
+    """See, before any work is done, that a page can be written; nothing is touched.
+
+    Args:
+        path: of the page.
+        results: folder of the results that it is to show.
+
+    Raises:
+        ResultsError: it cannot be written, or something else than such a page is there.
+    """
+    check_file(path)
+    if _is_beside(path, results):
+        if path.name != PAGE:
+            raise ResultsError(f"{path}: in a folder of results the page is called {PAGE}; give a path outside of it")
+        check_added(results, path.name, KIND)
+    elif path.exists() and GENERATOR.encode() not in path.read_bytes()[:1000]:
+        raise ResultsError(f"{path}: is there and is no page of nextview's; give another name")
+
+
+def _is_beside(path: Path, results: Path) -> bool:
+    return path.parent.resolve() == results.resolve()
 
 
 def page(results: Results, pictures: Pictures) -> str:

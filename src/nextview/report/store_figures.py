@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nextview.data.store import RENDERED, ViewStore
+from nextview.outputs import written_whole
 from nextview.viewsphere import ViewSphere
 
 BLUE, ORANGE, GREY = "#2f6db3", "#e08a2e", "#8a8a8a"
@@ -20,10 +21,8 @@ CELL = 112
 
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG or whatever the suffix says, aside and then renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.part{path.suffix}")
-    figure.savefig(part, dpi=150, facecolor="white")
-    part.replace(path)
+    with written_whole(path) as part:
+        figure.savefig(part, dpi=150, facecolor="white")
 
 
 def object_figure(store: ViewStore, i: int) -> Figure:

@@ -13,6 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 from nextview.errors import ModelError
 from nextview.models.model_card import file_hash
 from nextview.models.onnx_file import open_onnx
+from nextview.outputs import written_whole
 from nextview.policies.gain import Gain
 from nextview.policies.gain_weights import FEATURES_INPUT
 from nextview.policies.policy_card import write_policy
@@ -107,16 +108,14 @@ def write_gain(card: Path, policy: Gain, facts: dict[str, Any], features: NDArra
     if not isinstance(policy.score, Perceptrons):
         raise ModelError("only a policy that was just trained can be written")
     weights = card.with_suffix(".onnx")
-    part = weights.with_name(weights.name + ".part")
-    onnx.save(gain_graph(policy.score), part)
-    sha256 = file_hash(part)
-    answers = open_onnx(part, sha256, threads=1).run(["cells"], {FEATURES_INPUT: features.astype(np.float32)})[0]
-    difference = float(np.abs(answers - policy.score(features.astype(np.float64))).max())
-    if not difference <= BOUND:
-        part.unlink()
-        raise ModelError(
-            f"{weights}: ONNX Runtime's answers differ by {difference:.2g} from the networks'; not written"
-        )
-    part.rename(weights)
+    with written_whole(weights) as part:
+        onnx.save(gain_graph(policy.score), part)
+        sha256 = file_hash(part)
+        answers = open_onnx(part, sha256, threads=1).run(["cells"], {FEATURES_INPUT: features.astype(np.float32)})[0]
+        difference = float(np.abs(answers - policy.score(features.astype(np.float64))).max())
+        if not difference <= BOUND:
+            raise ModelError(
+                f"{weights}: ONNX Runtime's answers differ by {difference:.2g} from the networks'; not written"
+            )
     write_policy(card, facts | {"sha256": sha256, "table": policy.facts()})
     return difference

@@ -19,6 +19,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch.utils.data import DataLoader, IterableDataset
 
 from nextview.errors import ModelError
+from nextview.outputs import written_whole
 from nextview.training.ahead import Ahead
 from nextview.training.hardware import Hardware
 
@@ -76,12 +77,10 @@ class Log(L.Callback):
         self.rows.append(row)
         if trainer.is_global_zero:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            part = self.path.with_suffix(".part")
-            with part.open("w", newline="") as file:
+            with written_whole(self.path) as part, part.open("w", newline="") as file:
                 table = csv.DictWriter(file, list(self.rows[0]))
                 table.writeheader()
                 table.writerows(self.rows)
-            part.rename(self.path)
 
     def state_dict(self) -> dict[str, Any]:
         return {"rows": self.rows}

@@ -14,6 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from nextview.models.inference import BINS_OUTPUT
+from nextview.outputs import written_whole
 
 OPSET = 18
 SMALL = 2**17
@@ -101,9 +102,8 @@ def export_onnx(
         )
     model = strip_traces(shrink_weights(program.model_proto, bits))
     onnx.checker.check_model(model, full_check=True)
-    part = path.with_suffix(".part")
-    onnx.save(model, part)
-    part.rename(path)
+    with written_whole(path) as part:
+        onnx.save(model, part)
 
 
 def strip_traces(model: onnx.ModelProto) -> onnx.ModelProto:
