@@ -67,8 +67,8 @@ def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibr
     views = together.outcome.views
     for e in range(b):
         kept = np.flatnonzero(~empty[e])
-        message = np.zeros((1, 3)) if len(kept) == 0 else logits[e, kept]
-        total = message.sum(0) / calibration.temperature(max(len(kept), 1))
+        log_evidence = np.zeros((1, 3)) if len(kept) == 0 else logits[e, kept]
+        total = log_evidence.sum(0) / calibration.temperature_after(max(len(kept), 1))
         if azimuth_bins is not None:
             zero = np.zeros((3, 8))  # by the azimuth of the object's azimuth bin 0
             for observation in kept:
