@@ -19,11 +19,11 @@ import tyro
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, shape_inference
 
-from nextview.models.card import Card, bundled_cards, find_card
-from nextview.models.networks import open_weights, sight
+from nextview.models.inference import open_weights, sight
+from nextview.models.model_card import Card, bundled_cards, find_card
 
 SIDE = 2048
-"""Of the matrices of the yardstick."""
+"""Of the matrices of the baselines."""
 
 
 def flops(card: Card, shape: tuple[int, ...]) -> float:

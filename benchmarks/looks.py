@@ -1,10 +1,10 @@
-"""Compare policies at a fixed number of looks: nobody stops early, and each look and each cell of travel is counted.
+"""Compare policies at a fixed number of views: nobody stops early, and each view and each cell of travel is counted.
 
     python benchmarks/looks.py test.npz --out looks [--policies gain@0.01 ...] [--looks 2 3 5] [--against lem ...]
 
 Writes looks.md (the table), looks.csv (every number in a row of its own) and front.png (accuracy against travel) into
-the folder, and prints the table. A policy chooses without knowing how many looks there will be, so it is run once and
-its path cut after each number of looks; the numbers are those of
+the folder, and prints the table. A policy chooses without knowing how many views there will be, so it is run once and
+its path cut after each number of views; the numbers are those of
 
     nextview benchmark test.npz --thresholds 1 --max-views 2
 
@@ -32,15 +32,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from matplotlib.transforms import Bbox
 
-from nextview.benchmark.contestants import Trials, contestant_policy
-from nextview.benchmark.replay import Ends, Paths, cut, make_trials
+from nextview.benchmark.entries import EpisodeSpecs, entry_policy
+from nextview.benchmark.replay import Outcomes, Trajectories, make_specs, truncate
 from nextview.benchmark.run import Grid, run_grid
 from nextview.benchmark.statistics import interval, mcnemar, ratio, resample
 from nextview.cli.progress import track
 from nextview.data.predictions import Predictions
 from nextview.report.curves import COLOURS, OWN, is_oracle
+from nextview.report.html_tables import KNOWING
 from nextview.report.style import STYLE, to_png
-from nextview.report.tables import KNOWING
 
 POLICIES = (
     "random",
@@ -64,13 +64,13 @@ REFERENCES = ("random", "random-all")
 CEILING = "oracle-gain"
 
 
-def after(paths: Paths, looks: int) -> Ends:
-    """How the episodes stand after so many looks."""
+def after(paths: Trajectories, n_views: int) -> Outcomes:
+    """How the episodes stand after so many views."""
     fields = ("views", "answers", "confidences", "travel", "arc")
-    return cut(replace(paths, **{name: getattr(paths, name)[:, :looks] for name in fields}), None)
+    return truncate(replace(paths, **{name: getattr(paths, name)[:, :n_views] for name in fields}), None)
 
 
-def measured(grid: Grid, looks: Sequence[int], samples: int, references: Sequence[str] = REFERENCES) -> pd.DataFrame:
+def measured(grid: Grid, n_views: Sequence[int], samples: int, references: Sequence[str] = REFERENCES) -> pd.DataFrame:
     """Every number: policy, looks, measure, value, low, high, p.
 
     The measures: ``accuracy``; ``travel``, grid cells; ``to_random`` and so on, differences of accuracy to references;
@@ -78,9 +78,9 @@ def measured(grid: Grid, looks: Sequence[int], samples: int, references: Sequenc
     those of the benchmark, the same for all policies, which pairs the differences.
     """
     names = list(grid.paths)
-    weights = resample(len(grid.trials.predictions), samples, np.random.default_rng([grid.seed, 1]))
+    weights = resample(len(grid.specs.predictions), samples, np.random.default_rng([grid.seed, 1]))
     rows: list[tuple] = []
-    for k in looks:
+    for k in n_views:
         ends = [after(grid.paths[name], k) for name in names]
         right = dict(zip(names, (grid.right(e.answer) for e in ends), strict=True))
         columns = {(name, "accuracy"): r.mean(0) for name, r in right.items()}
@@ -100,7 +100,7 @@ def measured(grid: Grid, looks: Sequence[int], samples: int, references: Sequenc
         for name in names:
             share = value[name, "to_random"] / gap if gap > 0 else np.nan
             rows.append((name, k, "share_of_gap", share, np.nan, np.nan, np.nan))
-    return pd.DataFrame(rows, columns=["policy", "looks", "measure", "value", "low", "high", "p"])
+    return pd.DataFrame(rows, columns=["policy", "n_views", "measure", "value", "low", "high", "p"])
 
 
 Numbers = dict[tuple[str, int, str], tuple[float, float, float, float]]
@@ -113,23 +113,23 @@ def by_key(table: pd.DataFrame) -> Numbers:
 
 def markdown(table: pd.DataFrame, left_out: Sequence[str], references: Sequence[str] = REFERENCES) -> str:
     """The table as text."""
-    found, looks = by_key(table), table["looks"].unique().tolist()
-    at = " at " + ", ".join(map(str, looks))
+    found, n_views = by_key(table), table["n_views"].unique().tolist()
+    at = " at " + ", ".join(map(str, n_views))
 
     def difference(name: str, k: int, reference: str) -> str:
         value, *_, p = found[name, k, f"to_{reference}"]
         # rounded first: no minus before a zero
         return f"{round(100 * value, 1) + 0.0:+.1f} (p {'< 0.0001' if p < 1e-4 else f'{p:.2g}'})"
 
-    head = ["policy", *(f"{k} look{'s' * (k > 1)}" for k in looks), f"travel{at}"]
+    head = ["policy", *(f"{k} look{'s' * (k > 1)}" for k in n_views), f"travel{at}"]
     head += [f"points over {reference}{at}" for reference in references] + [f"of the gap{at}"]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for name in table["policy"].unique():
-        cells = ["{:.3f} ({:.3f}-{:.3f})".format(*found[name, k, "accuracy"][:3]) for k in looks]
-        cells.append(", ".join(f"{found[name, k, 'travel'][0]:.2f}" for k in looks))
+        cells = ["{:.3f} ({:.3f}-{:.3f})".format(*found[name, k, "accuracy"][:3]) for k in n_views]
+        cells.append(", ".join(f"{found[name, k, 'travel'][0]:.2f}" for k in n_views))
         for reference in references:
-            cells.append("" if name == reference else ", ".join(difference(name, k, reference) for k in looks))
-        shares = [found[name, k, "share_of_gap"][0] for k in looks]
+            cells.append("" if name == reference else ", ".join(difference(name, k, reference) for k in n_views))
+        shares = [found[name, k, "share_of_gap"][0] for k in n_views]
         cells.append(", ".join("-" if np.isnan(s) else f"{100 * s:.0f} %" for s in shares))
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join([*lines, *(f"\nLeft out: {sentence}" for sentence in left_out)]) + "\n"
@@ -140,43 +140,46 @@ def knows(policy: str) -> bool:
     return is_oracle(policy) or policy.split("-")[0] in KNOWING
 
 
-def families(names: Sequence[str], trials: Trials) -> dict[str, list[tuple[float, str]]]:
-    """The policies that were run at two prices or more: price and full name of each, ascending.
+def families(names: Sequence[str], specs: EpisodeSpecs) -> dict[str, list[tuple[float, str]]]:
+    """The policies that were run at two travel weights or more: travel weight and full name of each, ascending.
 
-    Where a policy's own price was asked for by number too, it is the policy's.
+    Where a policy's own travel weight was asked for by number too, it is the policy's.
     """
     found: dict[str, dict[float, str]] = {}
     for name in sorted(names):
-        price = getattr(contestant_policy(name, trials), "price", None)
-        if price is not None:
-            found.setdefault(name.partition("@")[0], {}).setdefault(price, name)
+        travel_weight = getattr(entry_policy(name, specs), "travel_weight", None)
+        if travel_weight is not None:
+            found.setdefault(name.partition("@")[0], {}).setdefault(travel_weight, name)
     return {family: sorted(members.items()) for family, members in found.items() if len(members) > 1}
 
 
-def front(table: pd.DataFrame, prices: dict[str, list[tuple[float, str]]]) -> Figure:
-    """Accuracy against travel, a panel for each number of looks; what is told the truth is only named above it.
+def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]]) -> Figure:
+    """Accuracy against travel, a panel for each number of views; what takes the truth is only named above it.
 
-    A line joins the prices of one policy. Dots are filled where McNemar's p against random is under 0.05.
+    A line joins the travel weights of one policy. Dots are filled where McNemar's p against random is under 0.05.
     """
-    found, looks = by_key(table), table["looks"].unique().tolist()
-    at_prices = {name for members in prices.values() for _, name in members}
+    found, n_views = by_key(table), table["n_views"].unique().tolist()
+    at_prices = {name for members in travel_weights.values() for _, name in members}
     drawn = [name for name in table["policy"].unique() if not knows(name)]
-    names = [name for name in drawn if name in at_prices or name.partition("@")[0] not in prices]
+    names = [name for name in drawn if name in at_prices or name.partition("@")[0] not in travel_weights]
     colour = {name: COLOURS.get(name, "#4a5560") for name in names}
-    said = {name: Path(name).name for name in names}
-    for own, (family, members) in zip(OWN * len(prices), prices.items(), strict=False):
-        for price, name in members:
-            colour[name], said[name] = own, f"{Path(family).name}@{price:g}" if name == family else f"@{price:g}"
-        if family not in said:
-            said[members[0][1]] = Path(members[0][1]).name
+    log_evidence = {name: Path(name).name for name in names}
+    for own, (family, members) in zip(OWN * len(travel_weights), travel_weights.items(), strict=False):
+        for travel_weight, name in members:
+            colour[name], log_evidence[name] = (
+                own,
+                f"{Path(family).name}@{travel_weight:g}" if name == family else f"@{travel_weight:g}",
+            )
+        if family not in log_evidence:
+            log_evidence[members[0][1]] = Path(members[0][1]).name
     with matplotlib.rc_context(STYLE):
-        figure = Figure((3.7 * len(looks), 4.4), dpi=160, layout="constrained")
+        figure = Figure((3.7 * len(n_views), 4.4), dpi=160, layout="constrained")
         FigureCanvasAgg(figure)  # measures text
-        panels = figure.subplots(1, len(looks), sharey=True, squeeze=False)[0]
+        panels = figure.subplots(1, len(n_views), sharey=True, squeeze=False)[0]
         lines = []
-        for axes, k in zip(panels, looks, strict=True):
+        for axes, k in zip(panels, n_views, strict=True):
             place = {name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0]) for name in names}
-            for members in prices.values():
+            for members in travel_weights.values():
                 line = [place[name] for _, name in members]
                 axes.plot(*zip(*line, strict=True), color=colour[members[0][1]], linewidth=1.2, zorder=2)
                 lines.append((axes, line))
@@ -200,16 +203,16 @@ def front(table: pd.DataFrame, prices: dict[str, list[tuple[float, str]]]) -> Fi
         figure.supxlabel("filled: differs from random by McNemar's test (p < 0.05)", fontsize=8, x=0.99, ha="right")
         figure.canvas.draw()  # settles where the points are
         figure.set_layout_engine("none")
-        for axes, k in zip(panels, looks, strict=True):
+        for axes, k in zip(panels, n_views, strict=True):
             points = {name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0]) for name in names}
-            label(axes, points, said, colour, [line for of, line in lines if of is axes])
+            label(axes, points, log_evidence, colour, [line for of, line in lines if of is axes])
     return figure
 
 
 def label(
     axes: Axes,
     points: dict[str, tuple[float, float]],
-    said: dict[str, str],
+    log_evidence: dict[str, str],
     colour: dict[str, str],
     lines: Sequence[Sequence[tuple[float, float]]],
 ) -> None:
@@ -227,7 +230,7 @@ def label(
     crowd = {name: np.sort(np.hypot(*(everyone - at).T))[:4].sum() for name, at in dots.items()}
     for name in sorted(dots, key=crowd.__getitem__):
         at = dots[name]
-        text = axes.annotate(said[name], points[name], xytext=(0, 0), textcoords="offset points", va="bottom",
+        text = axes.annotate(log_evidence[name], points[name], xytext=(0, 0), textcoords="offset points", va="bottom",
                              fontsize=7.5, color=colour[name], zorder=4)  # fmt: skip
         size = np.array(text.get_window_extent().size)
         tries = []
@@ -258,9 +261,9 @@ def _overlap(a: Bbox, b: Bbox) -> float:
 
 def main(
     predictions: tyro.conf.Positional[Path],
-    out: Path = Path("looks"),
+    out: Path = Path("n_views"),
     policies: tuple[str, ...] = (),
-    looks: tuple[int, ...] = (2, 3, 5),
+    n_views: tuple[int, ...] = (2, 3, 5),
     split: Literal["train", "test"] | None = None,
     runs: int = 10,
     samples: int = 2000,
@@ -271,10 +274,10 @@ def main(
 
     Args:
         predictions: made by nextview predict.
-        out: folder for looks.md, looks.csv and front.png.
+        out: folder for views.md, looks.csv and front.png.
         policies: names, or MODULE:CLASS for your own, beside random, random-all and oracle-gain; by default a choice of
             those that the predictions allow.
-        looks: after how many the policies are compared.
+        n_views: after how many the policies are compared.
         split: take only the objects of this one; needed where the predictions hold several.
         runs: random first views of each object.
         samples: of the bootstrap.
@@ -286,24 +289,24 @@ def main(
         table = table.of_split(split)
     elif len(set(table.splits)) > 1:
         raise ValueError(f"{predictions}: holds training and test objects; choose with --split which are compared")
-    if not looks or not 1 <= min(looks) <= max(looks) <= len(table.sphere):
-        raise ValueError(f"policies are compared after 1 to {len(table.sphere)} looks, not {looks}")
-    trials = make_trials(table, runs, seed)
+    if not n_views or not 1 <= min(n_views) <= max(n_views) <= len(table.sphere):
+        raise ValueError(f"policies are compared after 1 to {len(table.sphere)} looks, not {n_views}")
+    specs = make_specs(table, runs, seed)
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
     names = list(dict.fromkeys([*REFERENCES, *against, *(policies or POLICIES), CEILING]))
-    grid = Grid(trials, runs, (), max(looks), seed)
+    grid = Grid(specs, runs, (), max(n_views), seed)
     track(run_grid(grid, names), len(names), "replaying policies")
-    for name in [name for name, paths in grid.paths.items() if paths.views.shape[1] < max(looks) and paths.fixed]:
-        grid.failures[name] = f"{name} is over before look {max(looks)}"
+    for name in [name for name, paths in grid.paths.items() if paths.views.shape[1] < max(n_views) and paths.fixed]:
+        grid.failures[name] = f"{name} is over before look {max(n_views)}"
         del grid.paths[name]
     compared = [name for name in dict.fromkeys((REFERENCES[0], *against)) if name in grid.paths]
-    found = measured(grid, sorted(set(looks)), samples, compared)
+    found = measured(grid, sorted(set(n_views)), samples, compared)
     text = markdown(found, list(grid.failures.values()), compared)
     out.mkdir(parents=True, exist_ok=True)
     (out / "looks.md").write_text(text, encoding="utf-8")
     found.to_csv(out / "looks.csv", index=False)
     choosing = [name for name, paths in grid.paths.items() if not paths.fixed]
-    to_png(front(found, families(choosing, trials)), out / "front.png")
+    to_png(front(found, families(choosing, specs)), out / "front.png")
     print(text, end="")
     if (policies or against != REFERENCES) and grid.failures:
         raise ValueError("not all that was asked for could be run")

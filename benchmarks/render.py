@@ -90,7 +90,7 @@ def embree_bounded(files: list[str]) -> Cost:
 
 def one_process(files: list[str]) -> Cost:
     """nextview's work on each object, mesh file to arrays in memory."""
-    from nextview.data.render import render_object
+    from nextview.data.rendering import render_object
     from nextview.mesh import load_mesh
     from nextview.viewsphere import ViewSphere
 
@@ -228,7 +228,7 @@ def end_to_end(files: list[str], workers: int) -> tuple[np.ndarray, float, float
 
     The processes' starting is in both.
     """
-    from nextview.data.render import render
+    from nextview.data.rendering import render
     from nextview.viewsphere import ViewSphere
 
     with tempfile.TemporaryDirectory() as folder:

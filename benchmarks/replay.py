@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from nextview.benchmark.contestants import default_contestants
-from nextview.benchmark.replay import make_trials
+from nextview.belief import Calibration
+from nextview.benchmark.entries import default_entries
+from nextview.benchmark.replay import make_specs
 from nextview.benchmark.run import THRESHOLDS, Grid, run_grid
 from nextview.benchmark.summary import summarise
 from nextview.data.predictions import Predictions
-from nextview.recognition import Calibration
 from nextview.viewsphere import ViewSphere
 
 TEN = ["random", "random-all", "furthest", "unidirectional", "lem", "lem-peak"]
@@ -45,7 +45,7 @@ def made_up(objects: int, azimuths: int = 8, classes: int = 10) -> Predictions:
         sphere,
         {},
         {"lem": ("class_0",)},
-        Calibration(1.0, 0.8, side_correlation=0.1),
+        Calibration(1.0, 0.8, bin_correlation=0.1),
         rng.normal(size=(objects, v, classes, 8)).astype(np.float32),
     )
 
@@ -54,30 +54,30 @@ def run(source: Path | tuple[int, int], names: list[str] | None, max_views: int 
     """Seconds to load and replay, seconds to summarise, peak memory in GB, episodes."""
     predictions = Predictions.load(source) if isinstance(source, Path) else made_up(*source)
     began = time.perf_counter()
-    trials = make_trials(predictions, 10, 0)
-    grid = Grid(trials, 10, THRESHOLDS, max_views, 0)
-    list(run_grid(grid, names or default_contestants(trials)))
+    specs = make_specs(predictions, 10, 0)
+    grid = Grid(specs, 10, THRESHOLDS, max_views, 0)
+    list(run_grid(grid, names or default_entries(specs)))
     replayed = time.perf_counter()
     summarise(grid, "random", 2000, np.random.default_rng(0))
     done = time.perf_counter()
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    return replayed - began, done - replayed, memory, len(trials.objects) * len(list(grid.cells()))
+    return replayed - began, done - replayed, memory, len(specs.objects) * len(list(grid.cells()))
 
 
-def with_networks(meshes: list[Path], looks: int = 40) -> float:
-    """Seconds a look with the simulated camera and the bundled networks, one look at a time, as live."""
+def with_networks(meshes: list[Path], n_views: int = 40) -> float:
+    """Seconds a view with the simulated camera and the bundled networks, one view of a time, as live."""
     from nextview.cameras.simulated import SimulatedCamera
     from nextview.mesh import load_mesh
-    from nextview.models.networks import load_models
+    from nextview.models.inference import load_models
 
     models, sphere = load_models(), ViewSphere.named("40")
     cameras = [SimulatedCamera(load_mesh(path), 224, sphere.distance) for path in meshes]
     models.evidence([cameras[0].observe(sphere.poses[0])])
     began = time.perf_counter()
     for camera in cameras:
-        for pose in sphere.poses[:looks]:
+        for pose in sphere.poses[:n_views]:
             models.evidence([camera.observe(pose)])
-    return (time.perf_counter() - began) / (looks * len(cameras))
+    return (time.perf_counter() - began) / (n_views * len(cameras))
 
 
 def main(predictions: Path | None = None, meshes: list[Path] | None = None) -> None:
@@ -85,12 +85,12 @@ def main(predictions: Path | None = None, meshes: list[Path] | None = None) -> N
 
     Args:
         predictions: of the full grid; made-up ones of 899 objects by default.
-        meshes: to measure looks that run the networks.
+        meshes: to measure views that run the networks.
     """
     full = predictions or (899, 8)
     cases: list[tuple[str, tuple]] = [
         ("full grid: 10 policies", (full, TEN)),
-        ("all contestants", (full, None)),
+        ("all entries", (full, None)),
         ("5 policies", (full, TEN[:5])),
         ("450 objects", ((450, 8), TEN)),
         ("899 objects", ((899, 8), TEN)),
@@ -98,8 +98,8 @@ def main(predictions: Path | None = None, meshes: list[Path] | None = None) -> N
         ("3,596 objects", ((3596, 8), TEN)),
         ("80 views on the sphere", ((899, 16), TEN)),
         ("160 views on the sphere", ((899, 32), TEN)),
-        ("at most 10 looks", (full, TEN, 10)),
-        ("at most 20 looks", (full, TEN, 20)),
+        ("at most 10 views", (full, TEN, 10)),
+        ("at most 20 views", (full, TEN, 20)),
     ]
     print("| 10 starts, 5 thresholds | replay, s | tables, s | peak memory, GB | episodes |")
     print("|---|---|---|---|---|")
@@ -108,13 +108,13 @@ def main(predictions: Path | None = None, meshes: list[Path] | None = None) -> N
             replayed, summarised, memory, episodes = pool.submit(run, *case).result()
         print(f"| {what} | {replayed:.2f} | {summarised:.2f} | {memory:.2f} | {episodes:,} |", flush=True)
     if meshes:
-        look = with_networks(meshes)
+        observation = with_networks(meshes)
         table = Predictions.load(full) if isinstance(full, Path) else made_up(*full)
-        grid = Grid(make_trials(table, 10, 0), 10, THRESHOLDS, 5, 0)
+        grid = Grid(make_specs(table, 10, 0), 10, THRESHOLDS, 5, 0)
         list(run_grid(grid, TEN))
-        looks = sum(int(ends.looks.sum()) for _, _, ends in grid.cells())
-        print(f"\nWith the networks: {1000 * look:.1f} ms a look over {len(meshes)} meshes; the grid's {looks:,} looks")
-        print(f"would take {look * looks / 3600:.1f} hours.")
+        n_views = sum(int(ends.n_views.sum()) for _, _, ends in grid.cells())
+        print(f"\nWith the networks: {1000 * observation:.1f} ms a view over {len(meshes)} meshes; {n_views:,} views")
+        print(f"would take {observation * n_views / 3600:.1f} hours.")
 
 
 if __name__ == "__main__":

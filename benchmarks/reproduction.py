@@ -14,14 +14,14 @@ from typing import NamedTuple
 import numpy as np
 import tyro
 
-from nextview.benchmark.contestants import default_contestants
+from nextview.belief import PLAIN_SUM
+from nextview.benchmark.entries import default_entries
 from nextview.benchmark.published import published, published_threshold
-from nextview.benchmark.replay import make_trials
+from nextview.benchmark.replay import make_specs
 from nextview.benchmark.run import THRESHOLDS, Grid, run_grid
 from nextview.benchmark.summary import Tables, summarise
 from nextview.data.predictions import Predictions
-from nextview.models.card import file_hash
-from nextview.recognition import PLAIN_SUM
+from nextview.models.model_card import file_hash
 
 AT = 0.97
 BASELINES = ("random", "furthest", "unidirectional")
@@ -72,9 +72,9 @@ def tests_of(tables: Tables, measure: str) -> dict[tuple[str, float], Compared]:
 
 def page(predictions: Path, samples: int = 2000) -> str:
     table = replace(Predictions.load(predictions), calibration=PLAIN_SUM)  # as published
-    trials = make_trials(table, 10, 0)
-    grid = Grid(trials, 10, THRESHOLDS, 5, 0)
-    list(run_grid(grid, default_contestants(trials)))
+    specs = make_specs(table, 10, 0)
+    grid = Grid(specs, 10, THRESHOLDS, 5, 0)
+    list(run_grid(grid, default_entries(specs)))
     ran = {name for name, paths in grid.paths.items() if not paths.fixed}
     references = [name for name in (*BASELINES, "lem", "true-lem", "lcm") if name in ran]
     tables = {name: summarise(grid, name, samples, np.random.default_rng([0, 1])) for name in references}
@@ -96,7 +96,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
     out = [
         "# What of the published comparison holds up",
         "",
-        f"{len(table)} objects, {len(table.classes)} classes, 10 first views each, at most 5 looks; the same first "
+        f"{len(table)} objects, {len(table.classes)} classes, 10 first views each, at most 5 views; the same first "
         "views for every policy and threshold. In brackets: 95 % bootstrap intervals over objects. p-values are of the "
         "paired bootstrap, Holm-corrected over all policies and thresholds. Differences of accuracy are in percentage "
         "points.",
@@ -105,8 +105,8 @@ def page(predictions: Path, samples: int = 2000) -> str:
         f"The predictions (SHA-256 `{file_hash(predictions)[:16]}...`) come from `nextview predict modelnet10.zarr "
         "predictions.npz --split test`; models: "
         + ", ".join(f"{kind} {name} (`{sha[:12]}...`)" for kind, (name, sha) in table.models.items())
-        + f". Valley classes: {named(trials.valley_classes)} (LEM), {named(trials.lcm_valley_classes)} (LCM), chosen "
-        "on validation objects. Single looks are right "
+        + f". Valley classes: {named(specs.valley_classes)} (LEM), {named(specs.lcm_valley_classes)} (LCM), chosen "
+        "on validation objects. Single views are right "
         f"{100 * (table.logits.argmax(2) == table.labels[:, None]).mean():.1f} % of the time (published: 87.1 %).",
         "",
         "## In short",
@@ -114,8 +114,8 @@ def page(predictions: Path, samples: int = 2000) -> str:
     ]
     for name in ("oracle-valley", "lem", "lcm-oracle-valley", "lcm", "true-oracle-valley", "true-lem"):
         if name in ran:
-            said = "; ".join(f"{test[b][name, AT].verdict} {b}: {test[b][name, AT]}" for b in BASELINES)
-            out.append(f"- **{name}** ({LEMS[name]}) at {AT}: {said}.")
+            log_evidence = "; ".join(f"{test[b][name, AT].verdict} {b}: {test[b][name, AT]}" for b in BASELINES)
+            out.append(f"- **{name}** ({LEMS[name]}) at {AT}: {log_evidence}.")
     for leak, honest in (("oracle-valley", "lem"), ("lcm-oracle-valley", "lcm"), ("true-oracle-valley", "true-lem")):
         if leak in ran and honest in test:
             out.append(
@@ -151,7 +151,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "|---|---|---|---|---|---|",
     ]
     for name in dict.fromkeys((*BASELINES, *lems, *sorted(ran))):
-        measures = ("accuracy", 3), ("clean_accuracy", 3), ("looks", 2), ("travel_all", 2), ("arc_all", 2)
+        measures = ("accuracy", 3), ("clean_accuracy", 3), ("n_views", 2), ("travel_all", 2), ("arc_all", 2)
         out.append(f"| {name} | " + " | ".join(number(name, AT, m, digits) for m, digits in measures) + " |")
     out += [
         "",

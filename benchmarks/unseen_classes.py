@@ -4,7 +4,7 @@
     python benchmarks/unseen_classes.py unseen.zarr [--card lem-modelnet10]
 
 The store's classes must not be among those that the network was trained on; that is up to you. Prints the scores over
-all views, overall and by class, beside a yardstick: the mean map of these very objects, the same for every view.
+all views, overall and by class, beside a baselines: the mean map of these very objects, the same for every view.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from nextview.benchmark.evaluate import yardsticks
+from nextview.benchmark.evaluation import baselines
 from nextview.benchmark.scores import map_scores
 from nextview.benchmark.statistics import interval, ratio, resample
 from nextview.cli.progress import track
-from nextview.data.seen import seen_views
+from nextview.data.input_views import input_views
 from nextview.data.store import ViewStore
 from nextview.measures.depth_entropy import normalise_per_object
-from nextview.models.networks import MapNetwork
+from nextview.models.inference import MapNetwork
 
 PUBLISHED = "published LEM, trained on 10 classes, tested on its own unseen ones (table 4): d <= 1 0.364"
 
@@ -41,7 +41,7 @@ def main(store: tyro.conf.Positional[Path], card: str = "lem-modelnet10", sample
 
     def predict() -> object:
         for row, i in enumerate(objects):
-            maps[row] = network.from_inputs(seen_views(views, int(i), *network.sees))[network.card.kind]
+            maps[row] = network.from_inputs(input_views(views, int(i), *network.sees))[network.card.kind]
             yield row + 1
 
     track(predict(), len(objects), f"maps of {views.path.name}")
@@ -55,9 +55,9 @@ def main(store: tyro.conf.Positional[Path], card: str = "lem-modelnet10", sample
     print(f"{'':22}{'objects':>8}{'MSE':>9}{'d = 0':>8}{'d <= 1':>8}{'d < 2':>8}{'regret':>8}")
     rows = {"all": (maps, true)}
     rows |= {name: (maps[labels == k], true[labels == k]) for k, name in enumerate(views.classes)}
-    rows["yardstick: mean map"] = (yardsticks(true, labels)["mean map"], true)
-    for name, (said, right) in rows.items():
-        scores = map_scores(flat(said), flat(right))
+    rows["baselines: mean map"] = (baselines(true, labels)["mean map"], true)
+    for name, (log_evidence, right) in rows.items():
+        scores = map_scores(flat(log_evidence), flat(right))
         print(f"{name:22}{len(right):8}{scores['mse']:9.4f}", *(f"{v:7.3f}" for k, v in scores.items() if k != "mse"))
     near = np.array([map_scores(m, t)["d_le_1"] for m, t in zip(maps, true, strict=True)])
     weights = resample(len(objects), samples, np.random.default_rng(seed))

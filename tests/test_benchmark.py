@@ -9,13 +9,13 @@ import pandas as pd
 import pytest
 from test_predictions import some_predictions
 
+from nextview.belief import Calibration, RiskBounds
 from nextview.benchmark import results
 from nextview.benchmark.published import ACCURACY, TRAVEL, published, read_table
-from nextview.benchmark.replay import cut, make_trials, replay
+from nextview.benchmark.replay import make_specs, replay, truncate
 from nextview.benchmark.statistics import calibration_error
 from nextview.cli.benchmark import benchmark
 from nextview.errors import EntryError, PredictionsError
-from nextview.recognition import Calibration, RiskBounds
 
 TEN = tuple(read_table(ACCURACY[10]))
 
@@ -42,7 +42,7 @@ def test_every_episode_is_a_row_and_is_what_it_says(folder, predictions):
     row_of = {name: i for i, name in enumerate(predictions.names)}
     for row in rows.sample(200, random_state=0).itertuples():
         i, views = row_of[row.object], list(row.views)
-        assert len(set(views)) == len(views) == row.looks
+        assert len(set(views)) == len(views) == row.n_views
         total = np.exp(predictions.logits[i, views].astype(float).sum(0))
         belief = total / total.sum()
         assert row.label == predictions.classes[predictions.labels[i]]
@@ -65,14 +65,14 @@ def test_the_summary_is_what_pandas_makes_of_the_episodes(folder, predictions):
     rows["clean"] = ~rows["object"].isin(np.array(predictions.names)[predictions.conflicting])
     summary = pd.read_csv(folder / "out" / "summary.csv").set_index(["policy", "threshold", "measure"])["value"]
     for (policy, threshold), cell in rows.groupby(["policy", "threshold"], observed=True):
-        moved, sure = cell[cell.looks > 1], cell[cell.stop == "confident"]
+        moved, sure = cell[cell.n_views > 1], cell[cell.stop == "confident"]
         by_class = cell.groupby("label", observed=True)
         wanted = {
             "accuracy": cell.right.mean(),
             "clean_accuracy": cell.right[cell.clean].mean(),
             "class_accuracy": by_class.right.mean().mean(),
             "class_accuracy_std": by_class.right.mean().std(ddof=0),
-            "looks": cell.looks.mean(),
+            "n_views": cell.n_views.mean(),
             "travel_all": cell.travel.mean(),
             "travel_moved": moved.travel.mean(),
             "class_travel_moved": moved.groupby("label", observed=True).travel.mean().mean(),
@@ -98,12 +98,12 @@ def test_intervals_hold_their_values_and_tests_have_the_sign_of_the_difference(f
 
 def test_areas_lie_between_the_first_look_and_the_best(folder, predictions):
     areas = pd.read_csv(folder / "out" / "areas.csv").set_index(["policy", "budget"])["value"]
-    trials = make_trials(predictions, 3, 0)
+    specs = make_specs(predictions, 3, 0)
     for name in ("random", "lem", "oracle-gain"):
-        curve = [(cut(replay(name, trials, 5, 0), t).answer == trials.labels).mean() for t in np.linspace(0, 1, 21)]
-        for budget in ("looks", "travel_all"):
+        curve = [(truncate(replay(name, specs, 5, 0), t).answer == specs.labels).mean() for t in np.linspace(0, 1, 21)]
+        for budget in ("n_views", "travel_all"):
             assert min(curve) <= areas[name, budget] <= max(curve)
-    assert areas["oracle-gain", "looks"] > areas["random", "looks"]
+    assert areas["oracle-gain", "n_views"] > areas["random", "n_views"]
 
 
 def test_the_same_seed_gives_the_same_results_to_the_bit(folder):
@@ -145,7 +145,7 @@ def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(fold
     assert found.settings["risks"] == {"0.15": 0.8}
     row = found.episodes("random", 0.9).iloc[0]
     i = predictions.names.index(row.object)
-    total = predictions.logits[i, list(row.views)].astype(float).sum(0) / (0.7 * (1 + 0.5 * (row.looks - 1)))
+    total = predictions.logits[i, list(row.views)].astype(float).sum(0) / (0.7 * (1 + 0.5 * (row.n_views - 1)))
     assert row.confidence == pytest.approx((np.exp(total) / np.exp(total).sum()).max())
 
     benchmark(folder / "c.npz", out=folder / "plain", uncalibrated=True, **settings)
@@ -163,8 +163,8 @@ def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(fold
         ({"max_views": 0}, "at least one view"),
         ({"valley_classes": ("sofa",)}, "no class 'sofa'"),
         ({"risks": (0.05,)}, "promises no error rate"),
-        ({"risks": (0.05,), "decline": 0.5}, "without a decline"),
-        ({"decline": -1.0}, "decline"),
+        ({"risks": (0.05,), "threshold_decay": 0.5}, "without a threshold decay"),
+        ({"threshold_decay": -1.0}, "threshold decay"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(folder, wrong, sentence):
@@ -188,7 +188,7 @@ def test_a_folder_with_something_else_in_it_is_left_alone(folder):
 def test_a_benchmark_of_one_view_has_no_travel(folder):
     benchmark(folder / "p.npz", out=folder / "one", policies=("random", "furthest"), max_views=1, runs=2, samples=50)
     summary = results.load(folder / "one").tables.summary
-    assert (summary[summary.measure == "looks"].value == 1).all()
+    assert (summary[summary.measure == "n_views"].value == 1).all()
     assert (summary[summary.measure == "travel_all"].value == 0).all()
     assert summary[summary.measure == "travel_moved"].value.isna().all()
 
@@ -217,7 +217,7 @@ def test_the_page_of_the_reproduction_says_what_the_tables_say(folder):
     tests = pd.read_csv(folder / "full" / "tests.csv").set_index(["policy", "threshold", "measure"])
     for name in ("lem", "oracle-gain"):
         row = next(line for line in text.split("## Every policy")[1].splitlines() if line.startswith(f"| {name} |"))
-        for cell, measure in zip(row.split("|")[2:], ["accuracy", "clean_accuracy", "looks"], strict=False):
+        for cell, measure in zip(row.split("|")[2:], ["accuracy", "clean_accuracy", "n_views"], strict=False):
             assert float(cell.split()[0]) == pytest.approx(summary[name, 0.97, measure], abs=0.0051)
         test = tests.loc[(name, 0.97, "accuracy")]
         assert f"{100 * test.difference:+.1f} ({100 * test.low:+.1f} to {100 * test.high:+.1f}" in text

@@ -1,4 +1,4 @@
-"""Points of a look, against the depth image they come from, and what the map networks are given of them."""
+"""Points of a view, against the depth image they come from, and what the map networks are given of them."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from nextview.cloud import pixel_order, visible_points
+from nextview.cloud import POINTS, pixel_order, visible_points
 from nextview.models.cloud_input import cloud_input
-from nextview.observation import POINTS, pinhole
+from nextview.observation import pinhole
 from nextview.viewsphere import ViewSphere, look_at_origin
 
 POSES = ViewSphere.named("40").poses

@@ -7,7 +7,7 @@ import trimesh
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.cli.correspond import correspond
 from nextview.data.correspond import correspondence, correspondence_maps
-from nextview.data.render import render
+from nextview.data.rendering import render
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.mesh import make_mesh
@@ -16,10 +16,10 @@ from nextview.viewsphere import ViewSphere
 SPHERE = ViewSphere.named("40")
 
 
-def look(mesh: trimesh.Trimesh):
+def observation(mesh: trimesh.Trimesh):
     camera = SimulatedCamera(make_mesh(mesh.vertices, mesh.faces), 224)
-    looks = [camera.observe(pose) for pose in SPHERE.poses]
-    return np.stack([o.points for o in looks]), np.stack([o.depth for o in looks]), camera.intrinsics
+    n_views = [camera.observe(pose) for pose in SPHERE.poses]
+    return np.stack([o.points for o in n_views]), np.stack([o.depth for o in n_views]), camera.intrinsics
 
 
 def first_hit(triangles, origin, targets):
@@ -39,7 +39,7 @@ def first_hit(triangles, origin, targets):
 
 def test_a_ball_shows_what_lies_before_the_tangent_plane():
     """A point p of the unit sphere is seen from c exactly if p . c > 1."""
-    points, depth, intrinsics = look(trimesh.creation.icosphere(5))
+    points, depth, intrinsics = observation(trimesh.creation.icosphere(5))
     share = correspondence(points, depth, SPHERE.poses, intrinsics)
     true = np.stack([(points @ centre > 1).mean(-1) for centre in SPHERE.poses[:, :3, 3]], 1)
     np.testing.assert_array_equal(share.diagonal(), 1)
@@ -59,7 +59,7 @@ def test_a_hollow_shape_hides_its_own_parts():
             trimesh.creation.box([0.1, 1.5, 0.8], trimesh.transformations.translation_matrix([-0.8, 0, 0.4])),
         ]
     )
-    points, depth, intrinsics = look(shape)
+    points, depth, intrinsics = observation(shape)
     share = correspondence(points, depth, SPHERE.poses, intrinsics)
     mesh = make_mesh(shape.vertices, shape.faces)
     for view, other in [(0, 4), (0, 34), (9, 11), (38, 2), (20, 20)]:

@@ -11,8 +11,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 
-from nextview.data import download as downloading
-from nextview.data.download import PATIENCE, Archive
+from nextview.data import downloading
+from nextview.data.downloading import PATIENCE, Archive
 from nextview.data.lock import only_one
 from nextview.errors import DatasetError
 

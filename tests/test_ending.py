@@ -82,7 +82,7 @@ def test_a_command_that_does_not_resume_says_nothing_of_it(monkeypatch, capsys):
     def interrupted(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nextview.models.card.bundled_cards", interrupted)
+    monkeypatch.setattr("nextview.models.model_card.bundled_cards", interrupted)
     with pytest.raises(SystemExit, match="130"):
         main(["models"])
     assert capsys.readouterr().err == "nextview: stopped; run the same command again\n"
@@ -91,7 +91,7 @@ def test_a_command_that_does_not_resume_says_nothing_of_it(monkeypatch, capsys):
 def test_an_ignored_signal_stays_ignored():
     code = (
         "import signal, sys, os; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
-        "import nextview.models.card as card; cards = card.bundled_cards\n"
+        "import nextview.models.model_card as card; cards = card.bundled_cards\n"
         "card.bundled_cards = lambda: os.kill(os.getpid(), signal.SIGTERM) or cards()\n"
         "from nextview.cli.main import main; main(['models'])"
     )

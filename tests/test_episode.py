@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import softmax
 
+from nextview.belief import PLAIN_SUM, Calibration, Stopping
 from nextview.episode import Episodes, run_episodes, select
 from nextview.errors import PolicyError
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.baselines import Random, RandomAll, Unidirectional
 from nextview.policies.maps import MapPeak
-from nextview.recognition import PLAIN_SUM, Calibration, Stopping
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("40")
@@ -36,14 +36,14 @@ class Table:
         return cls(logits, rng.random((objects, len(sphere), sphere.rings, 3)))
 
     def observe(self, episodes: np.ndarray, views: np.ndarray) -> Evidence:
-        return Evidence(self.logits[episodes, views], {"lem": self.lem[episodes, views]}, self.lem[episodes, views, 0])
+        return Evidence(self.logits[episodes, views], {"lem": self.lem[episodes, views]})
 
 
 def walk(table: Table, policy, episode: int, start: int, stopping: Stopping, calibration, sphere=SPHERE):
     """One episode as one would write it for one object: views, beliefs."""
     views, beliefs = [start], []
     while True:
-        beliefs.append(softmax(table.logits[episode, views].sum(0) / calibration.temperature(len(views))))
+        beliefs.append(softmax(table.logits[episode, views].sum(0) / calibration.temperature_after(len(views))))
         if beliefs[-1].max() >= stopping.threshold or len(views) in (stopping.max_views, len(sphere)):
             return views, beliefs
         visited = np.zeros((1, len(sphere)), bool)
@@ -75,7 +75,7 @@ def test_many_episodes_at_once_are_each_episode_alone(seed, threshold, max_views
         views, beliefs = walk(table, policy, e, int(start), stopping, calibration)
         assert end.views[e, : len(views)].tolist() == views
         assert (end.views[e, len(views) :] == -1).all()
-        assert end.looks[e] == len(views)
+        assert end.n_views[e] == len(views)
         assert end.answer[e] == beliefs[-1].argmax()
         assert end.confidence[e] == pytest.approx(beliefs[-1].max(), abs=1e-12)
         assert end.confident[e] == (beliefs[-1].max() >= threshold)
@@ -108,7 +108,7 @@ def test_no_view_twice_and_every_view_where_nothing_is_certain():
 
 def test_a_threshold_of_zero_takes_one_look():
     end = run(Table.random(10), MapPeak(SPHERE), np.arange(10), Stopping(0.0, 5)).outcome
-    assert (end.looks == 1).all()
+    assert (end.n_views == 1).all()
     assert end.confident.all()
     assert (end.travel == 0).all()
     assert (end.arc == 0).all()
@@ -116,50 +116,50 @@ def test_a_threshold_of_zero_takes_one_look():
 
 def test_one_look_allowed_asks_no_policy():
     end = run(Table.random(10), Broken("raises"), np.arange(10), Stopping(1.0, 1)).outcome
-    assert (end.looks == 1).all()
+    assert (end.n_views == 1).all()
 
 
 def test_confidence_counts_at_the_threshold_itself():
     logits = np.zeros((1, 40, 2))
     end = run(Table(logits, Table.random(1).lem), MapPeak(SPHERE), np.array([0]), Stopping(0.5, 5)).outcome
-    assert end.looks == 1
+    assert end.n_views == 1
     assert end.confident
 
 
 class Turning:
-    """Remembers what it was told of the sides; goes where the rng says."""
+    """Remembers what it was told of the azimuth bins; goes where the rng says."""
 
-    needs = ("sides",)
+    needs = ("azimuth_bins",)
 
     def __init__(self):
-        self.told = []
+        self.features = []
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator):
-        self.told.append((state.episodes, state.current, state.sides))
+        self.features.append((state.episodes, state.current, state.azimuth_bins))
         return RandomAll(SPHERE).next_views(state, rng)
 
 
 def test_the_belief_in_the_side_is_that_of_an_object_that_stands_still():
-    """Each look says something of the side seen from it; together they speak of where the object's own zero points."""
+    """Each view says something of the side seen from it; together they speak of where the object's own zero points."""
     table, policy, calibration = Table.random(20), Turning(), Calibration(0.7, 0.4)
-    said = np.random.default_rng(1).normal(size=(20, len(SPHERE), CLASSES, 8))
+    log_evidence = np.random.default_rng(1).normal(size=(20, len(SPHERE), CLASSES, 8))
 
     def observe(episodes, views):
-        return replace(table.observe(episodes, views), sides=said[episodes, views])
+        return replace(table.observe(episodes, views), azimuth_bins=log_evidence[episodes, views])
 
     starts = np.random.default_rng(2).integers(0, 40, 20)
     rng = np.random.default_rng(0)
     done = run_episodes(observe, SPHERE, policy, starts, Stopping(0.995, 6), rng, calibration)
-    assert len({len(episodes) for episodes, _, _ in policy.told}) > 1  # some end earlier
-    for looks, (episodes, current, sides) in enumerate(policy.told, 1):
-        for e, now, found in zip(episodes, current, sides, strict=True):
-            at = done.outcome.views[e, :looks]
+    assert len({len(episodes) for episodes, _, _ in policy.features}) > 1  # some end earlier
+    for n_views, (episodes, current, azimuth_bins) in enumerate(policy.features, 1):
+        for e, now, found in zip(episodes, current, azimuth_bins, strict=True):
+            at = done.outcome.views[e, :n_views]
             assert at[-1] == now
             zero = np.zeros((CLASSES, 8))  # summed by the azimuth that the object's zero has, a steps from the view's
             for view in at:
                 for side in range(8):
-                    zero[:, (SPHERE.azimuth_index[view] - side) % 8] += said[e, view, :, side]
-            expected = softmax(zero / (1 + 0.4 * (looks - 1)), axis=1)
+                    zero[:, (SPHERE.azimuth_index[view] - side) % 8] += log_evidence[e, view, :, side]
+            expected = softmax(zero / (1 + 0.4 * (n_views - 1)), axis=1)
             seen = expected[:, (SPHERE.azimuth_index[now] - np.arange(8)) % 8]
             np.testing.assert_allclose(found, seen, atol=1e-9)
 
@@ -175,19 +175,19 @@ def test_another_sphere():
     table, stopping = Table.random(12, ring), Stopping(0.99, 12)
     end = run(table, Unidirectional(ring), np.arange(12), stopping, ring).outcome
     for e in range(12):
-        assert end.views[e, : end.looks[e]].tolist() == [(e + k) % 12 for k in range(end.looks[e])]
-    np.testing.assert_allclose(end.travel, end.looks - 1)
+        assert end.views[e, : end.n_views[e]].tolist() == [(e + k) % 12 for k in range(end.n_views[e])]
+    np.testing.assert_allclose(end.travel, end.n_views - 1)
 
 
 def test_select_keeps_rows_of_everything():
     evidence = Table.random(6).observe(np.arange(6), np.arange(6))
+    evidence = replace(evidence, azimuth_bins=np.random.default_rng(1).normal(size=(6, CLASSES, 8)))
     keep = np.array([True, False, True, True, False, False])
     kept = select(evidence, keep)
     np.testing.assert_array_equal(kept.logits, evidence.logits[[0, 2, 3]])
     np.testing.assert_array_equal(kept.maps["lem"], evidence.maps["lem"][[0, 2, 3]])
-    assert kept.features is not None
-    assert len(kept.features) == 3
-    assert select(Evidence(evidence.logits), keep).features is None
+    np.testing.assert_array_equal(kept.azimuth_bins, evidence.azimuth_bins[[0, 2, 3]])
+    assert select(Evidence(evidence.logits), keep).azimuth_bins is None
 
 
 # Refusing
@@ -270,11 +270,11 @@ def test_no_outcome_before_the_end():
     episodes = Episodes(SPHERE, MapPeak(SPHERE), np.array([0, 1]), Stopping(1.0, 2), np.random.default_rng(0))
     with pytest.raises(ValueError, match="still running"):
         _ = episodes.outcome
-    episodes.tell(table.observe(episodes.running, episodes.current))
+    episodes.update(table.observe(episodes.running, episodes.current))
     with pytest.raises(ValueError, match="still running"):
         _ = episodes.outcome
-    episodes.tell(table.observe(episodes.running, episodes.current))
-    assert (episodes.outcome.looks == 2).all()
+    episodes.update(table.observe(episodes.running, episodes.current))
+    assert (episodes.outcome.n_views == 2).all()
 
 
 def test_a_look_that_fails_is_not_taken_in():
@@ -289,14 +289,14 @@ def test_a_look_that_fails_is_not_taken_in():
 
     policy, sphere = Moody(), ViewSphere.named("40")
     episodes = Episodes(sphere, policy, np.array([3]), Stopping(1.0, 3), np.random.default_rng(0))
-    look = Evidence(np.array([[1.0, 0.0]]))
+    observation = Evidence(np.array([[1.0, 0.0]]))
     with pytest.raises(PolicyError, match="not now"):
-        episodes.tell(look)
+        episodes.update(observation)
     with pytest.raises(ValueError, match="finite"):
-        episodes.tell(Evidence(np.array([[np.nan, 0.0]])))
-    with pytest.raises(ValueError, match="2 looks for 1"):
-        episodes.tell(Evidence(np.zeros((2, 2))))
+        episodes.update(Evidence(np.array([[np.nan, 0.0]])))
+    with pytest.raises(ValueError, match="2 views for 1"):
+        episodes.update(Evidence(np.zeros((2, 2))))
     policy.fail = False
-    step = episodes.tell(look)
+    step = episodes.update(observation)
     assert step.belief[0, 0] == pytest.approx(1 / (1 + np.exp(-1)))
     assert step.next_views.tolist() == [4]

@@ -9,10 +9,10 @@ from scipy.special import softmax
 from scipy.stats import bootstrap
 from test_predictions import some_predictions
 
-from nextview.benchmark.evaluate import evaluate, fused_views, yardsticks
+from nextview.belief import Calibration
+from nextview.benchmark.evaluation import baselines, evaluate, fused_views
 from nextview.benchmark.published import published_map, published_recognisers, read_table
 from nextview.errors import ResultsError
-from nextview.recognition import Calibration
 from nextview.viewsphere import ViewSphere
 
 TEN = tuple(read_table("table8_accuracy_per_class_modelnet10"))
@@ -75,7 +75,7 @@ def score(table, **where):
 
 def test_accuracy_by_hand():
     table = evaluate(by_hand(), 200, np.random.default_rng(0)).accuracy
-    of = {(row.looks, row.label, row.measure): (row.value, row.objects) for row in table.itertuples()}
+    of = {(row.n_views, row.label, row.measure): (row.value, row.objects) for row in table.itertuples()}
     assert of[1, "", "accuracy"] == pytest.approx((6 / 12, 4))
     assert of[1, "a", "accuracy"] == pytest.approx((6 / 9, 3))
     assert of[1, "b", "accuracy"] == (0, 1)
@@ -95,7 +95,7 @@ def test_what_is_right_without_knowing_the_size_stands_beside():
     known, shape = (evaluate(x, 50, np.random.default_rng(0)).accuracy for x in (sized, p))
     for row in shape.query("measure == 'accuracy' or measure == 'class_accuracy'").itertuples():
         before = row.measure.removesuffix("accuracy")
-        here = {"looks": row.looks, "label": row.label}
+        here = {"n_views": row.n_views, "label": row.label}
         assert score(known, **here, measure=f"{before}shape_accuracy").value == row.value
         assert score(known, **here, measure=row.measure).value == 1
     assert "shape_accuracy" not in set(shape["measure"])
@@ -103,16 +103,16 @@ def test_what_is_right_without_knowing_the_size_stands_beside():
 
 def test_confusion_and_calibration_by_hand():
     found = evaluate(by_hand(), 10, np.random.default_rng(0))
-    answers = {(row.looks, row.label, row.answer): row.answers for row in found.confusion.itertuples()}
+    answers = {(row.n_views, row.label, row.answer): row.answers for row in found.confusion.itertuples()}
     assert answers == {
         (1, "a", "a"): 6, (1, "a", "b"): 3, (1, "b", "a"): 3, (1, "b", "b"): 0,
         (3, "a", "a"): 3, (3, "a", "b"): 0, (3, "b", "a"): 1, (3, "b", "b"): 0,
     }  # fmt: skip
     # one view: 9 answers at 0.9, of which 6 are right; 3 at 0.6, none of them right
-    rows = found.reliability[found.reliability["looks"] == 1]
+    rows = found.reliability[found.reliability["n_views"] == 1]
     np.testing.assert_allclose(rows[["confidence", "accuracy", "answers"]], [[0.6, 0, 3], [0.9, 6 / 9, 9]], rtol=1e-6)
     error = (9 * abs(0.9 - 6 / 9) + 3 * 0.6) / 12
-    assert score(found.fusion, looks=1).calibration_error == pytest.approx(error)
+    assert score(found.fusion, n_views=1).calibration_error == pytest.approx(error)
 
 
 def test_fusing_random_views_against_every_combination():
@@ -129,11 +129,11 @@ def test_fusing_random_views_against_every_combination():
 
 def test_one_and_all_views_fused_are_the_two_accuracies():
     found = evaluate(some_predictions(31, seed=4), 50, np.random.default_rng(7))
-    assert list(found.fusion["looks"]) == list(range(1, 41))
-    for looks in (1, 40):
-        row = score(found.fusion, looks=looks)
+    assert list(found.fusion["n_views"]) == list(range(1, 41))
+    for n_views in (1, 40):
+        row = score(found.fusion, n_views=n_views)
         for ours, measure in ((row.accuracy, "accuracy"), (row.class_accuracy, "class_accuracy")):
-            assert ours == pytest.approx(score(found.accuracy, looks=looks, label="", measure=measure).value)
+            assert ours == pytest.approx(score(found.accuracy, n_views=n_views, label="", measure=measure).value)
 
 
 def test_intervals_are_scipys():
@@ -142,8 +142,8 @@ def test_intervals_are_scipys():
     single = (p.logits.argmax(2) == p.labels[:, None]).mean(1)
     error = ((p.maps["lem"] - true_windows(p)) ** 2).mean((1, 2, 3))
     for row, values in (
-        (score(found.accuracy, looks=1, label="", measure="accuracy"), single),
-        (score(found.accuracy, looks=1, label="box", measure="accuracy"), single[p.labels == 1]),
+        (score(found.accuracy, n_views=1, label="", measure="accuracy"), single),
+        (score(found.accuracy, n_views=1, label="box", measure="accuracy"), single[p.labels == 1]),
         (score(found.maps, by="network", label="", measure="mse"), error),
     ):
         theirs = bootstrap((values,), np.mean, n_resamples=4000, method="percentile", rng=1).confidence_interval
@@ -200,7 +200,7 @@ def test_a_perfect_map_network_is_perfect():
 
 def test_the_mean_map_has_the_least_squared_error_of_all_constant_maps():
     true = np.random.default_rng(0).random((5, 8, 2, 3))
-    mean = yardsticks(true, np.zeros(5, int))["mean map"]
+    mean = baselines(true, np.zeros(5, int))["mean map"]
     for step in (-0.01, 0.01):
         assert ((mean - true) ** 2).mean() < ((mean + step - true) ** 2).mean()
     assert ((mean - true) ** 2).mean() == pytest.approx(true.reshape(40, 6).var(0).mean())

@@ -13,7 +13,7 @@ from test_predictions import some_predictions
 from test_report import Page
 
 from nextview.cli.main import main
-from nextview.models.card import file_hash, write_card
+from nextview.models.model_card import file_hash, write_card
 
 TABLES = ("accuracy", "fusion", "confusion", "reliability", "maps")
 
@@ -34,10 +34,10 @@ def refused(capsys, *arguments):
     with pytest.raises(SystemExit) as stopped:
         main(["evaluate", *map(str, arguments)])
     assert stopped.value.code == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.count("\n") == 1
-    return said.err
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1
+    return printed.err
 
 
 def test_the_folder_holds_numbers_tables_figures_and_a_page(made):
@@ -76,11 +76,11 @@ def test_the_page_is_whole_and_needs_nothing_from_outside(made):
 def test_the_page_shows_the_numbers_of_the_results(made):
     results = json.loads((made / "out" / "results.json").read_text())
     text = (made / "out" / "evaluate.html").read_text()
-    of = {(row["looks"], row["label"], row["measure"]): row["value"] for row in results["accuracy"]}
+    of = {(row["n_views"], row["label"], row["measure"]): row["value"] for row in results["accuracy"]}
     cells = re.findall(r"<td>([\d.]+)", re.search(r'<tr><th scope="row">pillar</th>.*?</tr>', text)[0])
     assert cells == [
         "10",
-        *(f"{of[looks, 'pillar', m]:.3f}" for looks in (1, 40) for m in ("accuracy", "clean_accuracy")),
+        *(f"{of[n_views, 'pillar', m]:.3f}" for n_views in (1, 40) for m in ("accuracy", "clean_accuracy")),
     ]
     mse = next(row["value"] for row in results["maps"] if (row["map"], row["label"]) == ("lem", "box"))
     section = text[text.index('id="lem"') : text.index('id="lcm"')]
@@ -96,13 +96,13 @@ def test_the_same_seed_gives_the_same_bytes(made):
 
 def test_the_terminal_tells_the_numbers_of_another_seed(made, capsys):
     main(["evaluate", str(made / "p.npz"), "--out", str(made / "told"), "--samples", "50", "--seed", "1"])
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     results = json.loads((made / "told" / "results.json").read_text())
     for row in results["accuracy"]:
         if row["measure"] == "class_accuracy" or row["label"] == "ball":
-            assert f"{row['value']:.3f}" in said
-    assert "LEM" in said
-    assert "LCM" in said
+            assert f"{row['value']:.3f}" in printed
+    assert "LEM" in printed
+    assert "LCM" in printed
     for name in ("fusion.csv", "lem_examples.png"):
         assert (made / "out" / name).read_bytes() != (made / "told" / name).read_bytes()
 
@@ -131,7 +131,7 @@ def test_copies_of_a_shape_are_judged_once_where_that_is_asked_for(tmp_path):
         main(["evaluate", str(tmp_path / "p.npz"), "--out", str(tmp_path / "out"), "--samples", "5", *more])
         settings = json.loads((tmp_path / "out" / "results.json").read_text())["settings"]
         assert settings["objects"] == objects
-        assert settings["each_shape_once"] == bool(more)
+        assert settings["deduplicate"] == bool(more)
 
 
 def test_one_object_is_enough(tmp_path):
@@ -159,7 +159,7 @@ def test_splits_are_never_mixed(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "log_evidence"),
     [
         ({"logits": np.full((6, 40, 3), np.nan, np.float32)}, "not a finite number"),
         ({"logits": np.zeros((6, 40, 2), np.float32)}, "shape"),
@@ -168,13 +168,13 @@ def test_splits_are_never_mixed(tmp_path, capsys):
          "one class only, ball"),
     ],
 )  # fmt: skip
-def test_bad_predictions_are_refused_in_a_sentence(tmp_path, capsys, change, said):
+def test_bad_predictions_are_refused_in_a_sentence(tmp_path, capsys, change, printed):
     path = tmp_path / "p.npz"
     some_predictions(6).save(path)
     with np.load(path) as file:
         arrays = {name: file[name] for name in file.files} | change
     np.savez(path, **arrays)
-    assert said in refused(capsys, path, "--out", tmp_path / "out")
+    assert printed in refused(capsys, path, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

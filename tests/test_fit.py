@@ -12,9 +12,9 @@ import pytest
 torch = pytest.importorskip("torch")
 L = pytest.importorskip("lightning")
 
-from nextview.models.card import ModelError  # noqa: E402
+from nextview.models.model_card import ModelError  # noqa: E402
 from nextview.report.training_curves import read_log, training_curves  # noqa: E402
-from nextview.training import fit as fitting  # noqa: E402
+from nextview.training import loop as fitting  # noqa: E402
 from nextview.training import recogniser  # noqa: E402
 from nextview.training.ahead import Ahead  # noqa: E402
 from nextview.training.hardware import Hardware  # noqa: E402
@@ -42,8 +42,7 @@ class SmallNet(torch.nn.Module):
         self.fc = torch.nn.Linear(8, classes)
 
     def forward(self, x):
-        features = self.features(x).flatten(1)
-        return self.fc(features), features
+        return (self.fc(self.features(x).flatten(1)),)
 
 
 def train(out, recipe=RECIPE, hardware=Hardware(), stop=None):

@@ -10,18 +10,18 @@ from scipy.stats import binomtest
 from test_predictions import some_predictions
 from tiny_models import make_recogniser
 
+from nextview.belief import PLAIN_SUM, Calibration
+from nextview.calibration.fitting_set import FittingSet, blind_walks, fitting_set
+from nextview.calibration.policy_tables import fit_class_table, fit_ring, fit_sequence
+from nextview.calibration.temperature import error_bound, fit_risk, fit_temperature, loss
 from nextview.cli.main import main
 from nextview.data.predictions import Predictions
-from nextview.data.split import divide
+from nextview.data.splits import divide
 from nextview.errors import PredictionsError
-from nextview.fitting.calibration import error_bound, fit_risk, fit_temperature, loss
-from nextview.fitting.evidence import FittingSet, blind_walks, fitting_set
-from nextview.fitting.tables import fit_class_table, fit_ring, fit_sequence
-from nextview.models.networks import Recogniser
+from nextview.models.inference import Recogniser
 from nextview.policies.baselines import Random
+from nextview.policies.learned_tables import ClassTable, cells_from, cells_to
 from nextview.policies.registry import make_policy
-from nextview.policies.tables import ClassTable, cells_from, cells_to
-from nextview.recognition import PLAIN_SUM, Calibration
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("40")
@@ -42,7 +42,7 @@ def correlated(n: int, correlation: float, temperature: float, seed: int = 0) ->
 def test_the_correlation_and_temperature_of_generated_looks_are_found(correlation, temperature):
     data = correlated(4000, correlation, temperature)
     found = fit_temperature(data, np.random.default_rng(1), walks=1)
-    assert found.temperature_of_one == pytest.approx(temperature, rel=0.08)
+    assert found.temperature == pytest.approx(temperature, rel=0.08)
     assert found.correlation == pytest.approx(correlation, abs=0.06)
     losses = [loss(data, c, np.random.default_rng(2), walks=1) for c in (found, Calibration(temperature, correlation))]
     assert losses[0] == pytest.approx(losses[1], rel=0.01)
@@ -52,21 +52,21 @@ def test_the_correlation_and_temperature_of_generated_looks_are_found(correlatio
 
 @pytest.mark.parametrize("right", [0.8, 0.5])
 def test_sides_count_as_far_as_looks_are_right_about_them(right):
-    """Both classes look alike; seen as the true one, a look claims to be right about the side 8 times in 10."""
+    """Both classes look alike; seen as the true one, a view claims to be right about the side 8 times in 10."""
     rng, n, v, s = np.random.default_rng(0), 2000, len(SMALL), SMALL.azimuths
     labels, zero = rng.integers(0, 2, n), rng.integers(0, s, n)
     claimed = rng.integers(0, s, (n, v, 2))  # seen as the other class: anything
     true = (SMALL.azimuth_index - zero[:, None]) % s
     wrong = (true + rng.integers(1, s, (n, v))) % s
     claimed[np.arange(n)[:, None], np.arange(v), labels[:, None]] = np.where(rng.random((n, v)) < right, true, wrong)
-    sides = np.log(np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))).astype(np.float32)
-    data = FittingSet(rng.normal(size=(n, v, 2)).astype(np.float32) / 100, labels, SMALL, ("a", "b"), sides)
+    azimuth_bins = np.log(np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))).astype(np.float32)
+    data = FittingSet(rng.normal(size=(n, v, 2)).astype(np.float32) / 100, labels, SMALL, ("a", "b"), azimuth_bins)
     found = fit_temperature(data, np.random.default_rng(1), walks=1)
     if right == 0.8:  # as good as they claim, and each by itself
-        assert found.side_correlation == pytest.approx(0, abs=0.05)
+        assert found.bin_correlation == pytest.approx(0, abs=0.05)
     else:
-        assert found.side_correlation > 0.1
-    blind = Calibration(found.temperature_of_one, found.correlation)
+        assert found.bin_correlation > 0.1
+    blind = Calibration(found.temperature, found.correlation)
     of_found, of_blind = (loss(data, c, np.random.default_rng(2), walks=1) for c in (found, blind))
     assert of_found < of_blind
 
@@ -94,13 +94,13 @@ def test_several_episodes_of_an_object_count_as_one():
 def test_promises_are_kept_as_often_as_promised():
     whole = correlated(40_000, 0.5, 1.0, seed=9)
     even = whole.weights
-    calibration, risk, looks, delta = Calibration(1.0, 0.5), 0.22, 3, 0.2
+    calibration, risk, n_views, delta = Calibration(1.0, 0.5), 0.22, 3, 0.2
     walks = blind_walks(
-        SMALL, Random(SMALL), np.random.default_rng(0).integers(12, size=len(whole)), looks, np.random.default_rng(1)
+        SMALL, Random(SMALL), np.random.default_rng(0).integers(12, size=len(whole)), n_views, np.random.default_rng(1)
     )
     total = np.cumsum(whole.logits[np.arange(len(whole))[:, None], walks], axis=1)
     sure = np.stack(
-        [np.exp(log_softmax(total[:, k] / calibration.temperature(k + 1), 1)).max(1) for k in range(looks)], 1
+        [np.exp(log_softmax(total[:, k] / calibration.temperature_after(k + 1), 1)).max(1) for k in range(n_views)], 1
     )
     wrong = total.argmax(2) != whole.labels[:, None]
 
@@ -113,22 +113,22 @@ def test_promises_are_kept_as_often_as_promised():
     for seed in range(60):
         some = np.random.default_rng([5, seed]).choice(len(whole), 300, replace=False)
         part = replace(whole, logits=whole.logits[some], labels=whole.labels[some])
-        bounds = fit_risk(part, calibration, np.random.default_rng(seed), delta, looks, walks=1)
-        if min(bounds.bounds[looks - 1]) <= risk:  # else it promises nothing, and nothing is broken
+        bounds = fit_risk(part, calibration, np.random.default_rng(seed), delta, n_views, walks=1)
+        if min(bounds.bounds[n_views - 1]) <= risk:  # else it promises nothing, and nothing is broken
             promises += 1
-            broken += error_at(bounds.threshold(risk, looks)) > risk
+            broken += error_at(bounds.threshold(risk, n_views)) > risk
     assert promises > 30
     assert broken <= 60 * delta + 3 * np.sqrt(60 * delta * (1 - delta))
 
 
 def test_bounds_fall_with_the_threshold_and_promise_nothing_where_few_stop():
-    bounds = fit_risk(correlated(500, 0.5, 1.0), Calibration(1.0, 0.5), np.random.default_rng(0), looks=4)
+    bounds = fit_risk(correlated(500, 0.5, 1.0), Calibration(1.0, 0.5), np.random.default_rng(0), n_views=4)
     assert len(bounds.bounds) == 4
     for row in np.array(bounds.bounds):
-        said = row < 1
-        assert (np.diff(row[said]) <= 0).all()
-        assert not said[-1]  # of these noisy looks hardly any is that sure
-        assert said[0]
+        reached = row < 1
+        assert (np.diff(row[reached]) <= 0).all()
+        assert not reached[-1]  # of these noisy views hardly any is that sure
+        assert reached[0]
 
 
 # What may be fitted to
@@ -147,12 +147,12 @@ def copied(p: Predictions, often: int) -> Predictions:
 def test_a_shape_that_was_copied_counts_once():
     p = replace(some_predictions(60), splits=np.array(["train"] * 60))
     many = copied(p, 9)
-    once = many.each_shape_once()
+    once = many.deduplicate()
     assert once.names == p.names
     np.testing.assert_array_equal(once.logits, p.logits)
-    assert many.each_shape_once().each_shape_once().names == p.names
+    assert many.deduplicate().deduplicate().names == p.names
     relabelled = replace(many, labels=np.r_[many.labels[:-1], (many.labels[-1] + 1) % 3])
-    assert relabelled.each_shape_once().names == (*p.names, "copy8")  # which of two labels is right is not for us
+    assert relabelled.deduplicate().names == (*p.names, "copy8")  # which of two labels is right is not for us
     np.testing.assert_array_equal(fitting_set(many, 1.0, 0).logits, p.logits)
     drawn = [fitting_set(many, 0.1, seed) for seed in range(40)]
     assert any(p.logits[0] in data.logits for data in drawn)
@@ -214,8 +214,8 @@ def test_what_tells_most_is_found(anywhere):
     by_class = fit_class_table(telling(SMALL, [[0], [2]]), 4, 0.0, PLAIN_SUM, np.random.default_rng(0))
     assert (SMALL.ring[by_class[0].argmax(1)] == 0).all()
     assert (SMALL.ring[by_class[1].argmax(1)] == 2).all()
-    alike = fit_class_table(telling(SMALL, [[0], [2]]), 4, 1e9, PLAIN_SUM, np.random.default_rng(0))
-    np.testing.assert_allclose(alike[0], alike[1], atol=1e-6)
+    duplicate_groups = fit_class_table(telling(SMALL, [[0], [2]]), 4, 1e9, PLAIN_SUM, np.random.default_rng(0))
+    np.testing.assert_allclose(duplicate_groups[0], duplicate_groups[1], atol=1e-6)
 
 
 @pytest.mark.parametrize("anywhere", [True, False])
@@ -223,26 +223,28 @@ def test_each_move_of_a_sequence_is_the_best_there_is(anywhere):
     rng, calibration = np.random.default_rng(0), Calibration(0.8, 0.5)
     labels = np.array([0, 0, 0, 1, 2])
     data = FittingSet(rng.normal(size=(5, len(SMALL), 3)).astype(np.float32), labels, SMALL, ("a", "b", "c"))
-    price = 0.05
-    moves = fit_sequence(data, anywhere, 2, calibration, price)
+    travel_weight = 0.05
+    moves = fit_sequence(data, anywhere, 2, calibration, travel_weight)
 
     def turned(view: int, steps: int) -> int:
         ring, azimuth = divmod(view, 4)
         return ring * 4 + (azimuth + steps) % 4
 
-    def worth(path: list[int]) -> float:
+    def value(path: list[int]) -> float:
         by_class = {0: [], 1: [], 2: []}
         for i, label in enumerate(labels):
             for steps in range(4):
                 total = data.logits[i, [turned(v, steps) for v in path]].astype(float).sum(0)
-                by_class[label].append(log_softmax(total / calibration.temperature(len(path)))[label])
+                by_class[label].append(log_softmax(total / calibration.temperature_after(len(path)))[label])
         return np.mean([np.mean(values) for values in by_class.values()])
 
     for ring in range(3):
         path = [ring * 4]
         for move in moves[ring]:
             reachable = range(12) if anywhere else SMALL.window(path[-1]).ravel()
-            values = {v: worth([*path, v]) - price * SMALL.travel[path[-1], v] for v in reachable if v not in path}
+            values = {
+                v: value([*path, v]) - travel_weight * SMALL.travel[path[-1], v] for v in reachable if v not in path
+            }
             path.append(int(cells_from(SMALL)[path[-1], move]))
             assert values[path[-1]] == pytest.approx(max(values.values()), abs=1e-9)
 
@@ -290,7 +292,7 @@ def test_a_calibration_is_fitted_to_what_the_card_calls_unseen_whatever_the_size
     replace(p, logits=p.logits + of_size[:, None], of_size=of_size).save(path)
     main(["fit", "calibration", str(path), str(card)])
     sized = json.loads(card.read_text())["calibration"]
-    assert sized["temperature_of_one"] == pytest.approx(by_shape["temperature_of_one"], abs=1e-3)
+    assert sized["temperature"] == pytest.approx(by_shape["temperature"], abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -325,10 +327,10 @@ def test_learned_policies_can_be_run_from_their_cards(training_predictions, tmp_
             data = fitting_set(Predictions.load(path), 0.1, 0)
             calibration = fit_temperature(data, np.random.default_rng([0, 0]), walks=1 + 8000 // 9)
             values = fit_class_table(data, 5, 20.0, calibration, np.random.default_rng(0))
-            price = 0.01 if card.stem.endswith("near") else 0.0
+            travel_weight = 0.01 if card.stem.endswith("near") else 0.0
             for ring, azimuth in [(0, 0), (2, 5)]:
                 view = 8 * ring + azimuth
-                paid = values[:, ring, cells_to(SPHERE)[view]] - price * SPHERE.travel[view]
+                paid = values[:, ring, cells_to(SPHERE)[view]] - travel_weight * SPHERE.travel[view]
                 here = policy.values[:, ring, cells_to(SPHERE)[view]]
                 np.testing.assert_allclose(here, paid, atol=1e-5)
         with pytest.raises(ValueError, match="other classes"):

@@ -14,15 +14,23 @@ from test_fitting import SMALL, telling
 from test_policies import SPHERE, state_of
 from test_predictions import some_predictions
 
+from nextview.belief import PLAIN_SUM, Calibration, reorient
+from nextview.calibration.rollout import (
+    OUTCOMES,
+    ReplayTable,
+    candidate_values,
+    fit_travel_weight,
+    judge,
+    outcome,
+    rollout,
+)
 from nextview.cli.main import main
 from nextview.errors import PolicyError
-from nextview.fitting.choices import OUTCOMES, ReplayTable, choices, follow, judge, outcome, travel_price
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Random, RandomAll
-from nextview.policies.card import bundled_policies
-from nextview.policies.gain import INPUTS, MAPS, Gain, mirrored, told, told_mirrored
+from nextview.policies.gain import INPUTS, MAPS, Gain, features, mirrored, mirrored_features
+from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import make_policy
-from nextview.recognition import PLAIN_SUM, Calibration, reorient
 from nextview.training.perceptrons import Perceptrons
 from nextview.training.recipes import GainRecipe
 
@@ -32,7 +40,7 @@ CLASSES = 4
 def some_gain(sphere=SPHERE, inputs=INPUTS, networks=2, seed=0, frame="camera", **rest) -> Gain:
     """With weights at random: whatever it was trained to, these promises hold."""
     rng = np.random.default_rng(seed)
-    widths = [len(told_mirrored(sphere, CLASSES, inputs, frame)), 8, 8, len(sphere)]
+    widths = [len(mirrored_features(sphere, CLASSES, inputs, frame)), 8, 8, len(sphere)]
     layers = [
         tuple((rng.normal(size=(a, b)) / a**0.5, rng.normal(size=b)) for a, b in pairwise(widths))
         for _ in range(networks)
@@ -47,8 +55,8 @@ def some_state(sphere=SPHERE, episodes=60, seed=0):
     state.visited[:] |= rng.random(state.visited.shape) < rng.random((episodes, 1))
     columns = {name: sphere.azimuths if name.endswith("-sphere") else 3 for name in MAPS}
     maps = {name: rng.random((episodes, sphere.rings, wide)) for name, wide in columns.items()}
-    sides = rng.dirichlet([1] * sphere.azimuths, (episodes, CLASSES))
-    return replace(state, evidence=Evidence(rng.normal(size=(episodes, CLASSES)), maps), sides=sides)
+    azimuth_bins = rng.dirichlet([1] * sphere.azimuths, (episodes, CLASSES))
+    return replace(state, evidence=Evidence(rng.normal(size=(episodes, CLASSES)), maps), azimuth_bins=azimuth_bins)
 
 
 # The contract
@@ -57,7 +65,7 @@ def some_state(sphere=SPHERE, episodes=60, seed=0):
 @pytest.mark.parametrize("anywhere", [True, False])
 @pytest.mark.parametrize(
     ("inputs", "frame"),
-    [(INPUTS, "camera"), (INPUTS, "object"), (("belief",), "camera"), (("look", "place"), "object")],
+    [(INPUTS, "camera"), (INPUTS, "object"), (("belief",), "camera"), (("view", "place"), "object")],
 )
 def test_an_unvisited_view_is_chosen_in_each_episode_by_itself(anywhere, inputs, frame):
     state, policy = some_state(), some_gain(inputs=inputs, frame=frame, anywhere=anywhere)
@@ -71,7 +79,7 @@ def test_an_unvisited_view_is_chosen_in_each_episode_by_itself(anywhere, inputs,
             current=state.current[[i]],
             visited=state.visited[[i]],
             belief=state.belief[[i]],
-            sides=state.sides[[i]],
+            azimuth_bins=state.azimuth_bins[[i]],
             evidence=Evidence(state.evidence.logits[[i]], {n: m[[i]] for n, m in state.evidence.maps.items()}),
         )
         assert policy.next_views(alone, np.random.default_rng(1)) == chosen[i]
@@ -86,9 +94,9 @@ def turned(state, sphere, steps: int):
 
 
 @pytest.mark.parametrize("frame", ["camera", "object"])
-@pytest.mark.parametrize("price", [0.0, 0.3])
-def test_absolute_azimuth_means_nothing(price, frame):
-    state, policy = some_state(), some_gain(price=price, frame=frame)
+@pytest.mark.parametrize("travel_weight", [0.0, 0.3])
+def test_absolute_azimuth_means_nothing(travel_weight, frame):
+    state, policy = some_state(), some_gain(travel_weight=travel_weight, frame=frame)
     gains, chosen = policy.gains(state), policy.next_views(state, np.random.default_rng(0))
     for steps in (1, 3, 4):
         other, views = turned(state, SPHERE, steps)
@@ -99,31 +107,31 @@ def test_absolute_azimuth_means_nothing(price, frame):
 
 def test_in_the_objects_frame_it_does_not_matter_from_which_azimuth_the_object_is_seen():
     """The same views of it are visited, and the camera stands at one of them or another of the same ring."""
-    zero, ring = 3, 2  # azimuth at which the object shows its side 0, and the ring of the camera
+    zero, ring = 3, 2  # azimuth at which the object shows its azimuth bin 0, and the ring of the camera
     states = []
     for azimuth in (1, 6):
         state = some_state(episodes=1)
         side = (azimuth - zero) % 8
-        state.sides[:] = 0.02
-        state.sides[:, :, side] = 0.86
+        state.azimuth_bins[:] = 0.02
+        state.azimuth_bins[:, :, side] = 0.86
         around = np.random.default_rng(1).random((1, 5, 8))  # of the sphere, by the object's own azimuth
         state.evidence.maps["lem-sphere"] = around[:, :, (np.arange(8) + side) % 8]
         state.visited[:] = np.arange(40) % 3 == 0
         states.append(replace(state, current=np.array([ring * 8 + azimuth])))
     inputs = ("belief", "place", "lem-sphere")
-    np.testing.assert_allclose(*(told(SPHERE, state, inputs, "object") for state in states))
-    assert not np.allclose(*(told(SPHERE, state, inputs, "camera") for state in states))
+    np.testing.assert_allclose(*(features(SPHERE, state, inputs, "object") for state in states))
+    assert not np.allclose(*(features(SPHERE, state, inputs, "camera") for state in states))
     for state in states:  # and the networks are told on which side the camera is
-        assert told(SPHERE, state, ("side",), "object")[0, :8].argmax() == (state.current[0] % 8 - zero) % 8
+        assert features(SPHERE, state, ("azimuth_bin",), "object")[0, :8].argmax() == (state.current[0] % 8 - zero) % 8
 
 
 @pytest.mark.parametrize("frame", ["camera", "object"])
 def test_a_recogniser_that_does_not_know_the_sides_is_refused(frame):
-    state, policy = some_state(), some_gain(inputs=("side",), frame=frame)
-    assert policy.needs == ("sides",)
-    for sides in (None, np.ones((60, CLASSES, 4)) / 4):
-        with pytest.raises(ValueError, match="tells 8 sides of an object apart"):
-            policy.next_views(replace(state, sides=sides), np.random.default_rng(0))
+    state, policy = some_state(), some_gain(inputs=("azimuth_bin",), frame=frame)
+    assert policy.needs == ("azimuth_bins",)
+    for azimuth_bins in (None, np.ones((60, CLASSES, 4)) / 4):
+        with pytest.raises(ValueError, match="tells 8 azimuth bins of an object apart"):
+            policy.next_views(replace(state, azimuth_bins=azimuth_bins), np.random.default_rng(0))
 
 
 def reflected(state):
@@ -135,8 +143,13 @@ def reflected(state):
         for name, m in state.evidence.maps.items()
     }
     evidence = Evidence(state.evidence.logits, maps)
-    sides = state.sides[..., -np.arange(8) % 8]
-    moved = {"current": flip[state.current], "visited": state.visited[:, flip], "evidence": evidence, "sides": sides}
+    azimuth_bins = state.azimuth_bins[..., -np.arange(8) % 8]
+    moved = {
+        "current": flip[state.current],
+        "visited": state.visited[:, flip],
+        "evidence": evidence,
+        "azimuth_bins": azimuth_bins,
+    }
     return replace(state, **moved), flip
 
 
@@ -146,13 +159,13 @@ def test_an_object_and_its_mirror_image_are_alike(frame):
     other, flip = reflected(state)
     np.testing.assert_allclose(policy.gains(other)[:, flip], policy.gains(state), atol=1e-7)
     np.testing.assert_array_equal(
-        told(SPHERE, other, INPUTS, frame),
-        told(SPHERE, state, INPUTS, frame)[:, told_mirrored(SPHERE, CLASSES, INPUTS, frame)],
+        features(SPHERE, other, INPUTS, frame),
+        features(SPHERE, state, INPUTS, frame)[:, mirrored_features(SPHERE, CLASSES, INPUTS, frame)],
     )
 
 
 def test_a_high_price_buys_the_nearest_view():
-    state, policy = some_state(), some_gain(price=1e6)
+    state, policy = some_state(), some_gain(travel_weight=1e6)
     chosen = policy.next_views(state, np.random.default_rng(0))
     going = ~state.visited.all(1)
     distance = np.where(state.visited, np.inf, SPHERE.travel[state.current])
@@ -172,38 +185,38 @@ def test_a_decision_takes_less_than_three_milliseconds():
 # What every choice leads to
 
 
-def some_table(n=30, sphere=SMALL, seed=0, sides=False) -> ReplayTable:
+def some_table(n=30, sphere=SMALL, seed=0, azimuth_bins=False) -> ReplayTable:
     rng = np.random.default_rng(seed)
     data = telling(sphere, [[0], [1], [2]], n, seed)
     noisy = data.logits + rng.normal(size=data.logits.shape)
     maps = {"lem-sphere": rng.random((n, len(sphere), sphere.rings, sphere.azimuths), dtype=np.float32)}
     shape = (n, len(sphere), len(data.classes), sphere.azimuths)
-    likely = log_softmax(rng.normal(size=shape), axis=3).astype(np.float32) if sides else None
-    data = replace(data, logits=noisy.astype(np.float32), sides=likely)
-    return ReplayTable(data, maps, Calibration(0.8, 0.5, side_correlation=0.1 if sides else None))
+    likely = log_softmax(rng.normal(size=shape), axis=3).astype(np.float32) if azimuth_bins else None
+    data = replace(data, logits=noisy.astype(np.float32), azimuth_bins=likely)
+    return ReplayTable(data, maps, Calibration(0.8, 0.5, bin_correlation=0.1 if azimuth_bins else None))
 
 
-@pytest.mark.parametrize("sides", [False, True])
-def test_what_a_choice_leads_to_is_what_is_there_after_it(sides):
-    table, seen = some_table(sides=sides), []
-    for moment in follow(table, RandomAll(SMALL), 4, np.random.default_rng(0)):
+@pytest.mark.parametrize("azimuth_bins", [False, True])
+def test_what_a_choice_leads_to_is_what_is_there_after_it(azimuth_bins):
+    table, seen = some_table(azimuth_bins=azimuth_bins), []
+    for moment in rollout(table, RandomAll(SMALL), 4, np.random.default_rng(0)):
         state = moment.state
         if seen:
-            before, said = seen[-1]
+            before, log_evidence = seen[-1]
             moved = SMALL.travel[before.state.current, state.current]
             np.testing.assert_allclose(moment.travel - before.travel, moved)
             for kind in OUTCOMES:
                 reached = outcome(table, moment.total, state.step, kind)
-                np.testing.assert_allclose(reached, said[kind][np.arange(30), state.current], atol=1e-9)
-        seen.append((moment, {kind: choices(table, moment, kind) for kind in OUTCOMES}))
+                np.testing.assert_allclose(reached, log_evidence[kind][np.arange(30), state.current], atol=1e-9)
+        seen.append((moment, {kind: candidate_values(table, moment, kind) for kind in OUTCOMES}))
     moment = seen[-1][0]
     logits = np.stack([table.data.logits[np.arange(30), m.state.current] for m, _ in seen], 1).astype(float)
     logs = logits.sum(1) / (0.8 * 2.5)
-    if sides:
+    if azimuth_bins:
         at = [m.state.current for m, _ in seen]
-        said = [table.data.sides[np.arange(30), view].astype(float) for view in at]
+        log_evidence = [table.data.azimuth_bins[np.arange(30), view].astype(float) for view in at]
         azimuths = [SMALL.azimuth_index[view] / SMALL.azimuths for view in at]
-        pointing = sum(map(reorient, said, azimuths)) / 1.3
+        pointing = sum(map(reorient, log_evidence, azimuths)) / 1.3
         logs += np.log(np.exp(pointing).sum(2))
     logs = log_softmax(logs, axis=1)
     np.testing.assert_allclose(np.log(moment.state.belief), logs, atol=1e-9)
@@ -233,14 +246,14 @@ def test_the_calibration_is_the_predictions_own_or_fitted_to_what_is_learned_fro
 
 onnx = pytest.importorskip("onnx")
 
-from nextview.models.card import file_hash  # noqa: E402
+from nextview.models.model_card import file_hash  # noqa: E402
 from nextview.training.gain_export import gain_graph, write_gain  # noqa: E402
 
 
 def write_card(card, policy, state=None):
     """The card of a policy, and the ONNX file beside it."""
     facts = {"kind": "gain", "anywhere": policy.anywhere, "elevations": SPHERE.elevations, "azimuths": SPHERE.azimuths}
-    seen = told(SPHERE, state or some_state(), policy.inputs)
+    seen = features(SPHERE, state or some_state(), policy.inputs)
     return write_gain(card, policy, facts | {"classes": ["a", "b", "c", "d"]}, seen.astype(np.float32))
 
 
@@ -253,7 +266,7 @@ def shipped(folder, policy) -> Gain:
 @pytest.mark.parametrize("networks", [1, 3])
 def test_the_file_decides_each_episode_by_itself_to_the_last_bit(networks, tmp_path):
     policy = shipped(tmp_path, some_gain(networks=networks))
-    seen = told(SPHERE, some_state(episodes=300), INPUTS).astype(np.float32)
+    seen = features(SPHERE, some_state(episodes=300), INPUTS).astype(np.float32)
     together = policy.score(seen)
     assert together.dtype == np.float32
     assert together.std(0).min() > 1e-3
@@ -262,11 +275,11 @@ def test_the_file_decides_each_episode_by_itself_to_the_last_bit(networks, tmp_p
         np.testing.assert_array_equal(np.concatenate(parts), together)
 
 
-@pytest.mark.parametrize("price", [0.0, 0.3])
-def test_a_mirrored_object_gets_the_mirrored_choice(price, tmp_path):
-    state, policy = some_state(episodes=300), shipped(tmp_path, some_gain(price=price))
+@pytest.mark.parametrize("travel_weight", [0.0, 0.3])
+def test_a_mirrored_object_gets_the_mirrored_choice(travel_weight, tmp_path):
+    state, policy = some_state(episodes=300), shipped(tmp_path, some_gain(travel_weight=travel_weight))
     other, flip = reflected(state)
-    seen = (told(SPHERE, each, INPUTS).astype(np.float32) for each in (state, other))
+    seen = (features(SPHERE, each, INPUTS).astype(np.float32) for each in (state, other))
     here, there = (policy.score(each) for each in seen)
     np.testing.assert_array_equal(there[:, flip], here)
     chosen, mirror = (policy.next_views(each, np.random.default_rng(0)) for each in (state, other))
@@ -276,12 +289,12 @@ def test_a_mirrored_object_gets_the_mirrored_choice(price, tmp_path):
 
 
 @pytest.mark.parametrize("anywhere", [True, False])
-@pytest.mark.parametrize("inputs", [INPUTS, ("belief",), ("look", "place")])
+@pytest.mark.parametrize("inputs", [INPUTS, ("belief",), ("view", "place")])
 def test_the_file_chooses_as_the_networks_do(anywhere, inputs, tmp_path):
-    state, policy = some_state(episodes=300), some_gain(inputs=inputs, anywhere=anywhere, price=0.1)
+    state, policy = some_state(episodes=300), some_gain(inputs=inputs, anywhere=anywhere, travel_weight=0.1)
     other = shipped(tmp_path, policy)
-    assert (other.inputs, other.anywhere, other.price) == (inputs, anywhere, 0.1)
-    seen = told(SPHERE, state, inputs)
+    assert (other.inputs, other.anywhere, other.travel_weight) == (inputs, anywhere, 0.1)
+    seen = features(SPHERE, state, inputs)
     np.testing.assert_allclose(other.score(seen.astype(np.float32)), policy.score(seen), atol=1e-5)
     random = np.random.default_rng(0)
     np.testing.assert_array_equal(other.next_views(state, random), policy.next_views(state, random))
@@ -333,7 +346,7 @@ FAULTS = {
     "infinite": (lambda w: set_number(w, "weights2", np.inf), True, "a weight is not a finite number"),
     "hidden by a ReLU": (lambda w: set_number(w, "bias0", -np.inf), True, "a weight is not a finite number"),
 }
-"""What is done to the ONNX file, whether the card then holds its new hash, and what is said of it."""
+"""What is done to the ONNX file, whether the card then holds its new hash, and the log-evidence of it."""
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -373,8 +386,8 @@ from nextview.policies.registry import make_policy
 from nextview.viewsphere import ViewSphere
 sphere = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
 evidence = Evidence(np.zeros((1, 10)), {"lem": np.zeros((1, 5, 3)), "lem-sphere": np.zeros((1, 5, 8))})
-visited, belief, sides = np.arange(40)[None] == 3, np.full((1, 10), 0.1), np.full((1, 10, 8), 0.125)
-state = EpisodeState(np.array([3]), visited, belief, evidence, 1, sides=sides)
+visited, belief, azimuth_bins = np.arange(40)[None] == 3, np.full((1, 10), 0.1), np.full((1, 10, 8), 0.125)
+state = EpisodeState(np.array([3]), visited, belief, evidence, 1, azimuth_bins=azimuth_bins)
 print(*make_policy("gain", sphere).next_views(state, np.random.default_rng(0)))
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
@@ -387,11 +400,11 @@ print(*make_policy("gain", sphere).next_views(state, np.random.default_rng(0)))
 
 torch = pytest.importorskip("torch")
 
-from nextview.training.gain import Networks, averaged, best_epoch, train  # noqa: E402
+from nextview.training.gain_training import Networks, averaged, best_epoch, train  # noqa: E402
 
 
 def test_what_ships_says_what_torch_says(tmp_path):
-    width = len(told_mirrored(SPHERE, CLASSES, INPUTS))
+    width = len(mirrored_features(SPHERE, CLASSES, INPUTS))
     networks = Networks([width, 8, 8, len(SPHERE)], 3, torch.Generator().manual_seed(0))
     for part in networks.parameters():
         part.data += 0.3 * torch.randn(part.shape, generator=torch.Generator().manual_seed(1))
@@ -400,39 +413,42 @@ def test_what_ships_says_what_torch_says(tmp_path):
     state = some_state()
     other, flip = reflected(state)
     with torch.no_grad():
-        here, there = (networks(torch.from_numpy(told(SPHERE, s, INPUTS)).float()).mean(0) for s in (state, other))
+        here, there = (networks(torch.from_numpy(features(SPHERE, s, INPUTS)).float()).mean(0) for s in (state, other))
     expected = ((here + there[:, flip]) / 2).numpy()
     assert expected.std(0).min() > 0.01
-    np.testing.assert_allclose(policy.score(told(SPHERE, state, INPUTS).astype(np.float32)), expected, atol=1e-5)
+    np.testing.assert_allclose(policy.score(features(SPHERE, state, INPUTS).astype(np.float32)), expected, atol=1e-5)
 
 
-QUICK = GainRecipe(epochs=6, walks=2, batch=128, networks=2, looks=3, rate=1e-2)
+QUICK = GainRecipe(epochs=6, walks=2, batch=128, networks=2, n_views=3, lr=1e-2)
 
 
 def test_training_finds_the_views_that_tell_the_class_believed():
-    """Every class is told on one ring alone, and each look hints at the class: go to the ring of the class believed."""
+    """Every class is told on one ring alone, and each view hints at the class: go to the ring of the class believed."""
     learned = ReplayTable(telling(SMALL, [[0], [1], [2]], 240), {}, PLAIN_SUM)
     fresh = ReplayTable(telling(SMALL, [[0], [1], [2]], 90, seed=1), {}, PLAIN_SUM)
-    recipe = replace(QUICK, inputs=("belief", "look", "place"), frame="camera", epochs=20)
-    *_, ((policy,), worth) = best_epoch([train(learned, recipe)], [fresh], recipe)
-    first, second = (SMALL.ring[m.state.current] for m in follow(fresh, policy, 2, np.random.default_rng(5)))
+    recipe = replace(QUICK, inputs=("belief", "view", "place"), frame="camera", epochs=20)
+    *_, ((policy,), value) = best_epoch([train(learned, recipe)], [fresh], recipe)
+    first, second = (SMALL.ring[m.state.current] for m in rollout(fresh, policy, 2, np.random.default_rng(5)))
     not_told_yet = first != fresh.data.labels
     assert np.mean((second == fresh.data.labels)[not_told_yet]) > 0.9
     blind = judge(fresh, RandomAll(SMALL), 3, "log-belief", np.random.default_rng(0))
-    assert (worth.outcome > blind.outcome + 0.05).all()
+    assert (value.outcome > blind.outcome + 0.05).all()
     # What may be bought for little travel depends on where one stands: dearer ways are shorter.
     travel = [
-        judge(fresh, replace(policy, price=p), 3, "log-belief", np.random.default_rng(0)).travel[-1]
+        judge(fresh, replace(policy, travel_weight=p), 3, "log-belief", np.random.default_rng(0)).travel[-1]
         for p in (0.0, 0.05, 10.0)
     ]
     assert travel[0] > travel[1] > travel[2]
-    price = travel_price([(fresh, policy)], 3, "log-belief", 0)
+    travel_weight = fit_travel_weight([(fresh, policy)], 3, "log-belief", 0)
     limit = judge(fresh, Random(SMALL), 3, "log-belief", np.random.default_rng(0)).travel
-    assert (judge(fresh, replace(policy, price=price), 3, "log-belief", np.random.default_rng(0)).travel <= limit).all()
+    assert (
+        judge(fresh, replace(policy, travel_weight=travel_weight), 3, "log-belief", np.random.default_rng(0)).travel
+        <= limit
+    ).all()
 
 
 def test_the_same_seed_gives_the_same_policy():
-    table = some_table(sides=True)
+    table = some_table(azimuth_bins=True)
     recipe = replace(QUICK, epochs=2)
 
     def weights(seed):
@@ -452,15 +468,15 @@ def test_folds_judge_policies_that_have_not_seen_them_and_are_averaged(monkeypat
         asked.append((table, policy))
         return judge(table, policy, *rest, **options)
 
-    monkeypatch.setattr("nextview.training.gain.judge", listen)
+    monkeypatch.setattr("nextview.training.gain_training.judge", listen)
     trainings = [train(parts[0], recipe, k) for k in range(2)]
-    *_, (policies, worth) = best_epoch(trainings, parts[1:], recipe)
+    *_, (policies, value) = best_epoch(trainings, parts[1:], recipe)
     assert [table is parts[1 + k % 2] for k, (table, _) in enumerate(asked)] == [True] * 4
-    worths = [
+    values = [
         judge(t, p, 3, "log-belief", np.random.default_rng([0, 2]), 4) for t, p in zip(parts[1:], policies, strict=True)
     ]
-    np.testing.assert_allclose(worth.outcome, np.mean([w.outcome for w in worths], 0))
-    told_some = np.random.default_rng(0).random((7, len(policies[0].score.told_flip))).astype(np.float32)
+    np.testing.assert_allclose(value.outcome, np.mean([w.outcome for w in values], 0))
+    told_some = np.random.default_rng(0).random((7, len(policies[0].score.features_flip))).astype(np.float32)
     one, other = (policy.score(told_some) for policy in policies)
     assert np.abs(one - other).max() > 1e-3
     np.testing.assert_allclose(averaged(policies).score(told_some), (one + other) / 2, atol=1e-6)
@@ -471,8 +487,10 @@ def unseen(tmp_path):
     path = tmp_path / "unseen.npz"
     p = some_predictions(90)
     sphere = np.random.default_rng(0).random((90, len(p.sphere), p.sphere.rings, p.sphere.azimuths)).astype(np.float32)
-    sides = np.random.default_rng(1).normal(size=(90, len(p.sphere), 3, p.sphere.azimuths)).astype(np.float32)
-    replace(p, splits=np.array(["train"] * 90), maps=p.maps | {"lem-sphere": sphere}, sides=sides).save(path)
+    azimuth_bins = np.random.default_rng(1).normal(size=(90, len(p.sphere), 3, p.sphere.azimuths)).astype(np.float32)
+    replace(p, splits=np.array(["train"] * 90), maps=p.maps | {"lem-sphere": sphere}, azimuth_bins=azimuth_bins).save(
+        path
+    )
     return path
 
 
@@ -484,21 +502,21 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
     assert "each judged by networks of 19 other folds" in facts["learned_from"]
     policy = make_policy(str(card), SPHERE, classes=("ball", "box", "pillar"))
     assert isinstance(policy, Gain)
-    assert policy.price == facts["table"]["price"]
-    assert make_policy(f"{card}@0.5", SPHERE).price == 0.5
+    assert policy.travel_weight == facts["table"]["travel_weight"]
+    assert make_policy(f"{card}@0.5", SPHERE).travel_weight == 0.5
     assert policy.needs == ()
     for wrong in ("-1", "much", "nan", ""):
-        with pytest.raises(ValueError, match="a price is a number of at least 0"):
+        with pytest.raises(ValueError, match="a travel weight is a number of at least 0"):
             make_policy(f"{card}@{wrong}", SPHERE)
-    with pytest.raises(ValueError, match="pays no price"):
+    with pytest.raises(ValueError, match="pays no travel weight"):
         make_policy("class-table@1", SPHERE)
     with pytest.raises(ValueError, match="other classes"):
         make_policy(str(card), SPHERE, classes=("ball", "box"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.json", "mine.onnx", "unseen.npz"]
     assert "its answers differ from the networks' by" in " ".join(capsys.readouterr().err.split())
-    main(["train", "gain", str(unseen), str(card), "--epochs", "1", "--local", "--price", "0.2"])
+    main(["train", "gain", str(unseen), str(card), "--epochs", "1", "--local", "--travel-weight", "0.2"])
     policy = make_policy(str(card), SPHERE)
-    assert (policy.anywhere, policy.price, policy.needs) == (False, 0.2, ("lem-sphere", "sides"))
+    assert (policy.anywhere, policy.travel_weight, policy.needs) == (False, 0.2, ("lem-sphere", "azimuth_bins"))
     assert policy.frame == "object"
 
 
@@ -509,18 +527,18 @@ def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsy
     some = replace(
         p, logits=p.logits[:20], maps={n: m[:20] for n, m in p.maps.items()}, depth_entropy=p.depth_entropy[:20],
         names=p.names[:20], labels=p.labels[:20], splits=p.splits[:20], conflicting=p.conflicting[:20],
-        sides=p.sides[:20],
+        azimuth_bins=p.azimuth_bins[:20],
     )  # fmt: skip
     some.save(tmp_path / "validation.npz")
     card = tmp_path / "mine.json"
     main(["train", "gain", str(unseen), str(card), "--epochs", "1", "--validation", str(tmp_path / "validation.npz")])
     assert "70 objects" in json.loads(card.read_text())["learned_from"]
-    replace(Predictions.load(unseen), sides=None).save(tmp_path / "sideless.npz")
+    replace(Predictions.load(unseen), azimuth_bins=None).save(tmp_path / "sideless.npz")
     for arguments, sentence in [
         ([str(unseen), str(tmp_path / "mine")], "NAME.json"),
         ([str(tmp_path / "none.npz"), str(card)], "no such file"),
         ([str(unseen), str(card), "--inputs", "belief", "lcm"], "holds no map 'lcm'"),
-        ([str(tmp_path / "sideless.npz"), str(card)], "says nothing of sides"),
+        ([str(tmp_path / "sideless.npz"), str(card)], "says nothing of azimuth bins"),
     ]:
         with pytest.raises(SystemExit) as end:
             main(["train", "gain", *arguments])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.samples import sample_mesh
 from nextview.models.geometry_input import CHANNELS, geometry_input
-from nextview.observation import POINTS, Observation, pinhole
+from nextview.observation import Observation, pinhole
 from nextview.viewsphere import ViewSphere, look_at_origin
 
 SIZE = 224
@@ -165,11 +165,10 @@ def test_what_a_sensor_gives_for_nothing_is_background(nothing):
     sensed = np.where(clean > 0, clean, np.float32(nothing))
     expected = geometry_input(clean[None], POSES[[13]], INTRINSICS, 112)
     np.testing.assert_array_equal(geometry_input(sensed[None], POSES[[13]], INTRINSICS, 112), expected)
-    image, points = np.zeros(clean.shape, np.uint8), np.zeros((POINTS, 3), np.float32)
-    look = Observation(image, sensed, points, POSES[13], INTRINSICS)
-    np.testing.assert_array_equal(look.depth, clean)
-    assert look.depth.dtype == np.float32
-    assert Observation(image, clean, points, POSES[13], INTRINSICS).depth is clean  # nothing is copied
+    observation = Observation(sensed, POSES[13], INTRINSICS)
+    np.testing.assert_array_equal(observation.depth, clean)
+    assert observation.depth.dtype == np.float32
+    assert Observation(clean, POSES[13], INTRINSICS).depth is clean  # nothing is copied
 
 
 def test_a_floor_a_wall_and_a_ceiling():

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from nextview.cli.main import main
-from nextview.data.render import render
+from nextview.data.rendering import render
 from nextview.data.store import ViewStore
 from nextview.errors import MeshError
 from nextview.glb import read_glb

@@ -6,8 +6,8 @@ import trimesh
 
 from nextview.cli.inspect import inspect
 from nextview.cli.main import main
-from nextview.data.measure import measure
-from nextview.data.render import render
+from nextview.data.measuring import measure
+from nextview.data.rendering import render
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.report.store_figures import disk_use, median_radii, object_figure, store_figure, summary
@@ -53,7 +53,7 @@ def test_sizes_are_told_where_the_unit_is_known(views, tmp_path, capsys):
 
 def test_bars_are_as_long_as_the_classes(views):
     bars = store_figure(ViewStore.open(views)).subfigs[0].axes[0].containers
-    counts = {bar.get_label(): [patch.get_width() for patch in bar] for bar in bars}
+    counts = {threshold_at.get_label(): [patch.get_width() for patch in threshold_at] for threshold_at in bars}
     assert counts == {"train": [1, 1], "test": [1, 2], "not rendered": [0, 1]}  # ball, box
 
 

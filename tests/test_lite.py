@@ -6,22 +6,21 @@ import numpy as np
 import pytest
 
 from nextview.cli.main import main
-from nextview.models.card import write_card
-from nextview.models.networks import Recogniser
+from nextview.models.inference import Recogniser
+from nextview.models.model_card import write_card
 
 torch = pytest.importorskip("torch")
 
-from nextview.models.card import ModelError  # noqa: E402
-from nextview.training.export import CalibratedRecogniser, export_onnx  # noqa: E402
+from nextview.models.model_card import ModelError  # noqa: E402
+from nextview.training.checkpoints import exported_networks, load_checkpoint, load_exported  # noqa: E402
 from nextview.training.lite import Depthwise, InvertedBottleneck, LiteNet  # noqa: E402
-from nextview.training.weights import exported_networks, load_checkpoint, load_exported  # noqa: E402
+from nextview.training.onnx_export import CalibratedRecogniser, export_onnx  # noqa: E402
 
 LITE0 = ((16, 3, 1), (24, 3, 2), (40, 5, 2), (80, 3, 3), (112, 5, 3), (192, 5, 4), (320, 3, 1))
 """Width, kernel and blocks of the stages."""
-LITE2 = ((16, 3, 1), (24, 3, 3), (48, 5, 3), (88, 3, 4), (120, 5, 4), (208, 5, 5), (352, 3, 1))
 
 
-def checkpoint(path: Path, classes: int = 1000, seed: int = 0, plan: tuple = LITE0) -> dict:
+def checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
     """Random weights under the names that published checkpoints use, from the network's plan in words."""
     rng, state = torch.Generator().manual_seed(seed), {}
 
@@ -37,7 +36,7 @@ def checkpoint(path: Path, classes: int = 1000, seed: int = 0, plan: tuple = LIT
     convolution("_conv_stem", 32, 3, 3, 3)
     norm("_bn0", 32)
     inputs, index = 32, 0
-    for widths, kernel, repeats in plan:
+    for widths, kernel, repeats in LITE0:
         for _ in range(repeats):
             block, wide = f"_blocks.{index}", inputs * (6 if index else 1)
             if index:
@@ -56,25 +55,22 @@ def checkpoint(path: Path, classes: int = 1000, seed: int = 0, plan: tuple = LIT
     return state
 
 
-@pytest.mark.parametrize(
-    ("scale", "size", "parameters", "multiplications"), [(0, 224, 4.7, 407), (1, 240, 5.4, 631), (2, 260, 6.1, 899)]
-)
-def test_it_is_as_large_as_published(scale, size, parameters, multiplications):
-    """Millions, at the published image size (TensorFlow's EfficientNet-Lite, 2020)."""
-    network, products = LiteNet(1000, 3, scale=scale).eval(), []
+def test_it_is_as_large_as_published():
+    """4.7 million parameters and 407 million multiplications (TensorFlow's EfficientNet-Lite, 2020)."""
+    network, products = LiteNet(1000, 3).eval(), []
     for part in network.modules():
         if isinstance(part, torch.nn.Conv2d | torch.nn.Linear):
             weights = part.weight.numel()
             part.register_forward_hook(lambda _, __, out, weights=weights: products.append(weights * out[0, 0].numel()))
-    network(torch.zeros(1, 3, size, size))
-    assert sum(p.numel() for p in network.parameters()) == pytest.approx(parameters * 1e6, rel=0.02)
-    assert sum(products) == pytest.approx(multiplications * 1e6, rel=0.06)
+    network(torch.zeros(1, 3, 224, 224))
+    assert sum(p.numel() for p in network.parameters()) == pytest.approx(4.7e6, rel=0.02)
+    assert sum(products) == pytest.approx(407e6, rel=0.06)
 
 
 def test_any_number_of_channels_and_the_sides():
-    logits, features, sides = LiteNet(7, 5, 8).eval()(torch.rand(2, 5, 64, 64))
-    assert (logits.shape, features.shape, sides.shape) == ((2, 7), (2, 1280), (2, 7, 8))
-    assert torch.allclose(sides.exp().sum(2), torch.ones(2, 7))
+    logits, azimuth_bins = LiteNet(7, 5, 8).eval()(torch.rand(2, 5, 64, 64))
+    assert (logits.shape, azimuth_bins.shape) == ((2, 7), (2, 7, 8))
+    assert torch.allclose(azimuth_bins.exp().sum(2), torch.ones(2, 7))
 
 
 def test_a_published_checkpoint_loads_whole(tmp_path):
@@ -88,16 +84,6 @@ def test_a_published_checkpoint_loads_whole(tmp_path):
     assert torch.equal(ours["stages.3.norm2.running_var"], state["_blocks.3._bn2.running_var"])
     assert torch.equal(ours["norm1.bias"], state["_bn1.bias"])
     assert torch.equal(ours["fc.weight"], state["_fc.weight"])
-
-
-def test_the_largest_checkpoint_fits_its_own_network_alone(tmp_path):
-    state = checkpoint(tmp_path / "lite2.pth", plan=LITE2)
-    network = LiteNet(1000, 3, scale=2)
-    load_checkpoint(network, tmp_path / "lite2.pth")
-    last = network.state_dict()["stages.20.project.weight"]
-    assert torch.equal(last, state["_blocks.20._project_conv.weight"])
-    with pytest.raises(ModelError, match=r"not the weights of this EfficientNet-Lite0 \(it holds stages\.16\."):
-        load_checkpoint(LiteNet(1000, 3), tmp_path / "lite2.pth")
 
 
 def test_blocks_are_skipped_for_some_images_in_training_alone():
@@ -151,30 +137,32 @@ def test_it_goes_on_from_its_export_also_beside_another(tmp_path, bits):
     shipped = CalibratedRecogniser(networks, 1.0).eval()
     export_onnx(shipped, views[:2], "input", shipped.outputs, tmp_path / "two.onnx", bits)
     facts = {"name": "two", "kind": "recogniser", "input_size": 64, "sees": "geometry", "temperature": 1.0}
-    facts |= {"classes": ["a", "b"], "sides": 8, "network": "EfficientNet-Lite0 + EfficientNet-Lite0"}
+    facts |= {"classes": ["a", "b"], "azimuth_bins": 8, "network": "EfficientNet-Lite0 + EfficientNet-Lite0"}
     write_card(tmp_path / "two.json", facts)
     x = torch.from_numpy(views).float() / 255
     again = exported_networks(tmp_path / "two.json", 4, x)
     with torch.no_grad():
-        said = torch.stack([network(x)[0] for network in again]).mean(0).numpy()
+        output = torch.stack([network(x)[0] for network in again]).mean(0).numpy()
     exact = Recogniser(tmp_path / "two.json").from_inputs(views).logits
-    assert np.abs(said - exact).max() < 1e-3
+    assert np.abs(output - exact).max() < 1e-3
     assert np.ptp(exact) > 0.1
     with pytest.raises(ModelError, match="not one network of this depth and input"):
         load_exported(LiteNet(2, 4, 8), tmp_path / "two.json", x)
+    write_card(tmp_path / "two.json", facts | {"network": "EfficientNet-Lite0 + EfficientNet-Lite2"})
+    with pytest.raises(ModelError, match=r"two\.json: there is no EfficientNet-Lite2"):
+        exported_networks(tmp_path / "two.json", 4, x)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "log_evidence"),
     [
-        (["--network", "lite0", "--blocks", "2", "--size", "224"], "only a ResNet sees pixels in blocks"),
-        (["--network", "lite2", "--depth", "34"], "only a ResNet has a --depth"),
-        (["--drop", "0.2"], "only an EfficientNet-Lite drops features"),
-        (["--network", "lite0", "--drop", "1"], "--drop is a chance, 0 or more and less than 1, not 1.0"),
+        (["--network", "lite0", "--depth", "34"], "only a ResNet has a --depth"),
+        (["--dropout", "0.2"], "only EfficientNet-Lite0 drops features"),
+        (["--network", "lite0", "--dropout", "1"], "--dropout is a chance, 0 or more and less than 1, not 1.0"),
     ],
 )
-def test_options_of_another_network_are_refused(tmp_path, capsys, options, said):
+def test_options_of_another_network_are_refused(tmp_path, capsys, options, output):
     command = ["train", "recogniser", str(tmp_path / "no.zarr"), str(tmp_path / "run")]
     with pytest.raises(SystemExit):
         main([*command, *options])
-    assert said in " ".join(capsys.readouterr().err.split())
+    assert output in " ".join(capsys.readouterr().err.split())

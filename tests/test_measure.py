@@ -6,8 +6,8 @@ import trimesh
 from skimage.draw import disk, polygon
 from skimage.measure import perimeter_crofton
 
-from nextview.data.measure import measure
-from nextview.data.render import render
+from nextview.data.measuring import measure
+from nextview.data.rendering import render
 from nextview.data.store import DEPTH_UNIT, ViewStore
 from nextview.errors import DatasetError
 from nextview.measures.depth_spread import BIN, depth_distribution, max_depth

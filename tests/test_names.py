@@ -18,7 +18,7 @@ from nextview.cli.main import main
 from nextview.cli.report import report
 from nextview.cli.terminal import Terminal
 from nextview.data.folders import list_dataset
-from nextview.data.render import render
+from nextview.data.rendering import render
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.report.diagrams import confusion_matrix

@@ -7,9 +7,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from nextview.models.card import ModelError  # noqa: E402
-from nextview.training.networks import ResNet  # noqa: E402
-from nextview.training.weights import load_checkpoint  # noqa: E402
+from nextview.models.model_card import ModelError  # noqa: E402
+from nextview.training.architectures import ResNet  # noqa: E402
+from nextview.training.checkpoints import load_checkpoint  # noqa: E402
 
 BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3), 152: (3, 8, 36, 3)}
 PUBLISHED = {18: 11_689_512, 34: 21_797_672, 50: 25_557_032, 101: 44_549_160, 152: 60_192_808}
@@ -71,11 +71,10 @@ def test_resnet_is_torchvisions(depth):
     assert {name: tuple(value.shape) for name, value in network.state_dict().items()} == torchvisions_shapes(depth)
 
 
-@pytest.mark.parametrize(("depth", "features"), [(18, 512), (50, 2048)])
-def test_any_number_of_channels(depth, features):
-    logits, pooled = ResNet(depth, 7, 5).eval()(torch.rand(2, 5, 64, 64))
+@pytest.mark.parametrize("depth", [18, 50])
+def test_any_number_of_channels(depth):
+    (logits,) = ResNet(depth, 7, 5).eval()(torch.rand(2, 5, 64, 64))
     assert logits.shape == (2, 7)
-    assert pooled.shape == (2, features)
 
 
 @pytest.mark.parametrize("depth", [34, 50])

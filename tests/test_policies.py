@@ -11,14 +11,14 @@ from scipy.ndimage import maximum_filter
 from scipy.stats import chisquare
 from skimage.feature import peak_local_max
 
+from nextview.belief import Calibration
 from nextview.policies.base import EpisodeState, Evidence, best_in_window
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
+from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence, cells_from, cells_to
 from nextview.policies.maps import MapPeak, local_peaks, peaks_first
 from nextview.policies.oracle import OracleGain, OracleValley
 from nextview.policies.registry import POLICIES, make_policy
 from nextview.policies.spread import Spread
-from nextview.policies.tables import ClassTable, FixedRing, FixedSequence, cells_from, cells_to
-from nextview.recognition import Calibration
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("40")
@@ -86,9 +86,11 @@ def policies(sphere, rng):
     yield from (make_policy(name, sphere, (1,)) for name in POLICIES)
     labels, objects = rng.integers(0, 2, 50), np.arange(50)
     yield OracleValley(sphere, labels, (1,))
-    said = rng.normal(size=(50, len(sphere), 2 * 9))
-    yield OracleGain(sphere, said, 2, labels, objects)
-    yield OracleGain(sphere, said, 2, labels, objects, anywhere=True, calibration=Calibration(side_correlation=0.1))
+    log_evidence = rng.normal(size=(50, len(sphere), 2 * 9))
+    yield OracleGain(sphere, log_evidence, 2, labels, objects)
+    yield OracleGain(
+        sphere, log_evidence, 2, labels, objects, anywhere=True, calibration=Calibration(bin_correlation=0.1)
+    )
     for anywhere in (True, False):
         yield FixedSequence(sphere, rng.integers(len(sphere), size=(sphere.rings, 4)), anywhere)
         yield ClassTable(sphere, rng.random((2, sphere.rings, len(sphere))), anywhere)
@@ -355,7 +357,8 @@ def test_map_peak_goes_from_peak_to_peak_then_to_the_highest_rest():
         chosen = policy.next_views(state, np.random.default_rng(0))
         state.visited[0, chosen] = True
         taken.append(int(chosen[0]))
-    # 3 is below, 34 and 36 are at the sides of the top ring; no peak left, the highest rest is 35 between them (0.6).
+    # 3 is below, 34 and 36 are at the azimuth bins of the top ring; no peak left, the highest rest is 35 between them
+    # (0.6).
     assert taken == [3, 34, 36, 35]
 
 

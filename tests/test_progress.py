@@ -10,7 +10,7 @@ from nextview.cli import progress
 
 
 def shown(monkeypatch, columns: int, counts, total: int, what: str, **more) -> str:
-    """The last state of the bar, on a terminal so wide."""
+    """The last state of the threshold, on a terminal so wide."""
     file = io.StringIO()
     monkeypatch.setattr(progress, "console", Console(file=file, width=columns))
     progress.track(counts, total, what, **more)

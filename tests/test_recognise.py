@@ -16,9 +16,9 @@ from nextview import SimulatedCamera, Stopping, ViewSphere, load_mesh, load_mode
 from nextview.cli.main import main
 from nextview.data.samples import SAMPLES, sample_mesh
 from nextview.errors import ModelError
-from nextview.models.card import BUNDLED, bundled_cards
-from nextview.models.networks import RECOGNISER, MapNetwork, Recogniser
-from nextview.policies.card import bundled_policies
+from nextview.models.inference import RECOGNISER, MapNetwork, Recogniser
+from nextview.models.model_card import BUNDLED, bundled_cards
+from nextview.policies.policy_card import bundled_policies
 
 DATA = os.environ.get("NEXTVIEW_DATA")
 
@@ -33,18 +33,20 @@ def chair(tmp_path_factory):
 def test_json_holds_the_whole_episode(chair, capsys):
     main(["recognise", str(chair), "--json", "--start", "3", "--threshold", "1", "--max-views", "4"])
     episode = json.loads(capsys.readouterr().out)
-    looks = episode["looks"]
-    assert next(look["view"] for look in looks) == 3
-    assert len(looks) == len({look["view"] for look in looks}) == 4
-    assert [look["next_view"] for look in looks] == [look["view"] for look in looks[1:]] + [None]
-    for look in looks:
-        assert sum(look["belief"].values()) == pytest.approx(1, abs=1e-4)
-        assert look["side"]["belief"] > 0.5
-    assert len({(look["azimuth"] - look["side"]["degrees"]) % 360 for look in looks}) == 1  # the chair stands still
-    assert looks[0]["belief"] == looks[0]["image_says"]
+    views = episode["views"]
+    assert next(view["view"] for view in views) == 3
+    assert len(views) == len({view["view"] for view in views}) == 4
+    assert [view["next_view"] for view in views] == [view["view"] for view in views[1:]] + [None]
+    for view in views:
+        assert sum(view["belief"].values()) == pytest.approx(1, abs=1e-4)
+        assert view["azimuth_bin"]["belief"] > 0.5
+    assert (
+        len({(view["azimuth"] - view["azimuth_bin"]["degrees"]) % 360 for view in views}) == 1
+    )  # the chair stands still
+    assert views[0]["belief"] == views[0]["alone"]
     sphere = ViewSphere.named("40")
-    legs = [sphere.travel[a["view"], b["view"]] for a, b in itertools.pairwise(looks)]
-    assert looks[-1]["travel_cells"] == pytest.approx(sum(legs), abs=1e-5)
+    legs = [sphere.travel[a["view"], b["view"]] for a, b in itertools.pairwise(views)]
+    assert views[-1]["travel_cells"] == pytest.approx(sum(legs), abs=1e-5)
 
 
 def test_same_seed_same_episode(chair, capsys):
@@ -64,7 +66,7 @@ def test_a_risk_stops_at_the_threshold_that_the_recogniser_promises(chair, capsy
     policy = make_policy("lem", sphere, models.valley_classes("lem"))
     result = recognise(SimulatedCamera(load_mesh(chair)), models, policy, sphere, 3, stopping)
     found = json.loads(by_risk)
-    assert [look["view"] for look in found["looks"]] == [look.view for look in result.looks]
+    assert [view["view"] for view in found["views"]] == [view.index for view in result.views]
     assert found["confidence"] == pytest.approx(result.confidence, abs=1e-6)
     for arguments in (["--risk", "0.000001"], ["--risk", "2"], ["--risk", "0.1", "--max-views", "40"]):
         with pytest.raises(SystemExit) as end:
@@ -77,12 +79,12 @@ def test_every_bundled_policy_runs_live(chair, capsys):
     for name in bundled_policies():
         arguments = ["--policy", name, "--threshold", "1", "--max-views", "3", "--start", "9", "--json"]
         main(["recognise", str(chair), *arguments])
-        looks = json.loads(capsys.readouterr().out)["looks"]
-        assert len({look["view"] for look in looks}) == 3
+        views = json.loads(capsys.readouterr().out)["views"]
+        assert len({view["view"] for view in views}) == 3
         if name.endswith("local"):
             sphere = ViewSphere.named("40")
-            for look in looks[:-1]:
-                assert look["next_view"] in sphere.window(look["view"])
+            for view in views[:-1]:
+                assert view["next_view"] in sphere.window(view["view"])
     with pytest.raises(SystemExit) as end:
         main(["recognise", str(chair), "--policy", "clairvoyant"])
     assert end.value.code == 2

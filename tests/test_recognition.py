@@ -10,8 +10,8 @@ from hypothesis.extra import numpy as npst
 from scipy.special import log_softmax, softmax
 from scipy.stats import multivariate_normal
 
+from nextview.belief import Calibration, RiskBounds, Stopping, fuse, log_evidence_of, reorient
 from nextview.errors import RiskError
-from nextview.recognition import Calibration, RiskBounds, Stopping, additive, fuse, reorient
 
 logits = npst.arrays(
     st.sampled_from([np.float32, np.float64]),
@@ -54,14 +54,14 @@ def test_a_logit_that_is_not_finite_is_refused(bad):
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.9])
 def test_calibrated_belief_is_the_posterior_of_equally_correlated_looks(correlation):
-    # Two classes, each look a Gaussian measurement around -1 or +1 whose noise is correlated between looks.
+    # Two classes, each view a Gaussian measurement around -1 or +1 whose noise is correlated between views.
     rng, spread = np.random.default_rng(0), 1.7
-    for looks in (1, 2, 5, 20):
-        noise = spread**2 * ((1 - correlation) * np.eye(looks) + correlation)
-        seen = rng.multivariate_normal(np.ones(looks), noise, size=6)
-        likelihood = np.stack([multivariate_normal(np.full(looks, m), noise).logpdf(seen) for m in (-1, 1)], -1)
+    for n_views in (1, 2, 5, 20):
+        noise = spread**2 * ((1 - correlation) * np.eye(n_views) + correlation)
+        seen = rng.multivariate_normal(np.ones(n_views), noise, size=6)
+        likelihood = np.stack([multivariate_normal(np.full(n_views, m), noise).logpdf(seen) for m in (-1, 1)], -1)
         of_each = np.stack([-((seen - m) ** 2) / (2 * spread**2) for m in (-1, 1)], -1)
-        belief = fuse(of_each, Calibration(1.0, correlation).temperature(looks))
+        belief = fuse(of_each, Calibration(1.0, correlation).temperature_after(n_views))
         np.testing.assert_allclose(belief, softmax(likelihood, -1), atol=1e-9)
 
 
@@ -75,12 +75,12 @@ def test_a_calibration_survives_the_card():
 @pytest.mark.parametrize(
     "facts",
     [
-        {"temperature_of_one": 0, "correlation": 0},
-        {"temperature_of_one": 1, "correlation": -0.1},
-        {"temperature_of_one": 1, "correlation": np.nan},
-        {"temperature_of_one": "warm", "correlation": 0},
+        {"temperature": 0, "correlation": 0},
+        {"temperature": 1, "correlation": -0.1},
+        {"temperature": 1, "correlation": np.nan},
+        {"temperature": "warm", "correlation": 0},
         {"correlation": 0},
-        {"temperature_of_one": 1, "correlation": 0, "risk": {"delta": 0.1}},
+        {"temperature": 1, "correlation": 0, "risk": {"delta": 0.1}},
         "calibrated",
     ],
 )
@@ -117,26 +117,28 @@ def test_a_threshold_is_a_probability(threshold):
         Stopping(threshold)
 
 
-@pytest.mark.parametrize("decline", [-0.1, np.nan, np.inf])
-def test_a_bar_comes_down_or_stays(decline):
-    with pytest.raises(ValueError, match="decline"):
-        Stopping(0.9, 5, decline)
+@pytest.mark.parametrize("threshold_decay", [-0.1, np.nan, np.inf])
+def test_a_bar_comes_down_or_stays(threshold_decay):
+    with pytest.raises(ValueError, match="threshold decay"):
+        Stopping(0.9, 5, threshold_decay)
 
 
 @given(st.floats(0.5, 0.999), st.floats(0, 2), st.integers(1, 8), st.integers(0, 2**32))
-def test_with_a_decline_of_its_correlation_a_calibrated_belief_stops_where_the_plain_sum_does(bar, c, looks, seed):
+def test_with_a_decline_of_its_correlation_a_calibrated_belief_stops_where_the_plain_sum_does(
+    threshold_at, c, n_views, seed
+):
     # Of two classes, where the peak of the belief is one to one with the difference of the logits.
-    logits = np.random.default_rng(seed).normal(size=(50, looks, 2))
-    plain = fuse(logits).max(-1) >= Stopping(bar).bar(looks)
-    belief = fuse(logits, Calibration(1.0, c).temperature(looks)).max(-1)
-    near = np.abs(belief - Stopping(bar, 8, c).bar(looks)) < 1e-9
-    np.testing.assert_array_equal((belief >= Stopping(bar, 8, c).bar(looks)) | near, plain | near)
+    logits = np.random.default_rng(seed).normal(size=(50, n_views, 2))
+    plain = fuse(logits).max(-1) >= Stopping(threshold_at).threshold_at(n_views)
+    belief = fuse(logits, Calibration(1.0, c).temperature_after(n_views)).max(-1)
+    near = np.abs(belief - Stopping(threshold_at, 8, c).threshold_at(n_views)) < 1e-9
+    np.testing.assert_array_equal((belief >= Stopping(threshold_at, 8, c).threshold_at(n_views)) | near, plain | near)
 
 
 def test_a_threshold_that_is_certain_or_nothing_stays_so():
     for threshold in (0.0, 1.0):
-        assert Stopping(threshold, 5, 0.7).bar(np.arange(1, 6)).tolist() == [threshold] * 5
-    assert Stopping(0.9).bar(4) == 0.9
+        assert Stopping(threshold, 5, 0.7).threshold_at(np.arange(1, 6)).tolist() == [threshold] * 5
+    assert Stopping(0.9).threshold_at(4) == 0.9
 
 
 @pytest.mark.parametrize("views", [0, -3])
@@ -146,66 +148,74 @@ def test_at_least_one_view(views):
 
 
 def test_what_is_said_of_sides_is_said_of_where_side_0_points():
-    sides = np.random.default_rng(0).normal(size=(3, 2, 8))
+    azimuth_bins = np.random.default_rng(0).normal(size=(3, 2, 8))
     azimuth = np.array([0.0, 0.25, -0.5])
-    pointing = reorient(sides, azimuth)
-    for look, step in enumerate((0, 2, -4)):
-        for side in range(8):  # from azimuth a side s is seen if side 0 points to a - s
-            np.testing.assert_array_equal(pointing[look, :, (step - side) % 8], sides[look, :, side])
-    np.testing.assert_array_equal(reorient(pointing, azimuth), sides)
+    pointing = reorient(azimuth_bins, azimuth)
+    for observation, step in enumerate((0, 2, -4)):
+        for side in range(8):  # from azimuth a side s is seen if azimuth bin 0 points to a - s
+            np.testing.assert_array_equal(
+                pointing[observation, :, (step - side) % 8], azimuth_bins[observation, :, side]
+            )
+    np.testing.assert_array_equal(reorient(pointing, azimuth), azimuth_bins)
 
 
 def test_between_two_steps_what_is_said_of_sides_is_interpolated():
-    sides = np.random.default_rng(0).normal(size=(1, 3, 4))
-    between = reorient(sides, np.array([0.375]))  # one and a half of four steps
-    np.testing.assert_allclose(between, (reorient(sides, np.array([0.25])) + reorient(sides, np.array([0.5]))) / 2)
+    azimuth_bins = np.random.default_rng(0).normal(size=(1, 3, 4))
+    between = reorient(azimuth_bins, np.array([0.375]))  # one and a half of four steps
+    np.testing.assert_allclose(
+        between, (reorient(azimuth_bins, np.array([0.25])) + reorient(azimuth_bins, np.array([0.5]))) / 2
+    )
 
 
-def some_looks(looks, classes=3, sides=8):
-    rng = np.random.default_rng(looks)
-    likely = log_softmax(2 * rng.normal(size=(looks, classes, sides)), axis=2)
-    return rng.normal(size=(looks, classes)), likely, rng.integers(0, 8, looks)
+def some_views(n_views, classes=3, azimuth_bins=8):
+    rng = np.random.default_rng(n_views)
+    likely = log_softmax(2 * rng.normal(size=(n_views, classes, azimuth_bins)), axis=2)
+    return rng.normal(size=(n_views, classes)), likely, rng.integers(0, 8, n_views)
 
 
-@pytest.mark.parametrize("looks", [1, 2, 5])
-def test_looks_that_agree_on_the_side_are_believed_as_bayes_would(looks):
+@pytest.mark.parametrize("n_views", [1, 2, 5])
+def test_looks_that_agree_on_the_side_are_believed_as_bayes_would(n_views):
     """Independent looks at an object of which neither class nor azimuth is known, each as likely as any other."""
-    logits, sides, azimuth = some_looks(looks)
-    belief = Calibration(0.7, 0.0, side_correlation=0.0).belief(additive(logits, sides, azimuth / 8).sum(0), looks, 3)
+    logits, azimuth_bins, azimuth = some_views(n_views)
+    belief = Calibration(0.7, 0.0, bin_correlation=0.0).belief(
+        log_evidence_of(logits, azimuth_bins, azimuth / 8).sum(0), n_views, 3
+    )
     joint = np.zeros((3, 8))
     for c in range(3):
         for zero in range(8):
-            seen = [sides[k, c, (azimuth[k] - zero) % 8] for k in range(looks)]
+            seen = [azimuth_bins[k, c, (azimuth[k] - zero) % 8] for k in range(n_views)]
             joint[c, zero] = np.exp((logits[:, c] / 0.7).sum() + np.sum(seen))
     np.testing.assert_allclose(belief, joint.sum(1) / joint.sum())
-    if looks == 1:  # one look has nothing to agree with
+    if n_views == 1:  # one view has nothing to agree with
         np.testing.assert_allclose(belief, softmax(logits[0] / 0.7))
 
 
 def test_correlated_looks_agree_less_and_the_world_may_be_turned():
-    logits, sides, azimuth = some_looks(4)
-    calibration = Calibration(0.7, 0.5, side_correlation=0.2)
-    turned = [calibration.belief(additive(logits, sides, (azimuth + by) % 8 / 8).sum(0), 4, 3) for by in (0, 3)]
+    logits, azimuth_bins, azimuth = some_views(4)
+    calibration = Calibration(0.7, 0.5, bin_correlation=0.2)
+    turned = [
+        calibration.belief(log_evidence_of(logits, azimuth_bins, (azimuth + by) % 8 / 8).sum(0), 4, 3) for by in (0, 3)
+    ]
     np.testing.assert_allclose(*turned)
-    pointing = reorient(sides, azimuth / 8).sum(0) / 1.6
+    pointing = reorient(azimuth_bins, azimuth / 8).sum(0) / 1.6
     expected = softmax(logits.sum(0) / (0.7 * 2.5) + np.log(np.exp(pointing).sum(1)))
     np.testing.assert_allclose(turned[0], expected)
-    both = np.stack([additive(logits, sides, azimuth / 8)[:k].sum(0) for k in (2, 4)])
+    both = np.stack([log_evidence_of(logits, azimuth_bins, azimuth / 8)[:k].sum(0) for k in (2, 4)])
     np.testing.assert_allclose(calibration.belief(both, np.array([2, 4]), 3)[1], expected)
 
 
 def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
-    logits, sides, azimuth = some_looks(3)
-    total = additive(logits, sides, azimuth / 8).sum(0)
+    logits, azimuth_bins, azimuth = some_views(3)
+    total = log_evidence_of(logits, azimuth_bins, azimuth / 8).sum(0)
     for calibration in (Calibration(), Calibration(0.7, 0.5)):
-        np.testing.assert_allclose(calibration.belief(total, 3, 3), fuse(logits, calibration.temperature(3)))
-    np.testing.assert_array_equal(additive(logits, None, azimuth / 8), logits)
+        np.testing.assert_allclose(calibration.belief(total, 3, 3), fuse(logits, calibration.temperature_after(3)))
+    np.testing.assert_array_equal(log_evidence_of(logits, None, azimuth / 8), logits)
     with pytest.raises(ValueError, match="not a finite number"):
         Calibration().belief(total + np.nan, 3, 3)
 
 
 def test_the_correlation_of_sides_is_kept_with_the_calibration():
-    calibration = Calibration(0.7, 0.5, side_correlation=0.2)
+    calibration = Calibration(0.7, 0.5, bin_correlation=0.2)
     assert Calibration.of_facts(json.loads(json.dumps(calibration.facts()))) == calibration
     with pytest.raises(ValueError, match="no calibration"):
-        Calibration(side_correlation=-0.1)
+        Calibration(bin_correlation=-0.1)

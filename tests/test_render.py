@@ -14,7 +14,7 @@ import trimesh
 from nextview.data.folders import list_dataset
 from nextview.data.lock import only_one
 from nextview.data.pool import WorkerDied, each
-from nextview.data.render import Deform, render
+from nextview.data.rendering import Deform, render
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.viewsphere import ViewSphere
@@ -24,7 +24,7 @@ SIZE = 64
 SCRIPT = """
 import multiprocessing, os, signal, sys
 from pathlib import Path
-from nextview.data.render import render
+from nextview.data.rendering import render
 from nextview.viewsphere import ViewSphere
 dataset, path, victim = sys.argv[1:]
 for n, _ in enumerate(render(Path(dataset), Path(path), ViewSphere.named("12"), 64, workers=2), 1):
@@ -206,7 +206,7 @@ def test_identical_meshes_are_known_by_their_bytes(tmp_path):
     (meshes / "box/train/twin.off").write_bytes((meshes / "ball/train/thing_01.off").read_bytes())
     list(render(meshes, tmp_path / "views.zarr", SPHERE, SIZE, workers=0))
     store = ViewStore.open(tmp_path / "views.zarr")
-    assert [{store.names[i] for i in group} for group in store.twins] == [{"thing_01", "twin"}]
+    assert [{store.names[i] for i in group} for group in store.duplicates] == [{"thing_01", "duplicate"}]
 
 
 def test_a_box_is_stored_as_it_is_seen(tmp_path):

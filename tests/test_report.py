@@ -129,7 +129,7 @@ def test_the_tables_show_the_numbers_of_the_results(made):
         cells = re.findall(r"<td>([\d.]+)", row)
         of = summary.query("policy == @policy and threshold == 0.97").set_index("measure")["value"]
         assert cells[:4] == [f"{of[m]:.3f}" for m in ("accuracy", "clean_accuracy", "class_accuracy")] + [
-            f"{of['looks']:.2f}"
+            f"{of['n_views']:.2f}"
         ]
 
 
@@ -147,9 +147,9 @@ def test_of_a_crowd_the_curves_show_the_reference_the_best_eight_and_two_oracles
     assert (len(shown), len(best), len(left)) == (11, 8, 4)
     assert min(of[list(best)]) >= max(of[list(left)])
     assert headline_policy(crowd, 0.97) in best
-    assert drawn(curves.threshold_curve(crowd)) == drawn(curves.budget_curve(crowd, "looks")) == shown
-    looks = [curves.look_of(name, crowd) for name in shown]
-    assert len({(look["color"], look["linestyle"]) for look in looks}) == len(shown)
+    assert drawn(curves.threshold_curve(crowd)) == drawn(curves.budget_curve(crowd, "n_views")) == shown
+    n_views = [curves.look_of(name, crowd) for name in shown]
+    assert len({(observation["color"], observation["linestyle"]) for observation in n_views}) == len(shown)
     rows = [label.get_text() for label in curves.class_differences(crowd, 0.97).axes[0].get_yticklabels()]
     assert rows == [name for name in shown if name not in ("random", "oracle-gain")]
 

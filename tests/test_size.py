@@ -1,7 +1,6 @@
 """How large an object is counts for its class where it is known, and nowhere else."""
 
 import json
-import runpy
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -13,24 +12,23 @@ from scipy.stats import norm
 from tests.test_predictions import some_predictions
 from tiny_models import make_recogniser
 
+from nextview.calibration.fitting_set import FittingSet
+from nextview.calibration.size_density import ANY_SIZE, RADII, densities, fit_weight
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.cli.main import main
 from nextview.cli.recognise import Unit
-from nextview.data.predict import predict
+from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
-from nextview.data.render import Deform, render
+from nextview.data.rendering import Deform, render
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, MeshError, ModelError, PredictionsError
-from nextview.fitting.evidence import FittingSet
-from nextview.fitting.size import ANY_SIZE, RADII, densities, fit_weight
 from nextview.mesh import UNITS, load_mesh
-from nextview.models.card import read_card
-from nextview.models.networks import Recogniser
-from nextview.models.size import SizeEvidence
+from nextview.models.inference import Recogniser
+from nextview.models.model_card import read_card
+from nextview.models.size_evidence import SizeEvidence
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("40")
-BENCHMARK = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "size.py"))
 CLASSES = ["big", "small"]
 
 
@@ -93,7 +91,7 @@ def test_the_weight_is_the_most_likely_one():
 
 
 def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
-    views, card, honest = str(shop / "views.zarr"), str(shop / "tiny.json"), str(tmp_path / "honest.npz")
+    views, card, honest = str(shop / "views.zarr"), str(shop / "tiny.json"), str(tmp_path / "held-out.npz")
     assert np.isnan(ViewStore.open(views).radii).all()
     main(["predict", views, honest, "--unseen", "--recogniser", card, "--maps"])
     with pytest.raises(SystemExit):
@@ -123,11 +121,11 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
 
     recogniser = Recogniser(card)
     path = shop / "meshes/small/test/small_7.off"
-    looks = [SimulatedCamera(load_mesh(path, unit=unit), 32).observe(SPHERE.poses[9]) for unit in ("cm", None)]
-    assert [look.radius for look in looks] == [pytest.approx(radii["small_7"]), None]
+    n_views = [SimulatedCamera(load_mesh(path, unit=unit), 32).observe(SPHERE.poses[9]) for unit in ("cm", None)]
+    assert [observation.radius for observation in n_views] == [pytest.approx(radii["small_7"]), None]
     row = known.names.index("small_7")
-    said = recogniser(looks).logits
-    np.testing.assert_allclose(said, [known.logits[row, 9], by_shape.logits[row, 9]], atol=2e-3)  # depth is rounded
+    found = recogniser(n_views).logits
+    np.testing.assert_allclose(found, [known.logits[row, 9], by_shape.logits[row, 9]], atol=2e-3)  # depth is rounded
     strange = tmp_path / "strange.npz"
     replace(Predictions.load(honest), names=("a", "b", "c", "d")).save(strange)
     with pytest.raises(SystemExit):
@@ -144,9 +142,9 @@ def test_a_stretched_mesh_keeps_its_size(shop, tmp_path):
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, np.nan, np.inf])
 def test_a_radius_is_a_positive_number(shop, radius):
-    look = SimulatedCamera(load_mesh(shop / "meshes/big/test/big_7.off"), 32).observe(SPHERE.poses[0])
+    observation = SimulatedCamera(load_mesh(shop / "meshes/big/test/big_7.off"), 32).observe(SPHERE.poses[0])
     with pytest.raises(ValueError, match="a positive number of metres, or None"):
-        replace(look, radius=radius)
+        replace(observation, radius=radius)
 
 
 def test_a_unit_is_one_of_a_few(shop):
@@ -183,17 +181,3 @@ def test_predictions_keep_what_the_size_said(tmp_path):
     np.testing.assert_allclose(p.by_shape().logits, p.logits - of_size[:, None])
     with pytest.raises(PredictionsError, match="of_size"):
         replace(p, of_size=of_size[:5])
-
-
-def test_the_benchmark_compares_with_and_without(tmp_path, capsys):
-    p = some_predictions(40)
-    of_size = (100.0 * np.eye(3)[p.labels]).astype(np.float32)
-    rows = list(BENCHMARK["lines"](replace(p, logits=p.logits + of_size[:, None], of_size=of_size)))
-    assert all("| 1.000 (1.000) |" in row for row in rows[2:9])
-    share = (p.logits.argmax(2) == p.labels[:, None]).mean()
-    assert rows[2].startswith(f"| 1 | {share:.3f} (")
-    assert f"| {100 * (1 - share):+.1f} (" in rows[2]
-    assert rows[-1].startswith("| pillar | ")
-    p.save(tmp_path / "p.npz")
-    with pytest.raises(ValueError, match="nothing is said of sizes"):
-        BENCHMARK["main"](tmp_path / "p.npz")

@@ -8,10 +8,10 @@ import pytest
 import trimesh
 
 from nextview.cli.main import main
-from nextview.data.check import check
+from nextview.data.checking import check
 from nextview.data.correspond import correspond
-from nextview.data.measure import measure
-from nextview.data.render import render
+from nextview.data.measuring import measure
+from nextview.data.rendering import render
 from nextview.data.store import RENDERED, ViewStore
 from nextview.errors import DatasetError
 from nextview.measures.registry import MEASURES
@@ -105,10 +105,10 @@ def refused(capsys, *arguments) -> str:
     with pytest.raises(SystemExit) as end:
         main([str(a) for a in arguments])
     assert end.value.code == 2
-    *before, said = capsys.readouterr().err.strip().splitlines()
+    *before, message = capsys.readouterr().err.strip().splitlines()
     assert all("/3 " in line for line in before)
-    assert said.startswith("nextview: ")
-    return said
+    assert message.startswith("nextview: ")
+    return message
 
 
 @pytest.mark.parametrize("name", RENDERED)
@@ -142,9 +142,9 @@ def test_inspect_draws_what_is_there(views, capsys):
     main(["inspect", str(views), str(picture), "--object", "b"])
     shutil.rmtree(views / "image")
     main(["inspect", str(views), str(picture)])
-    said = " ".join(capsys.readouterr().err.split())
-    assert "arrays that are missing image, measures/depth_entropy" in said
-    assert "per view depth" in said
+    message = " ".join(capsys.readouterr().err.split())
+    assert "arrays that are missing image, measures/depth_entropy" in message
+    assert "per view depth" in message
     assert "the array image is missing" in refused(capsys, "inspect", views, picture, "--object", "b")
     shutil.rmtree(views / "status")
     assert "the array status is missing" in refused(capsys, "inspect", views, picture)
@@ -153,8 +153,8 @@ def test_inspect_draws_what_is_there(views, capsys):
 def test_a_damaged_object_is_named(views, capsys):
     flip_a_byte(chunk(views, "depth", 1))
     for command in (["measure", views, "max_depth"], ["inspect", views, views.parent / "b.png", "--object", "b"]):
-        said = refused(capsys, *command) if command[0] == "inspect" else refused(capsys, *command, "--workers", 1)
-        assert "depth of b cannot be read" in said
+        message = refused(capsys, *command) if command[0] == "inspect" else refused(capsys, *command, "--workers", 1)
+        assert "depth of b cannot be read" in message
 
 
 @pytest.mark.parametrize("place", ["zarr.json", "depth/zarr.json"])
@@ -162,10 +162,10 @@ def test_a_damaged_object_is_named(views, capsys):
 def test_damaged_attributes_are_one_sentence(views, capsys, place, content):
     (views / place).write_text(content)
     for command in (["check", views], ["measure", views], ["inspect", views, views.parent / "b.png", "--object", "b"]):
-        said = refused(capsys, *command)
-        assert str(views) in said
+        message = refused(capsys, *command)
+        assert str(views) in message
         expected = "not a view store" if content == "{}" else "zarr.json cannot be read"
-        assert (expected if place == "zarr.json" else "depth cannot be opened") in said
+        assert (expected if place == "zarr.json" else "depth cannot be opened") in message
 
 
 def test_arrays_of_another_length_are_refused(views):
@@ -187,5 +187,5 @@ def test_a_store_without_hashes_and_failures_is_still_read(views):
     kept = {k: v for k, v in store.group.attrs.items() if k not in ("sha256", "failures")}
     store.group.attrs.put(kept)
     old = ViewStore.open(views)
-    assert (old.failures, old.twins) == ({}, [])
+    assert (old.failures, old.duplicates) == ({}, [])
     assert list(render(views.parent / "meshes", views, SPHERE, 48, workers=0)) == []

@@ -21,17 +21,17 @@ from nextview.cli.presets import with_preset  # noqa: E402
 from nextview.cli.train import train_recogniser  # noqa: E402
 from nextview.data.folders import Entry  # noqa: E402
 from nextview.data.lock import only_one  # noqa: E402
-from nextview.data.split import split_training  # noqa: E402
+from nextview.data.splits import split_training  # noqa: E402
 from nextview.data.store import DONE, ViewStore  # noqa: E402
 from nextview.errors import DatasetError, ModelError  # noqa: E402
-from nextview.models.card import find_card  # noqa: E402
 from nextview.models.image_input import image_input  # noqa: E402
-from nextview.models.networks import RECOGNISER  # noqa: E402
+from nextview.models.inference import RECOGNISER  # noqa: E402
+from nextview.models.model_card import bundled_cards, find_card  # noqa: E402
+from nextview.training.architectures import ResNet  # noqa: E402
 from nextview.training.grid import published_cells  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
-from nextview.training.networks import ResNet  # noqa: E402
 from nextview.training.packed import load_packed, pack, save_packed  # noqa: E402
-from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe  # noqa: E402
+from nextview.training.recipes import THESIS_RECOGNISER, MapRecipe, RecogniserRecipe  # noqa: E402
 from nextview.training.recogniser import RecogniserModule, Source, ValidationViews, Views, augment  # noqa: E402
 from nextview.training.runs import begin  # noqa: E402
 from nextview.viewsphere import ViewSphere  # noqa: E402
@@ -80,7 +80,7 @@ def test_the_published_recipe_sees_every_view_once_an_epoch_in_a_new_order():
 
 
 def test_networks_to_be_averaged_draw_apart():
-    first, again, other = (drawn(views_of(RecogniserRecipe(member=k, batch=5))) for k in (0, 0, 1))
+    first, again, other = (drawn(views_of(RecogniserRecipe(ensemble_seed=k, batch=5))) for k in (0, 0, 1))
     assert first == again
     assert first != other
 
@@ -97,10 +97,10 @@ def test_balanced_draws_even_out_the_classes():
 
 def test_deformed_twins_may_have_fewer_views_and_each_gets_its_share():
     own = np.zeros((6, 40, 1, 1, 1), np.uint8)
-    twins = [np.full((3, 20, 1, 1, 1), k, np.uint8) for k in (1, 2)]
+    duplicates = [np.full((3, 20, 1, 1, 1), k, np.uint8) for k in (1, 2)]
     row = np.array([0, 1, 2, -1, -1, -1])
     recipe = RecogniserRecipe(views=2000, batch=50, deformed_share=0.5)
-    sources = [Source(own, np.arange(6)), *(Source(twin, row) for twin in twins)]
+    sources = [Source(own, np.arange(6)), *(Source(duplicate, row) for duplicate in duplicates)]
     views = Views(sources, np.arange(3), np.zeros(6, int), recipe)
     found = np.concatenate([images.numpy().ravel() for images, _ in views])
     assert np.bincount(found) / len(found) == pytest.approx([0.5, 0.25, 0.25], abs=0.03)
@@ -196,42 +196,42 @@ def test_the_published_rate_halves_every_fifth_epoch():
 def test_the_published_optimiser_is_adam():
     torch.manual_seed(0)
     module = RecogniserModule(replace(THESIS_RECOGNISER, depth=18), 10, 1000)
-    twin = RecogniserModule(replace(THESIS_RECOGNISER, depth=18), 10, 1000)
-    twin.load_state_dict(module.state_dict())
+    duplicate = RecogniserModule(replace(THESIS_RECOGNISER, depth=18), 10, 1000)
+    duplicate.load_state_dict(module.state_dict())
     for network, optimizer in (
         (module.net, module.configure_optimizers()["optimizer"]),
-        (twin.net, torch.optim.Adam(twin.net.parameters(), lr=1e-3)),
+        (duplicate.net, torch.optim.Adam(duplicate.net.parameters(), lr=1e-3)),
     ):
         for _ in range(2):
             for k, parameter in enumerate(network.parameters()):
                 parameter.grad = torch.full_like(parameter, 0.1 * (k % 3 - 1)) + parameter.detach()
             optimizer.step()
-    for ours, theirs in zip(module.net.parameters(), twin.net.parameters(), strict=True):
+    for ours, theirs in zip(module.net.parameters(), duplicate.net.parameters(), strict=True):
         assert torch.allclose(ours, theirs, atol=1e-7)
 
 
 def test_the_published_recipe_is_what_the_thesis_says():
-    published = {"depth": 34, "size": 224, "batch": 32, "rate": 1e-3, "input": "image", "views": 40}
+    published = {"depth": 34, "size": 224, "batch": 32, "lr": 1e-3, "input": "image", "views": 40}
     ours = asdict(THESIS_RECOGNISER)
     assert {name: ours[name] for name in published} == published
-    assert (ours["decay"], ours["smoothing"], ours["augment"], ours["balanced"]) == (0, 0, False, False)
+    assert (ours["weight_decay"], ours["smoothing"], ours["augment"], ours["balanced"]) == (0, 0, False, False)
 
 
 def test_augmented_background_stays_empty():
     torch.manual_seed(0)
     x = torch.zeros(8, 1, 32, 32)
-    assert augment(x, 32)[0].abs().max() == 0
+    assert augment(x)[0].abs().max() == 0
     x[:, :, 8:24, 8:24] = 0.5
-    y, _ = augment(x, 16)
-    assert y.shape == (8, 1, 16, 16)
-    assert (y[:, :, 8, 8] > 0).float().mean() > 0.5
+    y, _ = augment(x)
+    assert y.shape == x.shape
+    assert (y[:, :, 16, 16] > 0).float().mean() > 0.5
 
 
 def test_augment_says_which_views_it_mirrored():
     torch.manual_seed(0)
     x = torch.zeros(64, 1, 32, 32)
     x[:, :, :, 4:12] = 0.5  # something on the left
-    y, mirrored = augment(x, 32)
+    y, mirrored = augment(x)
     on_the_right = y[..., 16:].sum((1, 2, 3)) > y[..., :16].sum((1, 2, 3))
     assert torch.equal(on_the_right, mirrored)
     assert 16 < mirrored.sum() < 48
@@ -313,13 +313,13 @@ def test_one_fold_alone_starts_from_weights(store, tmp_path, capsys):
     state["conv1.weight"] = torch.zeros(64, 3, 7, 7)
     torch.save(state, tmp_path / "zeros.pth")
     command = ["train", "recogniser", str(store), str(tmp_path / "out"), "--folds", "2", "--weights"]
-    main([*command, str(tmp_path / "zeros.pth"), "--fold", "1", "--rate", "0", *FAST])
+    main([*command, str(tmp_path / "zeros.pth"), "--fold", "1", "--lr", "0", *FAST])
     assert [path.name for path in (tmp_path / "out").iterdir() if path.is_dir()] == ["fold1"]
     trained = torch.load(tmp_path / "out/fold1/network.pt", weights_only=True)
     assert not trained["layer4.1.conv2.weight"].any()  # a rate of 0 leaves the weights that it was given
     (tmp_path / "others.pth").write_bytes((tmp_path / "zeros.pth").read_bytes() + b" ")
     for options, message in (
-        ([str(tmp_path / "others.pth"), "--fold", "1", "--rate", "0"], "started from other weights"),
+        ([str(tmp_path / "others.pth"), "--fold", "1", "--lr", "0"], "started from other weights"),
         ([str(tmp_path / "missing.pth"), "--fold", "0"], "there is no such checkpoint"),
         ([str(tmp_path / "zeros.pth"), "--fold", "2"], "there is no fold 2 of 2"),
     ):
@@ -410,10 +410,13 @@ def test_two_devices_train_one_network(store, tmp_path):
 
 
 GUIDE = (Path(__file__).parent.parent / "docs/training.md").read_text()
+TRAINED = {name: card.facts["training"] for name, card in bundled_cards().items()}
+COMMAND_LINES = [*re.findall(r"^nextview .*?(?=  +#|$)", GUIDE, re.M)]
+COMMAND_LINES += [line for training in TRAINED.values() for line in training["commands"]]
 
 
-@pytest.mark.parametrize("line", re.findall(r"^nextview .*?(?=  +#|$)", GUIDE, re.M))
-def test_the_guide_names_commands_and_options_that_exist(line, capsys):
+@pytest.mark.parametrize("line", dict.fromkeys(COMMAND_LINES))
+def test_the_guide_and_the_cards_name_commands_and_options_that_exist(line, capsys):
     words = line.split()
     command = words[1:3] if isinstance(COMMANDS[words[1]], dict) else words[1:2]
     with pytest.raises(SystemExit):
@@ -421,3 +424,11 @@ def test_the_guide_names_commands_and_options_that_exist(line, capsys):
     offered = capsys.readouterr().out
     for option in re.findall(r"--[a-z-]+", line):
         assert option == "--help" or f"{option} " in offered, f"{option} is no option of {command}"
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_the_recipes_of_the_cards_are_recipes_of_this_version(name):
+    training = TRAINED[name]
+    kind = RecogniserRecipe if "recipes" in training else MapRecipe
+    for noted in training.get("recipes") or [training["recipe"]]:
+        assert asdict(kind(**noted)) == noted

@@ -12,34 +12,33 @@ import numpy as np
 import onnxruntime as ort
 import pytest
 from scipy.special import softmax
-from tests.test_lite import LITE2, checkpoint
+from tests.test_lite import checkpoint
 from tests.test_readme import write_off
 
+from nextview.calibration.valleys import valley_gains
 from nextview.cli.main import main
-from nextview.data import split
+from nextview.data import splits
+from nextview.data.input_views import input_views
 from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
-from nextview.data.seen import seen_views
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError
-from nextview.fitting.valleys import valley_gains
-from nextview.models.networks import MapNetwork, Recogniser
+from nextview.models.inference import MapNetwork, Recogniser
 from nextview.observation import Observation
 from nextview.viewsphere import ViewSphere
 
 torch = pytest.importorskip("torch")
 
 from nextview.benchmark.scores import map_scores, recogniser_scores  # noqa: E402
-from nextview.models.card import find_card  # noqa: E402
-from nextview.training.export import export_onnx, fit_temperature  # noqa: E402
+from nextview.models.model_card import find_card  # noqa: E402
+from nextview.training.architectures import PointNet, ResNet, orthogonality  # noqa: E402
+from nextview.training.checkpoints import load_exported, load_run  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.lite import LiteNet  # noqa: E402
-from nextview.training.maps import MapModule, Windows  # noqa: E402
-from nextview.training.merge import merge  # noqa: E402
-from nextview.training.networks import PointNet, ResNet, orthogonality  # noqa: E402
+from nextview.training.map_training import MapModule, Windows  # noqa: E402
+from nextview.training.onnx_export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
-from nextview.training.weights import load_exported, load_run  # noqa: E402
 
 
 def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
@@ -72,7 +71,7 @@ def test_export_keeps_the_answers(tmp_path):
     torch.manual_seed(0)
     network = ResNet(18, 5, 4).eval()
     x = torch.rand(2, 4, 64, 64)
-    export_onnx(network, x.numpy(), "input", ["logits", "features"], tmp_path / "net.onnx")
+    export_onnx(network, x.numpy(), "input", ["logits"], tmp_path / "net.onnx")
     assert [p.name for p in tmp_path.iterdir()] == ["net.onnx"]
     session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
     more = torch.rand(3, 4, 64, 64)  # another batch size than the example's
@@ -130,12 +129,12 @@ def trained(tmp_path_factory):
     table = boxes_mesh(SAMPLES["table"](), "table")
     for name, scale in (("table_small", 1), ("table_larger", 2)):
         write_off(root / "meshes/table/train" / f"{name}.off", replace(table, vertices=scale * table.vertices))
-    twin = root / "meshes/table/train/table_0.off"
-    (root / "meshes/monitor/train/monitor_twin.off").write_bytes(twin.read_bytes())
+    duplicate = root / "meshes/table/train/table_0.off"
+    (root / "meshes/monitor/train/monitor_twin.off").write_bytes(duplicate.read_bytes())
     store, runs, models = root / "views.zarr", root / "runs", root / "models"
     small = ["--epochs", "2", "--views", "4", "--batch", "8", "--validation", "0.25"]
     main(["render", str(root / "meshes"), str(store), "--workers", "1"])
-    main(["train", "recogniser", str(store), str(runs / "recogniser"), *small, "--side", "0.3"])
+    main(["train", "recogniser", str(store), str(runs / "recogniser"), *small, "--azimuth-bins-weight", "0.3"])
     main(["export", "recogniser", str(runs / "recogniser"), str(store), str(models), "--name", "tiny"])
     main(["train", "lem", str(store), str(runs / "lem"), *small])
     main(["export", "lem", str(runs / "lem"), str(store), str(models), "--name", "tiny-lem"])
@@ -145,23 +144,23 @@ def trained(tmp_path_factory):
 def test_split_keeps_twins_together_and_test_objects_out(trained):
     store = ViewStore.open(trained / "views.zarr")
     for seed in range(6):
-        training, validation = split.split_training(store, 0.25, seed)
+        training, validation = splits.split_training(store, 0.25, seed)
         assert not set(training) & set(validation)
-        assert set(training) | set(validation) | set(split.test_objects(store)) == set(range(len(store)))
+        assert set(training) | set(validation) | set(splits.test_objects(store)) == set(range(len(store)))
         assert (store.splits[[*training, *validation]] == "train").all()
-        twins = [store.names.index(name) for name in ("table_0", "monitor_twin")]
-        assert np.isin(twins, validation).sum() in (0, 2)
+        duplicates = [store.names.index(name) for name in ("table_0", "monitor_twin")]
+        assert np.isin(duplicates, validation).sum() in (0, 2)
         assert set(store.labels[validation]) == {0, 1}
         copies = np.isin([store.names.index(name) for name in ("table_small", "table_larger")], validation)
         assert copies.all() == copies.any()
-        judging = split.each_shape_once(store, validation)  # the twin has another label
+        judging = splits.deduplicate(store, validation)  # the twin has another label
         assert len(judging) == len(validation) - copies.all()
 
 
 def test_a_shape_that_was_copied_judges_training_once(trained, tmp_path, monkeypatch):
     store = ViewStore.open(trained / "views.zarr")
     copy = store.names.index("table_larger")
-    seed = next(s for s in range(99) if copy in split.split_training(store, 0.25, s)[1])
+    seed = next(s for s in range(99) if copy in splits.split_training(store, 0.25, s)[1])
 
     class Judged(Exception):
         pass
@@ -183,27 +182,14 @@ def test_trained_models_have_cards_and_run(trained):
     assert card["classes"] == ["monitor", "table"]
     assert {part.split()[0] for part in card["scores"]} == {"validation"}  # training leaves the test split alone
     recogniser = Recogniser(trained / "models/tiny.json")
-    said = recogniser.from_inputs(np.zeros((3, 4, 112, 112), np.uint8))
-    assert said.logits.shape == (3, 2)
-    assert said.features.shape == (3, 512)
-    assert card["sides"] == recogniser.sides == 8
-    assert np.exp(said.sides).sum(2) == pytest.approx(np.ones((3, 2)), abs=1e-4)
+    output = recogniser.from_inputs(np.zeros((3, 4, 112, 112), np.uint8))
+    assert output.logits.shape == (3, 2)
+    assert card["azimuth_bins"] == recogniser.azimuth_bins == 8
+    assert np.exp(output.azimuth_bins).sum(2) == pytest.approx(np.ones((3, 2)), abs=1e-4)
     lem = MapNetwork(trained / "models/tiny-lem.json").from_inputs(np.zeros((2, 4, 56, 56), np.uint8))
     assert lem["lem"].shape == (2, 5, 3)
     assert lem["lem-sphere"].shape == (2, 5, 8)
     assert (lem["lem"] == lem["lem-sphere"][:, :, [-1, 0, 1]]).all()
-
-
-def test_a_mirrored_view_has_the_mirrored_map(trained):
-    run, store = trained / "runs/lem", trained / "views.zarr"
-    options = ["--mirror", "--bits", "8", "--name", "both"]
-    main(["export", "lem", str(run), str(store), str(trained / "models"), *options])
-    network = MapNetwork(trained / "models/both.json")
-    seen = seen_views(ViewStore.open(store), 0, "geometry", 56)
-    maps, flipped = (network.from_inputs(np.ascontiguousarray(views)) for views in (seen, seen[..., ::-1]))
-    assert np.abs(maps["lem"] - flipped["lem"][..., ::-1]).max() < 1e-5
-    assert np.abs(maps["lem"] - maps["lem"][..., ::-1]).max() > 1e-4  # or nothing would be tested
-    assert np.abs(maps["lem-sphere"] - flipped["lem-sphere"][..., -np.arange(8) % 8]).max() < 1e-5
 
 
 def test_the_published_map_network_trains_on_clouds_and_predicts_the_window(trained):
@@ -212,7 +198,7 @@ def test_the_published_map_network_trains_on_clouds_and_predicts_the_window(trai
     recipe = json.loads((run / "recipe.json").read_text())
     assert (recipe["input"], recipe["batch"], recipe["schedule"]) == ("cloud", 16, "tenth")
     main(["export", "lem", str(run), store, str(trained / "models"), "--name", "published"])
-    cloud = seen_views(ViewStore.open(trained / "views.zarr"), 0, "cloud", 0)[:2]
+    cloud = input_views(ViewStore.open(trained / "views.zarr"), 0, "cloud", 0)[:2]
     assert {k: v.shape for k, v in MapNetwork(trained / "models/published.json").from_inputs(cloud).items()} == {
         "lem": (2, 5, 3)
     }
@@ -272,7 +258,7 @@ def test_two_devices_train_one_map_network(trained, tmp_path):
     assert "MEMBER: 2/2" in done.stderr
     assert (run / "network.pt").exists()
     state = torch.load(run / "last.ckpt", weights_only=True)
-    training, _ = split.split_training(ViewStore.open(trained / "views.zarr"), 0.25, 0)
+    training, _ = splits.split_training(ViewStore.open(trained / "views.zarr"), 0.25, 0)
     assert state["global_step"] == 2 * (len(training) * 4 // 8)  # the batch is that of both together
     assert len((run / "log/metrics.csv").read_text().splitlines()) == 3
 
@@ -284,15 +270,15 @@ def within_one_cell(at, other):
 @pytest.mark.parametrize("reach", [0, 1])
 def test_the_peak_weighs_in_which_cell_of_the_window_is_highest(monkeypatch, reach):
     rng, sphere = np.random.default_rng(0), ViewSphere.named("40")
-    said, true = rng.random((2, 4, 5, 8)).astype(np.float32)
+    output, true = rng.random((2, 4, 5, 8)).astype(np.float32)
     module = MapModule(MapRecipe(peak=0.3, sharpness=0.1, reach=reach), sphere, 1)
-    monkeypatch.setattr(module, "forward", lambda seen: (torch.from_numpy(said),))
+    monkeypatch.setattr(module, "forward", lambda seen: (torch.from_numpy(output),))
     monkeypatch.setattr(module, "log", lambda *args, **options: None)
     loss = module.training_step((torch.zeros(4), torch.from_numpy(true)), 0)
-    near, goal = (values[:, :, [-1, 0, 1]].reshape(4, 15) for values in (said, true))
+    near, goal = (values[:, :, [-1, 0, 1]].reshape(4, 15) for values in (output, true))
     counts = [[k == best or (reach and within_one_cell(k, best)) for k in range(15)] for best in goal.argmax(1)]
     chance = (softmax(near / 0.1, 1) * counts).sum(1)
-    squared = (((near - goal) ** 2).mean() + ((said - true) ** 2).mean()) / 2
+    squared = (((near - goal) ** 2).mean() + ((output - true) ** 2).mean()) / 2
     assert loss.item() == pytest.approx(squared - 0.3 * np.log(chance).mean(), rel=1e-5)
 
 
@@ -310,13 +296,13 @@ def test_a_finished_run_is_not_trained_again(trained):
 def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
     store, runs, models = trained / "views.zarr", trained / "runs", trained / "models"
     small = ["--epochs", "1", "--views", "2", "--batch", "8", "--validation", "0.25"]
-    main(["train", "recogniser", str(store), str(runs / "folds"), "--folds", "2", "--small-epochs", "1", *small])
+    main(["train", "recogniser", str(store), str(runs / "folds"), "--folds", "2", *small])
     unseen = []
     for k in range(2):
         main(["export", "recogniser", str(runs / f"folds/fold{k}"), str(store), str(models), "--name", f"fold{k}"])
         unseen.append(set(json.loads((models / f"fold{k}.json").read_text())["unseen"]))
     views = ViewStore.open(store)
-    training, validation = split.split_training(views, 0.25, 0)
+    training, validation = splits.split_training(views, 0.25, 0)
     assert unseen[0] | unseen[1] == {views.names[i] for i in [*training, *validation]}
     assert unseen[0] & unseen[1] == {views.names[i] for i in validation}
     out = trained / "unseen.npz"
@@ -346,7 +332,7 @@ def test_valley_classes_are_fitted_to_objects_that_neither_network_has_seen(trai
     cards = ["--maps", f"lem={card}", "--recogniser", str(models / "tiny.json"), "--workers", "1"]
     main(["predict", store, str(out), "--unseen", *cards])
     main(["fit", "valleys", str(out), str(card)])
-    facts, p = json.loads(card.read_text()), Predictions.load(out).each_shape_once()
+    facts, p = json.loads(card.read_text()), Predictions.load(out).deduplicate()
     gains = valley_gains(p.sphere, p.logits, p.maps["lem"], p.labels)
     assert facts["valley_classes"] == [p.classes[c] for c, gain in gains.items() if gain > 0]
     assert facts["valley_gain"] == {p.classes[c]: round(gain, 4) for c, gain in gains.items()}
@@ -368,13 +354,11 @@ def test_a_recogniser_of_images_sees_images_live_and_in_predictions(trained):
     out = trained / "images.npz"
     main(["predict", str(store), str(out), "--maps", "--recogniser", str(models / "of-images.json"), "--workers", "1"])
     views, predictions = ViewStore.open(store), Predictions.load(out)
-    look = Observation(
-        views.image(3)[7], views.depth(3)[7], views.points(3)[7], views.sphere.poses[7], views.intrinsics
-    )
+    observation = Observation(views.depth(3)[7], views.sphere.poses[7], views.intrinsics, image=views.image(3)[7])
     at = predictions.names.index(views.names[3])
-    live = Recogniser(models / "of-images.json")([look]).logits
+    live = Recogniser(models / "of-images.json")([observation]).logits
     assert predictions.logits[at, 7] == pytest.approx(live[0], abs=1e-4)
-    dark = Recogniser(models / "of-images.json")([replace(look, image=look.image // 4)]).logits
+    dark = Recogniser(models / "of-images.json")([replace(observation, image=observation.image // 4)]).logits
     assert np.abs(live - dark).max() > 1e-3  # it does look at the image
     mixture = ["export", "recogniser", str(run), str(store), str(models), "--also", str(trained / "runs/recogniser")]
     with pytest.raises(SystemExit) as mixed:
@@ -402,56 +386,18 @@ def test_what_is_no_finished_run_is_not_exported(trained, tmp_path, capsys):
     assert not (tmp_path / "models").exists()
 
 
-def test_several_networks_are_exported_as_their_mean(trained):
-    runs, models = trained / "runs", trained / "models"
-    both = ["--also", str(runs / "recogniser"), "--mirror", "--name", "both"]
-    main(["export", "recogniser", str(runs / "recogniser"), str(trained / "views.zarr"), str(models), *both])
-    alone, jury = Recogniser(models / "tiny.json"), Recogniser(models / "both.json")
-    x = np.random.default_rng(0).integers(0, 256, (3, 4, 112, 112), dtype=np.uint8)
-    mean = (alone.from_inputs(x).logits + alone.from_inputs(x[..., ::-1].copy()).logits) / 2
-    scale = alone.card.facts["temperature"] / jury.card.facts["temperature"]
-    together = jury.from_inputs(x)
-    assert together.logits == pytest.approx(mean * scale, abs=2e-2)
-    assert together.features.shape == (3, 1024)
-    mirrored = jury.from_inputs(x[..., ::-1].copy())  # what was side 1 is side -1 in the mirror
-    assert together.sides == pytest.approx(mirrored.sides[..., -np.arange(8) % 8], abs=1e-3)
-
-
-def test_a_network_that_sees_blocks_of_pixels(trained, capsys):
-    run, store, models = str(trained / "runs/blocks"), str(trained / "views.zarr"), str(trained / "models")
-    small = ["--epochs", "1", "--views", "2", "--batch", "8", "--validation", "0.25", "--blocks", "2"]
-    main(["train", "recogniser", store, run, *small])
-    main(["export", "recogniser", run, store, models, "--name", "blocks"])
-    facts = find_card(trained / "models/blocks.json").facts
-    assert (facts["input_size"], facts["blocks"]) == (112, 2)
-    main(["export", "recogniser", str(trained / "models/blocks.json"), store, models, "--name", "again"])
-    once, again = (Recogniser(trained / f"models/{name}.json") for name in ("blocks", "again"))
-    x = seen_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
-    once, again = (model.from_inputs(x).logits * model.card.facts["temperature"] for model in (once, again))
-    assert once == pytest.approx(again, abs=2e-2)
-    with pytest.raises(SystemExit):
-        main(
-            ["export", "recogniser", run, store, models, "--name", "mixed", "--also", str(trained / "models/tiny.json")]
-        )
-    assert "pixels in blocks of [1, 2]" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["train", "recogniser", store, str(trained / "runs/odd"), *small, "--size", "7"])
-    assert "images of 7 pixels, and small ones, must be whole blocks of 2" in capsys.readouterr().err
-
-
 def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
     run, store, models = trained / "runs/recogniser", trained / "views.zarr", trained / "models"
     command = ["export", "recogniser", str(run), str(store), str(models)]
     main([*command, "--name", "two", "--also", str(models / "tiny.json")])
-    x = seen_views(ViewStore.open(store), 0, "geometry", 112)[:3]
+    x = input_views(ViewStore.open(store), 0, "geometry", 112)[:3]
     alone, joined = Recogniser(models / "tiny.json"), Recogniser(models / "two.json")
     facts = joined.card.facts
     assert facts["network"] == "ResNet-18 + ResNet-18"
     assert facts["unseen"] == alone.card.facts["unseen"]
     assert len(facts["training"]["recipes"]) == 2
-    raw, said = alone.from_inputs(x).logits * alone.card.facts["temperature"], joined.from_inputs(x)
-    assert said.features.shape == (3, 1024)
-    assert said.logits * facts["temperature"] == pytest.approx(raw, abs=2e-2)
+    raw, output = alone.from_inputs(x).logits * alone.card.facts["temperature"], joined.from_inputs(x)
+    assert output.logits * facts["temperature"] == pytest.approx(raw, abs=2e-2)
     with pytest.raises(SystemExit):
         main([*command, "--name", "three", "--also", str(models / "two.json")])
     with pytest.raises(ModelError, match="not one network"):
@@ -461,8 +407,8 @@ def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
         main([*command, "--also", str(models / "tiny-lem.json")])
     assert "not a recogniser" in capsys.readouterr().err
     facts = json.loads((models / "tiny.json").read_text())
-    for name, told in (("foreign", facts | {"unseen": ["chair_9"]}), ("silent", facts | {"training": {}})):
-        (models / f"{name}.json").write_text(json.dumps(told))
+    for name, features in (("foreign", facts | {"unseen": ["chair_9"]}), ("silent", facts | {"training": {}})):
+        (models / f"{name}.json").write_text(json.dumps(features))
         shutil.copy(models / "tiny.onnx", models / f"{name}.onnx")
         with pytest.raises(SystemExit):
             main([*command, "--also", str(models / f"{name}.json")])
@@ -486,77 +432,41 @@ def test_folds_divide_every_class_evenly_and_keep_twins_together(tmp_path):
         hold_out(labels, measured, 1, seed=0)
 
 
-def test_merged_runs_ship_as_one_network_that_training_goes_on_from(trained, capsys):
-    runs, store, models = trained / "runs", trained / "views.zarr", trained / "models"
-    command = [
-        "export",
-        "recogniser",
-        str(runs / "recogniser"),
-        str(store),
-        str(models),
-        "--name",
-        "merged",
-        "--merged",
-    ]
-    with pytest.raises(SystemExit):
-        main(command)
-    assert "name the others with --also" in capsys.readouterr().err
-    main([*command, "--also", str(runs / "recogniser")])
-    assert json.loads((models / "merged.json").read_text())["network"] == "ResNet-18, the mean of 2 runs"
-    views = seen_views(ViewStore.open(store), 0, "geometry", 112)
-    assert np.isfinite(Recogniser(models / "merged.json").from_inputs(views).logits).all()
-    load_exported(ResNet(18, 2, 4, 8), models / "merged.json", torch.from_numpy(views).float() / 255)
-
-
 def test_eight_bits_a_weight_are_enough_for_the_answers_and_nearly_halve_the_file_again(tmp_path):
     torch.manual_seed(0)
     network = ResNet(18, 10, 4).eval()
     with torch.no_grad():  # every row of another magnitude, as in trained networks
         network.layer4[1].conv1.weight *= torch.logspace(-2, 1, 512)[:, None, None, None]
     x = np.random.default_rng(0).random((2, 4, 64, 64)).astype(np.float32)
-    said = {}
+    output = {}
     for bits in (16, 8):
-        export_onnx(network, x, "input", ["logits", "features"], tmp_path / f"{bits}.onnx", bits)
+        export_onnx(network, x, "input", ["logits"], tmp_path / f"{bits}.onnx", bits)
         session = ort.InferenceSession(tmp_path / f"{bits}.onnx", providers=["CPUExecutionProvider"])
-        said[bits] = session.run(["features"], {"input": x})[0]
-    true = network(torch.from_numpy(x))[1].detach().numpy()
-    assert np.abs(said[8] - true).max() < 0.02 * np.abs(true).max()
-    assert np.abs(said[8] - true).max() > np.abs(said[16] - true).max()  # so they do have fewer
+        output[bits] = session.run(["logits"], {"input": x})[0]
+    true = network(torch.from_numpy(x))[0].detach().numpy()
+    assert np.abs(output[8] - true).max() < 0.02 * np.abs(true).max()
+    assert np.abs(output[8] - true).max() > np.abs(output[16] - true).max()  # so they do have fewer
     assert (tmp_path / "8.onnx").stat().st_size < 0.55 * (tmp_path / "16.onnx").stat().st_size
 
 
-def test_merged_networks_have_the_mean_weights_and_norms_that_know_what_they_see():
-    torch.manual_seed(0)
-    networks = [ResNet(18, 3, 4) for _ in range(2)]
-    views = [torch.rand(8, 4, 32, 32) for _ in range(3)]
-    one = merge(networks, views)
-    for name, value in one.named_parameters():
-        expected = sum(dict(network.named_parameters())[name] for network in networks) / 2
-        assert torch.equal(value, expected)
-    with torch.no_grad():
-        before = torch.cat([one.conv1(x) for x in views])
-    assert torch.allclose(one.bn1.running_mean, before.mean((0, 2, 3)), atol=1e-5)
-    assert not one.training
-    with pytest.raises(ModelError, match="cannot be merged"):
-        merge([networks[0], ResNet(34, 3, 4)], views)
-
-
 def test_a_lite_network_goes_from_a_checkpoint_to_a_card_that_it_shares(trained, tmp_path, capsys):
-    checkpoint(tmp_path / "imagenet.pth", plan=LITE2)
+    checkpoint(tmp_path / "imagenet.pth")
     run, store, models = trained / "runs/lite", str(trained / "views.zarr"), trained / "models"
-    small = ["--epochs", "1", "--views", "4", "--batch", "8", "--validation", "0.25", "--side", "0.3"]
-    command = ["train", "recogniser", store, str(run), *small, "--network", "lite2", "--drop", "0.2"]
+    small = ["--epochs", "1", "--views", "4", "--batch", "8", "--validation", "0.25", "--azimuth-bins-weight", "0.3"]
+    command = ["train", "recogniser", store, str(run), *small, "--network", "lite0", "--dropout", "0.2"]
     main([*command, "--weights", str(tmp_path / "imagenet.pth")])
     main(["export", "recogniser", str(run), store, str(models), "--name", "pair", "--also", str(models / "tiny.json")])
     facts = find_card(models / "pair.json").facts
-    assert facts["network"] == "EfficientNet-Lite2 + ResNet-18"
-    assert [recipe["network"] for recipe in facts["training"]["recipes"]] == ["lite2", "resnet"]
-    x = seen_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
+    assert facts["network"] == "EfficientNet-Lite0 + ResNet-18"
+    assert [recipe["network"] for recipe in facts["training"]["recipes"]] == ["lite0", "resnet"]
+    x = input_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
     alone, pair = Recogniser(models / "tiny.json"), Recogniser(models / "pair.json")
     with torch.no_grad():
-        said = load_run(LiteNet(2, 4, 8, scale=2), run)(torch.from_numpy(x).float() / 255)[0].numpy()
-    mean = (said + alone.from_inputs(x).logits * alone.card.facts["temperature"]) / 2
+        logits, bins = (output.numpy() for output in load_run(LiteNet(2, 4, 8), run)(torch.from_numpy(x).float() / 255))
+    mean = (logits + alone.from_inputs(x).logits * alone.card.facts["temperature"]) / 2
     assert pair.from_inputs(x).logits * facts["temperature"] == pytest.approx(mean, abs=2e-2)
+    both = np.exp((bins + alone.from_inputs(x).azimuth_bins) / 2)
+    assert np.exp(pair.from_inputs(x).azimuth_bins) == pytest.approx(both / both.sum(2, keepdims=True), abs=2e-2)
     main([*command[:3], str(trained / "runs/on"), *command[4:], "--weights", str(models / "pair.json")])
     with pytest.raises(SystemExit):
         main([*command[:3], str(trained / "runs/wrong"), *small, "--weights", str(tmp_path / "imagenet.pth")])

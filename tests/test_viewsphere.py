@@ -1,4 +1,4 @@
-"""View geometry against hand-written layouts, haversine arcs and the definition of a look-at pose."""
+"""View geometry against hand-written layouts, haversine arcs and the definition of a view-at pose."""
 
 import numpy as np
 import pytest

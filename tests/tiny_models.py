@@ -7,10 +7,11 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from nextview.models.card import file_hash
+from nextview.models.inference import BINS_OUTPUT
+from nextview.models.model_card import file_hash
 
 
-def make_recogniser(folder: Path, classes: list[str], size: int = 16, seed: int = 0, sides: int = 0) -> Path:
+def make_recogniser(folder: Path, classes: list[str], size: int = 16, seed: int = 0, azimuth_bins: int = 0) -> Path:
     """A recogniser whose answers are random linear maps of each channel's mean over the image."""
     weights = np.random.default_rng(seed).normal(size=(4, len(classes))).astype(np.float32) / 16
     weights -= weights.mean(0)
@@ -25,17 +26,17 @@ def make_recogniser(folder: Path, classes: list[str], size: int = 16, seed: int 
     outputs += [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["batch", 4])]
     constants = {"weights": weights, "image": np.array([2, 3])}
     facts: dict = {"kind": "recogniser", "classes": classes, "input_size": size}
-    if sides:
+    if azimuth_bins:
         nodes += [
             helper.make_node("MatMul", ["features", "side_weights"], ["flat"]),
             helper.make_node("Reshape", ["flat", "side_shape"], ["shaped"]),
-            helper.make_node("LogSoftmax", ["shaped"], ["sides"], axis=2),
+            helper.make_node("LogSoftmax", ["shaped"], [BINS_OUTPUT], axis=2),
         ]
-        shape = ["batch", len(classes), sides]
-        outputs += [helper.make_tensor_value_info("sides", TensorProto.FLOAT, shape)]
-        side_weights = np.random.default_rng(seed + 1).normal(size=(4, len(classes) * sides)).astype(np.float32)
+        shape = ["batch", len(classes), azimuth_bins]
+        outputs += [helper.make_tensor_value_info(BINS_OUTPUT, TensorProto.FLOAT, shape)]
+        side_weights = np.random.default_rng(seed + 1).normal(size=(4, len(classes) * azimuth_bins)).astype(np.float32)
         constants |= {"side_weights": side_weights / 16, "side_shape": np.array([-1, *shape[1:]])}
-        facts["sides"] = sides
+        facts["azimuth_bins"] = azimuth_bins
     return _save(folder / "tiny.json", nodes, inputs, outputs, constants, facts)
 
 

@@ -9,21 +9,20 @@
 'chair'
 """
 
+from nextview.belief import Stopping
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.mesh import Mesh, load_mesh
-from nextview.models.networks import Models, load_models
+from nextview.models.inference import Models, load_models
 from nextview.observation import Camera, Observation
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.registry import make_policy
-from nextview.recognition import Stopping
-from nextview.session import Look, Recognition, Session, recognise
+from nextview.session import Recognition, Session, View, recognise
 from nextview.viewsphere import ViewSphere
 
 __all__ = [
     "Camera",
     "EpisodeState",
     "Evidence",
-    "Look",
     "Mesh",
     "Models",
     "Observation",
@@ -32,6 +31,7 @@ __all__ = [
     "Session",
     "SimulatedCamera",
     "Stopping",
+    "View",
     "ViewSphere",
     "load_mesh",
     "load_models",

@@ -1,4 +1,4 @@
-"""From a depth image to points: the cloud of one look, and the point under every pixel."""
+"""From a depth image to points: the cloud of one view, and the point under every pixel."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.observation import POINTS, object_depth
+from nextview.depth import object_depth
+
+POINTS = 1024
+"""Points in the partial cloud of one view (thesis, section 4.1.2)."""
 
 
 @lru_cache(maxsize=8)
@@ -24,7 +27,7 @@ def visible_points(
 ) -> NDArray[np.float32]:
     """Points on the visible surface: a uniform draw, without replacement, from the pixels that show the object.
 
-    The draw depends on the seed and the visible pixels alone, so a look is the same whenever it is taken. With fewer
+    The draw depends on the seed and the visible pixels alone, so a view is the same whenever it is taken. With fewer
     visible pixels than points they repeat.
 
     Args:

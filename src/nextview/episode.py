@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
 from nextview.errors import PolicyError, SessionError, UsageError
 from nextview.policies.base import EpisodeState, Evidence, Policy
-from nextview.recognition import PLAIN_SUM, Calibration, Stopping, additive
 from nextview.viewsphere import ViewSphere
 
 
 @dataclass(frozen=True)
 class Step:
-    """One look in the episodes that were still running, A of them.
+    """One view in the episodes that were still running, A of them.
 
     Attributes:
         episodes: which ones, (A,) int64.
@@ -25,7 +25,8 @@ class Step:
         belief: fused after it, (A, classes).
         stopped: whether the episode ended here, (A,) bool.
         next_views: where it goes next, (A,) int64; -1 where it ended.
-        total: sum of what was said in it and before, (A, D), see ``recognition.additive``.
+        total: sum of the log-evidence in it and before, (A, D), see ``recognition.log_evidence_of``.
+        seen: views so far in which anything was seen, (A,) int64.
     """
 
     episodes: NDArray[np.int64]
@@ -35,6 +36,7 @@ class Step:
     stopped: NDArray[np.bool_]
     next_views: NDArray[np.int64]
     total: NDArray[np.float64]
+    seen: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -44,16 +46,16 @@ class Outcome:
     Attributes:
         answer: most believed class, (B,) int64.
         confidence: its belief, (B,) float64.
-        looks: views taken, (B,) int64.
-        confident: whether the bar was reached (else the views ran out), (B,) bool.
+        n_views: views taken, (B,) int64.
+        confident: whether the threshold was reached (else the views ran out), (B,) bool; never where nothing was seen.
         travel: sum over the moves in grid cells, (B,) float64.
         arc: sum over the moves in radians, (B,) float64.
-        views: the views in order, (B, max looks) int64, -1 after the end.
+        views: the views in order, (B, max views) int64, -1 after the end.
     """
 
     answer: NDArray[np.int64]
     confidence: NDArray[np.float64]
-    looks: NDArray[np.int64]
+    n_views: NDArray[np.int64]
     confident: NDArray[np.bool_]
     travel: NDArray[np.float64]
     arc: NDArray[np.float64]
@@ -61,7 +63,7 @@ class Outcome:
 
 
 class Episodes:
-    """B episodes side by side. Give ``tell`` what was seen from ``current``, until ``running`` is empty.
+    """B episodes side by side. Give ``update`` what was seen from ``current``, until ``running`` is empty.
 
     Args:
         sphere: the viewpoints.
@@ -90,11 +92,13 @@ class Episodes:
         self.steps: list[Step] = []
         self._visited = np.zeros((len(starts), len(sphere)), bool)
         self._total: NDArray[np.float64] = np.zeros((len(starts), 0))
+        self._seen = np.zeros(len(starts), np.int64)
 
-    def tell(self, evidence: Evidence) -> Step:
-        """Take in the evidence of one look in every running episode; stop or choose its next view.
+    def update(self, evidence: Evidence) -> Step:
+        """Take in the evidence of one view in every running episode; stop or choose its next view.
 
-        Where this raises, nothing is taken in: the same look can be told again.
+        A view in which nothing was seen is taken, but changes no belief and ends no episode as a confident one. Where
+        this raises, nothing is taken in: the same view can be told again.
 
         Raises:
             UsageError: the evidence is of another number of episodes, or a logit is not finite.
@@ -102,37 +106,40 @@ class Episodes:
         """
         now, views = self.running, self.current[self.running]
         if len(evidence.logits) != len(now):
-            raise UsageError(f"evidence of {len(evidence.logits)} looks for {len(now)} running episodes")
+            raise UsageError(f"evidence of {len(evidence.logits)} views for {len(now)} running episodes")
+        evidence, seen = _without_unseen(evidence)
         before = self._total[now] if self.steps else 0.0
         azimuth = self.sphere.turn[views]
-        total = before + np.asarray(additive(evidence.logits, evidence.sides, azimuth), np.float64)
-        looks, classes = len(self.steps) + 1, evidence.logits.shape[1]
-        belief = self.calibration.belief(total, looks, classes)
+        total = before + np.asarray(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64)
+        n_views, classes = len(self.steps) + 1, evidence.logits.shape[1]
+        counted = self._seen[now] + seen
+        weighed = np.maximum(counted, 1)  # before anything is seen the total is zero, whatever it is divided by
+        belief = self.calibration.belief(total, weighed, classes)
         visited = self._visited[now]
         visited[np.arange(len(now)), views] = True
-        stopped = belief.max(1) >= self.stopping.bar(looks)
-        if looks >= min(self.stopping.max_views, len(self.sphere)):
+        stopped = (belief.max(1) >= self.stopping.threshold_at(weighed)) & seen
+        if n_views >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
         going = ~stopped
         next_views = np.full(len(now), -1)
         if going.any():
-            left, sides = now[going], None
-            if "sides" in self.policy.needs:
-                sides = self.calibration.sides(total[going], looks, classes, azimuth[going])
+            left, azimuth_bins = now[going], None
+            if "azimuth_bins" in self.policy.needs:
+                azimuth_bins = self.calibration.azimuth_bins(total[going], weighed[going], classes, azimuth[going])
             state = EpisodeState(
                 views[going],
                 visited[going],
                 belief[going],
                 select(evidence, going),
-                looks,
+                n_views,
                 left,
-                sides,
+                azimuth_bins,
             )
             next_views[going] = self._choose(state)
-        step = Step(now, views, evidence, belief, stopped, next_views, total)
+        step = Step(now, views, evidence, belief, stopped, next_views, total, counted)
         if not self.steps:
             self._total = np.zeros((len(self.current), total.shape[1]))
-        self._total[now], self._visited[now] = total, visited
+        self._total[now], self._visited[now], self._seen[now] = total, visited, counted
         self.current[now[going]] = next_views[going]
         self.steps.append(step)
         self.running = now[going]
@@ -168,7 +175,7 @@ class Episodes:
                 select(state.evidence, here),
                 state.step,
                 state.episodes[here],
-                None if state.sides is None else state.sides[here],
+                None if state.azimuth_bins is None else state.azimuth_bins[here],
             )
             try:
                 self.policy.next_views(alone, self.rng)
@@ -187,19 +194,19 @@ class Episodes:
             raise SessionError("the episodes are still running")
         b = len(self.current)
         views = np.full((b, len(self.steps)), -1)
-        answer, looks, confidence = np.zeros(b, np.int64), np.zeros(b, np.int64), np.zeros(b)
+        answer, n_views, confidence = np.zeros(b, np.int64), np.zeros(b, np.int64), np.zeros(b)
         for k, step in enumerate(self.steps):
             views[step.episodes, k] = step.views
             answer[step.episodes] = step.belief.argmax(1)
             confidence[step.episodes] = step.belief.max(1)
-            looks[step.episodes] = k + 1
+            n_views[step.episodes] = k + 1
         moved = views[:, 1:] >= 0
         legs = (views[:, :-1], views[:, 1:])
         return Outcome(
             answer,
             confidence,
-            looks,
-            confidence >= self.stopping.bar(looks),
+            n_views,
+            (confidence >= self.stopping.threshold_at(np.maximum(self._seen, 1))) & (self._seen > 0),
             (self.sphere.travel[legs] * moved).sum(1),
             (self.sphere.arc[legs] * moved).sum(1),
             views,
@@ -208,9 +215,23 @@ class Episodes:
 
 def select(evidence: Evidence, keep: NDArray[np.bool_]) -> Evidence:
     """The evidence of some of the episodes."""
-    features = None if evidence.features is None else evidence.features[keep]
-    sides = None if evidence.sides is None else evidence.sides[keep]
-    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, features, sides)
+    azimuth_bins = None if evidence.azimuth_bins is None else evidence.azimuth_bins[keep]
+    seen = None if evidence.seen is None else evidence.seen[keep]
+    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, azimuth_bins, seen)
+
+
+def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
+    """The evidence with zeros where nothing was seen, and where anything was, (B,) bool."""
+    seen = evidence.seen
+    if seen is None or seen.all():
+        return evidence, np.ones(len(evidence.logits), bool)
+
+    def kept(values: NDArray[np.floating]) -> NDArray[np.floating]:
+        return np.where(seen.reshape(-1, *[1] * (values.ndim - 1)), values, 0)
+
+    azimuth_bins = None if evidence.azimuth_bins is None else kept(evidence.azimuth_bins)
+    maps = {name: kept(values) for name, values in evidence.maps.items()}
+    return Evidence(kept(evidence.logits), maps, azimuth_bins, seen), seen
 
 
 def run_episodes(
@@ -235,5 +256,5 @@ def run_episodes(
     """
     episodes = Episodes(sphere, policy, starts, stopping, rng, calibration)
     while len(episodes.running):
-        episodes.tell(observe(episodes.running, episodes.current[episodes.running]))
+        episodes.update(observe(episodes.running, episodes.current[episodes.running]))
     return episodes

@@ -69,4 +69,4 @@ class EntryError(NextviewError):
 
 
 class ResultsError(NextviewError):
-    """A folder that holds no results, or that must not be replaced."""
+    """Results that are not there, cannot be written, or must not be replaced."""

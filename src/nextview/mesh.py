@@ -22,6 +22,10 @@ UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}
 """What a file's unit of length may be, and how many metres it is."""
 
 
+FLAT = 1e-12
+"""Twice the area of a face below which it counts as a line, square object radii: rounding makes up to 1e-15."""
+
+
 @dataclass(frozen=True)
 class Mesh:
     """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex at radius 1.
@@ -64,7 +68,7 @@ def make_mesh(
         place show nothing new, and a great many of them take a minute a view.
 
     Raises:
-        MeshError: no faces, not triangles, an index out of range, a position that is not finite, no extent or no area.
+        MeshError: no faces, not triangles, an index out of range, a position that is not finite, no extent, or no area.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     for array, what in ((vertices, "vertices"), (faces, "faces")):
@@ -95,10 +99,19 @@ def make_mesh(
     radius = np.sqrt((vertices**2).sum(1).max())
     if reach > np.finfo(float).max / radius:
         raise MeshError(f"{name}: the mesh is too large, its radius is not a finite number")
-    placed = vertices / radius
-    if not _has_area(placed, faces):
-        raise MeshError(f"{name}: the mesh has no area, all its faces are lines or points, and nothing can be seen")
-    return Mesh(placed, faces.astype(np.int32), centre, float(radius * reach), name, unit)
+    normalised: NDArray[np.float64] = vertices / radius
+    if not _has_area(normalised, faces):
+        raise MeshError(f"{name}: the mesh has no area, all its faces are lines or points")
+    return Mesh(normalised, faces.astype(np.int32), centre, float(radius * reach), name, unit)
+
+
+def _has_area(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> bool:
+    """Whether any face is more than a line; most often the first few tell."""
+    for first in range(0, len(faces), 4096):
+        a, b, c = (vertices[faces[first : first + 4096, k]] for k in range(3))
+        if np.abs(np.cross(b - a, c - a)).max() > FLAT:
+            return True
+    return False
 
 
 def _first_of_equals(rows: NDArray) -> NDArray[np.int64]:
@@ -109,15 +122,6 @@ def _first_of_equals(rows: NDArray) -> NDArray[np.int64]:
     found = np.empty(len(rows), np.int64)
     found[order] = order[first][np.cumsum(first) - 1]
     return found
-
-
-def _has_area(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> bool:
-    """Whether any part of the mesh can be seen; a part at a time, for most often the first one can."""
-    for begin in range(0, len(faces), 100_000):
-        a, b, c = vertices[faces[begin : begin + 100_000].T]
-        if np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() > 1e-12:
-            return True
-    return False
 
 
 def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None, max_faces: int = MAX_FACES) -> Mesh:

@@ -1,50 +1,88 @@
-"""What one look yields, and what can take a look."""
+"""What one view yields, and what can take a view."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cached_property
+from numbers import Real
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.cloud import visible_points
+from nextview.depth import FARTHEST, object_depth
 from nextview.errors import ObservationError
+from nextview.shading import headlight
 
-POINTS = 1024
-"""Points in the partial cloud of one look (thesis, section 4.1.2)."""
-FARTHEST = 50.0
-"""Depth at which nothing counts as an object any more, object radii: depth cameras have large numbers for "nothing"."""
+LEAST_SHARE = 0.001
+"""Share of the image that an object fills at least, for it to be seen. The networks' images have 112 pixels a side:
+less than this would be a dozen pixels there, of which no two need touch."""
+LEAST_PIXELS = 9
+"""The same in pixels, for small images: 3 x 3 are the fewest of which one has neighbours all around."""
+RIGID = 1e-3
+"""How far a pose may be from a rigid motion: room for numbers that were written out with four digits."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """One look at an object.
+    """One view of an object. Lists are converted; arrays of the right type are not copied.
 
     Attributes:
-        image: grey image, (H, W) uint8, 0 where there is no object.
         depth: distance along the optical axis, (H, W) float32, object radii, 0 where there is no object. What a sensor
             gives for nothing else (see ``object_depth``) becomes 0 here.
-        points: on the visible surface, (1024, 3) float32, object frame, object radii; all zero if nothing is visible.
-        pose: camera-to-world, (4, 4) float64, OpenCV axes (x right, y down, z forward).
+        pose: camera-to-world, (4, 4) float64, OpenCV axes (x right, y down, z forward); the world is the object frame.
         intrinsics: pinhole matrix, (3, 3) float64, pixels; pixel (row, column) has its centre at
             (column + 0.5, row + 0.5).
         radius: the object radius, metres: what positions were divided by. None if the camera does not know its scale.
+        image: grey picture, (H, W) uint8, 0 where there is no object. None if the camera has none.
 
     Raises:
-        ObservationError: a radius that is not a positive number.
+        ObservationError: shapes that are not these, or numbers that no camera can have: what is wrong, and what it
+            looks like.
     """
 
-    image: NDArray[np.uint8]
     depth: NDArray[np.float32]
-    points: NDArray[np.float32]
     pose: NDArray[np.float64]
     intrinsics: NDArray[np.float64]
     radius: float | None = None
+    image: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
-        if self.radius is not None and not 0 < self.radius < np.inf:
+        given = _depth(self.depth)
+        depth = object_depth(given)
+        if depth is not given:
+            _check_unit(given, int(np.count_nonzero(depth)))
+        checked = {
+            "depth": depth,
+            "pose": checked_pose(self.pose),
+            "intrinsics": _intrinsics(self.intrinsics, depth.shape),
+            "image": None if self.image is None else _image(self.image, depth.shape),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        if self.radius is not None and not (isinstance(self.radius, Real) and 0 < self.radius < np.inf):
             raise ObservationError(f"the object radius is a positive number of metres, or None, not {self.radius}")
-        object.__setattr__(self, "depth", object_depth(self.depth))
+
+    @cached_property
+    def visible(self) -> int:
+        """Pixels that show the object."""
+        return int(np.count_nonzero(self.depth))
+
+    @property
+    def seen(self) -> bool:
+        """Whether enough of the object is visible to say anything of it. A view without it is no evidence."""
+        return self.visible >= max(LEAST_PIXELS, LEAST_SHARE * self.depth.size)
+
+    @cached_property
+    def points(self) -> NDArray[np.float32]:
+        """On the visible surface, (1024, 3) float32, object frame, object radii; all zero if nothing is visible."""
+        return visible_points(self.depth, self.pose, self.intrinsics)
+
+    @cached_property
+    def picture(self) -> NDArray[np.uint8]:
+        """The image; where the camera has none, the depth as a headlight would show it. (H, W) uint8."""
+        return headlight(self.depth, self.intrinsics) if self.image is None else self.image
 
 
 class Camera(Protocol):
@@ -55,18 +93,99 @@ class Camera(Protocol):
         ...
 
 
-def object_depth(depth: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Depth as all of nextview understands it: 0 where a sensor gives NaN, infinity, a negative or a huge number.
+def checked_pose(pose: Any) -> NDArray[np.float64]:
+    """A camera-to-world pose, if it is one.
 
     Args:
-        depth: any shape, object radii.
+        pose: (4, 4), OpenCV axes, object radii.
 
     Returns:
-        The same array if it holds nothing of the kind, else a mended copy.
+        (4, 4) float64.
+
+    Raises:
+        ObservationError: not a rigid motion, or one to a place from which no object can be seen.
     """
-    if depth.min() >= 0 and depth.max() < FARTHEST:  # not so if there is a NaN
-        return depth
-    return np.where((depth > 0) & (depth < FARTHEST), depth, 0)
+    pose = _numbers(pose, "the pose").astype(np.float64, copy=False)
+    if pose.shape != (4, 4):
+        raise ObservationError(f"the pose is a camera-to-world matrix of the shape (4, 4), not {pose.shape}")
+    if not np.isfinite(pose).all():
+        raise ObservationError("the pose holds NaN or infinity")
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID:
+        raise ObservationError(f"the last row of the pose is {pose[3].tolist()}, not 0 0 0 1: is it transposed?")
+    rotation = pose[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID:
+        raise ObservationError("the pose is not rigid: its rotation does not keep lengths and angles")
+    if np.linalg.det(rotation) < 0:
+        raise ObservationError("the pose is mirrored: an axis is reversed (OpenCV axes are x right, y down, z forward)")
+    distance = float(np.sqrt((pose[:3, 3] ** 2).sum()))
+    if distance > 2 * FARTHEST:
+        raise ObservationError(
+            f"the camera stands {distance:.4g} object radii from the object: is its position in millimetres? "
+            "Divide it by the object radius"
+        )
+    return pose
+
+
+def _numbers(values: Any, what: str) -> NDArray[Any]:
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError) as error:  # rows of different lengths, or what cannot become an array at all
+        raise ObservationError(f"{what} cannot be taken for an array of numbers ({error})") from None
+    if array.dtype.kind not in "fiu":
+        raise ObservationError(f"{what} is an array of numbers, not of {array.dtype}")
+    return array
+
+
+def _depth(depth: Any) -> NDArray[np.float32]:
+    depth = _numbers(depth, "the depth")
+    if depth.ndim != 2 or depth.size == 0:
+        raise ObservationError(f"the depth is one image of the shape (H, W), not {depth.shape}")
+    with np.errstate(over="ignore"):  # what is too large becomes infinity, and so 0
+        return depth.astype(np.float32, copy=False)
+
+
+def _check_unit(given: NDArray[np.float32], near: int) -> None:
+    """Refuse depth of which next to nothing is near enough to be an object, given how many pixels are.
+
+    One large number, the same everywhere, is what a sensor gives for nothing, and so not a sign of another unit.
+    """
+    if 99 * near >= given.size:
+        return
+    far = given[np.isfinite(given) & (given >= FARTHEST)]
+    varied = np.count_nonzero(far < far.max()) if len(far) else 0
+    if varied > max(LEAST_PIXELS, 99 * near):
+        raise ObservationError(
+            f"the depth looks like millimetres, or metres, not object radii (its median is {np.median(far):.4g}, and "
+            f"{FARTHEST:g} and more counts as nothing): divide it by the object radius, and set all else to 0"
+        )
+
+
+def _intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    intrinsics = _numbers(intrinsics, "the matrix of intrinsics").astype(np.float64, copy=False)
+    if intrinsics.shape != (3, 3):
+        raise ObservationError(f"the intrinsics are a pinhole matrix of the shape (3, 3), not {intrinsics.shape}")
+    if not (np.abs(intrinsics) < 1e6).all():  # not so if there is a NaN
+        raise ObservationError("the intrinsics hold NaN, infinity or a number that no camera has")
+    if np.abs(intrinsics[2] - (0, 0, 1)).max() > RIGID:
+        raise ObservationError(
+            f"the last row of the intrinsics is {intrinsics[2].tolist()}, not 0 0 1: are they transposed?"
+        )
+    focal = intrinsics[0, 0], intrinsics[1, 1]
+    if not min(focal) > 0.01 * max(shape):  # less would show all that lies ahead: metres, say
+        raise ObservationError(
+            f"the focal lengths are positive numbers of pixels, about as many as the image has a side ({max(shape)}), "
+            f"not {focal[0]:g} and {focal[1]:g}"
+        )
+    return intrinsics
+
+
+def _image(image: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    image = _numbers(image, "the image")
+    if image.shape != shape:
+        raise ObservationError(f"the image is grey and of the depth's shape {shape}, not {image.shape}")
+    if image.dtype != np.uint8 and (image.dtype.kind == "f" or image.min() < 0 or image.max() > 255):
+        raise ObservationError(f"the image holds whole numbers from 0 to 255 (uint8), not {image.dtype}")
+    return image.astype(np.uint8, copy=False)
 
 
 def pinhole(size: int, distance: float) -> NDArray[np.float64]:

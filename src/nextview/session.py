@@ -7,41 +7,41 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.belief import Stopping, fuse
 from nextview.episode import Episodes
 from nextview.errors import SessionError
-from nextview.models.networks import Models
+from nextview.models.inference import Models
 from nextview.observation import Camera, Observation
 from nextview.policies.base import Policy, maps_among
-from nextview.recognition import Stopping, fuse
 from nextview.viewsphere import ViewSphere
 
 
 @dataclass(frozen=True)
-class Look:
-    """One look and what followed from it.
+class View:
+    """One view and what followed from it.
 
     Attributes:
-        view: where it was taken from.
+        index: the candidate viewpoint it was taken from.
         observation: what was seen.
-        guess: what this image alone says, (classes,) float64.
-        belief: fused over all looks so far, (classes,) float64.
+        alone: belief by this view alone, (classes,) float64; the same for all classes if nothing is seen in it.
+        belief: fused over all views so far, (classes,) float64.
         maps: predicted local maps by name, each (rings, 3).
         next_view: where to look next; None where the episode ends.
         travel: so far, in grid cells.
         arc: so far, in radians.
-        sides: belief, over all looks, in the side of the object that is seen from here, for each class, (classes,
-            sides), in even steps of azimuth; None if the recogniser was not taught them.
+        azimuth_bins: belief, over all views, in the side of the object that is seen from here, for each class,
+            (classes, azimuth bins), in even steps of azimuth; None if the recogniser was not taught them.
     """
 
-    view: int
+    index: int
     observation: Observation
-    guess: NDArray[np.float64]
+    alone: NDArray[np.float64]
     belief: NDArray[np.float64]
     maps: dict[str, NDArray[np.floating]]
     next_view: int | None
     travel: float
     arc: float
-    sides: NDArray[np.float64] | None = None
+    azimuth_bins: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -49,29 +49,36 @@ class Recognition:
     """The end of an episode.
 
     Attributes:
-        looks: in order.
+        views: in order.
         classes: their names.
-        confident: whether the threshold was reached (else the views ran out).
+        confident: whether the threshold was reached (else the views ran out); never if nothing was seen.
     """
 
-    looks: tuple[Look, ...]
+    views: tuple[View, ...]
     classes: tuple[str, ...]
     confident: bool
 
     @property
-    def answer(self) -> str:
-        """The class believed most."""
-        return self.classes[int(self.looks[-1].belief.argmax())]
+    def seen(self) -> bool:
+        """Whether the object was seen from any of the views."""
+        return any(view.observation.seen for view in self.views)
+
+    @property
+    def answer(self) -> str | None:
+        """The class believed most; None if nothing was seen."""
+        if not self.seen:
+            return None
+        return self.classes[int(self.views[-1].belief.argmax())]
 
     @property
     def confidence(self) -> float:
-        """The belief in the answer."""
-        return float(self.looks[-1].belief.max())
+        """The belief in the answer; 0 if there is none."""
+        return float(self.views[-1].belief.max()) if self.seen else 0.0
 
     @property
     def travel(self) -> float:
         """Of the whole episode, in grid cells."""
-        return self.looks[-1].travel
+        return self.views[-1].travel
 
 
 class Session:
@@ -79,7 +86,7 @@ class Session:
 
     >>> session = Session(models, policy, sphere, start=0)                      # doctest: +SKIP
     >>> while not session.done:                                                 # doctest: +SKIP
-    ...     look = session.tell(my_camera.observe(session.pose))
+    ...     view = session.update(my_camera.observe(session.pose))
 
     Args:
         models: recogniser and map networks.
@@ -99,13 +106,15 @@ class Session:
         stopping: Stopping = Stopping(),
         rng: np.random.Generator | None = None,
     ) -> None:
-        if "sides" in policy.needs and not models.recogniser.sides:
-            raise SessionError("this policy wants to know the side that is seen, and the recogniser was not taught it")
+        if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:
+            raise SessionError(
+                "this policy wants to know the azimuth bin that is seen, and the recogniser was not taught it"
+            )
         missing = [name for name in maps_among(policy.needs) if name.removesuffix("-sphere") not in models.maps]
         if missing:
             raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")
         self.models, self.sphere = models, sphere
-        self.looks: list[Look] = []
+        self.views: list[View] = []
         rng = rng or np.random.default_rng(0)
         calibration = models.recogniser.calibration
         self._episodes = Episodes(sphere, policy, np.array([start]), stopping, rng, calibration)
@@ -125,35 +134,36 @@ class Session:
         """Where to look now, as a camera-to-world pose (4, 4), OpenCV axes, object radii."""
         return self.sphere.poses[self.view]
 
-    def tell(self, observation: Observation) -> Look:
-        """Take in what was seen from ``pose``.
+    def update(self, observation: Observation) -> View:
+        """Take in what was seen from ``pose``. Where this raises, nothing is taken in: the same view can be told again.
 
         Raises:
             SessionError: the episode has ended.
+            ObservationError: the image does not suit the networks.
         """
         if self.done:
             raise SessionError("this session has ended; begin another one")
-        step = self._episodes.tell(self.models.evidence([observation]))
-        view, to = int(step.views[0]), int(step.next_views[0])
-        travel, arc = (self.looks[-1].travel, self.looks[-1].arc) if self.looks else (0.0, 0.0)
-        if self.looks:
-            travel += float(self.sphere.travel[self.looks[-1].view, view])
-            arc += float(self.sphere.arc[self.looks[-1].view, view])
+        step = self._episodes.update(self.models.evidence([observation]))
+        here, to = int(step.views[0]), int(step.next_views[0])
+        travel, arc = (self.views[-1].travel, self.views[-1].arc) if self.views else (0.0, 0.0)
+        if self.views:
+            travel += float(self.sphere.travel[self.views[-1].index, here])
+            arc += float(self.sphere.arc[self.views[-1].index, here])
         calibration, azimuth = self._episodes.calibration, self.sphere.turn[step.views]
-        sides = calibration.sides(step.total, len(self.looks) + 1, len(self.models.classes), azimuth)
-        look = Look(
-            view,
+        azimuth_bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), len(self.models.classes), azimuth)
+        view = View(
+            here,
             observation,
-            fuse(step.evidence.logits[:, None], self._episodes.calibration.temperature(1))[0],
+            fuse(step.evidence.logits[:, None], self._episodes.calibration.temperature_after(1))[0],
             step.belief[0],
             {name: values[0] for name, values in step.evidence.maps.items()},
             None if to < 0 else to,
             travel,
             arc,
-            None if sides is None else sides[0],
+            None if azimuth_bins is None else azimuth_bins[0],
         )
-        self.looks.append(look)
-        return look
+        self.views.append(view)
+        return view
 
     @property
     def result(self) -> Recognition:
@@ -162,7 +172,7 @@ class Session:
         Raises:
             SessionError: it has not.
         """
-        return Recognition(tuple(self.looks), self.models.classes, bool(self._episodes.outcome.confident[0]))
+        return Recognition(tuple(self.views), self.models.classes, bool(self._episodes.outcome.confident[0]))
 
 
 def recognise(
@@ -177,5 +187,5 @@ def recognise(
     """Look at an object until its class is believed or the views run out. Arguments as for ``Session``."""
     session = Session(models, policy, sphere, start, stopping, rng)
     while not session.done:
-        session.tell(camera.observe(session.pose))
+        session.update(camera.observe(session.pose))
     return session.result

@@ -60,7 +60,7 @@ def published(
     """The published value of one of our cells; None where nothing was published for it.
 
     Args:
-        policy: name of a contestant.
+        policy: name of a entry.
         threshold: of the cell; the published ones differ between policies (table 5).
         measure: "accuracy" or "travel_moved", over objects or, with "class_" before it, over classes.
         classes: of the data: only those of ModelNet10 and 40 were published.

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,11 +13,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from nextview.benchmark.replay import Ends
+from nextview.benchmark.replay import Outcomes
 from nextview.benchmark.run import Grid
 from nextview.benchmark.summary import Tables
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError
+from nextview.outputs import left_by_a_cut
+
+KIND = "benchmark"
+"""Of these results, in their manifest."""
 
 
 @dataclass(frozen=True)
@@ -46,42 +47,12 @@ class Results:
 
 
 def save(folder: Path, grid: Grid, tables: Tables, settings: dict[str, Any]) -> None:
-    """Write results aside and put them in place when they are whole. Earlier results of that name are replaced.
-
-    Raises:
-        ResultsError: the folder is there and holds something else.
-    """
-    check_target(folder)
-    with written_whole(folder) as part:
-        _write_episodes(part / "episodes.parquet", grid)
-        for name, table in tables.named().items():
-            table.to_csv(part / f"{name}.csv", index=False)
-        grid.trials.predictions.save(part / "predictions.npz")
-        (part / "benchmark.json").write_text(json.dumps(settings, indent=1) + "\n")
-
-
-def check_target(folder: Path, mark: str = "benchmark.json", what: str = "benchmark") -> None:
-    """Refuse to replace anything but earlier results, which are known by a file among them."""
-    if folder.exists() and not (folder / mark).exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ResultsError(f"{folder}: is there and holds no {what} results; give another folder")
-
-
-@contextmanager
-def written_whole(folder: Path) -> Iterator[Path]:
-    """A new folder to write into, which takes the place of ``folder`` when all is written.
-
-    Raises:
-        ResultsError: it cannot be made.
-    """
-    part = folder.with_name(folder.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        part.mkdir(parents=True)
-    except OSError as error:
-        raise ResultsError(f"{folder}: cannot be written ({error.strerror})") from None
-    yield part
-    shutil.rmtree(folder, ignore_errors=True)
-    part.rename(folder)
+    """Write results into a new folder, such as ``outputs.written_results`` makes."""
+    _write_episodes(folder / "episodes.parquet", grid)
+    for name, table in tables.named().items():
+        table.to_csv(folder / f"{name}.csv", index=False)
+    grid.specs.predictions.save(folder / "predictions.npz")
+    (folder / "benchmark.json").write_text(json.dumps(settings, indent=1) + "\n")
 
 
 def load(folder: Path) -> Results:
@@ -96,6 +67,11 @@ def load(folder: Path) -> Results:
         if not (folder / "episodes.parquet").exists():
             raise FileNotFoundError
     except FileNotFoundError:
+        left = left_by_a_cut(folder, KIND)
+        if left is not None:
+            raise ResultsError(
+                f"{folder}: a run was killed while it put its results there; rename {left} to it"
+            ) from None
         raise ResultsError(f"{folder}: holds no benchmark results; make some with nextview benchmark") from None
     except ValueError as error:
         raise ResultsError(f"{folder}: these benchmark results are damaged ({error})") from None
@@ -104,9 +80,9 @@ def load(folder: Path) -> Results:
 
 def _write_episodes(path: Path, grid: Grid) -> None:
     """One row an episode, one row group a cell."""
-    p, runs = grid.trials.predictions, grid.runs
-    names = pa.DictionaryArray.from_arrays(pa.array(grid.trials.objects, pa.int32()), pa.array(p.names))
-    labels = pa.DictionaryArray.from_arrays(pa.array(grid.trials.labels, pa.int32()), pa.array(p.classes))
+    p, runs = grid.specs.predictions, grid.runs
+    names = pa.DictionaryArray.from_arrays(pa.array(grid.specs.objects, pa.int32()), pa.array(p.names))
+    labels = pa.DictionaryArray.from_arrays(pa.array(grid.specs.labels, pa.int32()), pa.array(p.classes))
     run = pa.array(np.repeat(np.arange(runs, dtype=np.int32), len(p)))
     writer = None
     for policy, threshold, ends in grid.cells():
@@ -118,11 +94,11 @@ def _write_episodes(path: Path, grid: Grid) -> None:
                 "run": run,
                 "policy": _constant(policy, len(names)),
                 "threshold": pa.array(np.full(len(names), np.nan if threshold is None else threshold)),
-                "views": _lists(grid.paths[policy].views, ends.looks),
+                "views": _lists(grid.paths[policy].views, ends.n_views),
                 "stop": _stops(ends, fixed),
                 "answer": pa.DictionaryArray.from_arrays(pa.array(ends.answer, pa.int32()), pa.array(p.classes)),
                 "confidence": pa.array(ends.confidence),
-                "looks": pa.array(ends.looks, pa.int32()),
+                "n_views": pa.array(ends.n_views, pa.int32()),
                 "travel": pa.array(ends.travel),
                 "arc": pa.array(ends.arc),
             }
@@ -140,12 +116,12 @@ def _constant(text: str, n: int) -> pa.DictionaryArray:
 STOPS = ("views ran out", "confident", "fixed views")
 
 
-def _stops(ends: Ends, fixed: bool) -> pa.DictionaryArray:
+def _stops(ends: Outcomes, fixed: bool) -> pa.DictionaryArray:
     return pa.DictionaryArray.from_arrays(pa.array(np.where(fixed, 2, ends.confident), pa.int32()), pa.array(STOPS))
 
 
-def _lists(views: NDArray[np.int64], looks: NDArray[np.int64]) -> pa.ListArray:
+def _lists(views: NDArray[np.int64], n_views: NDArray[np.int64]) -> pa.ListArray:
     """The first so many views of each row, as lists."""
-    taken = np.arange(views.shape[1]) < looks[:, None]
-    offsets = np.concatenate([[0], np.cumsum(looks)]).astype(np.int32)
+    taken = np.arange(views.shape[1]) < n_views[:, None]
+    offsets = np.concatenate([[0], np.cumsum(n_views)]).astype(np.int32)
     return pa.ListArray.from_arrays(pa.array(offsets), pa.array(views[taken].astype(np.int16)))

@@ -1,4 +1,4 @@
-"""Error bars and tests. What is drawn anew is the object: the looks and runs of one object are not independent."""
+"""Error bars and tests. What is drawn anew is the object: the views and runs of one object are not independent."""
 
 from __future__ import annotations
 

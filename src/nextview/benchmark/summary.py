@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from nextview.benchmark import statistics as st
 from nextview.benchmark.published import published
-from nextview.benchmark.replay import Ends, cut
+from nextview.benchmark.replay import Outcomes, truncate
 from nextview.benchmark.run import Grid
 
 Float = NDArray[np.float64]
 
-Cell = tuple[str, float | None, Ends]
+Cell = tuple[str, float | None, Outcomes]
 
-TESTED = ("accuracy", "clean_accuracy", "looks", "travel_all")
+TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
 SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)
-"""Thresholds of the curves of accuracy against looks and travel: from the first look for all to the last for most."""
+"""Thresholds of the curves of accuracy against views and travel: from the first view for all to the last for most."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Tables:
 
     Attributes:
         summary: policy, threshold, measure, value, low, high, published. The measures: ``accuracy``;
-            ``clean_accuracy``, without the objects whose very mesh also has another label; ``looks``;
+            ``clean_accuracy``, without the objects whose very mesh also has another label; ``n_views``;
             ``travel_moved``, over the episodes that moved, as published, and ``travel_all``, in grid cells;
             ``arc_all`` in radians; ``confident``, the share that reached the threshold, and ``confident_accuracy``,
             how often these are right; ``calibration_error``. With ``class_`` before them they are means over classes;
@@ -36,8 +36,8 @@ class Tables:
         per_class: policy, threshold, label, measure (accuracy, travel_moved), value, low, high, published.
         tests: policy, threshold, measure, difference to the reference, low, high, p (paired bootstrap), p_holm, and
             for accuracy mcnemar, mcnemar_holm. Holm's correction is over all rows of a measure.
-        sweep: policy, threshold, accuracy, looks, travel_all, arc_all: the points of the curves.
-        areas: policy, budget (looks or travel_all), value: mean accuracy over all budgets, low, high, and the
+        sweep: policy, threshold, accuracy, views, travel_all, arc_all: the points of the curves.
+        areas: policy, budget (n_views or travel_all), value: mean accuracy over all budgets, low, high, and the
             difference to the reference with difference_low, difference_high, p and p_holm.
         reliability: policy, threshold, bin, confidence, accuracy, episodes.
     """
@@ -63,7 +63,7 @@ def summarise(grid: Grid, reference: str, samples: int, rng: np.random.Generator
         samples: of the bootstrap.
         rng: draws them; the same ones for all policies, which pairs the differences.
     """
-    weights = st.resample(len(grid.trials.predictions), samples, rng)
+    weights = st.resample(len(grid.specs.predictions), samples, rng)
     cells = list(grid.cells())
     summary, drawn = _summary(grid, cells, weights)
     sweep, areas = _areas(grid, reference, weights[:500])
@@ -71,20 +71,20 @@ def summarise(grid: Grid, reference: str, samples: int, rng: np.random.Generator
     return Tables(summary, _per_class(grid, cells, weights), tests, sweep, areas, _reliability(grid, cells))
 
 
-def _measures(grid: Grid, ends: Ends) -> dict[str, tuple[Float, Float]]:
+def _measures(grid: Grid, ends: Outcomes) -> dict[str, tuple[Float, Float]]:
     """Each measure of a cell as a sum for each object and what to divide it by, (N,) each."""
     right = grid.right(ends.answer).astype(np.float64)
-    clean = np.where(grid.trials.predictions.conflicting, 0.0, 1.0)
+    clean = np.where(grid.specs.predictions.conflicting, 0.0, 1.0)
     one = np.ones(right.shape[1])
 
     def of(values: NDArray) -> NDArray:
         return values.reshape(grid.runs, -1)
 
-    moved, confident, mean = of(ends.looks > 1), of(ends.confident), right.mean(0)
+    moved, confident, mean = of(ends.n_views > 1), of(ends.confident), right.mean(0)
     return {
         "accuracy": (mean, one),
         "clean_accuracy": (mean * clean, clean),
-        "looks": (of(ends.looks).mean(0), one),
+        "n_views": (of(ends.n_views).mean(0), one),
         "travel_moved": (of(ends.travel).sum(0), moved.sum(0).astype(np.float64)),
         "travel_all": (of(ends.travel).mean(0), one),
         "arc_all": (of(ends.arc).mean(0), one),
@@ -107,14 +107,14 @@ def _columns(grid: Grid, cells: list[Cell], names: tuple[str, ...] | None = None
 
 def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFrame, dict[tuple, Float]]:
     """The table, and the bootstrap samples (S,) behind each of its cells."""
-    labels, classes = grid.trials.predictions.labels, grid.trials.predictions.classes
-    alike = np.ones((1, weights.shape[1]))
+    labels, classes = grid.specs.predictions.labels, grid.specs.predictions.classes
+    duplicate_groups = np.ones((1, weights.shape[1]))
     keys, top, bottom = _columns(grid, cells)
-    value, drawn = st.ratio(top, bottom, alike)[0], st.ratio(top, bottom, weights)
-    per_class = [i for i, key in enumerate(keys) if key[2] in ("accuracy", "travel_moved", "looks")]
+    value, drawn = st.ratio(top, bottom, duplicate_groups)[0], st.ratio(top, bottom, weights)
+    per_class = [i for i, key in enumerate(keys) if key[2] in ("accuracy", "travel_moved", "n_views")]
     keys += [(keys[i][0], keys[i][1], f"class_{keys[i][2]}") for i in per_class]
     top, bottom = top[:, per_class], bottom[:, per_class]
-    value = np.concatenate([value, st.class_mean(top, bottom, labels, alike)[0]])
+    value = np.concatenate([value, st.class_mean(top, bottom, labels, duplicate_groups)[0]])
     drawn = np.concatenate([drawn, st.class_mean(top, bottom, labels, weights)], 1)
     low, high = st.interval(drawn)
     rows = []
@@ -132,7 +132,7 @@ def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFram
 
 
 def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
-    p = grid.trials.predictions
+    p = grid.specs.predictions
     keys, top, bottom = _columns(grid, cells, ("accuracy", "travel_moved"))
     rows = []
     for index in np.unique(p.labels):
@@ -170,16 +170,16 @@ def _tests(
 
 
 def _areas(grid: Grid, reference: str, weights: Float) -> tuple[pd.DataFrame, pd.DataFrame]:
-    measures = ("accuracy", "looks", "travel_all", "arc_all")
+    measures = ("accuracy", "n_views", "travel_all", "arc_all")
     points, drawn = {}, {}  # of each policy: (T, measures), and its bootstrap samples (S, T, measures)
     for name, paths in grid.paths.items():
         if not paths.fixed:
-            _, top, _ = _columns(grid, [(name, t, cut(paths, t, grid.decline)) for t in SWEEP], measures)
+            _, top, _ = _columns(grid, [(name, t, truncate(paths, t, grid.threshold_decay)) for t in SWEEP], measures)
             points[name] = top.mean(0).reshape(len(SWEEP), -1)
             drawn[name] = (weights @ top / len(top)).reshape(len(weights), len(SWEEP), -1)
     rows = [(name, t, *values) for name, curve in points.items() for t, values in zip(SWEEP, curve, strict=True)]
     sweep = _frame(rows, ["policy", "threshold", *measures])
-    reach = {"looks": (1.0, float(grid.max_views)), "travel_all": (0.0, float(sweep["travel_all"].max()))}
+    reach = {"n_views": (1.0, float(grid.max_views)), "travel_all": (0.0, float(sweep["travel_all"].max()))}
     rows = []
     for budget, (low, high) in reach.items():
         if not high > low:

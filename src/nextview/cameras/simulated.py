@@ -7,13 +7,10 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from nextview.cloud import visible_points
 from nextview.mesh import Mesh
-from nextview.observation import Observation, pinhole
+from nextview.observation import Observation, checked_pose, pinhole
+from nextview.shading import AMBIENT
 from nextview.viewsphere import DISTANCE
-
-AMBIENT = 0.15
-"""Brightness of a surface seen edge-on, so that it stays apart from the black background."""
 
 
 def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -31,12 +28,10 @@ class SimulatedCamera:
         mesh: a normalised mesh.
         size: side of the square image, pixels.
         distance: distance at which the unit sphere just fills the image, object radii.
-        seed: decides which visible pixels become points.
     """
 
-    def __init__(self, mesh: Mesh, size: int = 224, distance: float = DISTANCE, seed: int = 0) -> None:
+    def __init__(self, mesh: Mesh, size: int = 224, distance: float = DISTANCE) -> None:
         self.size = size
-        self.seed = seed
         self.intrinsics = pinhole(size, distance)
         self.radius = mesh.metres
         vertices = mesh.vertices.astype(np.float32)
@@ -50,6 +45,7 @@ class SimulatedCamera:
 
     def observe(self, pose: NDArray[np.float64]) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object radii."""
+        pose = checked_pose(pose)
         rotation, origin = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
         image = np.zeros((self.size, self.size), np.uint8)
         depth = np.zeros((self.size, self.size), np.float32)
@@ -66,8 +62,7 @@ class SimulatedCamera:
             shade = np.where(hit, 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5, 0)
             image[bound] = shade.reshape(height, width)
             depth[bound] = np.where(hit, hits["tfar"], 0).reshape(height, width)
-        points = visible_points(depth, pose, self.intrinsics, self.seed)
-        return Observation(image, depth, points, pose, self.intrinsics, self.radius)
+        return Observation(depth, pose, self.intrinsics, self.radius, image)
 
     def _bound(self, rotation: NDArray[np.float32], origin: NDArray[np.float32]) -> tuple[slice, slice]:
         """Rows and columns that hold the projection of every vertex; the whole image if one is behind the camera."""

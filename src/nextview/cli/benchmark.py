@@ -17,7 +17,7 @@ def benchmark(
     policies: tuple[str, ...] = (),
     thresholds: tuple[float, ...] = (0.85, 0.9, 0.95, 0.97, 0.99),
     risks: tuple[float, ...] = (),
-    decline: float | None = None,
+    threshold_decay: float | None = None,
     uncalibrated: bool = False,
     split: Literal["train", "test"] | None = None,
     runs: int = 10,
@@ -31,16 +31,16 @@ def benchmark(
 
     Args:
         predictions: made by nextview predict.
-        out: folder for the results; earlier results there are replaced.
+        out: folder for the results; earlier results there are replaced, anything else is refused.
         policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
         thresholds: of the belief.
         risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too.
-        decline: how fast a threshold comes down with the looks; by default with the recogniser's correlation, as in
-            nextview recognise, or not at all with --risks, which are promised for thresholds that stay.
+        threshold_decay: how fast a threshold comes down with the views; by default with the recogniser's correlation,
+            as in nextview recognise, or not at all with --risks, which are promised for thresholds that stay.
         uncalibrated: believe the plain sum of the logits, as published, whatever the recogniser's card says.
         split: take only the objects of this one; needed where the predictions hold several.
         runs: random first views of each object.
-        max_views: looks at most.
+        max_views: views at most.
         reference: the policy that the others are compared with.
         valley_classes: classes whose map valley is the better view; those of the map network's card by default.
         samples: of the bootstrap.
@@ -50,33 +50,34 @@ def benchmark(
     import time
     from dataclasses import replace
 
-    from nextview.benchmark.contestants import default_contestants
-    from nextview.benchmark.replay import make_trials
+    from nextview.belief import PLAIN_SUM, Stopping
+    from nextview.benchmark.entries import default_entries
+    from nextview.benchmark.replay import make_specs
     from nextview.benchmark.run import Grid, run_grid
     from nextview.cli.extra import needs_extra
     from nextview.cli.progress import console, track
     from nextview.data.predictions import Predictions
-    from nextview.models.card import file_hash
-    from nextview.recognition import PLAIN_SUM, Stopping
+    from nextview.models.model_card import file_hash
+    from nextview.outputs import check_folder, written_results
 
     with needs_extra("benchmark"):
-        from nextview.benchmark.results import check_target, save
+        from nextview.benchmark.results import KIND, save
         from nextview.benchmark.summary import summarise
     import numpy as np
 
     began = time.perf_counter()
-    check_target(out)
+    check_folder(out, KIND)
     if not thresholds:
         raise UsageError("at least one threshold is needed")
     table = Predictions.load(predictions)
     if uncalibrated:
         table = replace(table, calibration=PLAIN_SUM)
-    if decline is None:
-        decline = 0.0 if risks else table.calibration.correlation
+    if threshold_decay is None:
+        threshold_decay = 0.0 if risks else table.calibration.correlation
     for threshold in thresholds:
-        Stopping(threshold, max_views, decline)  # says what is wrong with it
-    if risks and decline:
-        raise UsageError("error rates are promised for thresholds without a decline")
+        Stopping(threshold, max_views, threshold_decay)  # says what is wrong with it
+    if risks and threshold_decay:
+        raise UsageError("error rates are promised for thresholds without a threshold decay")
     promised = {risk: table.calibration.threshold(risk, max_views) for risk in risks}
     if split:
         table = table.of_split(split)
@@ -86,12 +87,14 @@ def benchmark(
     if unknown:
         raise UsageError(f"{predictions}: knows no class {unknown[0]!r}; there are {', '.join(table.classes)}")
     valleys = None if valley_classes is None else tuple(map(table.classes.index, valley_classes))
-    trials = make_trials(table, runs, seed, valleys)
+    specs = make_specs(table, runs, seed, valleys)
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
-    names = list(dict.fromkeys([*([reference] if policies else []), *(policies or default_contestants(trials))]))
-    grid = Grid(trials, runs, tuple(sorted({*thresholds, *promised.values()})), max_views, seed, decline)
-    track(run_grid(grid, names), len(names), "replaying policies")
-    if grid.paths:
+    names = list(dict.fromkeys([*([reference] if policies else []), *(policies or default_entries(specs))]))
+    grid = Grid(specs, runs, tuple(sorted({*thresholds, *promised.values()})), max_views, seed, threshold_decay)
+    with written_results(out, KIND) as part:
+        track(run_grid(grid, names), len(names), "replaying policies")
+        if not grid.paths:
+            raise EntryError("\n".join(grid.failures.values()))
         tables = summarise(grid, reference, samples, np.random.default_rng([seed, 1]))
         settings = {
             "predictions": predictions.name,
@@ -103,16 +106,16 @@ def benchmark(
             "reference": reference,
             "thresholds": grid.thresholds,
             "risks": {str(risk): threshold for risk, threshold in promised.items()},
-            "calibration": [table.calibration.temperature_of_one, table.calibration.correlation],
-            "decline": decline,
+            "calibration": [table.calibration.temperature, table.calibration.correlation],
+            "threshold_decay": threshold_decay,
             "runs": runs,
             "max_views": max_views,
-            "valley_classes": [table.classes[i] for i in trials.valley_classes],
+            "valley_classes": [table.classes[i] for i in specs.valley_classes],
             "samples": samples,
             "seed": seed,
         }
-        save(out, grid, tables, settings)
-        episodes = runs * len(table) * len(list(grid.cells()))
-        console.print(f"{episodes:,} episodes in {time.perf_counter() - began:.1f} s; results in {out}")
+        save(part, grid, tables, settings)
+    episodes = runs * len(table) * len(list(grid.cells()))
+    console.print(f"{episodes:,} episodes in {time.perf_counter() - began:.1f} s; results in {out}")
     if grid.failures:
         raise EntryError("\n".join(grid.failures.values()))

@@ -22,7 +22,7 @@ def check(
         scheduler: address of a dask.distributed scheduler to use instead.
     """
     from nextview.cli.progress import console, track
-    from nextview.data.check import check as check_store
+    from nextview.data.checking import check as check_store
     from nextview.data.store import ViewStore
 
     views = ViewStore.open(store)

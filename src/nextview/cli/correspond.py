@@ -35,6 +35,7 @@ def correspond(
     from nextview.data.correspond import ARRAY, correspondence_maps
     from nextview.data.correspond import correspond as correspond_store
     from nextview.data.store import ViewStore
+    from nextview.outputs import written_whole
     from nextview.report.store_figures import correspondence_figure, save
 
     views = ViewStore.open(store)
@@ -50,10 +51,8 @@ def correspond(
     share = ViewStore.open(store).group[ARRAY][:][of]
     maps = correspondence_maps(share).mean(0)
     arrays, picture = out.with_name(out.name + ".npz"), out.with_name(out.name + ".png")
-    arrays.parent.mkdir(parents=True, exist_ok=True)
-    part = arrays.with_name(out.name + ".part.npz")
-    np.savez(part, share=share.mean(0), maps=maps, objects=int(of.sum()))
-    part.replace(arrays)
+    with written_whole(arrays) as part:
+        np.savez(part, share=share.mean(0), maps=maps, objects=int(of.sum()))
     title = f"Point correspondence, mean over {int(of.sum()):,} objects" + (f" of the class {label}" if label else "")
     save(correspondence_figure(maps, views.sphere, title), picture)
     console.print(f"{arrays}\n{picture}")

@@ -22,8 +22,8 @@ def download(
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
     from nextview.cli.progress import console
-    from nextview.data.download import ARCHIVES
-    from nextview.data.download import download as fetch
+    from nextview.data.downloading import ARCHIVES
+    from nextview.data.downloading import download as fetch
 
     archive = ARCHIVES[dataset]
     columns = (

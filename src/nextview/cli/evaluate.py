@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-    from nextview.benchmark.evaluate import Evaluation
+    from nextview.benchmark.evaluation import Evaluation
     from nextview.report.elements import Number
 
 
@@ -23,7 +23,7 @@ def evaluate(
     /,
     out: Path = Path("evaluation"),
     split: Literal["train", "test"] | None = None,
-    each_shape_once: bool = False,
+    deduplicate: bool = False,
     cards: tuple[str, ...] = (),
     samples: int = 2000,
     seed: int = 0,
@@ -32,9 +32,10 @@ def evaluate(
 
     Args:
         predictions: made by nextview predict.
-        out: folder for numbers, tables, figures and evaluate.html; an earlier evaluation there is replaced.
+        out: folder for numbers, tables, figures and evaluate.html; an earlier evaluation there is replaced, anything
+            else is refused.
         split: take only the objects of this one; needed where the predictions hold several.
-        each_shape_once: of objects with the same label that look the same from every view, copies of one mesh, judge
+        deduplicate: of objects with the same label that look the same from every view, copies of one mesh, judge
             only the first; the published numbers count them all.
         cards: of the models that made the predictions; their scores are noted on these.
         samples: of the bootstrap.
@@ -44,43 +45,45 @@ def evaluate(
     from nextview.cli.progress import track
     from nextview.cli.terminal import Terminal
     from nextview.data.predictions import Predictions
-    from nextview.models.card import file_hash, find_card, write_card
+    from nextview.models.model_card import file_hash, find_card, write_card
+    from nextview.outputs import check_folder, written_results
 
     with needs_extra("benchmark"):
-        from nextview.benchmark import evaluate as judge
-        from nextview.report import evaluation
+        from nextview.benchmark import evaluation as judge
+        from nextview.report import evaluation_page as evaluation
     import numpy as np
 
-    evaluation.check_folder(out)
+    check_folder(out, evaluation.KIND)
     table = Predictions.load(predictions)
     if split:
         table = table.of_split(split)
     elif len(set(table.splits)) > 1:
         raise UsageError(f"{predictions}: holds training and test objects; choose with --split which are judged")
-    if each_shape_once:
-        table = table.each_shape_once()
+    if deduplicate:
+        table = table.deduplicate()
     noted = {}
     for name in cards:
         card = find_card(name)
         known = "" if table.of_size is None else ", of known size"
-        things = "shapes" if each_shape_once else "objects"
+        things = "shapes" if deduplicate else "objects"
         of = f"{split or table.splits[0] or 'all'} ({len(table)} {things}{known})"
         noted[card.path] = card.facts | {
             "scores": card.facts.get("scores", {}) | {of: judge.scores_for_card(card, table)}
         }
-    found = judge.evaluate(table, samples, np.random.default_rng([seed, 0]))
-    settings = {
-        "predictions": predictions.name,
-        "predictions_sha256": file_hash(predictions),
-        "models": table.models,
-        "split": split,
-        "each_shape_once": each_shape_once,
-        "objects": len(table),
-        "samples": samples,
-        "seed": seed,
-    }
-    figures = evaluation.all_figures(found, table, np.random.default_rng([seed, 1]))
-    track(evaluation.save(out, found, table, settings, figures), len(figures) + 1, "writing figures")
+    with written_results(out, evaluation.KIND) as part:
+        found = judge.evaluate(table, samples, np.random.default_rng([seed, 0]))
+        settings = {
+            "predictions": predictions.name,
+            "predictions_sha256": file_hash(predictions),
+            "models": table.models,
+            "split": split,
+            "deduplicate": deduplicate,
+            "objects": len(table),
+            "samples": samples,
+            "seed": seed,
+        }
+        figures = evaluation.all_figures(found, table, np.random.default_rng([seed, 1]))
+        track(evaluation.save(part, found, table, settings, figures), len(figures) + 1, "writing figures")
     for path, facts in noted.items():
         write_card(path.with_suffix(".json"), facts)
     console = Terminal()
@@ -99,7 +102,7 @@ def _recogniser(found: Evaluation, views: int) -> Table:
     from nextview.report.elements import numbers
 
     shown = Table("share of right answers", "objects", "one view", f"all {views} views")
-    right = numbers(found.accuracy, "looks", "label", "measure")
+    right = numbers(found.accuracy, "n_views", "label", "measure")
     objects = found.accuracy.groupby(["label", "measure"])["objects"].first()
     labels = [label for label in found.accuracy["label"].unique() if label]
     lines = [(label.replace("_", " "), label, "accuracy") for label in labels]
@@ -108,7 +111,7 @@ def _recogniser(found: Evaluation, views: int) -> Table:
     if "shape_accuracy" in set(found.accuracy["measure"]):
         lines += [("  size not known", "", "shape_accuracy")]
     for heading, label, measure in lines:
-        cells = (_cell(right[looks, label, measure], 3) for looks in (1, views))
+        cells = (_cell(right[n_views, label, measure], 3) for n_views in (1, views))
         shown.add_row(heading, str(objects[label, measure]), *cells, end_section=label == labels[-1])
     published = right[1, "", "accuracy"].published
     if isfinite(published):
@@ -117,23 +120,23 @@ def _recogniser(found: Evaluation, views: int) -> Table:
 
 
 def _map(found: Evaluation, name: str) -> Table:
-    """Scores of a map over objects and classes, beside the published ones and the yardsticks."""
+    """Scores of a map over objects and classes, beside the published ones and the baselines."""
     from rich.table import Table
 
     from nextview.report.elements import numbers
 
     measures = {"mse": "MSE", "d0": "d = 0", "d_le_1": "d <= 1", "d_lt_2": "d < 2", "regret": "regret"}
     scores = numbers(found.maps[(found.maps["map"] == name) & (found.maps["label"] == "")], "by", "measure")
-    yardsticks = [by for by in found.maps["by"].unique() if by != "network"]
+    baselines = [by for by in found.maps["by"].unique() if by != "network"]
     printed = any(isfinite(score.published) for score in scores.values())
     caption = "published: squared error over objects, peaks over classes (table 4)" if printed else None
-    shown = Table(name.upper(), "mean of objects", "of classes", "published", *yardsticks, caption=caption)
+    shown = Table(name.upper(), "mean of objects", "of classes", "published", *baselines, caption=caption)
     shown.columns[1].no_wrap = True
     for measure, heading in measures.items():
         digits = 4 if measure == "mse" else 3
         over_objects, over_classes = scores["network", measure], scores["network", f"class_{measure}"]
         published = over_objects.published if measure == "mse" else over_classes.published
-        rest = [over_classes.value, published, *(scores[by, measure].value for by in yardsticks)]
+        rest = [over_classes.value, published, *(scores[by, measure].value for by in baselines)]
         cells = (f"{value:.{digits}f}" if isfinite(value) else "-" for value in rest)
         shown.add_row(heading, _cell(over_objects, digits), *cells)
     return shown

@@ -30,8 +30,6 @@ def export_recogniser(
     out: tyro.conf.Positional[Path],
     /,
     also: tuple[Path, ...] = (),
-    merged: bool = False,
-    mirror: bool = False,
     bits: Literal[8, 16] = 16,
     name: str = "recogniser-modelnet10",
     commands: tuple[str, ...] = (),
@@ -44,8 +42,6 @@ def export_recogniser(
         store: the store that it was trained on.
         out: folder for NAME.onnx and NAME.json.
         also: further runs or cards, of the same store and input; the logits of all are averaged.
-        merged: average their weights instead, into one network; for runs that went on from one another (--weights).
-        mirror: average what the networks say of a view and of its mirror image.
         bits: that a weight takes in the file.
         name: what to call the model.
         commands: the commands that made the run, for the card.
@@ -57,18 +53,14 @@ def export_recogniser(
 
     from nextview.benchmark.scores import recogniser_scores
     from nextview.cli.progress import console
-    from nextview.data.split import each_shape_once
+    from nextview.data.splits import deduplicate
     from nextview.data.store import ViewStore
-    from nextview.models.card import write_card
-    from nextview.models.networks import Recogniser
-    from nextview.training.export import CalibratedRecogniser, answer, export_onnx, fit_temperature
+    from nextview.models.inference import Recogniser
+    from nextview.models.model_card import write_card
     from nextview.training.inputs import load_inputs
     from nextview.training.members import member, member_networks
-    from nextview.training.merge import merge
-    from nextview.training.recogniser import drawn_views
+    from nextview.training.onnx_export import CalibratedRecogniser, answer, export_onnx, fit_temperature
 
-    if merged and not also:
-        raise ModelError("--merged averages the weights of several runs: name the others with --also")
     views = ViewStore.open(store)
     members = [member(source, views) for source in (run, *also)]
     size, sees = members[0].size, members[0].sees
@@ -83,20 +75,13 @@ def export_recogniser(
     inputs = load_inputs(store, size, sees)
     sample = np.concatenate([inputs[i] for i in validation[:3]])
     networks = [network for one in members for network in member_networks(one, views, sample)]
-    blocks = {network.blocks for network in networks}
-    if len(blocks) > 1:
-        raise ModelError(f"{run} and the others do not see the same: pixels in blocks of {sorted(blocks)}")
-    names = [network.name for network in networks]
-    if merged:
-        drawn = drawn_views(inputs, training, views.labels, members[0].recipes[-1], 32)
-        networks, names = [merge(networks, drawn)], [f"{names[0]}, the mean of {len(networks)} runs"]
 
     out.mkdir(parents=True, exist_ok=True)
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
     facts: dict[str, Any] = {
         "name": name,
         "kind": "recogniser",
-        "network": " + ".join(names) + (", mirrored too" if mirror else ""),
+        "network": " + ".join(network.name for network in networks),
         "input": SEEN[sees],
         "sees": sees,
         "input_size": size,
@@ -104,19 +89,17 @@ def export_recogniser(
         "temperature": 1.0,
     }
     example = inputs[validation[0], :2]
-    uncalibrated = CalibratedRecogniser(networks, 1.0, mirror)
-    if blocks != {1}:
-        (facts["blocks"],) = blocks
-    if uncalibrated.sides:
-        facts["sides"] = uncalibrated.sides
+    uncalibrated = CalibratedRecogniser(networks, 1.0)
+    if uncalibrated.azimuth_bins:
+        facts["azimuth_bins"] = uncalibrated.azimuth_bins
     export_onnx(uncalibrated, example, "input", uncalibrated.outputs, weights, bits)
     write_card(card, facts)
-    plain, judging = Recogniser(card), each_shape_once(views, validation)
+    plain, judging = Recogniser(card), deduplicate(views, validation)
     raw = _tracked(lambda i: plain.from_inputs(inputs[i]).logits, judging, "validation views")
     labels = views.labels[judging]
     temperature = fit_temperature(raw.reshape(-1, raw.shape[2]), np.repeat(labels, raw.shape[1]))
 
-    shipped = CalibratedRecogniser(networks, temperature, mirror).eval()
+    shipped = CalibratedRecogniser(networks, temperature).eval()
     export_onnx(shipped, example, "input", shipped.outputs, weights, bits)
     write_card(card, facts)
     sample = np.stack([inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]])
@@ -144,7 +127,6 @@ def export_lem(
     store: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     /,
-    mirror: bool = False,
     bits: Literal[8, 16] = 16,
     name: str = "lem-modelnet10",
     commands: tuple[str, ...] = (),
@@ -156,7 +138,6 @@ def export_lem(
         run: folder made by nextview train lem.
         store: the store that it was trained on.
         out: folder for NAME.onnx and NAME.json.
-        mirror: average what a ResNet says of a view and of its mirror image.
         bits: that a weight takes in the file.
         name: what to call the model.
         commands: the commands that made the run, for the card.
@@ -167,7 +148,7 @@ def export_lem(
 
     target = entropy_target(ViewStore.open(store))
     what = "depth-entropy, 0 .. 1 over the object's views"
-    _export_map("lem", what, target, run, store, out, mirror, bits, name, commands, note)
+    _export_map("lem", what, target, run, store, out, bits, name, commands, note)
 
 
 def export_lcm(
@@ -176,7 +157,6 @@ def export_lcm(
     predictions: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     /,
-    mirror: bool = False,
     bits: Literal[8, 16] = 16,
     name: str = "lcm-modelnet10",
     commands: tuple[str, ...] = (),
@@ -189,7 +169,6 @@ def export_lcm(
         store: the store that it was trained on.
         predictions: those that it was trained on.
         out: folder for NAME.onnx and NAME.json.
-        mirror: average what a ResNet says of a view and of its mirror image.
         bits: that a weight takes in the file.
         name: what to call the model.
         commands: the commands that made the run, for the card.
@@ -201,7 +180,7 @@ def export_lcm(
 
     target = confidence_target(ViewStore.open(store), Predictions.load(predictions))
     what = "the recogniser's confidence where it is right, else 0"
-    _export_map("lcm", what, target, run, store, out, mirror, bits, name, commands, note)
+    _export_map("lcm", what, target, run, store, out, bits, name, commands, note)
 
 
 def _export_map(
@@ -211,7 +190,6 @@ def _export_map(
     run: Path,
     store: Path,
     out: Path,
-    mirror: bool,
     bits: int,
     name: str,
     commands: tuple[str, ...],
@@ -223,16 +201,16 @@ def _export_map(
 
     from nextview.benchmark.scores import map_scores
     from nextview.cli.progress import console
-    from nextview.data.seen import seen_views
-    from nextview.data.split import each_shape_once, split_training
+    from nextview.data.input_views import input_views
+    from nextview.data.splits import deduplicate, split_training
     from nextview.data.store import ViewStore
-    from nextview.models.card import write_card
-    from nextview.models.networks import MapNetwork
-    from nextview.training.export import ShippedMap, answer, export_onnx
-    from nextview.training.networks import map_network
+    from nextview.models.inference import MapNetwork
+    from nextview.models.model_card import write_card
+    from nextview.training.architectures import map_network
+    from nextview.training.checkpoints import load_run
+    from nextview.training.onnx_export import ShippedMap, answer, export_onnx
     from nextview.training.recipes import MapRecipe
     from nextview.training.runs import read_recipe
-    from nextview.training.weights import load_run
 
     recipe = read_recipe(run, MapRecipe)
     views = ViewStore.open(store)
@@ -240,17 +218,17 @@ def _export_map(
     parts = split_training(views, recipe.validation, recipe.seed)
     training, validation = map(target.known, parts)
     network = load_run(map_network(recipe, sphere), run)
-    shipped = ShippedMap(network, mirror).eval()
+    shipped = ShippedMap(network).eval()
 
     out.mkdir(parents=True, exist_ok=True)
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
     size = recipe.size if recipe.input != "cloud" else 0
-    sample = seen_views(views, int(validation[0]), recipe.input, size)[3:11]
+    sample = input_views(views, int(validation[0]), recipe.input, size)[3:11]
     export_onnx(shipped, sample, "seen", ["map", "sphere"] if shipped.whole else ["map"], weights, bits)
     facts: dict[str, Any] = {
         "name": name,
         "kind": kind,
-        "network": f"ResNet-{recipe.depth}{', mirrored too' * mirror}" if size else "PointNet with both transforms",
+        "network": f"ResNet-{recipe.depth}" if size else "PointNet with both transforms",
         "input": SEEN[recipe.input],
         "sees": recipe.input,
         "input_size": size,
@@ -266,9 +244,9 @@ def _export_map(
         raise ModelError(f"{weights}: its maps differ from the network's by up to {difference:.2g}")
 
     def one(i: int) -> NDArray:
-        return predictor.from_inputs(seen_views(views, i, *predictor.sees))[kind]
+        return predictor.from_inputs(input_views(views, i, *predictor.sees))[kind]
 
-    judging = each_shape_once(views, validation)
+    judging = deduplicate(views, validation)
     maps = _tracked(one, judging, "validation maps")
     shape = (-1, sphere.rings, 3)
     true = target.values[judging][:, sphere.windows]

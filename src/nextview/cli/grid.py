@@ -12,6 +12,7 @@ import tyro
 
 from nextview.cli.train import train_recogniser
 from nextview.errors import ModelError
+from nextview.outputs import written_whole
 from nextview.training.hardware import Hardware
 from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe
 
@@ -47,8 +48,8 @@ def train_grid(
     from nextview.data.store import ViewStore
     from nextview.report.grid_figure import grid_figure
     from nextview.report.style import to_png
-    from nextview.training.fit import is_first
     from nextview.training.grid import published_cells
+    from nextview.training.loop import is_first
 
     views = ViewStore.open(store)
     cells = {
@@ -71,12 +72,10 @@ def train_grid(
     for (run, own), published in zip(recipes.items(), cells.values(), strict=True):
         cell = {"depth": own.depth, "batch_size": own.batch} | _scores(run, store, views, own)
         rows += [cell | {"published": accuracy} for accuracy in (published or (None,))]
-    part = out / "grid.part"
-    with part.open("w", newline="") as file:
+    with written_whole(out / "grid.csv") as part, part.open("w", newline="") as file:
         table = csv.DictWriter(file, list(rows[0]))
         table.writeheader()
         table.writerows(rows)
-    part.rename(out / "grid.csv")
     to_png(grid_figure(rows), out / "grid.png")
 
 
@@ -85,7 +84,7 @@ def _scores(run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe) 
     import numpy as np
 
     from nextview.cli.progress import track
-    from nextview.data.split import test_objects
+    from nextview.data.splits import test_objects
     from nextview.report.training_curves import read_log
     from nextview.training.grid import count_right
     from nextview.training.inputs import load_inputs
@@ -110,9 +109,8 @@ def _scores(run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe) 
         "class_accuracy": round(_over_classes(share, labels[objects]), 4),
         "validation_class_accuracy": round(max(read_log(run)["class_accuracy"]), 4),
     }
-    part = kept.with_suffix(".part")
-    part.write_text(json.dumps(scores) + "\n")
-    part.rename(kept)
+    with written_whole(kept) as part:
+        part.write_text(json.dumps(scores) + "\n")
     return scores
 
 

@@ -12,7 +12,7 @@ from nextview.errors import DatasetError
 def inspect(
     store: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path | None] = None, /, object: str | None = None
 ) -> None:
-    """Draw what a view store holds: classes, counts, failures, size on disk; or one object from all sides.
+    """Draw what a view store holds: classes, counts, failures, size on disk; or one object from all azimuth bins.
 
     Args:
         store: view store made by nextview render.
@@ -40,8 +40,8 @@ def inspect(
             console.print(f"{what:22} {value}", highlight=False)
         sizes = median_radii(views)
         if sizes:
-            said = ", ".join(f"{name} {radius:.2f}" for name, radius in sizes.items())
-            console.print(f"{'median radius, m':22} {said}", highlight=False, soft_wrap=True)
+            shown = ", ".join(f"{name} {radius:.2f}" for name, radius in sizes.items())
+            console.print(f"{'median radius, m':22} {shown}", highlight=False, soft_wrap=True)
         for reason in views.failures.values():
             console.print(f"left out: {reason}", style="yellow", highlight=False)
         save(store_figure(views), out)

@@ -23,7 +23,7 @@ def measure(
         scheduler: address of a dask.distributed scheduler to use instead.
     """
     from nextview.cli.progress import track
-    from nextview.data.measure import measure as measure_store
+    from nextview.data.measuring import measure as measure_store
     from nextview.data.store import ViewStore
     from nextview.measures.registry import MEASURES
 

@@ -16,7 +16,7 @@ def models(name: tyro.conf.Positional[str | None] = None, /) -> None:
     from rich.table import Table
 
     from nextview.cli.terminal import Terminal
-    from nextview.models.card import bundled_cards, file_hash, find_card
+    from nextview.models.model_card import bundled_cards, file_hash, find_card
 
     if name:
         print(json.dumps(find_card(name).facts, indent=1))

@@ -40,10 +40,10 @@ def predict(
         scheduler: address of a dask.distributed scheduler, to use its workers instead.
     """
     from nextview.cli.progress import track
-    from nextview.data import predict as job
+    from nextview.data import predicting as job
     from nextview.data.store import ViewStore
-    from nextview.models.card import find_card
-    from nextview.models.networks import MAPS, RECOGNISER
+    from nextview.models.inference import MAPS, RECOGNISER
+    from nextview.models.model_card import find_card
 
     if len(recogniser) > 1 and not unseen:
         raise UsageError("several recognisers can only share the work with --unseen")

@@ -38,10 +38,10 @@ def recognise(
 
     Args:
         mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
-        policy: how the next view is chosen: gain (what a look is worth less its price), lem, lem-peak, lcm, lcm-peak,
-            random, random-all, furthest, unidirectional, spread, spread-local, another learned one that is bundled, or
-            the card of one (.json).
-        threshold: stop when the belief in one class reaches this after one look, less after several.
+        policy: how the next view is chosen: gain (what a view is worth less its travel weight), lem, lem-peak, lcm,
+            lcm-peak, random, random-all, furthest, unidirectional, spread, spread-local, another learned one that is
+            bundled, or the card of one (.json).
+        threshold: stop when the belief in one class reaches this after one view, less after several.
         risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
         max_views: stop after so many views.
         start: first view, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
@@ -81,10 +81,11 @@ def show(
     """Recognise what ``load`` returns and print the episode; the rest as for ``recognise``."""
     import numpy as np
 
+    from nextview.belief import Stopping
     from nextview.cameras.simulated import SimulatedCamera
-    from nextview.models.networks import load_models
+    from nextview.errors import ObservationError
+    from nextview.models.inference import load_models
     from nextview.policies.registry import make_policy
-    from nextview.recognition import Stopping
     from nextview.session import Session
     from nextview.viewsphere import ViewSphere
 
@@ -108,9 +109,14 @@ def show(
     while not session.done:
         seen = camera.observe(session.pose)
         watch.lap("looking")
-        session.tell(seen)
+        session.update(seen)
         watch.lap("thinking")
     result = session.result
+    if result.answer is None:
+        raise ObservationError(
+            f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.views)} views; "
+            "is it made of a few small parts far apart?"
+        )
 
     from nextview.cli.episode_table import as_json, print_episode
 

@@ -49,8 +49,8 @@ def render(
 
     from nextview.cli.progress import console, track
     from nextview.data.folders import list_dataset
-    from nextview.data.render import Deform
-    from nextview.data.render import render as render_dataset
+    from nextview.data.rendering import Deform
+    from nextview.data.rendering import render as render_dataset
     from nextview.data.store import ViewStore
     from nextview.viewsphere import ViewSphere
 
@@ -67,10 +67,10 @@ def render(
     for reason in made.failures.values():
         console.print(f"left out: {reason}", style="yellow", highlight=False)
     labels = [made.classes[label] for label in made.labels]
-    twins = made.twins
-    if twins:
-        console.print(f"{sum(map(len, twins)) - len(twins)} meshes are byte-identical copies of another one")
-    for group in twins:
+    duplicates = made.duplicates
+    if duplicates:
+        console.print(f"{sum(map(len, duplicates)) - len(duplicates)} meshes are byte-identical copies of another one")
+    for group in duplicates:
         if len({labels[i] for i in group}) > 1:
             same = " = ".join(f"{made.names[i]} ({labels[i]})" for i in group)
             console.print(f"one mesh, several labels: {same}", style="yellow", highlight=False)

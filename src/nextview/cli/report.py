@@ -17,7 +17,7 @@ def report(
 
     Args:
         results: folder made by nextview benchmark.
-        out: the page; RESULTS/report.html by default.
+        out: the page; RESULTS/report.html by default, which counts as one of the results.
         store: the view store of the predictions, for pictures of the objects.
     """
     from nextview.cli.extra import needs_extra
@@ -26,9 +26,10 @@ def report(
 
     with needs_extra("benchmark"):
         from nextview.benchmark.results import load
-        from nextview.report.html import write_report
+        from nextview.report.html import PAGE, check_page, write_report
         from nextview.report.trajectories import Pictures
 
-    target = out or results / "report.html"
+    target = out or results / PAGE
+    check_page(target, results)
     write_report(load(results), target, Pictures(ViewStore.open(store) if store else None))
     console.print(f"{target}: {target.stat().st_size / 1e6:.1f} MB")

@@ -50,31 +50,27 @@ def train_recogniser(
     import numpy as np
 
     from nextview.cli.progress import console
-    from nextview.data.split import each_shape_once, split_training
+    from nextview.data.splits import deduplicate, split_training
     from nextview.data.store import ViewStore
     from nextview.training import recogniser
+    from nextview.training.azimuth_bins import mirror_planes
+    from nextview.training.checkpoints import refuse_seen
     from nextview.training.folds import hold_out
     from nextview.training.runs import begin, finish, is_done
-    from nextview.training.sides import mirror_planes
-    from nextview.training.weights import refuse_seen
 
     if fold is not None and not 0 <= fold < folds:
         raise ModelError(f"there is no fold {fold} of {folds}: they are counted from 0")
-    if recipe.network != "resnet" and recipe.blocks > 1:
-        raise ModelError("only a ResNet sees pixels in blocks: leave --blocks, or take --network resnet")
     if recipe.network != "resnet" and recipe.depth != RecogniserRecipe.depth:
         raise ModelError(f"only a ResNet has a --depth: {recipe.network} is as deep as it is")
-    if recipe.network == "resnet" and recipe.drop:
-        raise ModelError("only an EfficientNet-Lite drops features and blocks: leave --drop, or take --network lite0")
-    if not 0 <= recipe.drop < 1:
-        raise ModelError(f"--drop is a chance, 0 or more and less than 1, not {recipe.drop}")
-    if recipe.size % recipe.blocks or (recipe.small_epochs and recipe.small % recipe.blocks):
-        raise ModelError(f"images of {recipe.size} pixels, and small ones, must be whole blocks of {recipe.blocks}")
+    if recipe.network == "resnet" and recipe.dropout:
+        raise ModelError("only EfficientNet-Lite0 drops features and blocks: leave --dropout, or take --network lite0")
+    if not 0 <= recipe.dropout < 1:
+        raise ModelError(f"--dropout is a chance, 0 or more and less than 1, not {recipe.dropout}")
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation, recipe.seed)
-    judging = each_shape_once(views, validation)
-    azimuths = views.sphere.azimuths if recipe.side else 0
-    planes = mirror_planes(views, training) if recipe.side else None
+    judging = deduplicate(views, validation)
+    azimuths = views.sphere.azimuths if recipe.azimuth_bins_weight else 0
+    planes = mirror_planes(views, training) if recipe.azimuth_bins_weight else None
     sources = [_source(path, views, training, recipe, planes) for path in (store, *deformed)]
     runs = {out: training[:0]}
     if folds:
@@ -108,8 +104,8 @@ def _source(
     import numpy as np
 
     from nextview.data.store import ViewStore
+    from nextview.training.azimuth_bins import azimuth_bins
     from nextview.training.recogniser import Source
-    from nextview.training.sides import sides
 
     store = ViewStore.open(path)
     row = {name: i for i, name in enumerate(store.names)}
@@ -118,7 +114,7 @@ def _source(
     if missing:
         raise DatasetError(f"{path}: lacks {len(missing)} of the training objects, {missing[0]} among them")
     inputs = _prepared(path, store, recipe.size, recipe.input)
-    return Source(inputs, rows, None if planes is None else sides(store, views.sphere.azimuths, planes))
+    return Source(inputs, rows, None if planes is None else azimuth_bins(store, views.sphere.azimuths, planes))
 
 
 def _prepared(path: Path, store: ViewStore, size: int, kind: str) -> PackedViews:
@@ -127,8 +123,8 @@ def _prepared(path: Path, store: ViewStore, size: int, kind: str) -> PackedViews
 
     from nextview.cli.progress import track
     from nextview.data.lock import only_one
-    from nextview.training.fit import is_first
     from nextview.training.inputs import inputs_path, load_inputs, prepare_inputs
+    from nextview.training.loop import is_first
 
     target = inputs_path(path, size, kind)
     if is_first() and not target.exists():
@@ -143,7 +139,7 @@ def _draw_curves(run: Path) -> None:
     """Draw how a training went, from its log, as curves.png."""
     from nextview.report.style import to_png
     from nextview.report.training_curves import read_log, training_curves
-    from nextview.training.fit import is_first
+    from nextview.training.loop import is_first
 
     if is_first():
         to_png(training_curves(read_log(run)), run / "curves.png")
@@ -162,7 +158,7 @@ def train_lem(
         store: view store made by nextview render, with the 40 views.
         out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the lowest squared error.
         weights: card (NAME.json) of the same depth and input from which a ResNet starts: a recogniser's, as what it
-            knows of shapes and of the side that is seen is of use; or that of a map network, to go on with it.
+            knows of shapes and of the azimuth bin that is seen is of use; or that of a map network, to go on with it.
         recipe: how to train.
         hardware: on what.
     """
@@ -189,7 +185,7 @@ def train_lcm(
             --recogniser CARD CARD).
         out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the lowest squared error.
         weights: card (NAME.json) of the same depth and input from which a ResNet starts: a recogniser's, as what it
-            knows of shapes and of the side that is seen is of use; or that of a map network, to go on with it.
+            knows of shapes and of the azimuth bin that is seen is of use; or that of a map network, to go on with it.
         recipe: how to train.
         hardware: on what.
     """
@@ -205,11 +201,11 @@ def _train_map(
     store: Path, target: Target, out: Path, weights: Path | None, recipe: MapRecipe, hardware: Hardware
 ) -> None:
     from nextview.cli.progress import console
-    from nextview.data.split import each_shape_once, split_training
+    from nextview.data.splits import deduplicate, split_training
     from nextview.data.store import ViewStore
-    from nextview.training import maps
+    from nextview.training import map_training as maps
+    from nextview.training.checkpoints import refuse_seen
     from nextview.training.runs import begin, finish, is_done
-    from nextview.training.weights import refuse_seen
 
     views = ViewStore.open(store)
     training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
@@ -223,7 +219,7 @@ def _train_map(
         seen: NDArray | PackedViews = (
             views.all_points() if cloud else _prepared(store, views, recipe.size, recipe.input)
         )
-        judging = each_shape_once(views, validation)
+        judging = deduplicate(views, validation)
         network = maps.train(seen, target.values, views.sphere, training, judging, recipe, out, hardware, weights)
         _draw_curves(out)
         finish(network, out)

@@ -1,4 +1,4 @@
-"""``nextview train gain``: learn what a look from each view is worth."""
+"""``nextview train gain``: learn what a view from each view is worth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def train_gain(
     /,
     validation: Path | None = None,
     folds: int = 20,
-    price: float | None = None,
+    travel_weight: float | None = None,
     local: bool = False,
     recipe: tyro.conf.OmitArgPrefixes[GainRecipe] = GainRecipe(),
 ) -> None:
@@ -26,13 +26,13 @@ def train_gain(
         predictions: of objects of the training split that the recogniser was not trained on, those that validated it or
             those that were kept from it in folds (nextview predict --unseen).
         out: card of the policy (.json), the weights beside it (.onnx); run it with --policy OUT, or OUT@PRICE for
-            another price.
-        validation: predictions of other objects of the training split, which choose the epoch and the price; those
-            among them are left out of the training. By default PREDICTIONS choose them, in folds.
+            another travel weight.
+        validation: predictions of other objects of the training split, which choose the epoch and the travel weight;
+            those among them are left out of the training. By default PREDICTIONS choose them, in folds.
         folds: without VALIDATION, so many policies are trained, each without its share of the objects, which judge it;
             the result is the mean of all.
-        price: of a grid cell of travel; by default the lowest at which the policy travels no farther than a random walk
-            in the local window.
+        travel_weight: of a grid cell of travel; by default the lowest at which the policy travels no farther than a
+            random walk in the local window.
         local: let it choose in the local window only.
         recipe: how to train.
     """
@@ -41,27 +41,29 @@ def train_gain(
 
     import numpy as np
 
+    from nextview.calibration.rollout import ReplayTable, Value, fit_travel_weight
     from nextview.cli.progress import console, track
     from nextview.data.predictions import Predictions
-    from nextview.fitting.choices import ReplayTable, Worth, travel_price
-    from nextview.models.card import file_hash
+    from nextview.models.model_card import file_hash
     from nextview.policies.gain import MAPS, Gain
     from nextview.training.folds import hold_out
-    from nextview.training.gain import averaged, best_epoch, train, walk
     from nextview.training.gain_export import write_gain
+    from nextview.training.gain_training import averaged, best_epoch, train, walk
 
     if out.suffix != ".json":
         raise UsageError(f"{out}: the card of a policy is called NAME.json")
-    table = Predictions.load(predictions).each_shape_once()
-    other = table if validation is None else Predictions.load(validation).each_shape_once()
+    table = Predictions.load(predictions).deduplicate()
+    other = table if validation is None else Predictions.load(validation).deduplicate()
     if (other.classes, other.sphere) != (table.classes, table.sphere):
         raise PredictionsError(f"{validation}: is of other classes or viewpoints than {predictions}")
     for path, source in ((predictions, table), (validation, other)):
         lacking = [name for name in recipe.inputs if name in MAPS and name not in source.maps]
         if lacking:
             raise PredictionsError(f"{path}: holds no map {lacking[0]!r}; predict it, or choose other --inputs")
-        if source.sides is None and (recipe.frame == "object" or "side" in recipe.inputs):
-            raise PredictionsError(f"{path}: says nothing of sides; teach the recogniser (--side), or do without")
+        if source.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
+            raise PredictionsError(
+                f"{path}: says nothing of azimuth bins; teach the recogniser (--azimuth-bins-weight), or do without"
+            )
     everything = np.arange(len(table))
     if validation is None:
         checking = hold_out(table.labels, table.depth_entropy, folds, recipe.seed)
@@ -71,7 +73,7 @@ def train_gain(
     rng = np.random.default_rng([recipe.seed, 1])
     learned = [ReplayTable.of(table, part, rng) for part in learning]
     checked = [ReplayTable.of(other, part, rng) for part in checking]
-    found: list[tuple[tuple[Gain, ...], Worth]] = []
+    found: list[tuple[tuple[Gain, ...], Value]] = []
 
     def epochs() -> Iterator[int]:
         trainings = [train(part, recipe, k) for k, part in enumerate(learned)]
@@ -80,11 +82,11 @@ def train_gain(
             yield len(found)
 
     track(epochs(), recipe.epochs, "training")
-    best, worth = found[-1]
+    best, value = found[-1]
     policies = [replace(policy, anywhere=not local) for policy in best]
-    if price is None:
+    if travel_weight is None:
         judged = list(zip(checked, policies, strict=True))
-        price = travel_price(judged, recipe.looks, recipe.outcome, recipe.seed)
+        travel_weight = fit_travel_weight(judged, recipe.n_views, recipe.outcome, recipe.seed)
     policy = averaged(policies)
     learners = len(np.unique(np.concatenate(learning)))
     chosen = f"{len(other)} others" if validation else f"the same, each judged by networks of {folds - 1} other folds"
@@ -96,17 +98,17 @@ def train_gain(
         "elevations": table.sphere.elevations,
         "azimuths": table.sphere.azimuths,
         "classes": table.classes,
-        "learned_from": f"{learners} objects of the training split, classes weighted evenly; epoch and price chosen on "
-        f"{chosen}",
+        "learned_from": f"{learners} objects of the training split, classes weighted evenly; epoch and travel weight "
+        f"chosen on {chosen}",
         "predictions": [{"sha256": file_hash(path), "models": source.models} for path, source in sources],
-        "calibration": [[c.temperature_of_one, c.correlation] for c in (part.calibration for part in learned)],
+        "calibration": [[c.temperature, c.correlation] for c in (part.calibration for part in learned)],
         "settings": asdict(recipe),
     }
-    seen = np.concatenate([walk(part, [policy], recipe, rng).told for part in checked])
-    difference = write_gain(out, replace(policy, price=price), facts, seen)
+    seen = np.concatenate([walk(part, [policy], recipe, rng).features for part in checked])
+    difference = write_gain(out, replace(policy, travel_weight=travel_weight), facts, seen)
     console.print(
-        f"learned from {learners} objects; on {chosen} the {recipe.outcome} after 2, 3, ... looks is "
-        f"{', '.join(f'{x:.4f}' for x in worth.outcome)} at price 0; price {price:g}: {out}"
+        f"learned from {learners} objects; on {chosen} the {recipe.outcome} after 2, 3, ... views is "
+        f"{', '.join(f'{x:.4f}' for x in value.outcome)} at travel weight 0; travel weight {travel_weight:g}: {out}"
     )
     console.print(
         f"weights: {out.with_suffix('.onnx')}; in {len(seen)} states its answers differ from the networks' by "

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.measure import keep
+from nextview.data.measuring import keep
 from nextview.data.store import ViewStore
 
 ARRAY = "correspondence"

@@ -16,14 +16,19 @@ def only_one(path: Path) -> Iterator[None]:
     """Hold the lock file beside ``path``. The system frees it when its holder ends, however that dies.
 
     Raises:
-        DatasetError: another run holds it, or the folder cannot be written.
+        DatasetError: another run holds it, something else has its name, or the folder cannot be written.
     """
     path = path.absolute()
-    lock = FileLock(path.with_name(path.name + ".lock"), timeout=0)
+    file = path.with_name(path.name + ".lock")
+    if file.is_symlink() or (file.exists() and (not file.is_file() or file.stat().st_size > 0)):  # poetry.lock, say
+        raise DatasetError(f"{file}: is there and is no lock of nextview's, which is an empty file; give another name")
+    lock = FileLock(file, timeout=0)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except Timeout:
+        if not file.exists():  # filelock tries again, in vain, where some file systems take no new file
+            raise DatasetError(f"{path}: cannot be written (no lock file can be made beside it)") from None
         raise DatasetError(f"{path}: another run is writing it; wait for that one or stop it") from None
     except OSError as error:
         raise DatasetError(f"{path}: cannot be written ({error.strerror or error})") from None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.split import distinct
+from nextview.belief import PLAIN_SUM, Calibration, log_evidence_of
+from nextview.data.splits import deduplicated
 from nextview.errors import PredictionsError
-from nextview.recognition import PLAIN_SUM, Calibration, additive
+from nextview.outputs import written_whole
 from nextview.viewsphere import ViewSphere
 
 FORMAT = 1
@@ -39,8 +39,8 @@ class Predictions:
         models: name and SHA-256 of the recogniser ("recogniser") and of each map network ("lem").
         valley_classes: for each map, the classes for which its card says that the valley is the better view.
         calibration: how far the recogniser's card says that a sum of its logits is to be trusted.
-        sides: what the recogniser says of the sides of the object, (N, V, C, sides) float32, see ``Evidence``; None if
-            it cannot tell them.
+        azimuth_bins: what the recogniser says of the azimuth bins of the object, (N, V, C, azimuth bins) float32, see
+            ``Evidence``; None if it cannot tell them.
         of_size: what the size of the object has added to the logits of each of its views, (N, C) float32; None if the
             recogniser knows nothing of sizes.
 
@@ -60,7 +60,7 @@ class Predictions:
     models: dict[str, tuple[str, str]]
     valley_classes: dict[str, tuple[str, ...]]
     calibration: Calibration = PLAIN_SUM
-    sides: NDArray[np.float32] | None = None
+    azimuth_bins: NDArray[np.float32] | None = None
     of_size: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
@@ -74,8 +74,8 @@ class Predictions:
         for name, values in self.maps.items():
             columns = self.sphere.azimuths if name.endswith("-sphere") else 3
             wanted[f"map {name}"], arrays[f"map {name}"] = (n, v, self.sphere.rings, columns), values
-        if self.sides is not None:
-            wanted["sides"], arrays["sides"] = (n, v, c, *self.sides.shape[-1:]), self.sides
+        if self.azimuth_bins is not None:
+            wanted["azimuth_bins"], arrays["azimuth_bins"] = (n, v, c, *self.azimuth_bins.shape[-1:]), self.azimuth_bins
         if self.of_size is not None:
             wanted["of_size"], arrays["of_size"] = (n, c), self.of_size
         for name, shape in wanted.items():
@@ -93,9 +93,9 @@ class Predictions:
         return len(self.names)
 
     @cached_property
-    def said(self) -> NDArray[np.float32]:
-        """What the recogniser says of each view, so that views can be summed, (N, V, D); see ``additive``."""
-        return additive(self.logits, self.sides, self.sphere.turn)
+    def log_evidence(self) -> NDArray[np.float32]:
+        """What the recogniser says of each view, so that views can be summed, (N, V, D); see ``log_evidence_of``."""
+        return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.turn)
 
     def of_split(self, split: str) -> Predictions:
         """The objects of one split.
@@ -109,17 +109,19 @@ class Predictions:
             raise PredictionsError(f"these predictions hold no objects of the split {split!r}, only of {there}")
         return self._of(np.flatnonzero(kept))
 
-    def each_shape_once(self) -> Predictions:
+    def deduplicate(self) -> Predictions:
         """One object of each shape and label: without the copies that look the same from every view."""
-        return self._of(distinct(self.labels, self.depth_entropy))
+        return self._of(deduplicated(self.labels, self.depth_entropy))
 
     def _of(self, kept: NDArray[np.int64]) -> Predictions:
         """Some of the objects."""
         arrays = {name: getattr(self, name)[kept] for name in ("logits", "depth_entropy", "labels", "splits")}
         maps = {name: values[kept] for name, values in self.maps.items()}
-        said = {name: values[kept] for name in ("sides", "of_size") if (values := getattr(self, name)) is not None}
+        optional = {
+            name: values[kept] for name in ("azimuth_bins", "of_size") if (values := getattr(self, name)) is not None
+        }
         names = tuple(self.names[i] for i in kept)
-        return replace(self, **arrays, **said, names=names, maps=maps, conflicting=self.conflicting[kept])
+        return replace(self, **arrays, **optional, names=names, maps=maps, conflicting=self.conflicting[kept])
 
     def by_shape(self) -> Predictions:
         """What the recogniser says to those who do not know how large the objects are."""
@@ -146,13 +148,12 @@ class Predictions:
         }
         arrays |= {f"map/{name}": values for name, values in self.maps.items()}
         arrays |= {f"valley/{name}": np.array(classes, np.str_) for name, classes in self.valley_classes.items()}
-        if self.sides is not None:
-            arrays["sides"] = self.sides
+        if self.azimuth_bins is not None:
+            arrays["azimuth_bins"] = self.azimuth_bins
         if self.of_size is not None:
             arrays["of_size"] = self.of_size
-        part = path.with_name(path.name + ".part.npz")
-        np.savez_compressed(part, **arrays)
-        os.replace(part, path)
+        with written_whole(path) as part, part.open("wb") as file:
+            np.savez_compressed(file, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Predictions:
@@ -188,7 +189,7 @@ class Predictions:
                 {kind: (name, sha) for kind, name, sha in f["models"].tolist()},
                 {name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
                 Calibration.of_facts(json.loads(str(f["calibration"])) if "calibration" in f else None),
-                f.get("sides"),
+                f.get("azimuth_bins"),
                 f.get("of_size"),
             )
         except KeyError as error:

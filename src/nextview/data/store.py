@@ -11,10 +11,11 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
+from nextview.cloud import POINTS
 from nextview.data.folders import Entry
 from nextview.errors import DatasetError
 from nextview.mesh import UNITS
-from nextview.observation import POINTS, pinhole
+from nextview.observation import pinhole
 from nextview.viewsphere import ViewSphere
 
 FORMAT = 2
@@ -189,7 +190,7 @@ class ViewStore:
         return self.array("radius")[:] * UNITS[unit]
 
     @property
-    def twins(self) -> list[list[int]]:
+    def duplicates(self) -> list[list[int]]:
         """Groups of objects whose mesh files hold the same bytes; none are known in a store made without hashes."""
         groups: dict[str, list[int]] = {}
         for i, digest in enumerate(self.group.attrs.get("sha256", ())):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.observation import object_depth
+from nextview.depth import object_depth
 
 QUANTUM = 1e-3
 """Depth values closer than this count as equal, object radii."""

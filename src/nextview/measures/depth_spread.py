@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.observation import object_depth
+from nextview.depth import object_depth
 
 BIN = 0.01
 """Width of the depth histogram's bins, object radii: a hundred across the object's radius."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.depth import object_depth, slope
 from nextview.errors import ObservationError
-from nextview.observation import object_depth
 
 CHANNELS = ("facing", "up", "height", "nearness")
 
@@ -41,8 +41,8 @@ def geometry_input(
     rotation, origin = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
     padded = np.pad(object_depth(depth).astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
     z = padded[:, 1:-1:k, 1:-1:k]
-    along_column = _slope(padded[:, 1:-1:k, :-2:k], z, padded[:, 1:-1:k, 2::k])
-    along_row = _slope(padded[:, :-2:k, 1:-1:k], z, padded[:, 2::k, 1:-1:k])
+    along_column = slope(padded[:, 1:-1:k, :-2:k], z, padded[:, 1:-1:k, 2::k])
+    along_row = slope(padded[:, :-2:k, 1:-1:k], z, padded[:, 2::k, 1:-1:k])
     focal, focal_y = intrinsics[0, 0].astype(np.float32), intrinsics[1, 1].astype(np.float32)
     along_row *= focal_y / focal  # a step down the image as long as one across it
     x = ((np.arange(0, w, k) + 0.5 - intrinsics[0, 2]) / focal).astype(np.float32)[None, None, :]
@@ -62,11 +62,3 @@ def geometry_input(
     channels = np.stack([2 * facing - 1, up, height, nearness], 1)
     coded = 1 + 127 * (np.clip(channels, -1, 1) + 1) + 0.5
     return np.where(z[:, None] > 0, coded, 0).astype(np.uint8)
-
-
-def _slope(before: NDArray, here: NDArray, after: NDArray) -> NDArray:
-    """Change of depth per pixel, from the side where it is smaller: the one on the same surface. 0 if alone."""
-    back = np.where(before > 0, here - before, np.inf)
-    forth = np.where(after > 0, after - here, np.inf)
-    slope = np.where(np.abs(back) < np.abs(forth), back, forth)
-    return np.where(np.isfinite(slope), slope, 0).astype(np.float32)

@@ -14,22 +14,23 @@ from nextview.viewsphere import ViewSphere
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the models say of one look in each of B episodes.
+    """What the models say of one view in each of B episodes.
 
     Attributes:
         logits: (B, classes) float.
         maps: those that the policy needs, by name: predicted local maps ("lem"), each (B, rings, 3) float, and maps of
             the whole sphere ("lem-sphere"), (B, rings, azimuths), columns once round from the view.
-        features: pooled image features, (B, D) float.
-        sides: logarithms of how likely each side of the object is the one that is seen, if it is of each class,
-            (B, classes, sides) float: sides in even steps of azimuth from one that the recogniser has settled on for
-            the class. None if the recogniser cannot tell.
+        azimuth_bins: logarithms of how likely each side of the object is the one that is seen, if it is of each class,
+            (B, classes, azimuth bins) float: azimuth bins in even steps of azimuth from one that the recogniser has
+            settled on for the class. None if the recogniser cannot tell.
+        seen: whether anything was seen, (B,) bool; None if something was in all. A view without is no evidence: in
+            episodes all the above counts as zero there.
     """
 
     logits: NDArray[np.floating]
     maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
-    features: NDArray[np.floating] | None = None
-    sides: NDArray[np.floating] | None = None
+    azimuth_bins: NDArray[np.floating] | None = None
+    seen: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -39,13 +40,13 @@ class EpisodeState:
     Attributes:
         current: the view just taken, (B,) int64.
         visited: views taken so far, the current one included, (B, V) bool.
-        belief: fused over all looks, (B, classes) float64.
-        evidence: of the current look.
-        step: looks taken so far, 1 or more.
+        belief: fused over all views, (B, classes) float64.
+        evidence: of the current view.
+        step: views taken so far, 1 or more.
         episodes: which episodes these are, (B,) int64: where an oracle looks up its truth. Live there is one, 0.
-        sides: belief, over all looks, in the side that is seen from the current view, if the object is of each class,
-            (B, classes, sides) float64, sums to 1 over the sides. None if the recogniser cannot tell, or "sides" is not
-            among the policy's needs.
+        azimuth_bins: belief, over all views, in the azimuth bin that is seen from the current view, if the object is
+            of each class, (B, classes, azimuth bins) float64, sums to 1 over the azimuth bins. None if the recogniser
+            cannot tell, or "azimuth bins" is not among the policy's needs.
     """
 
     current: NDArray[np.int64]
@@ -54,7 +55,7 @@ class EpisodeState:
     evidence: Evidence
     step: int
     episodes: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
-    sides: NDArray[np.float64] | None = None
+    azimuth_bins: NDArray[np.float64] | None = None
 
 
 class Policy(Protocol):
@@ -62,7 +63,7 @@ class Policy(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the maps it wants in the evidence; "sides" for what the recogniser says of them."""
+        """Names of the maps it wants in the evidence; "azimuth bins" for what the recogniser says of them."""
         ...
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -72,7 +73,7 @@ class Policy(Protocol):
 
 def maps_among(needs: Sequence[str]) -> list[str]:
     """Those of a policy's needs that are maps."""
-    return [name for name in needs if name != "sides"]
+    return [name for name in needs if name != "azimuth_bins"]
 
 
 def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]) -> NDArray[np.int64]:

@@ -25,7 +25,7 @@ class Random:
 
 @dataclass(frozen=True)
 class RandomAll:
-    """Any unvisited view of the whole sphere, with equal chance: the far looks that a local window rules out."""
+    """Any unvisited view of the whole sphere, with equal chance: the far views that a local window rules out."""
 
     sphere: ViewSphere
     needs: tuple[str, ...] = ()

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.belief import PLAIN_SUM, Calibration, of_true_class
 from nextview.policies.base import EpisodeState, best_in_window
 from nextview.policies.maps import peaks_first
-from nextview.recognition import PLAIN_SUM, Calibration, of_true_class
 from nextview.viewsphere import ViewSphere
 
 
@@ -43,11 +43,12 @@ class OracleValley:
 
 @dataclass(frozen=True)
 class OracleGain:
-    """The view after which the true class is believed most: the ceiling of choosing one look ahead.
+    """The view after which the true class is believed most: the ceiling of choosing one view ahead.
 
     Attributes:
         sphere: the viewpoints.
-        said: by the recogniser of every view of every object, so that it adds up, (N, V, D); see ``additive``.
+        log_evidence: by the recogniser of every view of every object, so that it adds up, (N, V, D); see
+            ``log_evidence_of``.
         classes: how many.
         labels: true class of each object, (N,) int64.
         objects: the object of each episode, (E,) int64.
@@ -56,7 +57,7 @@ class OracleGain:
     """
 
     sphere: ViewSphere
-    said: NDArray[np.floating]
+    log_evidence: NDArray[np.floating]
     classes: int
     labels: NDArray[np.int64]
     objects: NDArray[np.int64]
@@ -74,11 +75,13 @@ class OracleGain:
         return best_in_window(self.sphere, state, gain.reshape(b, -1, 3))
 
     def _gains(self, state: EpisodeState, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Logarithm of the belief in the truth after a look at each view, or each of the window, in some episodes."""
+        """Logarithm of the belief in the truth after a view of each view, or each of the window, in some episodes."""
         objects, current = self.objects[state.episodes[rows]], state.current[rows]
-        said = self.said[objects].astype(np.float64)
-        so_far = np.matmul(state.visited[rows, None].astype(np.float64), said)[:, 0]
+        log_evidence = self.log_evidence[objects].astype(np.float64)
+        so_far = np.matmul(state.visited[rows, None].astype(np.float64), log_evidence)[:, 0]
         if not self.anywhere:
-            said = said[np.arange(len(rows))[:, None], self.sphere.windows[current].reshape(len(rows), -1)]
-        logs = self.calibration.log_belief(so_far[:, None] + said, state.step + 1, self.classes)
+            log_evidence = log_evidence[
+                np.arange(len(rows))[:, None], self.sphere.windows[current].reshape(len(rows), -1)
+            ]
+        logs = self.calibration.log_belief(so_far[:, None] + log_evidence, state.step + 1, self.classes)
         return of_true_class(logs, self.labels[objects])

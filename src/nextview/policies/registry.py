@@ -10,9 +10,9 @@ from pathlib import Path
 from nextview.errors import PolicyError
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
-from nextview.policies.card import bundled_policies, read_policy
 from nextview.policies.gain import Gain
 from nextview.policies.maps import MapPeak
+from nextview.policies.policy_card import bundled_policies, read_policy
 from nextview.policies.spread import Spread
 from nextview.viewsphere import ViewSphere
 
@@ -37,8 +37,8 @@ def make_policy(
 
     Args:
         name: one of POLICIES, a learned one that is bundled, the path of a learned one's card (.json), or
-            "module:Class" for one of your own, which is called with the sphere alone. A learned one that pays a price
-            for travel is had at another price as NAME@PRICE.
+            "module:Class" for one of your own, which is called with the sphere alone. A learned one that weighs
+            travel takes another travel weight as NAME@WEIGHT.
         sphere: the viewpoints.
         valley_classes: classes (indices) whose believers go to the map's valley; only "lem" and "lcm" use it.
         classes: names of the recogniser's classes; a learned policy for others is refused.
@@ -49,22 +49,22 @@ def make_policy(
     if name in POLICIES:
         return POLICIES[name](sphere, tuple(valley_classes))
     learned = bundled_policies()
-    card, priced, price = name.partition("@")
+    card, weighted, travel_weight = name.partition("@")
     if card in learned or card.endswith(".json"):
         policy = read_policy(learned.get(card, Path(card)), sphere, classes)
-        return _at_price(policy, name, price) if priced else policy
+        return _at_travel_weight(policy, name, travel_weight) if weighted else policy
     if ":" in name:
         return _import_policy(name, sphere)
     raise PolicyError(f"no policy is called {name!r}; there are {', '.join([*POLICIES, *learned])}")
 
 
-def _at_price(policy: Policy, name: str, price: str) -> Policy:
+def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
     if not isinstance(policy, Gain):
-        raise PolicyError(f"{name}: this policy pays no price for travel")
+        raise PolicyError(f"{name}: this policy pays no travel weight")
     try:
-        return replace(policy, price=float(price))
+        return replace(policy, travel_weight=float(travel_weight))
     except ValueError:
-        raise PolicyError(f"{name}: a price is a number of at least 0") from None
+        raise PolicyError(f"{name}: a travel weight is a number of at least 0") from None
 
 
 def _import_policy(path: str, sphere: ViewSphere) -> Policy:

@@ -1,4 +1,4 @@
-"""Farthest-point sampling: each look as far as possible from all before it (Gonzalez 1985; Eldar et al. 1997)."""
+"""Farthest-point sampling: each view as far as possible from all before it (Gonzalez 1985; Eldar et al. 1997)."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from nextview.benchmark.contestants import ORACLES
+from nextview.benchmark.entries import ORACLES
 from nextview.benchmark.results import Results
 from nextview.report.diagrams import confusion_matrix, draw_reliability, reliability_figure
 from nextview.report.style import INK, legend, new_figure
@@ -38,7 +38,7 @@ CROWD, BEST = 12, 8
 
 
 def is_oracle(policy: str) -> bool:
-    """Whether a policy is told what a robot cannot know."""
+    """Whether a policy takes what a robot cannot know."""
     return policy in ORACLES
 
 
@@ -87,9 +87,9 @@ def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure
     for k, name in enumerate(names := [n for n in compared(results) if n in set(table["policy"])]):
         rows = table[table["policy"] == name].sort_values("threshold")
         x = np.arange(len(rows)) + (k - len(names) / 2) * 0.04  # side by side, so that the bars can be told apart
-        look = look_of(name, results)
-        axes.plot(x, rows["value"], marker="o", markersize=3.5, label=name, **look)
-        axes.vlines(x, rows["low"], rows["high"], color=look["color"], linewidth=0.8, alpha=0.55)
+        style = look_of(name, results)
+        axes.plot(x, rows["value"], marker="o", markersize=3.5, label=name, **style)
+        axes.vlines(x, rows["low"], rows["high"], color=style["color"], linewidth=0.8, alpha=0.55)
     axes.set_xticks(np.arange(len(ticks)), [f"{t:g}" for t in ticks])
     axes.set_xlabel("confidence threshold")
     axes.set_ylabel("class accuracy" if measure == "class_accuracy" else "accuracy")
@@ -99,7 +99,7 @@ def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure
 
 
 def budget_curve(results: Results, budget: str) -> Figure:
-    """Accuracy against mean looks or mean travel, over all thresholds; in the legend the mean height of the curve."""
+    """Accuracy against mean views or mean travel, over all thresholds; in the legend the mean height of the curve."""
     figure, axes = new_figure(4.6, 3.5)
     areas = results.tables.areas.query("budget == @budget").set_index("policy")["value"]
     for name in compared(results):
@@ -107,7 +107,7 @@ def budget_curve(results: Results, budget: str) -> Figure:
         axes.plot(
             rows[budget], rows["accuracy"], label=f"{name}  {areas.get(name, np.nan):.3f}", **look_of(name, results)
         )
-    labels = {"looks": "mean looks", "travel_all": "mean travel, grid cells", "arc_all": "mean travel, radians"}
+    labels = {"n_views": "mean views", "travel_all": "mean travel, grid cells", "arc_all": "mean travel, radians"}
     axes.set_xlabel(labels[budget])
     axes.set_ylabel("accuracy")
     axes.yaxis.set_major_formatter(PercentFormatter(1))
@@ -131,7 +131,7 @@ def differences(results: Results, threshold: float, measure: str) -> Figure:
     axes.set_yticks(np.arange(len(rows)), rows["policy"])
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
-    what = {"looks": "looks", "travel_all": "travel, grid cells"}.get(measure, "accuracy, percentage points")
+    what = {"n_views": "n_views", "travel_all": "travel, grid cells"}.get(measure, "accuracy, percentage points")
     axes.set_xlabel(f"{what}: difference to {results.settings['reference']}")
     return figure
 

@@ -40,15 +40,15 @@ def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Fig
     return figure
 
 
-def reliability_figure(said: str) -> tuple[Figure, Axes]:
+def reliability_figure(when: str) -> tuple[Figure, Axes]:
     """An empty reliability diagram: on its diagonal, 90 % sure is right nine times in ten.
 
     Args:
-        said: when the confidence was said.
+        when: when the confidence was said.
     """
     figure, axes = new_figure(4.6, 3.9)
     axes.plot([0, 1], [0, 1], color=INK, linewidth=0.9)
-    axes.set(xlim=(0, 1.03), ylim=(0, 1.03), xlabel=f"confidence {said}", ylabel="share that was right")
+    axes.set(xlim=(0, 1.03), ylim=(0, 1.03), xlabel=f"confidence {when}", ylabel="share that was right")
     axes.set_aspect("equal")
     return figure, axes
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import base64
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +15,8 @@ from matplotlib.figure import Figure
 from nextview.report.style import to_svg
 
 NONE = "&ndash;"
+GENERATOR = '<meta name="generator" content="nextview">'
+"""Near the beginning of every page; by this a page of our own is known."""
 
 
 class Number(NamedTuple):
@@ -105,7 +105,7 @@ def document(title: str, lead: str, sections: Iterable[tuple[str, str, str]], sc
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{asset('report.css')}</style></head><body><main>"
+        f"{GENERATOR}<title>{escape(title)}</title><style>{asset('report.css')}</style></head><body><main>"
         f"{lead}<nav>{links}</nav>{body}</main>{f'<script>{script}</script>' if script else ''}</body></html>\n"
     )
 
@@ -113,10 +113,3 @@ def document(title: str, lead: str, sections: Iterable[tuple[str, str, str]], sc
 def asset(name: str) -> str:
     """A style sheet or script that ships with the package."""
     return (files("nextview.report") / "page" / name).read_text(encoding="utf-8")
-
-
-def write(text: str, path: Path) -> None:
-    """Write a page, aside and then renamed."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)

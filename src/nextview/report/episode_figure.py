@@ -13,7 +13,7 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from nextview.errors import UsageError
 from nextview.report.style import PlainFigure
-from nextview.session import Look, Recognition
+from nextview.session import Recognition, View
 from nextview.viewsphere import ViewSphere
 
 INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
@@ -33,88 +33,88 @@ def save_episode(result: Recognition, sphere: ViewSphere, path: Path, title: str
 
 
 def draw_episode(result: Recognition, sphere: ViewSphere, title: str) -> Figure:
-    """One column for each look (image, predicted map with the choice marked, belief), and the sphere beside them."""
-    looks = result.looks
-    heights = [2.7, 2.6, 2.9] if looks[0].maps else [2.7, 2.9]
-    figure = PlainFigure(figsize=(2.5 * len(looks) + 5.2, sum(heights)), layout="constrained")
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.5 * len(looks), 5.2])[0]
-    axes = left.subplots(len(heights), len(looks), squeeze=False, gridspec_kw={"height_ratios": heights})
-    shown = np.argsort(-np.max([look.belief for look in looks], axis=0))[:5]
-    for k, look in enumerate(looks):
-        _draw_image(axes[0, k], look, sphere, k + 1)
-        if look.maps:
-            _draw_map(axes[1, k], look, sphere, first=k == 0)
-        _draw_belief(axes[-1, k], look, result.classes, shown, first=k == 0)
-    _draw_path(right.add_subplot(projection="3d"), looks, sphere)
+    """One column for each view (image, predicted map with the choice marked, belief), and the sphere beside them."""
+    views = result.views
+    heights = [2.7, 2.6, 2.9] if views[0].maps else [2.7, 2.9]
+    figure = PlainFigure(figsize=(2.5 * len(views) + 5.2, sum(heights)), layout="constrained")
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.5 * len(views), 5.2])[0]
+    axes = left.subplots(len(heights), len(views), squeeze=False, gridspec_kw={"height_ratios": heights})
+    shown = np.argsort(-np.max([view.belief for view in views], axis=0))[:5]
+    for k, view in enumerate(views):
+        _draw_image(axes[0, k], view, sphere, k + 1)
+        if view.maps:
+            _draw_map(axes[1, k], view, sphere, first=k == 0)
+        _draw_belief(axes[-1, k], view, result.classes, shown, first=k == 0)
+    _draw_path(right.add_subplot(projection="3d"), views, sphere)
     figure.suptitle(
-        f"{title}: {result.answer}, belief {result.confidence:.3f}, {len(looks)} look{'s' * (len(looks) > 1)}, "
-        f"{result.travel:.2f} cells of travel",
+        f"{title}: {result.answer or 'nothing is seen'}, belief {result.confidence:.3f}, "
+        f"{len(views)} view{'s' * (len(views) > 1)}, {result.travel:.2f} cells of travel",
         color=INK,
         fontsize=14,
     )
     return figure
 
 
-def _draw_image(axis: Axes, look: Look, sphere: ViewSphere, step: int) -> None:
-    elevation, azimuth = sphere.angles(look.view)
-    axis.imshow(look.observation.image, cmap="gray", vmin=0, vmax=255)
-    axis.set_title(f"look {step}: view {look.view}\n{elevation:.0f}° up, {azimuth:.0f}° round", color=INK, fontsize=10)
+def _draw_image(axis: Axes, view: View, sphere: ViewSphere, step: int) -> None:
+    elevation, azimuth = sphere.angles(view.index)
+    axis.imshow(view.observation.picture, cmap="gray", vmin=0, vmax=255)
+    axis.set_title(f"step {step}: view {view.index}\n{elevation:.0f}° up, {azimuth:.0f}° round", color=INK, fontsize=10)
     axis.axis("off")
 
 
-def _draw_map(axis: Axes, look: Look, sphere: ViewSphere, first: bool) -> None:
-    name, predicted = next(iter(look.maps.items()))
+def _draw_map(axis: Axes, view: View, sphere: ViewSphere, first: bool) -> None:
+    name, predicted = next(iter(view.maps.items()))
     axis.imshow(predicted, cmap="viridis", vmin=0, vmax=1, origin="lower", aspect="auto")
-    window = sphere.window(look.view)
+    window = sphere.window(view.index)
     for ring, column in np.ndindex(window.shape):
         value = predicted[ring, column]
         axis.text(
             column, ring, f"{value:.2f}", ha="center", va="center", fontsize=8, color="white" if value < 0.7 else INK
         )
-    for view, colour, label in ((look.view, "white", "here"), (look.next_view, ACCENT, "next")):
-        for ring, column in np.argwhere(window == view)[:1] if view is not None else ():
+    for index, colour, label in ((view.index, "white", "here"), (view.next_view, ACCENT, "next")):
+        for ring, column in np.argwhere(window == index)[:1] if index is not None else ():
             corner = (column - 0.46, ring - 0.46)
             axis.add_patch(Rectangle(corner, 0.92, 0.92, fill=False, edgecolor=colour, linewidth=2.2))
             axis.text(column, ring - 0.33, label, ha="center", va="center", fontsize=7, color=colour, weight="bold")
     axis.set_xticks(range(3), ["-1", "0", "+1"], fontsize=8)
     axis.set_yticks(range(sphere.rings), [f"{e:.0f}°" for e in sphere.elevations] if first else [], fontsize=8)
-    axis.set_title(f"predicted {name.upper()}" + ("" if look.next_view is not None else " (not needed)"), fontsize=9)
+    axis.set_title(f"predicted {name.upper()}" + ("" if view.next_view is not None else " (not needed)"), fontsize=9)
     if first:
         axis.set_ylabel("elevation")
     axis.set_xlabel("azimuth step", fontsize=8)
 
 
-def _draw_belief(axis: Axes, look: Look, classes: tuple[str, ...], shown: np.ndarray, first: bool) -> None:
+def _draw_belief(axis: Axes, view: View, classes: tuple[str, ...], shown: np.ndarray, first: bool) -> None:
     rows = np.arange(len(shown))[::-1]
-    axis.barh(rows + 0.18, look.belief[shown], 0.36, color=ACCENT, label="belief after this look")
-    axis.barh(rows - 0.18, look.guess[shown], 0.36, color=FAINT, label="this image alone")
+    axis.barh(rows + 0.18, view.belief[shown], 0.36, color=ACCENT, label="belief after this view")
+    axis.barh(rows - 0.18, view.alone[shown], 0.36, color=FAINT, label="this image alone")
     axis.set_xlim(0, 1)
     axis.set_yticks(rows, [classes[c].replace("_", " ") for c in shown] if first else [])
     axis.spines[["top", "right"]].set_visible(False)
-    best = int(look.belief.argmax())
-    axis.set_title(f"{classes[best].replace('_', ' ')} {look.belief[best]:.3f}", fontsize=10, color=ACCENT)
+    best = int(view.belief.argmax())
+    axis.set_title(f"{classes[best].replace('_', ' ')} {view.belief[best]:.3f}", fontsize=10, color=ACCENT)
     if first:
         axis.legend(fontsize=7, loc="lower right", frameon=False)
 
 
-def _draw_path(axis: Axes3D, looks: tuple[Look, ...], sphere: ViewSphere) -> None:
+def _draw_path(axis: Axes3D, views: tuple[View, ...], sphere: ViewSphere) -> None:
     d = sphere.directions
     axis.scatter(*d.T, s=14, color=FAINT, depthshade=False)
     for elevation in np.radians(sphere.elevations):
         around = np.linspace(0, 2 * np.pi, 91)
         ring = np.cos(elevation) * np.cos(around), np.cos(elevation) * np.sin(around), 0 * around + np.sin(elevation)
         axis.plot(*ring, color=FAINT, linewidth=0.6)
-    cloud = np.concatenate([look.observation.points[::3] for look in looks])
+    cloud = np.concatenate([view.observation.points[::3] for view in views])
     axis.scatter(*cloud.T, s=1, color=INK, alpha=0.35, depthshade=False)
-    views = [look.view for look in looks]
-    for a, b in itertools.pairwise(d[views]):
+    path = [view.index for view in views]
+    for a, b in itertools.pairwise(d[path]):
         arc = _great_circle(a, b)
         axis.plot(*arc.T, color=ACCENT, linewidth=2)
-    axis.scatter(*d[views].T, s=46, color=ACCENT, depthshade=False)
-    for step, view in enumerate(views, 1):
-        axis.text(*(d[view] * 1.16), str(step), color=ACCENT, fontsize=12, weight="bold", ha="center")
+    axis.scatter(*d[path].T, s=46, color=ACCENT, depthshade=False)
+    for step, index in enumerate(path, 1):
+        axis.text(*(d[index] * 1.16), str(step), color=ACCENT, fontsize=12, weight="bold", ha="center")
     # Look from the side where the path is, a little from above.
-    middle = d[views].sum(0)
+    middle = d[path].sum(0)
     axis.view_init(elev=24, azim=float(np.degrees(np.arctan2(middle[1], middle[0]))) - 25)
     axis.set_box_aspect((1, 1, 0.75), zoom=1.2)  # room for the numbers at its rim
     axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-0.5, 1))

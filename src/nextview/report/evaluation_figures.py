@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
-from nextview.benchmark.evaluate import TRUTHS, Evaluation, judged_objects
+from nextview.benchmark.evaluation import TRUTHS, Evaluation, judged_objects
 from nextview.data.predictions import Predictions
 from nextview.report.diagrams import confusion_matrix, draw_reliability, reliability_figure
 from nextview.report.style import INK, STYLE, PlainFigure, legend, new_figure
@@ -43,10 +43,10 @@ PREDICTED_PEAK: dict[str, Any] = {
 }  # fmt: skip
 
 
-def confusion(e: Evaluation, looks: int, classes: Sequence[str]) -> Figure:
-    """Confusion matrix of that many looks."""
-    table = e.confusion[e.confusion["looks"] == looks].pivot(index="label", columns="answer", values="answers")
-    title = "one view" if looks == 1 else f"all {looks} views fused"
+def confusion(e: Evaluation, n_views: int, classes: Sequence[str]) -> Figure:
+    """Confusion matrix of that many views."""
+    table = e.confusion[e.confusion["n_views"] == n_views].pivot(index="label", columns="answer", values="answers")
+    title = "one view" if n_views == 1 else f"all {n_views} views fused"
     return confusion_matrix(table.loc[list(classes), list(classes)].to_numpy(), classes, title)
 
 
@@ -54,10 +54,10 @@ def fusion_curve(e: Evaluation) -> Figure:
     """Accuracy against the number of random views fused, with 95 % intervals."""
     figure, axes = new_figure(4.6, 3.5)
     table = e.fusion
-    axes.fill_between(table["looks"], table["low"], table["high"], color=ALL, alpha=0.15, linewidth=0)
-    axes.plot(table["looks"], table["accuracy"], color=ALL, label="over objects, 95 % interval")
-    axes.plot(table["looks"], table["class_accuracy"], color=INK, linestyle="--", linewidth=1.1, label="over classes")
-    published = e.accuracy.query("looks == 1 and label == '' and measure == 'accuracy'")["published"].iloc[0]
+    axes.fill_between(table["n_views"], table["low"], table["high"], color=ALL, alpha=0.15, linewidth=0)
+    axes.plot(table["n_views"], table["accuracy"], color=ALL, label="over objects, 95 % interval")
+    axes.plot(table["n_views"], table["class_accuracy"], color=INK, linestyle="--", linewidth=1.1, label="over classes")
+    published = e.accuracy.query("n_views == 1 and label == '' and measure == 'accuracy'")["published"].iloc[0]
     if np.isfinite(published):
         axes.plot(1, published, "D", color=PUBLISHED, markersize=5, clip_on=False, label="published, one view")
     axes.set_ylabel("accuracy")
@@ -70,9 +70,11 @@ def confidence_curve(e: Evaluation) -> Figure:
     """Mean confidence and accuracy against the number of random views fused: the gap is misplaced trust."""
     figure, axes = new_figure(4.6, 3.9)
     table = e.fusion
-    axes.fill_between(table["looks"], table["accuracy"], table["confidence"], color=PUBLISHED, alpha=0.12, linewidth=0)
-    axes.plot(table["looks"], table["confidence"], color=PUBLISHED, label="mean confidence")
-    axes.plot(table["looks"], table["accuracy"], color=ALL, label="accuracy")
+    axes.fill_between(
+        table["n_views"], table["accuracy"], table["confidence"], color=PUBLISHED, alpha=0.12, linewidth=0
+    )
+    axes.plot(table["n_views"], table["confidence"], color=PUBLISHED, label="mean confidence")
+    axes.plot(table["n_views"], table["accuracy"], color=ALL, label="accuracy")
     _views_axis(axes, len(table))
     legend(axes)
     return figure
@@ -93,8 +95,8 @@ def class_accuracies(e: Evaluation) -> Figure:
     """Accuracy of each class, from one view and from all of them."""
     table = e.accuracy.query("measure == 'accuracy' and label != ''")
     series = {
-        "one view" if looks == 1 else f"all {looks} views fused": (colour, rows.set_index("label"))
-        for (looks, rows), colour in zip(table.groupby("looks"), (ONE, ALL), strict=False)
+        "one view" if n_views == 1 else f"all {n_views} views fused": (colour, rows.set_index("label"))
+        for (n_views, rows), colour in zip(table.groupby("n_views"), (ONE, ALL), strict=False)
     }
     figure, axes = _class_figure(series, list(dict.fromkeys(table["label"])))
     axes.set_xlabel("accuracy")
@@ -104,13 +106,13 @@ def class_accuracies(e: Evaluation) -> Figure:
 
 
 def reliability(e: Evaluation) -> Figure:
-    """Reliability after one look and more, in random order; bins of fewer than 20 answers are left out."""
+    """Reliability after one view and more, in random order; bins of fewer than 20 answers are left out."""
     figure, axes = reliability_figure("in the answer")
-    errors = e.fusion.set_index("looks")["calibration_error"]
-    for looks, colour in zip(e.reliability["looks"].unique().tolist(), BLUES, strict=False):
-        rows = e.reliability.query("looks == @looks and answers >= 20")
-        name = f"{looks} view{'s' * (looks > 1)}"
-        draw_reliability(axes, rows, rows["answers"], f"{name}  {errors[looks]:.3f}", colour)
+    errors = e.fusion.set_index("n_views")["calibration_error"]
+    for n_views, colour in zip(e.reliability["n_views"].unique().tolist(), BLUES, strict=False):
+        rows = e.reliability.query("n_views == @n_views and answers >= 20")
+        name = f"{n_views} view{'s' * (n_views > 1)}"
+        draw_reliability(axes, rows, rows["answers"], f"{name}  {errors[n_views]:.3f}", colour)
     legend(axes, "calibration error")
     return figure
 
@@ -122,8 +124,8 @@ def map_classes(e: Evaluation, name: str, measure: str) -> Figure:
     series = {"network": (ALL, rows)}
     figure, axes = _class_figure(series, list(rows.index))
     y = np.arange(len(rows))
-    yardstick = table[table["by"] == "mean map of the class"].set_index("label").loc[rows.index, "value"]
-    axes.plot(yardstick, y, "|", color=FAINT_INK, markersize=11, markeredgewidth=1.8, label="mean map of the class")
+    baseline = table[table["by"] == "mean map of the class"].set_index("label").loc[rows.index, "value"]
+    axes.plot(baseline, y, "|", color=FAINT_INK, markersize=11, markeredgewidth=1.8, label="mean map of the class")
     if rows["published"].notna().any():
         axes.plot(rows["published"], y, "D", color=PUBLISHED, markersize=4.5, label="published")
     axes.set_xlabel(MEASURES[measure])
@@ -202,10 +204,10 @@ def _draw_map(
     left, below, tall = place
     extent = (left, left + WIDE, below, below + tall)
     axes.imshow(values, cmap="viridis", vmin=0, vmax=1, origin="lower", extent=extent, aspect="auto")
-    for peak_of, look in ((true, TRUE_PEAK), (predicted, PREDICTED_PEAK)):
+    for peak_of, style in ((true, TRUE_PEAK), (predicted, PREDICTED_PEAK)):
         ring, column = divmod(int(peak_of.argmax()), peak_of.shape[1])
         x, y = (column + 0.5) / peak_of.shape[1], (ring + 0.5) / peak_of.shape[0]
-        axes.plot(left + x * WIDE, below + y * tall, **look)
+        axes.plot(left + x * WIDE, below + y * tall, **style)
 
 
 def _explain(axes: Axes) -> None:

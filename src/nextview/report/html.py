@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from nextview.benchmark.results import Results
+from nextview.benchmark.results import KIND, Results
 from nextview.errors import ResultsError
-from nextview.report import curves, tables
-from nextview.report.elements import asset, card, description, document, numbers, picture, side_by_side, write
+from nextview.outputs import added_file, check_added, check_file, written_whole
+from nextview.report import curves
+from nextview.report import html_tables as tables
+from nextview.report.elements import GENERATOR, asset, card, description, document, numbers, picture, side_by_side
 from nextview.report.trajectories import Pictures, gains, trajectories, worst_failures
 
 
@@ -24,8 +26,12 @@ def headline_policy(results: Results, threshold: float) -> str:
     return max(names, key=lambda n: found[n, threshold, "accuracy"].value, default=reference)
 
 
+PAGE = "report.html"
+"""Beside the results that it shows."""
+
+
 def write_report(results: Results, path: Path, pictures: Pictures) -> None:
-    """Write the page, aside and then renamed.
+    """Write the page, whole or not at all. In the folder of the results it counts as one of their files.
 
     Args:
         results: of a benchmark, with at least one policy that chooses its views.
@@ -33,11 +39,38 @@ def write_report(results: Results, path: Path, pictures: Pictures) -> None:
         pictures: of the objects, for the failures and the viewer.
 
     Raises:
-        ResultsError: there are fixed views only.
+        ResultsError: there are fixed views only, or see ``check_page``.
     """
+    check_page(path, results.folder)
     if results.tables.sweep.empty:
         raise ResultsError(f"{results.folder}: holds fixed views only; a report needs a policy that chooses")
-    write(page(results, pictures), path)
+    text = page(results, pictures)
+    beside = _is_beside(path, results.folder)
+    with added_file(results.folder, path.name, KIND) if beside else written_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def check_page(path: Path, results: Path) -> None:
+    """See, before any work is done, that a page can be written; nothing is touched.
+
+    Args:
+        path: of the page.
+        results: folder of the results that it is to show.
+
+    Raises:
+        ResultsError: it cannot be written, or something else than such a page is there.
+    """
+    check_file(path)
+    if _is_beside(path, results):
+        if path.name != PAGE:
+            raise ResultsError(f"{path}: in a folder of results the page is called {PAGE}; give a path outside of it")
+        check_added(results, path.name, KIND)
+    elif path.exists() and GENERATOR.encode() not in path.read_bytes()[:1000]:
+        raise ResultsError(f"{path}: is there and is no page of nextview's; give another name")
+
+
+def _is_beside(path: Path, results: Path) -> bool:
+    return path.parent.resolve() == results.resolve()
 
 
 def page(results: Results, pictures: Pictures) -> str:
@@ -47,7 +80,7 @@ def page(results: Results, pictures: Pictures) -> str:
     failures = worst_failures(results.episodes(best, at))
     sections = [
         ("results", "Results", _results(results, at)),
-        ("curves", "Accuracy against its price", _curves(results, at)),
+        ("curves", "Accuracy against its travel weight", _curves(results, at)),
         ("calibration", "Is the confidence worth its name?", _calibration(results, best, at)),
         ("classes", "By class", _classes(results, best, at)),
         ("fixed", "Fixed views", tables.five_views(results)),
@@ -67,13 +100,13 @@ def _headline(results: Results, best: str, at: float) -> str:
 
     def of(policy: str) -> str:
         n = found[policy, at, "accuracy"]
-        looks, travel = found[policy, at, "looks"].value, found[policy, at, "travel_all"].value
+        n_views, travel = found[policy, at, "n_views"].value, found[policy, at, "travel_all"].value
         return card(
             escape(policy), f"{100 * n.value:.1f} %",
-            f"{100 * n.low:.1f} &ndash; {100 * n.high:.1f} %; {looks:.2f} looks, {travel:.2f} cells",
+            f"{100 * n.low:.1f} &ndash; {100 * n.high:.1f} %; {n_views:.2f} views, {travel:.2f} cells",
         )  # fmt: skip
 
-    cards = [card("one look", f"{100 * first['accuracy']:.1f} %", "no travel")]
+    cards = [card("one view", f"{100 * first['accuracy']:.1f} %", "no travel")]
     ran = set(results.tables.sweep["policy"])
     cards += [of(name) for name in dict.fromkeys((reference, best)) if name in ran]
     if "oracle-gain" in ran:
@@ -81,7 +114,7 @@ def _headline(results: Results, best: str, at: float) -> str:
     return (
         f"{_verdict(results, best, at)}"
         f"<p>{len(p):,} objects of {len(set(p.labels.tolist()))} classes, {settings['runs']} first views each, "
-        f"threshold {at:g}, at most {settings['max_views']} looks. All intervals are 95&nbsp;% bootstrap intervals "
+        f"threshold {at:g}, at most {settings['max_views']} views. All intervals are 95&nbsp;% bootstrap intervals "
         f'over objects.</p><div class="cards">{"".join(cards)}</div>'
     )
 
@@ -108,8 +141,8 @@ def _verdict(results: Results, best: str, at: float) -> str:
 def _spoken(results: Results, policies: Sequence[str], at: float, measure: str) -> str:
     """The numbers of a figure in words, for those who cannot see it."""
     found = numbers(results.tables.summary, "policy", "threshold", "measure")
-    said = (f"{name} {found[name, at, measure].value:.3f}" for name in policies if (name, at, measure) in found)
-    return f"At threshold {at:g}: " + ", ".join(said) + "."
+    shown = (f"{name} {found[name, at, measure].value:.3f}" for name in policies if (name, at, measure) in found)
+    return f"At threshold {at:g}: " + ", ".join(shown) + "."
 
 
 def _others(results: Results, where: str = "the tables") -> str:
@@ -138,7 +171,7 @@ def _results(results: Results, at: float) -> str:
                     + _spoken(results, list(results.tables.sweep["policy"].unique()), at, measure),
                     f"Difference in {what} at threshold {at:g}; filled where Holm's p is under 0.05.",
                 )
-                for measure, what in (("accuracy", "accuracy"), ("looks", "looks"), ("travel_all", "travel"))
+                for measure, what in (("accuracy", "accuracy"), ("n_views", "n_views"), ("travel_all", "travel"))
             ),
             small=True,
         )
@@ -148,8 +181,8 @@ def _results(results: Results, at: float) -> str:
 def _curves(results: Results, at: float) -> str:
     names = curves.compared(results)
     text = (
-        "<p>A threshold buys accuracy with looks and travel. The curves go through all thresholds from &ldquo;one look "
-        "for all&rdquo; to &ldquo;all looks for nearly all&rdquo;; the number beside a name is the curve's mean "
+        "<p>A threshold buys accuracy with views and travel. The curves go through all thresholds from &ldquo;one view "
+        "for all&rdquo; to &ldquo;all views for nearly all&rdquo;; the number beside a name is the curve's mean "
         "height.</p>"
     )
     figures = [
@@ -160,7 +193,7 @@ def _curves(results: Results, at: float) -> str:
         )
         for measure, what in (("class_accuracy", "Mean class accuracy"), ("accuracy", "Accuracy over objects"))
     ]
-    for budget, what in (("looks", "looks"), ("travel_all", "travel")):
+    for budget, what in (("n_views", "n_views"), ("travel_all", "travel")):
         if results.tables.sweep[budget].max() > results.tables.sweep[budget].min():
             figures.append(
                 picture(
@@ -218,10 +251,12 @@ def _failures(results: Results, best: str, at: float, failures: list, pictures: 
         strip = "".join(
             f'<img src="{shown[v]}" alt="{escape(name)} from view {v}" title="view {v}">' for v in views if v in shown
         )
-        twin = " Its very mesh is also in the data under another label." if p.conflicting[p.names.index(name)] else ""
+        duplicate = (
+            " Its very mesh is also in the data under another label." if p.conflicting[p.names.index(name)] else ""
+        )
         items.append(
             f"<li><strong>{escape(name)}</strong>, taken for {escape(str(episode['answer'])).replace('_', ' ')}: wrong "
-            f"in {wrong} of {results.settings['runs']} runs, on average {100 * confidence:.1f}&nbsp;% sure.{twin} "
+            f"in {wrong} of {results.settings['runs']} runs, on average {100 * confidence:.1f}&nbsp;% sure.{duplicate} "
             f'<span class="soft">Views {", ".join(map(str, views))}.</span><div class="strip">{strip}</div></li>'
         )
     if not items:
@@ -249,10 +284,10 @@ def _viewer(results: Results, best: str, at: float, failures: list, pictures: Pi
         "to turn, and use the buttons or the arrow keys to step.</p>"
         '<div id="viewer"><div><div class="controls">'
         '<select id="scene" aria-label="object"></select><select id="policy" aria-label="policy"></select>'
-        '<button id="back" aria-label="one look back">&#9664;</button>'
-        '<button id="next" aria-label="next look">&#9654;</button></div>'
+        '<button id="back" aria-label="one view back">&#9664;</button>'
+        '<button id="next" aria-label="next view">&#9654;</button></div>'
         '<div class="stage"><canvas id="sphere" tabindex="0" role="img"></canvas></div></div>'
-        '<div><p id="why" class="soft"></p><p id="verdict" aria-live="polite"></p><ol id="looks"></ol></div></div>'
+        '<div><p id="why" class="soft"></p><p id="verdict" aria-live="polite"></p><ol id="steps"></ol></div></div>'
         f'<script type="application/json" id="trajectories">{data}</script>'
     )
 

@@ -1,4 +1,4 @@
-"""Pictures of a view store: one object from all sides, the whole data set, and point correspondence."""
+"""Pictures of a view store: one object from all azimuth bins, the whole data set, and point correspondence."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nextview.data.store import RENDERED, ViewStore
+from nextview.outputs import written_whole
 from nextview.report.style import PlainFigure
 from nextview.viewsphere import ViewSphere
 
@@ -21,10 +22,8 @@ CELL = 112
 
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG or whatever the suffix says, aside and then renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.part{path.suffix}")
-    figure.savefig(part, dpi=150, facecolor="white")
-    part.replace(path)
+    with written_whole(path) as part:
+        figure.savefig(part, dpi=150, facecolor="white")
 
 
 def object_figure(store: ViewStore, i: int) -> Figure:
@@ -141,8 +140,8 @@ def summary(store: ViewStore) -> dict[str, str]:
     size = sum(sizes.values())
     labels, done, views = store.labels, store.done, len(store.sphere)
     rendered = int(done.sum())
-    copies = sum(map(len, store.twins)) - len(store.twins)
-    conflicting = sum(len(set(labels[group])) > 1 for group in store.twins)
+    copies = sum(map(len, store.duplicates)) - len(store.duplicates)
+    conflicting = sum(len(set(labels[group])) > 1 for group in store.duplicates)
     side = store.group.attrs["size"]
     facts = {
         "objects": f"{len(store):,} in {len(store.classes)} classes",

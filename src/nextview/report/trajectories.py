@@ -1,4 +1,4 @@
-"""Episodes to step through in the 3D viewer, as JSON: where each policy went, and what was believed after each look."""
+"""Episodes to step through in the 3D viewer, as JSON: where each policy went, and what was believed after each view."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import pandas as pd
 from numpy.typing import NDArray
 from PIL import Image
 
-from nextview.benchmark.contestants import Trials
+from nextview.benchmark.entries import EpisodeSpecs
 from nextview.benchmark.published import COLUMNS
-from nextview.benchmark.replay import cut, replay
+from nextview.benchmark.replay import replay, truncate
 from nextview.benchmark.results import Results
 from nextview.data.store import ViewStore
 from nextview.measures.depth_entropy import normalise_per_object
@@ -125,12 +125,12 @@ def _views_taken(episodes: pd.DataFrame) -> dict[tuple[str, int], list[int]]:
 def _thesis_paths(results: Results, row: dict[str, int]) -> dict[str, list[int]]:
     p, seed = results.predictions, results.settings["seed"]
     valleys = tuple(p.classes.index(name) for name in results.settings["valley_classes"])
-    trials = Trials(p, np.array([row[THESIS[0]]]), np.array([THESIS[1]]), valleys)
+    specs = EpisodeSpecs(p, np.array([row[THESIS[0]]]), np.array([THESIS[1]]), valleys)
     names = [name for name in (*COLUMNS, "lem") if name in set(results.tables.sweep["policy"])]
     paths = {}
     for name in names:
-        path = replay(name, trials, results.settings["max_views"], seed)
-        paths[name] = path.views[0, : cut(path, 0.99).looks[0]].tolist()
+        path = replay(name, specs, results.settings["max_views"], seed)
+        paths[name] = path.views[0, : truncate(path, 0.99).n_views[0]].tolist()
     return paths
 
 
@@ -154,8 +154,8 @@ def _scene(
 
 def _episode(results: Results, i: int, policy: str, views: list[int]) -> dict[str, Any]:
     p = results.predictions
-    said = p.said[i, views].astype(np.float64).cumsum(0)
-    beliefs = p.calibration.belief(said, np.arange(1, len(views) + 1), len(p.classes))
+    log_evidence = p.log_evidence[i, views].astype(np.float64).cumsum(0)
+    beliefs = p.calibration.belief(log_evidence, np.arange(1, len(views) + 1), len(p.classes))
     top = [np.argsort(-belief, kind="stable")[:3] for belief in beliefs]
     travel = [0.0, *np.cumsum(p.sphere.travel[views[:-1], views[1:]])]
     return {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.split import alike
+from nextview.data.splits import duplicate_groups
 from nextview.errors import DatasetError
 
 
@@ -31,11 +31,11 @@ def hold_out(
     if not 2 <= folds <= len(labels):
         raise DatasetError(f"{len(labels)} objects cannot be divided into {folds} folds")
     rng = np.random.default_rng([seed, folds])
-    twin = alike(measured)
-    _, first = np.unique(twin, return_index=True)  # one object stands for all that look the same
+    duplicate = duplicate_groups(measured)
+    _, first = np.unique(duplicate, return_index=True)  # one object stands for all that look the same
     first = rng.permutation(first)
     first = first[np.argsort(labels[first], kind="stable")]  # dealt out class by class
     fold_of_twin = np.empty(len(first), np.int64)
-    fold_of_twin[twin[first]] = np.arange(len(first)) % folds
-    fold = fold_of_twin[twin]
+    fold_of_twin[duplicate[first]] = np.arange(len(first)) % folds
+    fold = fold_of_twin[duplicate]
     return [np.flatnonzero(fold == k) for k in range(folds)]

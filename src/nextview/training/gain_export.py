@@ -11,19 +11,21 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from nextview.errors import ModelError
-from nextview.models.card import file_hash
-from nextview.policies.card import write_policy
+from nextview.models.model_card import file_hash
+from nextview.models.onnx_file import open_onnx
+from nextview.outputs import written_whole
 from nextview.policies.gain import Gain
+from nextview.policies.gain_weights import FEATURES_INPUT
+from nextview.policies.policy_card import write_policy
 from nextview.training.perceptrons import Perceptrons
-from nextview.weights import open_onnx
 
 OPSET = 18
 IR_VERSION = 8
 """That of the ONNX releases with this opset: older ONNX Runtimes read it too."""
 
 BOUND = 1e-5
-"""How far the file's answers may be from those of the networks in double precision. A fiftieth of the lowest price of a
-cell of travel that is tried."""
+"""How far the file's answers may be from those of the networks in double precision. A fiftieth of the
+lowest travel weight that is tried."""
 
 
 def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
@@ -41,8 +43,8 @@ def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
     depths = {len(layers) for layers in p.networks}
     if len(depths) > 1:
         raise ModelError("the networks are not equally deep")
-    d, v = len(p.told_flip), len(p.cells_flip)
-    faces = np.stack([np.arange(d), p.told_flip])[:, None, None, :]
+    d, v = len(p.features_flip), len(p.cells_flip)
+    faces = np.stack([np.arange(d), p.features_flip])[:, None, None, :]
     straight = np.arange(e * v).reshape(e, v)
     constants: dict[str, NDArray[Any]] = {
         "faces": faces,
@@ -53,7 +55,7 @@ def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
         "half": np.array(0.5, np.float32),
         "nothing": np.array(0, np.float32),
     }
-    nodes = [helper.make_node("Gather", ["told", "faces"], ["values0"], axis=1)]
+    nodes = [helper.make_node("Gather", [FEATURES_INPUT, "faces"], ["values0"], axis=1)]
     for i, layer in enumerate(zip(*p.networks, strict=True)):
         constants[f"weights{i}"] = np.stack([weights for weights, _ in layer])[None].astype(np.float32)
         constants[f"bias{i}"] = np.stack([bias for _, bias in layer])[:, None].astype(np.float32)
@@ -77,7 +79,7 @@ def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
         helper.make_node("Mul", ["total", "nothing"], ["fault"]),
         helper.make_node("Add", ["worth", "fault"], ["cells"]),
     ]
-    inputs = [helper.make_tensor_value_info("told", TensorProto.FLOAT, ["batch", d])]
+    inputs = [helper.make_tensor_value_info(FEATURES_INPUT, TensorProto.FLOAT, ["batch", d])]
     outputs = [helper.make_tensor_value_info("cells", TensorProto.FLOAT, ["batch", v])]
     initial = [numpy_helper.from_array(np.ascontiguousarray(values), name) for name, values in constants.items()]
     graph = helper.make_graph(nodes, "gain", inputs, outputs, initial)
@@ -88,14 +90,14 @@ def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
     return model
 
 
-def write_gain(card: Path, policy: Gain, facts: dict[str, Any], told: NDArray[np.float32]) -> float:
+def write_gain(card: Path, policy: Gain, facts: dict[str, Any], features: NDArray[np.float32]) -> float:
     """Write a policy that was trained: the ONNX file, then the card, each aside and then renamed.
 
     Args:
         card: NAME.json; the ONNX file is NAME.onnx.
         policy: whose score is of ``Perceptrons``.
         facts: what the card is to say beside the hash and what the policy itself says.
-        told: states on which the file is compared with the networks, (S, D).
+        features: states on which the file is compared with the networks, (S, D).
 
     Returns:
         By how much their answers differ at most.
@@ -106,16 +108,14 @@ def write_gain(card: Path, policy: Gain, facts: dict[str, Any], told: NDArray[np
     if not isinstance(policy.score, Perceptrons):
         raise ModelError("only a policy that was just trained can be written")
     weights = card.with_suffix(".onnx")
-    part = weights.with_name(weights.name + ".part")
-    onnx.save(gain_graph(policy.score), part)
-    sha256 = file_hash(part)
-    answers = open_onnx(part, sha256, threads=1).run(["cells"], {"told": told.astype(np.float32)})[0]
-    difference = float(np.abs(answers - policy.score(told.astype(np.float64))).max())
-    if not difference <= BOUND:
-        part.unlink()
-        raise ModelError(
-            f"{weights}: ONNX Runtime's answers differ by {difference:.2g} from the networks'; not written"
-        )
-    part.rename(weights)
+    with written_whole(weights) as part:
+        onnx.save(gain_graph(policy.score), part)
+        sha256 = file_hash(part)
+        answers = open_onnx(part, sha256, threads=1).run(["cells"], {FEATURES_INPUT: features.astype(np.float32)})[0]
+        difference = float(np.abs(answers - policy.score(features.astype(np.float64))).max())
+        if not difference <= BOUND:
+            raise ModelError(
+                f"{weights}: ONNX Runtime's answers differ by {difference:.2g} from the networks'; not written"
+            )
     write_policy(card, facts | {"sha256": sha256, "table": policy.facts()})
     return difference

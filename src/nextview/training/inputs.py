@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nextview.data.seen import seen_views
+from nextview.data.input_views import input_views
 from nextview.data.store import ViewStore
 from nextview.models.geometry_input import CHANNELS
 from nextview.training.packed import PackedViews, load_packed, pack, save_packed
@@ -40,7 +40,7 @@ def prepare_inputs(path: Path, size: int, kind: str = "geometry", workers: int |
     store = ViewStore.open(path)
     chosen = np.flatnonzero(store.done).tolist()
     for first in chosen[:1]:  # a size that the views do not have is refused before anything is made
-        seen_views(store, first, kind, size)
+        input_views(store, first, kind, size)
     with ProcessPoolExecutor(workers or os.cpu_count(), get_context("spawn")) as pool:
         packed = pool.map(partial(_packed, path, size=size, kind=kind), chosen, chunksize=5)
         shape = (len(store), len(store.sphere), CHANNELS_OF[kind], size, size)
@@ -53,4 +53,4 @@ def load_inputs(path: Path, size: int, kind: str = "geometry") -> PackedViews:
 
 
 def _packed(path: Path, i: int, size: int, kind: str) -> list[bytes]:
-    return pack(seen_views(ViewStore.open(path), i, kind, size))
+    return pack(input_views(ViewStore.open(path), i, kind, size))

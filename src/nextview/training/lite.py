@@ -1,8 +1,6 @@
-"""EfficientNet-Lite: small recognisers whose first weights can come from ImageNet."""
+"""EfficientNet-Lite0: a small recogniser whose first weights can come from ImageNet."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor, nn
@@ -18,8 +16,7 @@ STAGES = (
     (6, 320, 3, 1, 1),
 )
 """Expansion, width, kernel, stride and blocks of the seven stages (Tan and Le, EfficientNet, ICML 2019, table 1)."""
-SCALES = {0: (1.0, 1.0), 1: (1.0, 1.1), 2: (1.1, 1.2)}
-"""By how much EfficientNet-Lite0, 1 and 2 are wider and deeper (TensorFlow's EfficientNet-Lite, 2020)."""
+BLOCKS = sum(length for *_, length in STAGES)
 FEATURES = 1280
 
 
@@ -64,31 +61,31 @@ class InvertedBottleneck(nn.Module):
 
 
 class LiteNet(nn.Module):
-    """EfficientNet-Lite: EfficientNet without squeeze and excitation, with ReLU6 for swish.
+    """EfficientNet-Lite0: EfficientNet-B0 without squeeze and excitation, with ReLU6 for swish (TensorFlow, 2020).
 
-    The smallest has a fifth of the arithmetic of a ResNet-18 and three tenths of its parameters. ``forward`` returns
-    what ``networks.ResNet`` does, with pooled features (B, 1280). For first weights see ``weights.load_checkpoint``.
+    It has a fifth of the arithmetic of a ResNet-18 and three tenths of its parameters. ``forward`` returns what
+    ``networks.ResNet`` does. For first weights see ``weights.load_checkpoint``.
 
     Args:
         classes: outputs.
         channels: of the input image (B, channels, H, W), values in 0 .. 1.
-        azimuths: sides that are told apart; 0 for none.
-        scale: 0, 1 or 2: which of them, the smallest first.
-        drop: chance in training that a pooled feature is dropped; the chance that a block with a shortcut is skipped
+        azimuths: azimuth bins that are told apart; 0 for none.
+        dropout: chance in training that a pooled feature is dropped; the chance that a block with a shortcut is skipped
             for an image rises from 0 at the first block towards it at the last.
     """
 
-    blocks = 1
+    name = "EfficientNet-Lite0"
 
-    def __init__(self, classes: int, channels: int, azimuths: int = 0, scale: int = 0, drop: float = 0.0) -> None:
+    def __init__(self, classes: int, channels: int, azimuths: int = 0, dropout: float = 0.0) -> None:
         super().__init__()
-        self.name, self.drop = f"EfficientNet-Lite{scale}", drop
-        inputs, shapes = 32, _shapes(scale)
+        self.dropout, inputs = dropout, 32
         self.stem, self.norm0 = nn.Conv2d(channels, inputs, 3, 2, 1, bias=False), _norm(inputs)
-        stages = []
-        for index, (expansion, width, kernel, stride) in enumerate(shapes):
-            stages.append(InvertedBottleneck(inputs, expansion, width, kernel, stride, drop * index / len(shapes)))
-            inputs = width
+        stages: list[nn.Module] = []
+        for expansion, width, kernel, stride, length in STAGES:
+            for index in range(length):
+                step, skip = 1 if index else stride, dropout * len(stages) / BLOCKS
+                stages.append(InvertedBottleneck(inputs, expansion, width, kernel, step, skip))
+                inputs = width
         self.stages = nn.Sequential(*stages)
         self.head, self.norm1 = nn.Conv2d(inputs, FEATURES, 1, bias=False), _norm(FEATURES)
         self.relu, self.avgpool = nn.ReLU6(inplace=True), nn.AdaptiveAvgPool2d(1)
@@ -101,24 +98,12 @@ class LiteNet(nn.Module):
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         x = self.stages(self.relu(self.norm0(self.stem(x))))
-        features = self.avgpool(self.relu(self.norm1(self.head(x)))).flatten(1)
-        kept = F.dropout(features, self.drop, self.training)
-        logits = self.fc(kept)
+        x = self.avgpool(self.relu(self.norm1(self.head(x)))).flatten(1)
+        features = F.dropout(x, self.dropout, self.training)
+        logits = self.fc(features)
         if self.side is None:
-            return logits, features
-        return logits, features, self.side(kept).unflatten(1, (-1, self.azimuths)).log_softmax(2)
-
-
-def _shapes(scale: int) -> list[tuple[int, int, int, int]]:
-    """Expansion, width, kernel and stride of each block. The first and the last stage are as deep in all of them."""
-    wider, deeper = SCALES[scale]
-    shapes = []
-    for stage, (expansion, width, kernel, stride, length) in enumerate(STAGES):
-        near = int(width * wider + 4) // 8 * 8  # the nearest multiple of 8, of which none is a tenth too narrow
-        scaled = near if near >= 0.9 * width * wider else near + 8
-        blocks = length if stage in (0, len(STAGES) - 1) else math.ceil(length * deeper)
-        shapes += [(expansion, scaled, kernel, 1 if index else stride) for index in range(blocks)]
-    return shapes
+            return (logits,)
+        return logits, self.side(features).unflatten(1, (-1, self.azimuths)).log_softmax(2)
 
 
 def _norm(width: int) -> nn.BatchNorm2d:

@@ -11,16 +11,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nextview.data.split import split_training
+from nextview.data.splits import split_training
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError
-from nextview.models.card import find_card
+from nextview.models.model_card import find_card
+from nextview.training.architectures import ResNet, recogniser_network
+from nextview.training.checkpoints import exported_networks, load_run
 from nextview.training.inputs import CHANNELS_OF
 from nextview.training.lite import LiteNet
-from nextview.training.networks import ResNet, recogniser_network
 from nextview.training.recipes import RecogniserRecipe
 from nextview.training.runs import read_recipe
-from nextview.training.weights import exported_networks, load_run
 
 
 @dataclass(frozen=True)
@@ -93,5 +93,5 @@ def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) ->
 
 def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet | LiteNet:
     """The recogniser of a finished run, in evaluation mode."""
-    azimuths = views.sphere.azimuths if recipe.side else 0
+    azimuths = views.sphere.azimuths if recipe.azimuth_bins_weight else 0
     return load_run(recogniser_network(recipe, len(views.classes), azimuths), run)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from numcodecs import Blosc
 from numpy.typing import NDArray
 
 from nextview.errors import DatasetError
+from nextview.outputs import written_whole
 
 PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)
 """Views of objects are mostly background and flat faces: a sixth is left or less, which fits into memory."""
@@ -73,17 +73,15 @@ def save_packed(folder: Path, shape: tuple[int, ...], objects: Iterable[tuple[in
         Objects written so far.
     """
     places = np.zeros((*shape[:2], 2), np.int64)
-    part = folder.with_name(f"{folder.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    with open(part / "views.lz4", "wb") as file:
-        for total, (i, packed) in enumerate(objects, 1):
-            counts = np.array([len(view) for view in packed])
-            places[i] = np.stack([file.tell() + np.cumsum(counts) - counts, counts], 1)
-            file.writelines(packed)
-            yield total
-    np.savez(part / "index.npz", places=places, size=shape[2:])
-    part.rename(folder)
+    with written_whole(folder) as part:
+        part.mkdir()
+        with open(part / "views.lz4", "wb") as file:
+            for total, (i, packed) in enumerate(objects, 1):
+                counts = np.array([len(view) for view in packed])
+                places[i] = np.stack([file.tell() + np.cumsum(counts) - counts, counts], 1)
+                file.writelines(packed)
+                yield total
+        np.savez(part / "index.npz", places=places, size=shape[2:])
 
 
 def load_packed(folder: Path) -> PackedViews:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import ModelError
-from nextview.policies.gain import Frame, mirrored, told_mirrored
+from nextview.policies.gain import Frame, mirrored, mirrored_features
 from nextview.viewsphere import ViewSphere
 
 Layers = tuple[tuple[NDArray[np.floating], NDArray[np.floating]], ...]
@@ -21,12 +21,12 @@ class Perceptrons:
 
     Attributes:
         networks: each a chain of weights (in, out) and biases (out,), ReLU between them.
-        told_flip: which of the inputs stands in each place for the mirror image, (D,) int64.
+        features_flip: which of the inputs stands in each place for the mirror image, (D,) int64.
         cells_flip: which cell lies in each place in the mirror, (V,) int64.
     """
 
     networks: tuple[Layers, ...]
-    told_flip: NDArray[np.int64]
+    features_flip: NDArray[np.int64]
     cells_flip: NDArray[np.int64]
 
     def __post_init__(self) -> None:
@@ -34,7 +34,7 @@ class Perceptrons:
             raise ModelError("needs at least one network")
         for layers in self.networks:
             shapes = [weights.shape for weights, _ in layers]
-            wide = [len(self.told_flip), *(bias.size for _, bias in layers)]
+            wide = [len(self.features_flip), *(bias.size for _, bias in layers)]
             if shapes != list(pairwise(wide)) or wide[-1] != len(self.cells_flip):
                 raise ModelError(f"weights of the shapes {shapes} do not lead from {wide[0]} inputs to the views")
             if not all(np.isfinite(numbers).all() for layer in layers for numbers in layer):
@@ -50,11 +50,14 @@ class Perceptrons:
         frame: Frame = "camera",
     ) -> Perceptrons:
         """With the mirror of a sphere; the other arguments as those of ``Gain``."""
-        return cls(networks, told_mirrored(sphere, classes, inputs, frame), mirrored(sphere))
+        return cls(networks, mirrored_features(sphere, classes, inputs, frame), mirrored(sphere))
 
-    def __call__(self, told: NDArray[np.floating]) -> NDArray[np.floating]:
+    def __call__(self, features: NDArray[np.floating]) -> NDArray[np.floating]:
         """What each cell is worth, (B, V), from what is told, (B, D); as precise as the numbers that are given."""
-        both = [_forward(told, n) + _forward(told[:, self.told_flip], n)[:, self.cells_flip] for n in self.networks]
+        both = [
+            _forward(features, n) + _forward(features[:, self.features_flip], n)[:, self.cells_flip]
+            for n in self.networks
+        ]
         return sum(both[1:], both[0]) / (2 * len(both))
 
 

@@ -11,28 +11,25 @@ class RecogniserRecipe:
     """How the recogniser is trained.
 
     Attributes:
-        network: a ResNet, or EfficientNet-Lite0, -1 or -2; the first has a fifth of the arithmetic of a ResNet-18.
+        network: a ResNet, or EfficientNet-Lite0, which has a fifth of the arithmetic of a ResNet-18.
         depth: ResNet-18, -34, -50, -101 or -152.
-        drop: of an EfficientNet-Lite: chance that a pooled feature is dropped; the chance that a block is skipped for a
-            view rises from 0 at the first towards it at the last.
+        dropout: of EfficientNet-Lite0: chance that a pooled feature is dropped; the chance that a block is skipped for
+            a view rises from 0 at the first towards it at the last.
         size: side of the input image, pixels.
-        blocks: side of the blocks of pixels that the first convolution sees as channels of one pixel (space to depth):
-            with 2, an image of twice the side takes half as long again, not four times as long. A ResNet's only.
-        small: side of the images in the first epochs, which are faster so; see ``small_epochs``.
-        small_epochs: how many epochs see small images.
         epochs: passes over the training objects.
         views: views of each object in one epoch, drawn at random.
         batch: views a step.
-        rate: peak learning rate of AdamW under a one-cycle schedule.
-        decay: weight decay.
+        lr: peak learning rate of AdamW under a one-cycle schedule.
+        weight_decay: of AdamW.
         smoothing: label smoothing.
-        side: weight of the cross-entropy of the side from which the object is seen, beside that of its class; 0 does
-            without. The objects of a class have to stand alike in their files, as ModelNet10's do.
+        azimuth_bins_weight: weight of the loss for the azimuth bin from which the object is seen, a cross-entropy,
+            beside that of its class; 0 does without. The objects of a class have to stand alike in their files, as
+            ModelNet10's do.
         validation: part of the training split held out for validation.
         deformed_share: chance that a view is drawn from the deformed objects, where such a store is given.
         seed: decides everything random.
-        member: which of several networks to be averaged this is: the seed's objects validate all of them, but each has
-            first weights and draws of its own.
+        ensemble_seed: which network of an ensemble this is: the seed's objects validate all of them, but each has first
+            weights and draws of its own.
         input: what the network sees: the geometry that a depth camera sees, or the shaded image.
         augment: vary what is seen; see ``recogniser.augment``.
         balanced: draw rare classes more often; otherwise every view comes once before any comes again.
@@ -40,24 +37,21 @@ class RecogniserRecipe:
         patience: stop after so many epochs without a better class mean on validation; 0 never stops early.
     """
 
-    network: Literal["resnet", "lite0", "lite1", "lite2"] = "resnet"
+    network: Literal["resnet", "lite0"] = "resnet"
     depth: Literal[18, 34, 50, 101, 152] = 18
-    drop: float = 0.0
+    dropout: float = 0.0
     size: int = 112
-    blocks: Literal[1, 2, 4] = 1
-    small: int = 80
-    small_epochs: int = 0
     epochs: int = 12
     views: int = 8
     batch: int = 64
-    rate: float = 2e-3
-    decay: float = 0.05
+    lr: float = 2e-3
+    weight_decay: float = 0.05
     smoothing: float = 0.1
-    side: float = 0.0
+    azimuth_bins_weight: float = 0.0
     validation: float = 0.1
     deformed_share: float = 0.5
     seed: int = 0
-    member: int = 0
+    ensemble_seed: int = 0
     input: Literal["geometry", "image"] = "geometry"
     augment: bool = True
     balanced: bool = True
@@ -71,8 +65,8 @@ THESIS_RECOGNISER = RecogniserRecipe(
     epochs=15,
     views=40,
     batch=32,
-    rate=1e-3,
-    decay=0.0,
+    lr=1e-3,
+    weight_decay=0.0,
     smoothing=0.0,
     deformed_share=0.0,
     input="image",
@@ -101,8 +95,8 @@ class MapRecipe:
         epochs: passes over the training objects.
         views: views of each object in one epoch, drawn at random.
         batch: views a step.
-        rate: peak learning rate of Adam.
-        decay: weight decay of AdamW.
+        lr: peak learning rate of Adam.
+        weight_decay: of AdamW.
         regular: weight of the orthogonality terms of the PointNet's transforms.
         peak: weight of the cross-entropy of which cell of the window is the highest, beside the squared error, which
             cares for all cells alike; values are taken over ``sharpness`` for log-odds.
@@ -124,8 +118,8 @@ class MapRecipe:
     epochs: int = 8
     views: int = 12
     batch: int = 64
-    rate: float = 2e-3
-    decay: float = 0.05
+    lr: float = 2e-3
+    weight_decay: float = 0.05
     regular: float = 1e-4
     peak: float = 0.0
     sharpness: float = 0.05
@@ -144,8 +138,8 @@ THESIS_MAP = MapRecipe(
     epochs=15,
     views=40,
     batch=16,
-    rate=1e-3,
-    decay=0.0,
+    lr=1e-3,
+    weight_decay=0.0,
     mirror=False,
     schedule="tenth",
 )
@@ -160,34 +154,34 @@ class GainRecipe:
     Attributes:
         inputs: what the networks are told; see ``policies.gain.INPUTS``.
         frame: from where azimuths are counted: from the camera's, or from the one at which the object is believed to
-            show its side 0, which takes a recogniser that was taught the sides.
-        outcome: of a look: belief in the true class after it, its logarithm, or whether the answer is right.
-        looks: the outcome of looks 2 to this one is learned.
+            show its azimuth bin 0, which takes a recogniser that was taught the azimuth bins.
+        outcome: of a view: belief in the true class after it, its logarithm, or whether the answer is right.
+        n_views: the outcome of views 2 to this one is learned.
         hidden: width of the two hidden layers.
         networks: that are averaged, of each fold; each weighs the objects by a bootstrap draw of its own.
         epochs: each over new walks of all objects.
         walks: of each object in an epoch.
         batch: states in a step.
-        rate: AdamW's learning rate at its peak (one-cycle).
-        decay: AdamW's weight decay.
+        lr: AdamW's learning rate at its peak (one-cycle).
+        weight_decay: AdamW's.
         seed: of everything random.
     """
 
-    inputs: tuple[Literal["belief", "look", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "side"], ...] = (
+    inputs: tuple[Literal["belief", "view", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "azimuth_bin"], ...] = (
         "belief",
-        "look",
+        "view",
         "place",
         "lem-sphere",
-        "side",
+        "azimuth_bin",
     )
     frame: Literal["camera", "object"] = "object"
     outcome: Literal["belief", "log-belief", "right"] = "log-belief"
-    looks: int = 5
+    n_views: int = 5
     hidden: int = 32
     networks: int = 2
     epochs: int = 15
     walks: int = 8
     batch: int = 1024
-    rate: float = 3e-3
-    decay: float = 0.1
+    lr: float = 3e-3
+    weight_decay: float = 0.1
     seed: int = 0

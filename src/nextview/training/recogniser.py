@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +15,29 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.data import IterableDataset
 
-from nextview.training.fit import fit
+from nextview.training.architectures import recogniser_network
+from nextview.training.azimuth_bins import side_loss
+from nextview.training.checkpoints import load_checkpoint, load_exported
 from nextview.training.hardware import Hardware
-from nextview.training.networks import recogniser_network
+from nextview.training.loop import fit
 from nextview.training.packed import AHEAD, PackedViews, ask_for
 from nextview.training.recipes import RecogniserRecipe
-from nextview.training.sides import side_loss
-from nextview.training.weights import load_checkpoint, load_exported
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where views of the training objects come from: their own store or one of deformed twins.
+    """Where views of the training objects come from: their own store or one of deformed duplicates.
 
     Attributes:
         inputs: (rows, V, C, S, S) uint8.
         row: of each object in them, (N,).
-        sides: that each view sees of its object, (rows, V), see ``sides.sides``; None if they are not to be learned.
+        azimuth_bins: that each view sees of its object, (rows, V), see ``azimuth_bins.azimuth_bins``; None if they are
+            not to be learned.
     """
 
     inputs: NDArray[np.uint8] | PackedViews
     row: NDArray[np.int64]
-    sides: NDArray[np.float32] | None = None
+    azimuth_bins: NDArray[np.float32] | None = None
 
 
 class Views(IterableDataset):
@@ -46,7 +46,7 @@ class Views(IterableDataset):
     Balanced, objects are drawn with weight 1/sqrt(objects of their class), so that rare classes are seen more often,
     and views at random. Otherwise every view comes at most once an epoch, and once exactly if ``recipe.views`` takes
     all of them. The views of an object come from its own store or, with chance ``recipe.deformed_share``, from one of
-    its deformed twins, which may have other views.
+    its deformed duplicates, which may have other views.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Views(IterableDataset):
         return len(self.objects) * views // self.recipe.batch
 
     def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
-        rng = np.random.default_rng([self.recipe.seed, self.epoch, self.recipe.member])
+        rng = np.random.default_rng([self.recipe.seed, self.epoch, self.recipe.ensemble_seed])
         n, v = len(self) * self.recipe.batch, self.sources[0].inputs.shape[1]
         if self.recipe.balanced:
             objects = rng.choice(self.objects, n, p=self.weights)
@@ -85,19 +85,21 @@ class Views(IterableDataset):
                 k = coming[source[coming] == s]
                 ask_for(own.inputs, zip(row[k], view[k], strict=True))
             images = [self.sources[source[k]].inputs[row[k], view[k]] for k in batch]
-            told = [self.sources[source[k]].sides for k in batch]
-            sides = [known[row[k], view[k]] for k, known in zip(batch, told, strict=True) if known is not None]
-            drawn = [np.stack(images), self.labels[objects[batch]], *([np.array(sides)] if sides else [])]
+            known_bins = [self.sources[source[k]].azimuth_bins for k in batch]
+            azimuth_bins = [
+                known[row[k], view[k]] for k, known in zip(batch, known_bins, strict=True) if known is not None
+            ]
+            drawn = [np.stack(images), self.labels[objects[batch]], *([np.array(azimuth_bins)] if azimuth_bins else [])]
             yield tuple(map(torch.from_numpy, drawn))
 
 
-def augment(x: Tensor, s: int) -> tuple[Tensor, Tensor]:
+def augment(x: Tensor) -> tuple[Tensor, Tensor]:
     """Vary inputs (B, C, S, S) in 0 .. 1: mirror, shift, scale and stretch, roll a little, hide a rectangle, add noise.
 
-    A mirrored object is of the same class, and none of the channels changes its sign under the mirror. The result is
-    (B, C, s, s) and which of them are mirrored, (B,) bool.
+    A mirrored object is of the same class, and none of the channels changes its sign under the mirror. The result has
+    the same shape; with it comes which of the inputs are mirrored, (B,) bool.
     """
-    (b, channels), on = x.shape[:2], {"device": x.device}
+    (b, _, _, s), on = x.shape, {"device": x.device}
     scale = torch.empty(b, 2, **on).uniform_(0.8, 1.25)
     mirrored = torch.randint(0, 2, (b,), **on) == 0
     scale[:, 0] *= torch.where(mirrored, -1.0, 1.0)
@@ -106,7 +108,7 @@ def augment(x: Tensor, s: int) -> tuple[Tensor, Tensor]:
     theta[:, 0, 0], theta[:, 0, 1] = scale[:, 0] * roll.cos(), -scale[:, 0] * roll.sin()
     theta[:, 1, 0], theta[:, 1, 1] = scale[:, 1] * roll.sin(), scale[:, 1] * roll.cos()
     theta[:, :, 2] = torch.empty(b, 2, **on).uniform_(-0.1, 0.1)
-    x = F.grid_sample(x, F.affine_grid(theta, [b, channels, s, s], align_corners=False), align_corners=False)
+    x = F.grid_sample(x, F.affine_grid(theta, list(x.shape), align_corners=False), align_corners=False)
     # A rectangle of background, in half of the images, as if something stood in front.
     side = torch.empty(b, 2, **on).uniform_(0.1, 0.4)
     corner = torch.rand(b, 2, **on) * (1 - side)
@@ -116,27 +118,6 @@ def augment(x: Tensor, s: int) -> tuple[Tensor, Tensor]:
     hidden = (rows[:, :, None] & columns[:, None, :] & (torch.rand(b, 1, 1, **on) < 0.5))[:, None]
     seen = (x > 0) & ~hidden
     return torch.where(seen, x + 0.02 * torch.randn_like(x), 0.0), mirrored
-
-
-def drawn_views(
-    inputs: NDArray[np.uint8] | PackedViews,
-    objects: NDArray[np.int64],
-    labels: NDArray[np.int64],
-    recipe: RecogniserRecipe,
-    most: int,
-) -> Iterator[Tensor]:
-    """At most so many batches of views as they are trained on, (B, C, S, S) in 0 .. 1, from the store itself.
-
-    Args:
-        inputs: (N, V, C, S, S).
-        objects: from which is drawn.
-        labels: class of each object, (N,).
-        recipe: how.
-        most: batches.
-    """
-    for batch in islice(Views([Source(inputs, np.arange(len(inputs)))], objects, labels, recipe), most):
-        x = batch[0].float() / 255
-        yield augment(x, recipe.size)[0] if recipe.augment else x
 
 
 class RecogniserModule(L.LightningModule):
@@ -153,21 +134,18 @@ class RecogniserModule(L.LightningModule):
             self.register_buffer(name, torch.zeros(classes), persistent=False)
 
     def training_step(self, batch: tuple[Tensor, ...], _: int) -> Tensor:
-        size = self.recipe.small if self.current_epoch < self.recipe.small_epochs else self.recipe.size
         x, label = batch[0].float() / 255, batch[1]
         mirrored = torch.zeros_like(label, dtype=torch.bool)
         if self.recipe.augment:
-            x, mirrored = augment(x, size)
-        elif size < x.shape[2]:
-            x = F.interpolate(x, size=(size, size), mode="area")
+            x, mirrored = augment(x)
         x = x.to(memory_format=torch.channels_last)
-        logits, _features, *likely = self.net(x)
+        logits, *likely = self.net(x)
         loss = F.cross_entropy(logits.float(), label, label_smoothing=self.recipe.smoothing)
         if likely:
             side = torch.where(mirrored, -batch[2] % likely[0].shape[2], batch[2])
             lost = side_loss(likely[0].float(), label, side)
             self.log("side_loss", lost, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))
-            loss = loss + self.recipe.side * lost
+            loss = loss + self.recipe.azimuth_bins_weight * lost
         self.log("loss", loss, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))
         return loss
 
@@ -191,13 +169,13 @@ class RecogniserModule(L.LightningModule):
         decayed = [p for p in self.net.parameters() if p.ndim > 1]
         plain = [p for p in self.net.parameters() if p.ndim <= 1]
         optimizer = torch.optim.AdamW(
-            [{"params": decayed, "weight_decay": self.recipe.decay}, {"params": plain, "weight_decay": 0.0}],
-            lr=self.recipe.rate,
+            [{"params": decayed, "weight_decay": self.recipe.weight_decay}, {"params": plain, "weight_decay": 0.0}],
+            lr=self.recipe.lr,
         )
         if self.recipe.schedule == "halving":
             schedule = torch.optim.lr_scheduler.StepLR(optimizer, step_size=5, gamma=0.5)
             return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "epoch"}}
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, self.recipe.rate, self.steps, pct_start=0.2)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, self.recipe.lr, self.steps, pct_start=0.2)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
@@ -231,7 +209,7 @@ def train(
     """Train and return the network of the best epoch; checkpoints in ``out``, from which a second call resumes.
 
     Args:
-        sources: the store's own, whose rows are the objects, and maybe those of deformed twins.
+        sources: the store's own, whose rows are the objects, and maybe those of deformed duplicates.
         labels: class of each object, (N,).
         training: objects that train.
         validation: objects that validate.
@@ -239,18 +217,18 @@ def train(
         out: folder for checkpoints and logs.
         weights: a published checkpoint, or the card of an exported recogniser, to start from.
         hardware: on what.
-        azimuths: sides of the object that the network learns to tell apart, 0 for none.
+        azimuths: azimuth bins of the object that the network learns to tell apart, 0 for none.
 
     Raises:
         ModelError: the weights or a checkpoint in ``out`` cannot be used.
     """
-    own = np.random.SeedSequence([recipe.seed, recipe.member])
+    own = np.random.SeedSequence([recipe.seed, recipe.ensemble_seed])
     L.seed_everything(int(own.generate_state(1)[0]), verbose=False)
     views = Views(sources, training, labels, recipe)
     module = RecogniserModule(recipe, int(labels.max()) + 1, recipe.epochs * len(views), azimuths)
     if weights and weights.suffix == ".json":
-        sample = next(drawn_views(sources[0].inputs, training, labels, recipe, 1))
-        load_exported(module.net, weights, sample)
+        sample = next(iter(Views(sources[:1], training, labels, recipe)))[0].float() / 255
+        load_exported(module.net, weights, augment(sample)[0] if recipe.augment else sample)
     elif weights:
         load_checkpoint(module.net, weights)
     validation_views = ValidationViews(sources[0].inputs, validation, labels)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
@@ -15,8 +14,9 @@ from torch import nn
 
 from nextview.data.lock import only_one
 from nextview.errors import ModelError
-from nextview.models.card import file_hash, find_card
-from nextview.training.fit import is_first
+from nextview.models.model_card import file_hash, find_card
+from nextview.outputs import written_whole
+from nextview.training.loop import is_first
 
 Recipe = TypeVar("Recipe")
 
@@ -42,9 +42,8 @@ def begin(run: Path, recipe: Any, weights: Path | None = None) -> Iterator[None]
         elif is_first():
             run.mkdir(parents=True, exist_ok=True)
             (run / "weights.json").write_text(json.dumps(start) + "\n")
-            part = noted.with_suffix(".part")
-            part.write_text(json.dumps(asdict(recipe), indent=1) + "\n")
-            part.rename(noted)
+            with written_whole(noted) as part:
+                part.write_text(json.dumps(asdict(recipe), indent=1) + "\n")
         yield
 
 
@@ -70,9 +69,8 @@ def read_recipe(run: Path, kind: type[Recipe]) -> Recipe:
 
 def finish(network: nn.Module, run: Path) -> None:
     """Keep a trained network's parameters as network.pt, whole or not at all."""
-    part = run / f"network.part{os.getpid()}"
-    torch.save(network.state_dict(), part)
-    part.rename(run / "network.pt")
+    with written_whole(run / "network.pt") as part:
+        torch.save(network.state_dict(), part)
 
 
 def _hash(weights: Path | None) -> str | None:

@@ -121,10 +121,10 @@
       if (k === state.step) item.setAttribute("aria-current", "step");
       return item;
     });
-    $("looks").replaceChildren(...list);
+    $("steps").replaceChildren(...list);
     const [answer, sure] = e.beliefs[state.step][0], last = state.step === e.views.length - 1;
     const right = answer === truth ? "right" : "wrong";
-    $("verdict").textContent = `${e.policy}, look ${state.step + 1} of ${e.views.length}: ` +
+    $("verdict").textContent = `${e.policy}, view ${state.step + 1} of ${e.views.length}: ` +
       `${last ? "answers" : "believes"} ${pretty(data.classes[answer])} (${(100 * sure).toFixed(1)} %), ` +
       `${right}; travelled ${e.travel[state.step].toFixed(2)} cells`;
     $("verdict").style.color = `var(--${right})`;

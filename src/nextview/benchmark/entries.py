@@ -1,0 +1,162 @@
+"""Who can take part in the benchmark, by name: policies, oracles, fixed views, and a user's own."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_softmax
+
+from nextview.data.predictions import Predictions
+from nextview.errors import EntryError, OtherUseError
+from nextview.measures.confidence_map import confidence_maps
+from nextview.measures.depth_entropy import normalise_per_object
+from nextview.policies.base import Policy
+from nextview.policies.fixed import orbit, ranked
+from nextview.policies.maps import MapPeak
+from nextview.policies.oracle import OracleGain, OracleValley
+from nextview.policies.policy_card import bundled_policies
+from nextview.policies.registry import POLICIES, make_policy
+
+
+@dataclass(frozen=True)
+class EpisodeSpecs:
+    """The E episodes that every entry has to go through: the same objects from the same first views.
+
+    Attributes:
+        predictions: what the models say, and the truth.
+        objects: row of each episode's object, (E,) int64.
+        starts: first view of each, (E,) int64.
+        valley_classes: classes (indices) for which the valley of the LEM is taken to be the better view.
+        lcm_valley_classes: the same for the LCM.
+    """
+
+    predictions: Predictions
+    objects: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    valley_classes: tuple[int, ...]
+    lcm_valley_classes: tuple[int, ...] = ()
+
+    @property
+    def labels(self) -> NDArray[np.int64]:
+        """True class of each episode's object, (E,) int64."""
+        return self.predictions.labels[self.objects]
+
+
+ORACLES: dict[str, Callable[[EpisodeSpecs], Policy]] = {
+    "oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes),
+    "true-lem": lambda t: MapPeak(t.predictions.sphere, "true-lem", t.valley_classes),
+    "true-lem-peak": lambda t: MapPeak(t.predictions.sphere, "true-lem"),
+    "true-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes, "true-lem"),
+    "lcm-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.lcm_valley_classes, "lcm"),
+    "true-lcm": lambda t: MapPeak(t.predictions.sphere, "true-lcm"),
+    "oracle-gain": lambda t: _gain(t, anywhere=False),
+    "oracle-gain-all": lambda t: _gain(t, anywhere=True),
+}
+"""Policies that are told the truth, or climb the true map."""
+
+FIXED = {
+    "best": "the views in which the true class has the most confidence",
+    "worst": "those in which it has the least",
+    "high-entropy": "the views with the highest true depth-entropy",
+    "low-entropy": "those with the lowest",
+    "random-fixed": "any views",
+    "orbit": "round the ring of the first view, then the next ring",
+}
+"""Fixed views by name, to be followed by how many: "best-5", "orbit-8". They go on to the end whatever is believed."""
+
+
+def _gain(t: EpisodeSpecs, anywhere: bool) -> Policy:
+    p = t.predictions
+    return OracleGain(p.sphere, p.log_evidence, len(p.classes), p.labels, t.objects, anywhere, p.calibration)
+
+
+def default_entries(specs: EpisodeSpecs) -> list[str]:
+    """All that these predictions allow."""
+    sphere = specs.predictions.sphere
+    n, v = sphere.azimuths, len(sphere)
+    names = [*POLICIES, *(name for name in bundled_policies() if _fits(name, specs)), *ORACLES]
+    names = [name for name in names if not _lacking(_make(name, specs), specs)]
+    names += [f"{kind}-{min(5, v)}" for kind in FIXED if kind != "orbit"]
+    return names + [f"orbit-{k}" for k in sorted({n, v})]
+
+
+def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
+    """The policy of that name.
+
+    Raises:
+        EntryError: there is none, it cannot be made, or it needs a map that the predictions lack.
+    """
+    policy = _make(name, specs)
+    lacking = _lacking(policy, specs)
+    if lacking:
+        what = (
+            "what the recogniser says of the azimuth bins"
+            if lacking[0] == "azimuth_bins"
+            else f"the map {lacking[0]!r}"
+        )
+        raise EntryError(f"policy {name} needs {what}, which these predictions lack")
+    return policy
+
+
+def _make(name: str, specs: EpisodeSpecs) -> Policy:
+    if name in ORACLES:
+        return ORACLES[name](specs)
+    card = name.partition("@")[0]
+    if name in POLICIES or card in bundled_policies() or card.endswith(".json") or ":" in name:
+        p = specs.predictions
+        valleys = specs.lcm_valley_classes if name.startswith("lcm") else specs.valley_classes
+        return make_policy(name, p.sphere, valleys, p.classes)
+    names = [*POLICIES, *bundled_policies(), *ORACLES, *(f"{kind}-K" for kind in FIXED)]
+    raise EntryError(f"no policy is called {name!r}; there are {', '.join(names)}")
+
+
+def _fits(name: str, specs: EpisodeSpecs) -> bool:
+    """Whether a bundled policy was learned for these viewpoints and classes."""
+    try:
+        _make(name, specs)
+    except OtherUseError:
+        return False
+    return True
+
+
+def _lacking(policy: Policy, specs: EpisodeSpecs) -> list[str]:
+    p = specs.predictions
+    there = {*p.maps, *TRUE_MAPS, *(["azimuth_bins"] if p.azimuth_bins is not None else [])}
+    return [wanted for wanted in policy.needs if wanted not in there]
+
+
+def fixed_views(name: str, specs: EpisodeSpecs, rng: np.random.Generator) -> NDArray[np.int64] | None:
+    """The views of each episode in order, (E, k) int64; None if the name is not one of fixed views."""
+    match = re.fullmatch(rf"({'|'.join(FIXED)})-(\d+)", name)
+    if not match:
+        return None
+    p, objects, kind, k = specs.predictions, specs.objects, match[1], int(match[2])
+    if not 1 <= k <= len(p.sphere):
+        raise EntryError(f"{name}: the sphere has {len(p.sphere)} views, so between 1 and {len(p.sphere)} can be taken")
+    if kind == "orbit":
+        return orbit(p.sphere, specs.starts, k)
+    if kind == "random-fixed":
+        return ranked(rng.random((len(objects), len(p.sphere))), k)
+    if kind in ("high-entropy", "low-entropy"):
+        values = p.depth_entropy.astype(np.float64)
+    else:
+        values = log_softmax(p.logits.astype(np.float64), axis=2)[np.arange(len(p)), :, p.labels]
+    return ranked(values if kind in ("high-entropy", "best") else -values, k)[objects]
+
+
+def true_lem(p: Predictions) -> NDArray[np.float32]:
+    """Local windows of the true entropy map, (N, V, R, 3)."""
+    return normalise_per_object(p.depth_entropy)[:, p.sphere.windows]
+
+
+def true_lcm(p: Predictions) -> NDArray[np.float32]:
+    """Local windows of the recogniser's confidence, 0 where it is wrong (section 4.1.3), (N, V, R, 3)."""
+    return confidence_maps(p.logits, p.labels)[:, p.sphere.windows]
+
+
+TRUE_MAPS: dict[str, Callable[[Predictions], NDArray]] = {"true-lem": true_lem, "true-lcm": true_lcm}
+"""Maps that no model predicts."""

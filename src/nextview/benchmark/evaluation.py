@@ -1,0 +1,280 @@
+"""How good the models under the policies are: every view of every object judged, no policy asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from nextview.belief import Calibration
+from nextview.benchmark import statistics as st
+from nextview.benchmark.entries import true_lcm, true_lem
+from nextview.benchmark.published import published_map, published_recognisers
+from nextview.benchmark.scores import map_errors, map_scores, recogniser_scores
+from nextview.data.predictions import Predictions
+from nextview.errors import ResultsError
+from nextview.models.model_card import Card
+
+Float = NDArray[np.float64]
+
+TRUTHS: dict[str, Callable[[Predictions], NDArray]] = {"lem": true_lem, "lcm": true_lcm}
+"""Maps whose truth the predictions tell."""
+
+RELIABILITY_LOOKS = (1, 2, 5)
+"""Views after which confidence is compared with accuracy, beside all of them."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The results, each a long table; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``.
+
+    Attributes:
+        accuracy: n_views (1, or V: all logits summed), label (empty: all classes), measure, objects, value,
+            low, high, published. The measures: ``accuracy``; ``clean_accuracy``, without the objects whose very mesh
+            also has another label; ``shape_accuracy``, where the recogniser takes how large the objects are, when it
+            is not; with ``class_`` before it the mean over classes.
+        fusion: n_views, accuracy, low, high, class_accuracy, confidence (its mean), calibration_error: that many random
+            views fused, calibrated as the recogniser's card says.
+        confusion: n_views, label, answer, answers: how many; a view is an answer, or a whole object.
+        reliability: n_views, bin, confidence, accuracy, answers: after one view and a few more, in random order.
+        maps: map, by, label, measure, value, low, high, published; the measures are those of ``scores.map_errors``.
+            ``by`` is the network or a baselines made from the true maps of these very objects, which flatters it:
+            their mean, the same for every view; or their mean for the object's true class at the view.
+        left_out: for each map that is not judged, or not of all objects, why.
+    """
+
+    accuracy: pd.DataFrame
+    fusion: pd.DataFrame
+    confusion: pd.DataFrame
+    reliability: pd.DataFrame
+    maps: pd.DataFrame
+    left_out: dict[str, str]
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """The tables by name."""
+        found = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: table for name, table in found.items() if isinstance(table, pd.DataFrame)}
+
+
+def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluation:
+    """Judge the recogniser and the map networks behind some predictions.
+
+    Args:
+        p: what they said.
+        samples: of the bootstrap.
+        rng: draws them, and the orders in which views are fused.
+
+    Raises:
+        ResultsError: the recogniser knows one class only.
+    """
+    if len(p.classes) < 2:
+        raise ResultsError(f"the recogniser knows one class only, {p.classes[0]}: there is nothing to tell apart")
+    if samples < 1:
+        raise ResultsError(f"at least one sample of the bootstrap is needed, not {samples}")
+    weights = st.resample(len(p), samples, rng)
+    right, confidence = fused_views(p.log_evidence, p.labels, p.calibration, rng, len(p.classes))
+    judged = _judged(p)
+    maps, left_out = _maps(p, weights)
+    return Evaluation(
+        _accuracy(p, judged, weights),
+        _fusion(p, right, confidence, weights),
+        _confusion(p, judged),
+        _reliability(right, confidence),
+        maps,
+        left_out,
+    )
+
+
+def _judged(p: Predictions) -> dict[int, NDArray]:
+    """What single views say and all of them together, by the number of views, each (N, answers, C)."""
+    return {1: p.logits, len(p.sphere): all_fused(p)[:, None]}
+
+
+def all_fused(p: Predictions) -> Float:
+    """Logarithm of the belief from all views of each object, up to a constant, (N, C)."""
+    return p.calibration.log_belief(p.log_evidence.astype(np.float64).sum(1), len(p.sphere), len(p.classes))
+
+
+def fused_views(
+    log_evidence: NDArray[np.floating],
+    labels: NDArray[np.int64],
+    calibration: Calibration,
+    rng: np.random.Generator,
+    classes: int,
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations.
+
+    Every view comes first once, second once, and so on: with one view this is the single-view accuracy exactly.
+
+    Args:
+        log_evidence: by the recogniser, so that it adds up, (N, V, D); see ``log_evidence_of``.
+        labels: (N,).
+        calibration: how far a sum of it is to be trusted.
+        rng: draws one order for each object.
+        classes: how many.
+
+    Returns:
+        Whether the answer is right, and its confidence, each (V views, N, V rotations).
+    """
+    n, v, _ = log_evidence.shape
+    order = rng.permuted(np.tile(np.arange(v), (n, 1)), axis=1)
+    shuffled = np.take_along_axis(log_evidence.astype(np.float64), order[:, :, None], axis=1)
+    right, confidence = np.empty((v, n, v), bool), np.empty((v, n, v), np.float32)
+    for turn in range(v):
+        total = np.roll(shuffled, -turn, axis=1).cumsum(1)
+        belief = calibration.belief(total, np.arange(1, v + 1), classes)
+        right[:, :, turn] = (belief.argmax(2) == labels[:, None]).T
+        confidence[:, :, turn] = belief.max(2).T
+    return right, confidence
+
+
+def _means(
+    top: Float, bottom: Float, labels: NDArray[np.int64], classes: tuple[str, ...], weights: Float | None
+) -> Iterator[tuple[str, str, Float, Float, Float]]:
+    """Ratios of sums over objects (N, M): over all of them, as the mean over classes ("class_"), and in each class.
+
+    Yields:
+        Label (empty: all), what stands before the measure, and values with the ends of their intervals, each (M,).
+    """
+    everything = np.ones(len(labels), bool)
+    groups = [("", "", everything), ("", "class_", everything)]
+    groups += [(classes[index], "", labels == index) for index in np.unique(labels)]
+    for label, over, here in groups:
+
+        def mean(w: Float, over: str = over, here: NDArray[np.bool_] = here) -> Float:
+            if over:
+                return st.class_mean(top, bottom, labels, w)
+            return st.ratio(top[here], bottom[here], w[:, here])
+
+        value = mean(np.ones((1, len(labels))))[0]
+        low, high = (np.full_like(value, np.nan),) * 2 if weights is None else st.interval(mean(weights))
+        yield label, over, value, low, high
+
+
+def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.DataFrame:
+    one, clean = np.ones(len(p)), np.where(p.conflicting, 0.0, 1.0)
+    by_shape = {} if p.of_size is None else _judged(p.by_shape())
+    best = published_recognisers(p.classes, len(p.sphere))
+    rows = []
+    for n_views, logits in judged.items():
+        log_evidence = {"accuracy": logits, "clean_accuracy": logits}
+        if by_shape:
+            log_evidence["shape_accuracy"] = by_shape[n_views]
+        right = np.stack([(x.argmax(2) == p.labels[:, None]).mean(1) for x in log_evidence.values()], 1)
+        bottom = np.stack([clean if measure == "clean_accuracy" else one for measure in log_evidence], 1)
+        for label, over, value, low, high in _means(right * bottom, bottom, p.labels, p.classes, weights):
+            here = p.labels == p.classes.index(label) if label else slice(None)
+            for i, (measure, objects) in enumerate(zip(log_evidence, bottom[here].sum(0), strict=True)):
+                beside = best[0][2] if best and (n_views, label, over, i) == (1, "", "", 0) else np.nan
+                rows.append((n_views, label, over + measure, int(objects), value[i], low[i], high[i], beside))
+    return pd.DataFrame(rows, columns=["n_views", "label", "measure", "objects", "value", "low", "high", "published"])
+
+
+def _fusion(p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.float32], weights: Float) -> pd.DataFrame:
+    top = right.mean(2).T
+    one = np.ones_like(top)
+    low, high = st.interval(st.ratio(top, one, weights))
+    return pd.DataFrame(
+        {
+            "n_views": np.arange(1, len(right) + 1),
+            "accuracy": top.mean(0),
+            "low": low,
+            "high": high,
+            "class_accuracy": st.class_mean(top, one, p.labels, np.ones((1, len(p))))[0],
+            "confidence": confidence.mean((1, 2), np.float64),
+            "calibration_error": [
+                st.calibration_error(sure.ravel(), answer.ravel())
+                for sure, answer in zip(confidence, right, strict=True)
+            ],
+        }
+    )
+
+
+def _confusion(p: Predictions, judged: dict[int, NDArray]) -> pd.DataFrame:
+    rows = []
+    for n_views, logits in judged.items():
+        counts = np.zeros((len(p.classes), len(p.classes)), np.int64)
+        np.add.at(counts, (p.labels[:, None], logits.argmax(2)), 1)
+        rows += [(n_views, p.classes[i], p.classes[j], int(count)) for (i, j), count in np.ndenumerate(counts)]
+    return pd.DataFrame(rows, columns=["n_views", "label", "answer", "answers"])
+
+
+def _reliability(right: NDArray[np.bool_], confidence: NDArray[np.float32]) -> pd.DataFrame:
+    rows, v = [], len(right)
+    for n_views in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
+        turns = slice(None) if n_views < v else slice(1)  # all views are the same in every order
+        sure, share, count = st.reliability(
+            confidence[n_views - 1, :, turns].ravel().astype(np.float64), right[n_views - 1, :, turns].ravel()
+        )
+        rows += [(n_views, i, sure[i], share[i], count[i]) for i in np.flatnonzero(count)]
+    return pd.DataFrame(rows, columns=["n_views", "bin", "confidence", "accuracy", "answers"])
+
+
+def judged_objects(p: Predictions, name: str) -> NDArray[np.int64]:
+    """The objects whose true map can be told: for the LCM those that are right from any view (section 4.1.3)."""
+    right = p.logits.argmax(2) == p.labels[:, None]
+    return np.flatnonzero(right.any(1)) if name == "lcm" else np.arange(len(p))
+
+
+def baselines(true: NDArray[np.floating], labels: NDArray[np.int64]) -> dict[str, NDArray[np.floating]]:
+    """Maps to be measured against: the mean map, and the mean map of the class at the view, each as ``true`` is.
+
+    Args:
+        true: (N, V, rings, 3).
+        labels: true class of each object, (N,).
+    """
+    classes, row = np.unique(labels, return_inverse=True)
+    of_class = np.stack([true[labels == index].mean(0) for index in classes])
+    return {"mean map": np.broadcast_to(true.mean((0, 1)), true.shape), "mean map of the class": of_class[row]}
+
+
+def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]:
+    rows: list[tuple] = []
+    left_out = {} if p.maps else {"maps": "these predictions hold none"}
+    for name, predicted in p.maps.items():
+        if name.endswith("-sphere"):  # its window is judged
+            continue
+        if name not in TRUTHS:
+            left_out[name] = f"what is true of this map is not known; known are {', '.join(TRUTHS)}"
+            continue
+        kept = judged_objects(p, name)
+        if len(kept) == 0:
+            left_out[name] = "no object is recognised from any view"
+            continue
+        if len(kept) < len(p):
+            left_out[name] = f"without the objects that are recognised from no view: {len(p) - len(kept)} of {len(p)}"
+        true, labels = TRUTHS[name](p)[kept], p.labels[kept]
+        for by, maps in {"network": predicted[kept], **baselines(true, labels)}.items():
+            window = true.shape[2:]
+            errors = map_errors(maps.reshape(-1, *window), true.reshape(-1, *window))
+            top = np.stack([values.reshape(len(kept), -1).mean(1) for values in errors.values()], 1)
+            drawn = weights[:, kept] if by == "network" else None
+            for label, over, value, low, high in _means(top, np.ones_like(top), labels, p.classes, drawn):
+                for i, measure in enumerate(errors):
+                    beside = None
+                    if by == "network":
+                        beside = published_map(name, over + measure, p.classes, label or None)
+                    rows.append((name, by, label, over + measure, value[i], low[i], high[i], beside))
+    columns = ["map", "by", "label", "measure", "value", "low", "high", "published"]
+    return pd.DataFrame(rows, columns=columns).astype({"published": "float64"}), left_out
+
+
+def scores_for_card(card: Card, p: Predictions) -> dict[str, Any]:
+    """The scores of one of the models that made some predictions, as its card notes them.
+
+    Raises:
+        ResultsError: the model did not make them, or they hold nothing that it can be judged by.
+    """
+    if p.models.get(card.kind) != (card.name, card.sha256):
+        raise ResultsError(f"these predictions were not made by model {card.name}")
+    if card.kind == "recogniser":
+        return recogniser_scores(p.logits, p.labels)
+    kept = judged_objects(p, card.kind)
+    if card.kind not in TRUTHS or len(kept) == 0:
+        raise ResultsError(f"these predictions hold no object by which model {card.name} can be judged")
+    shape = (-1, p.sphere.rings, 3)
+    return map_scores(p.maps[card.kind][kept].reshape(shape), TRUTHS[card.kind](p)[kept].reshape(shape))

@@ -1,0 +1,119 @@
+"""The predictions that something may be fitted to: never of the test split, nor of objects the recogniser learned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.belief import log_evidence_of
+from nextview.data.predictions import Predictions
+from nextview.data.splits import deduplicated, divide
+from nextview.errors import PredictionsError
+from nextview.models.model_card import Card
+from nextview.policies.base import EpisodeState, Evidence, Policy
+from nextview.viewsphere import ViewSphere
+
+
+@dataclass(frozen=True)
+class FittingSet:
+    """What an held-out recogniser says of N objects from V views.
+
+    Attributes:
+        logits: (N, V, C) float32.
+        labels: (N,) int64.
+        sphere: the viewpoints.
+        classes: names, in the order of the logits.
+        azimuth_bins: what it says of the azimuth bins, (N, V, C, azimuth bins) float32, see ``Evidence``; None if it
+            cannot tell.
+    """
+
+    logits: NDArray[np.float32]
+    labels: NDArray[np.int64]
+    sphere: ViewSphere
+    classes: tuple[str, ...]
+    azimuth_bins: NDArray[np.float32] | None = None
+
+    @classmethod
+    def of_all(cls, predictions: Predictions) -> FittingSet:
+        """All objects of predictions, in their order.
+
+        Raises:
+            PredictionsError: there are test objects among them.
+        """
+        if (predictions.splits == "test").any():
+            raise PredictionsError("these predictions hold objects of the test split, to which nothing may be fitted")
+        p = predictions
+        return cls(p.logits, p.labels, p.sphere, p.classes, p.azimuth_bins)
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @cached_property
+    def log_evidence(self) -> NDArray[np.float32]:
+        """All of it, so that views can be summed, (N, V, D); see ``log_evidence_of``."""
+        return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.turn)
+
+    def of(self, kept: NDArray) -> FittingSet:
+        """Some of the objects."""
+        azimuth_bins = None if self.azimuth_bins is None else self.azimuth_bins[kept]
+        return replace(self, logits=self.logits[kept], labels=self.labels[kept], azimuth_bins=azimuth_bins)
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Of the objects, (N,), sum N: every class that there is counts the same, whatever its share."""
+        count = np.bincount(self.labels, minlength=len(self.classes))
+        return len(self) / ((count > 0).sum() * count[self.labels])
+
+
+def held_out_by(card: Card, predictions: Predictions) -> NDArray[np.int64]:
+    """Objects on which a network was not trained, as its card says, duplicates left out: their indices."""
+    once = deduplicated(predictions.labels, predictions.depth_entropy)
+    return once[np.isin(np.array(predictions.names)[once], card.facts.get("unseen", []))]
+
+
+def fitting_set(predictions: Predictions, validation: float, seed: int) -> FittingSet:
+    """The objects of the training split that the recogniser was not trained on, duplicates left out.
+
+    Args:
+        predictions: of the whole training split, as ``nextview predict --split train`` makes them.
+        validation: part of every class that was kept out when the recogniser was trained (see ``data.split``); 1 if
+            all of them are out of fold: each said by a network that has not seen the object.
+        seed: decided which.
+
+    Raises:
+        PredictionsError: there are test objects, or none is left.
+    """
+    data = FittingSet.of_all(predictions)
+    if not 0 < validation <= 1:
+        raise PredictionsError(f"the validation part lies between 0 and 1, not {validation}")
+    _, kept = divide(predictions.labels, predictions.depth_entropy, validation, seed)
+    if len(kept) == 0:
+        raise PredictionsError("no object is left to fit to")
+    return data.of(kept[deduplicated(predictions.labels[kept], predictions.depth_entropy[kept])])
+
+
+def blind_walks(
+    sphere: ViewSphere, policy: Policy, starts: NDArray[np.int64], n_views: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Where a policy goes that views at nothing but where it has been.
+
+    Args:
+        sphere: the viewpoints.
+        policy: is shown a uniform belief.
+        starts: first views, (E,).
+        n_views: how many, at most all views.
+        rng: for policies that draw.
+
+    Returns:
+        Views in order, (E, views) int64.
+    """
+    rows, nothing = np.arange(len(starts)), np.zeros((len(starts), 1))
+    visited = np.zeros((len(starts), len(sphere)), bool)
+    views = [np.asarray(starts, np.int64)]
+    for k in range(1, n_views):
+        visited[rows, views[-1]] = True
+        views.append(policy.next_views(EpisodeState(views[-1], visited, nothing + 1, Evidence(nothing), k, rows), rng))
+    return np.stack(views, 1)

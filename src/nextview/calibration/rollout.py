@@ -1,0 +1,190 @@
+"""States on the way of a policy, and what every choice there would have led to: the predictions know all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.belief import PLAIN_SUM, Calibration, of_true_class
+from nextview.calibration.fitting_set import FittingSet
+from nextview.calibration.temperature import fit_temperature
+from nextview.data.predictions import Predictions
+from nextview.errors import PredictionsError
+from nextview.policies.base import EpisodeState, Evidence, Policy
+from nextview.policies.baselines import Random
+from nextview.policies.gain import Gain
+
+Float = NDArray[np.float64]
+
+OUTCOMES = ("belief", "log-belief", "right")
+"""What what was seen is worth: the belief in the true class, its logarithm, or whether the answer is right."""
+
+
+@dataclass(frozen=True)
+class ReplayTable:
+    """What held-out models say of N objects, and how far it is to be trusted.
+
+    Attributes:
+        data: what the recogniser says, and the truth.
+        maps: predicted local maps by name, each (N, V, R, 3).
+        calibration: of the belief.
+    """
+
+    data: FittingSet
+    maps: dict[str, NDArray[np.float32]]
+    calibration: Calibration
+
+    @classmethod
+    def of(cls, predictions: Predictions, kept: NDArray, rng: np.random.Generator) -> ReplayTable:
+        """Some of the objects of predictions, by index; calibrated anew where their recogniser is not.
+
+        Raises:
+            PredictionsError: there are test objects among the predictions, or none is kept.
+        """
+        if len(kept) == 0:
+            raise PredictionsError("no object is left to learn from")
+        data = FittingSet.of_all(predictions).of(kept)
+        maps = {name: values[kept] for name, values in predictions.maps.items()}
+        known = predictions.calibration != PLAIN_SUM
+        return cls(data, maps, predictions.calibration if known else fit_temperature(data, rng))
+
+
+@dataclass(frozen=True)
+class DecisionState:
+    """N episodes, one for each object, when the next view is to be chosen.
+
+    Attributes:
+        state: what the policy is shown.
+        total: sum of the log-evidence so far, (N, D) float64, see ``log_evidence_of``.
+        travel: so far, grid cells, (N,) float64.
+    """
+
+    state: EpisodeState
+    total: Float
+    travel: Float
+
+
+def rollout(table: ReplayTable, policy: Policy, n_views: int, rng: np.random.Generator) -> Iterator[DecisionState]:
+    """Every object once, from a random first view to where the policy leads.
+
+    Args:
+        table: what is seen.
+        policy: which is followed.
+        n_views: at most.
+        rng: draws the first views, and what the policy draws.
+
+    Yields:
+        The moment after each view.
+    """
+    data, classes = table.data, len(table.data.classes)
+    rows, sphere = np.arange(len(data)), data.sphere
+    current = rng.integers(len(sphere), size=len(data))
+    visited, total = np.zeros((len(data), len(sphere)), bool), np.zeros((len(data), data.log_evidence.shape[2]))
+    travel = np.zeros(len(data))
+    for k in range(1, n_views + 1):
+        visited[rows, current] = True
+        total = total + data.log_evidence[rows, current]
+        maps = {name: values[rows, current] for name, values in table.maps.items()}
+        belief = table.calibration.belief(total, k, classes)
+        seen = Evidence(
+            data.logits[rows, current],
+            maps,
+            azimuth_bins=None if data.azimuth_bins is None else data.azimuth_bins[rows, current],
+        )
+        azimuth_bins = table.calibration.azimuth_bins(total, k, classes, sphere.turn[current])
+        state = EpisodeState(current, visited.copy(), belief, seen, k, rows, azimuth_bins)
+        yield DecisionState(state, total, travel)
+        if k < n_views:
+            following = policy.next_views(state, rng)
+            travel = travel + sphere.travel[current, following]
+            current = following
+
+
+def outcome(table: ReplayTable, total: Float, n_views: int, kind: str) -> Float:
+    """What sums of the log-evidence of each object are worth.
+
+    Args:
+        table: holds the truth.
+        total: (N, ..., D), see ``log_evidence_of``.
+        n_views: how many were summed.
+        kind: one of OUTCOMES.
+
+    Returns:
+        (N, ...) float64.
+    """
+    logs = table.calibration.log_belief(total, n_views, len(table.data.classes))
+    if kind == "right":
+        return np.equal(logs.argmax(-1).T, table.data.labels).T.astype(np.float64)
+    of_truth = of_true_class(logs, table.data.labels)
+    return of_truth if kind == "log-belief" else np.exp(of_truth)
+
+
+def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Float:
+    """The outcome of looking from every view next, (N, V) float64."""
+    return outcome(table, moment.total[:, None] + table.data.log_evidence, moment.state.step + 1, kind)
+
+
+@dataclass(frozen=True)
+class Value:
+    """What a policy reaches on average, classes weighted evenly, after 2, 3, ... views.
+
+    Attributes:
+        outcome: (views - 1,).
+        travel: grid cells, (views - 1,).
+    """
+
+    outcome: Float
+    travel: Float
+
+
+def judge(
+    table: ReplayTable, policy: Policy, n_views: int, kind: str, rng: np.random.Generator, rounds: int = 8
+) -> Value:
+    """Follow a policy ``rounds`` times over every object; the other arguments as for ``rollout`` and ``outcome``."""
+    data = table.data
+    weights = data.weights / len(data) / rounds
+    reached = np.zeros((2, n_views - 1))
+    for _ in range(rounds):
+        for moment in rollout(table, policy, n_views, rng):
+            k = moment.state.step
+            if k > 1:
+                value = outcome(table, moment.total, k, kind)
+                reached[:, k - 2] += weights @ value, weights @ moment.travel
+    return Value(*reached)
+
+
+TRAVEL_WEIGHTS = (0.0, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.012, 0.015, 0.02, 0.03, 0.05, 0.1)
+"""Of a grid cell of travel, in the unit of the outcome."""
+
+
+def mean_value(parts: Sequence[Value], sizes: Sequence[int]) -> Value:
+    """What policies reach on average, each on objects of its own."""
+    return Value(*(np.average([getattr(p, name) for p in parts], 0, sizes) for name in ("outcome", "travel")))
+
+
+def fit_travel_weight(judged: Sequence[tuple[ReplayTable, Gain]], n_views: int, kind: str, seed: int) -> float:
+    """The lowest of PRICES at which policies travel no farther than a random walk in the local window, at any view.
+
+    Args:
+        judged: the policies whose travel weight is set, each with what is seen of the objects that judge it.
+        n_views: at most.
+        kind: one of OUTCOMES.
+        seed: of the first views.
+    """
+
+    def travel(policies: Iterable[Policy]) -> Float:
+        tables = [table for table, _ in judged]
+        values = [
+            judge(table, policy, n_views, kind, np.random.default_rng(seed))
+            for table, policy in zip(tables, policies, strict=True)
+        ]
+        return mean_value(values, [len(table.data) for table in tables]).travel
+
+    limit = travel(Random(table.data.sphere) for table, _ in judged)
+    for travel_weight in TRAVEL_WEIGHTS:
+        if (travel(replace(policy, travel_weight=travel_weight) for _, policy in judged) <= limit).all():
+            return travel_weight
+    return TRAVEL_WEIGHTS[-1]

@@ -1,0 +1,273 @@
+"""Run the models over every view of a store, once; resumable by object."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.belief import Calibration
+from nextview.data.input_views import input_views
+from nextview.data.lock import only_one
+from nextview.data.pool import WorkerDied, each
+from nextview.data.predictions import Predictions
+from nextview.data.splits import duplicate_groups
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, PredictionsError
+from nextview.models.inference import MapNetwork, Recogniser, knows_sphere, size_evidence
+from nextview.models.model_card import Card
+from nextview.outputs import check_file, written_whole
+from nextview.viewsphere import ViewSphere
+
+RECIPE = "recipe.json"
+"""In the folder of unfinished predictions: which these are."""
+
+
+def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
+    """Objects that look exactly like one with another label, in any split of the store, (N,) bool."""
+    duplicate = duplicate_groups(store.measure())
+    several = np.zeros((duplicate.max() + 1, len(store.classes)), bool)
+    several[duplicate, store.labels] = True
+    return (several.sum(1) > 1)[duplicate] & store.done
+
+
+def predict(
+    path: Path,
+    out: Path,
+    recognisers: Sequence[Card],
+    maps: dict[str, Card],
+    split: str | None = None,
+    unseen: bool = False,
+    size: bool = True,
+    batch: int = 8,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Iterator[tuple[int, int]]:
+    """Write the predictions of a store's rendered objects.
+
+    What is done is kept in a folder beside ``out`` until all is, so that a run that was killed goes on from there.
+
+    Args:
+        path: the view store.
+        out: the .npz file to make.
+        recognisers: cards; each object is judged by the first of them, or see ``unseen``.
+        maps: card of the network for each map.
+        split: only this split.
+        unseen: let each object be judged by a recogniser that has not seen it in training, and leave out those that
+            all have seen.
+        size: let the recogniser know how large the objects are, where store and card tell.
+        batch: views a call of the networks.
+        workers: processes; one for each core by default.
+        scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
+
+    Yields:
+        Objects done so far, and how many there are.
+
+    Raises:
+        DatasetError: the store holds no such objects, or a class that the recogniser does not know, or another run is
+            writing ``out``.
+        PredictionsError: ``out`` is there and comes from another store or other models, or an object kills its process.
+            Where it comes from the same, only what the cards say beside the networks (valley classes, sizes,
+            calibration) is brought up to date. Or what lies in the folder beside it is not of such a run.
+        ResultsError: ``out`` cannot be written.
+    """
+    check_file(out)
+    store = ViewStore.open(path)
+    chosen = np.flatnonzero(store.done & (True if split is None else store.splits == split))
+    if len(chosen) == 0:
+        raise DatasetError(f"{path}: holds no rendered object" + (f" of the split {split!r}" if split else ""))
+    judge = judges(recognisers, [store.names[i] for i in chosen]) if unseen else np.zeros(len(chosen), np.int64)
+    chosen, judge = chosen[judge >= 0], judge[judge >= 0]
+    if len(chosen) == 0:
+        raise DatasetError(f"{path}: holds no object that one of these recognisers has not seen in training")
+    recogniser = recognisers[0]
+    classes = tuple(recogniser.facts["classes"])
+    unknown = sorted({store.classes[label] for label in store.labels[chosen]} - set(classes))
+    if unknown:
+        raise DatasetError(f"{path}: recogniser {recogniser.name} does not know the class {unknown[0]!r}")
+    names = tuple(store.names[i] for i in chosen)
+    models = {"recogniser": identity(recognisers), **{name: identity([card]) for name, card in maps.items()}}
+    valleys = {name: tuple(card.facts.get("valley_classes", ())) for name, card in maps.items()}
+    calibration = Calibration.of_facts(recogniser.facts.get("calibration"))
+    entropy = store.measure()[chosen]  # differs where the views do
+    of_size = sizes_say(store, chosen, recognisers, judge) if size else None
+    if out.exists():
+        there = Predictions.load(out)
+        if (there.names, there.models) != (names, models) or not np.array_equal(there.depth_entropy, entropy):
+            raise PredictionsError(f"{out}: was made from other objects or models; give another name or remove it")
+        renewed = (valleys, calibration, None if of_size is None else of_size.tobytes())
+        known = (there.valley_classes, there.calibration, None if there.of_size is None else there.of_size.tobytes())
+        if renewed != known:
+            seen = there.by_shape()
+            logits = seen.logits if of_size is None else seen.logits + of_size[:, None]
+            replace(seen, logits=logits, of_size=of_size, valley_classes=valleys, calibration=calibration).save(out)
+        yield len(names), len(names)
+        return
+
+    recipe = {"names": names, "models": models, "views": hashlib.sha256(entropy.tobytes()).hexdigest()}
+    with only_one(out):
+        n, v = len(chosen), len(store.sphere)
+        windows = {name: shape for kind, card in maps.items() for name, shape in map_shapes(kind, card, store.sphere)}
+        azimuth_bins = recogniser.facts.get("azimuth_bins", 0)
+        optional = {"azimuth_bins": (n, v, len(classes), azimuth_bins)} if azimuth_bins else {}
+        maps_of = {f"map_{name}": (n, v, *shape) for name, shape in windows.items()}
+        shapes = {"logits": (n, v, len(classes)), **optional, **maps_of}
+        arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
+        # Logits are written last: an object counts as done when none of its logits is the NaN that the file began with.
+        todo = np.flatnonzero(np.isnan(arrays["logits"]).any((1, 2)))
+        total = n - len(todo)
+        yield total, n
+        paths = (
+            tuple(card.path.with_suffix(".json").absolute() for card in recognisers),
+            tuple((kind, card.path.with_suffix(".json").absolute()) for kind, card in maps.items()),
+        )
+        say = partial(_predict_object, path.absolute(), *paths, batch)
+        row = {int(i): at for at, i in enumerate(chosen)}
+        items = list(zip(chosen[todo].tolist(), judge[todo].tolist(), strict=True))
+        for (i, _), found in each(say, items, workers, scheduler):
+            if isinstance(found, WorkerDied):
+                raise PredictionsError(f"{path}: object {store.names[i]} cannot be predicted: {found}")
+            for name, values in found.items():
+                arrays[name][row[i]] = values
+            total += 1
+            yield total, n
+
+        seen_logits = np.array(arrays["logits"])
+        Predictions(
+            seen_logits if of_size is None else seen_logits + of_size[:, None],
+            {name: np.array(arrays[f"map_{name}"]) for name in windows},
+            entropy,
+            names,
+            np.array([classes.index(store.classes[label]) for label in store.labels[chosen]]),
+            classes,
+            store.splits[chosen],
+            conflicting_objects(store)[chosen],
+            store.sphere,
+            models,
+            valleys,
+            calibration,
+            np.array(arrays["azimuth_bins"]) if azimuth_bins else None,
+            of_size,
+        ).save(out)
+        _end(out.with_name(out.name + ".part"), shapes)
+
+
+def sizes_say(
+    store: ViewStore, chosen: NDArray[np.int64], recognisers: Sequence[Card], judge: NDArray[np.int64]
+) -> NDArray[np.float32] | None:
+    """What the sizes of the chosen objects say of their class to the recognisers that judge them, (N, C) float32.
+
+    None if no recogniser knows of sizes, or the store of none.
+    """
+    radii = store.radii[chosen]
+    found = [size_evidence(card) for card in recognisers]
+    if np.isnan(radii).all() or all(evidence is None for evidence in found):
+        return None
+    found_evidence = np.zeros((len(chosen), len(recognisers[0].facts["classes"])), np.float32)
+    for j, evidence in enumerate(found):
+        if evidence is not None:
+            found_evidence[judge == j] = evidence.logits(radii[judge == j])
+    return found_evidence
+
+
+def map_shapes(name: str, card: Card, sphere: ViewSphere) -> list[tuple[str, tuple[int, int]]]:
+    """Names and shapes of what a map network says of a view: its window and, if it knows it, its sphere."""
+    window = (name, (sphere.rings, 3))
+    return [window, (f"{name}-sphere", (sphere.rings, sphere.azimuths))] if knows_sphere(card) else [window]
+
+
+def judges(recognisers: Sequence[Card], names: Sequence[str]) -> NDArray[np.int64]:
+    """Which recogniser judges each object: the first that has not seen it in training; -1 for none.
+
+    Raises:
+        DatasetError: one of them does not say what it has not seen, or they do not know the same classes.
+    """
+    for card in recognisers:
+        if "unseen" not in card.facts:
+            raise DatasetError(f"recogniser {card.name} does not say which objects it has not seen in training")
+        for what in ("classes", "azimuth_bins"):
+            if card.facts.get(what) != recognisers[0].facts.get(what):
+                raise DatasetError(f"recognisers {recognisers[0].name} and {card.name} do not know the same {what}")
+    unseen = np.array([np.isin(names, card.facts["unseen"]) for card in recognisers])
+    return np.where(unseen.any(0), unseen.argmax(0), -1)
+
+
+def identity(cards: Sequence[Card]) -> tuple[str, str]:
+    """Name and SHA-256 of a model; of several together, their names and the hash of their hashes."""
+    if len(cards) == 1:
+        return cards[0].name, cards[0].sha256
+    return "+".join(c.name for c in cards), hashlib.sha256("".join(c.sha256 for c in cards).encode()).hexdigest()
+
+
+def _begin(part: Path, recipe: dict, shapes: dict[str, tuple[int, ...]]) -> dict[str, np.memmap]:
+    """Open the files of a run that was cut off, or begin them full of NaN.
+
+    Raises:
+        PredictionsError: something else has the name of their folder.
+    """
+    recipe = json.loads(json.dumps(recipe))
+    if not os.path.lexists(part):
+        with written_whole(part) as begun:
+            begun.mkdir()
+            for name, shape in shapes.items():
+                np.lib.format.open_memmap(begun / f"{name}.npy", "w+", np.float32, shape)[:] = np.nan
+            (begun / RECIPE).write_text(json.dumps(recipe))
+    try:
+        same = not part.is_symlink() and json.loads((part / RECIPE).read_bytes()) == recipe
+    except (OSError, ValueError):
+        same = False
+    if not same:
+        raise PredictionsError(
+            f"{part}: is there and is not the unfinished work of this very run; remove it or give another name"
+        )
+    try:
+        return {name: np.lib.format.open_memmap(part / f"{name}.npy", "r+") for name in shapes}
+    except (OSError, ValueError) as error:
+        raise PredictionsError(f"{part}: is damaged ({error}); remove it, and it is begun anew") from None
+
+
+def _end(part: Path, names: Iterable[str]) -> None:
+    """Remove the files of a run that is done, and their folder if nothing else is in it."""
+    for file in [part / RECIPE, *(part / f"{name}.npy" for name in names)]:
+        file.unlink()
+    with suppress(OSError):
+        part.rmdir()
+
+
+@lru_cache(maxsize=1)
+def _open(
+    path: Path, recognisers: tuple[Path, ...], maps: tuple[tuple[str, Path], ...]
+) -> tuple[ViewStore, list[Recogniser], dict[str, MapNetwork]]:
+    """Each process has its own store and networks, and one thread: objects are what runs side by side."""
+    networks = {name: MapNetwork(card, threads=1) for name, card in maps}
+    return ViewStore.open(path), [Recogniser(card, threads=1) for card in recognisers], networks
+
+
+def _predict_object(
+    path: Path, recognisers: tuple[Path, ...], maps: tuple[tuple[str, Path], ...], batch: int, item: tuple[int, int]
+) -> dict[str, NDArray[np.float32]]:
+    """Maps, azimuth bins and logits of all views of one object, by the names of their files; the logits last."""
+    i, judge = item
+    store, names_it, networks = _open(path, recognisers, maps)
+    recogniser = names_it[judge]
+    seen = {what: input_views(store, i, *what) for what in {recogniser.sees} | {n.sees for n in networks.values()}}
+    parts = [slice(start, start + batch) for start in range(0, len(store.sphere), batch)]
+    found = {}
+    for name, network in networks.items():
+        found_evidence = [network.from_inputs(seen[network.sees][p]) for p in parts]
+        for kind in found_evidence[0]:
+            found[f"map_{name}{kind.removeprefix(network.card.kind)}"] = np.concatenate(
+                [part[kind] for part in found_evidence]
+            )
+    answers = [recogniser.from_inputs(seen[recogniser.sees][p]) for p in parts]
+    if all(found_evidence.azimuth_bins is not None for found_evidence in answers):
+        found["azimuth_bins"] = np.concatenate([found_evidence.azimuth_bins for found_evidence in answers])
+    return {**found, "logits": np.concatenate([found_evidence.logits for found_evidence in answers])}

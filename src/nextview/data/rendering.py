@@ -1,0 +1,231 @@
+"""Render a dataset into a view store, on all cores, resumable."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from nextview.cameras.simulated import SimulatedCamera
+from nextview.cloud import POINTS
+from nextview.data.folders import Entry, list_dataset
+from nextview.data.lock import only_one
+from nextview.data.pool import each
+from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, RENDERED, ViewStore
+from nextview.errors import DatasetError, MeshError
+from nextview.measures.depth_entropy import depth_entropy
+from nextview.mesh import Mesh, load_mesh, make_mesh
+from nextview.mesh_format import MAX_FACES
+from nextview.viewsphere import ViewSphere
+
+
+@dataclass(frozen=True)
+class Deform:
+    """Make a new object of a mesh: turn it about z by any angle and scale each axis.
+
+    Attributes:
+        stretch: each axis is scaled by a factor drawn log-uniformly from 1/(1 + stretch) to 1 + stretch.
+        turn: whether to turn about z.
+    """
+
+    stretch: float = 0.0
+    turn: bool = False
+
+    def draw(self, seed: int, name: str) -> tuple[NDArray[np.float64], float]:
+        """The factors of the three axes, (3,), and the angle, radians, of the object of that name."""
+        rng = np.random.default_rng([seed, *name.encode()])
+        reach = np.log1p(self.stretch)
+        factors = np.exp(rng.uniform(-reach, reach, 3))
+        return factors, rng.uniform(0, 2 * np.pi) if self.turn else 0.0
+
+    def __call__(self, mesh: Mesh, seed: int, name: str) -> Mesh:
+        """The new object, normalised again."""
+        factors, angle = self.draw(seed, name)
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        return make_mesh((mesh.vertices * mesh.radius * factors) @ turn.T, mesh.faces, mesh.name)
+
+
+def render_object(mesh: Mesh, sphere: ViewSphere, size: int) -> dict[str, np.ndarray]:
+    """All views of one mesh as the store keeps them: image, depth, points and depth-entropy."""
+    camera = SimulatedCamera(mesh, size, sphere.distance)
+    image = np.empty((len(sphere), size, size), np.uint8)
+    depth = np.empty((len(sphere), size, size), np.uint16)
+    points = np.empty((len(sphere), POINTS, 3), np.float32)
+    for view, pose in enumerate(sphere.poses):
+        observation = camera.observe(pose)
+        image[view], points[view] = observation.picture, observation.points
+        depth[view] = np.rint(observation.depth / DEPTH_UNIT)
+    return {
+        "image": image,
+        "depth": depth,
+        "points": np.rint(points / POINT_UNIT).clip(-32767, 32767).astype(np.int16),
+        "measures/depth_entropy": np.array([depth_entropy(d * DEPTH_UNIT) for d in depth], np.float32),
+    }
+
+
+def render(
+    dataset: Path,
+    path: Path,
+    sphere: ViewSphere,
+    size: int = 224,
+    seed: int = 0,
+    deform: Deform | None = None,
+    split: str | None = None,
+    unit: str | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    max_faces: int = MAX_FACES,
+) -> Iterator[tuple[str, str | None]]:
+    """Render every mesh that the store does not hold yet; one that failed before is tried again.
+
+    The run may end at any moment, even by a kill or a full disk; the next one goes on with what is missing.
+
+    Args:
+        dataset: folder of meshes.
+        path: the store.
+        sphere: the viewpoints.
+        size: side of the images, pixels.
+        seed: decides the deformations.
+        deform: how to make a new object of each mesh; not at all by default.
+        split: only this split of the dataset.
+        unit: of length in the mesh files, one of ``mesh.UNITS``; None if it is not known. A store that was made without
+            one can be told later.
+        workers: processes; one for each core by default.
+        scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
+        max_faces: leave out larger meshes, see ``load_mesh``.
+
+    Yields:
+        (name, None) for each object done, (name, reason) for one that cannot be rendered.
+
+    Raises:
+        DatasetError: the dataset is unusable, the viewpoints are too far, the store was begun from another dataset or
+            with other settings or lacks an array, another run is writing it, or it cannot be written.
+    """
+    entries = [e for e in list_dataset(dataset.absolute()) if split in (None, e.split)]
+    deform = deform or Deform()
+    farthest = np.iinfo(np.uint16).max * DEPTH_UNIT
+    if sphere.distance + 1 > farthest:
+        raise DatasetError(
+            f"{path}: depth is stored up to {farthest:.2f} object radii, so the distance can be "
+            f"{farthest - 1:.2f} at most, not {sphere.distance:g}"
+        )
+    with only_one(path), writing(path):
+        store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit)
+        todo = [int(i) for i in np.flatnonzero(~store.done)]
+        # Largest files first, so that no worker is left with a long one at the end.
+        todo.sort(key=lambda i: -entries[i].path.stat().st_size)
+        task = partial(_render_entry, store.path, uuid4().hex, sphere, size, seed, deform, max_faces)
+        for (i, entry), reason in each(task, [(i, entries[i]) for i in todo], workers, scheduler):
+            if reason is not None:
+                # Only this process writes reasons; the status comes last, as for an object that is done.
+                store.group.attrs["failures"] = store.failures | {entry.name: f"{reason}"}
+                store.group["status"][i] = FAILED
+            elif entry.name in store.failures:
+                store.group.attrs["failures"] = {n: r for n, r in store.failures.items() if n != entry.name}
+            yield entry.name, None if reason is None else f"{reason}"
+
+
+def turns(store: ViewStore) -> NDArray[np.float64]:
+    """By how much each object of a store was turned about z when it was rendered, radians, (N,)."""
+    facts = store.group.attrs
+    deform = Deform(float(facts.get("stretch", 0.0)), bool(facts.get("turn", False)))
+    return np.array([deform.draw(int(facts.get("seed", 0)), name)[1] for name in store.names])
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Say what happens to a store when it cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DatasetError(f"{path}: cannot be written ({reason}); what is done is kept, run again to go on") from None
+
+
+def _begin(
+    path: Path, entries: list[Entry], sphere: ViewSphere, size: int, seed: int, deform: Deform, unit: str | None
+) -> ViewStore:
+    """The store as an earlier run left it, if that had the same meshes and settings, or a new one."""
+    with ThreadPoolExecutor() as pool:
+        hashes = list(pool.map(_file_hash, [e.path for e in entries]))
+    recipe = {"seed": seed, "stretch": deform.stretch, "turn": deform.turn, "sha256": hashes}
+    if not path.exists():
+        return ViewStore.create(path, entries, sphere, size, recipe | {"unit": unit})
+    store = ViewStore.open(path)
+    wanted = {
+        "names": [e.name for e in entries],
+        "size": size,
+        "elevations": list(sphere.elevations),
+        "azimuths": sphere.azimuths,
+        "distance": sphere.distance,
+        **recipe,
+    }
+    for key, value in wanted.items():
+        if store.group.attrs.get(key, value) != value:
+            raise DatasetError(f"{path}: was begun with other {key}; give another store or the same settings")
+    known = store.group.attrs.get("unit")
+    if unit not in (None, known):
+        if known is not None:
+            raise DatasetError(f"{path}: its meshes are measured in {known}, not {unit}")
+        store.group.attrs["unit"] = unit
+    for name in RENDERED:
+        store.array(name)  # says what is missing
+    for leftover in path.rglob("*.partial"):  # what was being written when a run was killed
+        leftover.unlink()
+    return store
+
+
+def _file_hash(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return f"unreadable {path.name}"  # its rendering will say why
+
+
+@lru_cache(maxsize=1)
+def _arrays(path: Path, run: str) -> dict[str, zarr.Array]:
+    """The store's arrays, opened once for each process and run."""
+    # Finding out whether a chunk is worth writing costs more than writing it.
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        store = ViewStore.open(path)
+        return {name: store.array(name) for name in RENDERED}
+
+
+def _render_entry(
+    path: Path,
+    run: str,
+    sphere: ViewSphere,
+    size: int,
+    seed: int,
+    deform: Deform,
+    max_faces: int,
+    item: tuple[int, Entry],
+) -> str | None:
+    """Render one object into the store; the reason if its mesh cannot be used."""
+    i, entry = item
+    arrays = _arrays(path, run)
+    try:
+        mesh = load_mesh(entry.path, max_faces=max_faces)
+        if deform != Deform():
+            mesh = deform(mesh, seed, entry.name)
+        rendered = render_object(mesh, sphere, size)
+    except MeshError as error:
+        return str(error)
+    except MemoryError:
+        return f"{entry.path}: too large for this machine's memory"
+    for name, values in rendered.items():
+        arrays[name][i] = values
+    arrays["radius"][i] = mesh.radius
+    arrays["status"][i] = DONE  # last, so that an object counts only when it is whole
+    return None

@@ -1,0 +1,91 @@
+"""Which objects train and which validate: by object, stratified by class, identical meshes together."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError
+
+
+def duplicate_groups(measured: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Which objects look the same from every view: a number for each, shared by those that do, (N,).
+
+    Copies of a mesh, be they byte for byte or moved and scaled, have identical depth-entropies from all views, and
+    different meshes hardly ever do.
+
+    Args:
+        measured: depth-entropy from every view, (N, V).
+    """
+    return np.unique(measured, axis=0, return_inverse=True)[1].ravel()
+
+
+def deduplicated(labels: NDArray[np.int64], measured: NDArray[np.floating]) -> NDArray[np.int64]:
+    """One object of each shape and label, the first: indices, sorted.
+
+    What is judged or fitted counts every shape once, so that one that was copied often does not rule.
+
+    Args:
+        labels: (N,).
+        measured: depth-entropy from every view, (N, V).
+    """
+    _, first = np.unique(np.stack([duplicate_groups(measured), labels], 1), axis=0, return_index=True)
+    return np.sort(first)
+
+
+def divide(
+    labels: NDArray[np.int64], measured: NDArray[np.floating], share: float, seed: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Divide objects into those that train and those that validate.
+
+    What looks the same stays on one side, whatever its labels: objects are drawn, and their copies follow them. So a
+    shape that was copied often is drawn more often than others; see ``deduplicated``.
+
+    Args:
+        labels: (N,).
+        measured: depth-entropy from every view, (N, V).
+        share: part of every class that validates.
+        seed: decides which.
+
+    Returns:
+        Indices of either, sorted.
+    """
+    duplicate = duplicate_groups(measured)
+    rng = np.random.default_rng(seed)
+    validates = np.zeros(len(labels), bool)
+    for label in np.unique(labels):
+        members = rng.permutation(np.flatnonzero(labels == label))
+        validates[members[: round(share * len(members))]] = True
+    validates = np.isin(duplicate, duplicate[validates])
+    return np.flatnonzero(~validates), np.flatnonzero(validates)
+
+
+def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Divide the rendered objects of the training split, see ``divide``.
+
+    Objects of a store without a training split all count as training.
+
+    Args:
+        store: the views.
+        share: part of every class that validates.
+        seed: decides which.
+
+    Returns:
+        Indices of the objects that train and of those that validate, sorted.
+    """
+    usable = np.flatnonzero(store.done & (store.splits != "test"))
+    if len(usable) == 0:
+        raise DatasetError(f"{store.path}: holds no rendered object of the training split")
+    training, validation = divide(store.labels[usable], store.measure()[usable], share, seed)
+    return usable[training], usable[validation]
+
+
+def deduplicate(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One object of each shape and label among some of a store, see ``deduplicated``."""
+    return objects[deduplicated(store.labels[objects], store.measure()[objects])]
+
+
+def test_objects(store: ViewStore) -> NDArray[np.int64]:
+    """Indices of the rendered objects of the test split."""
+    return np.flatnonzero(store.done & (store.splits == "test"))

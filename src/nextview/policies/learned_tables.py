@@ -1,0 +1,132 @@
+"""Policies that follow a table learned from predictions. They know the ring (from gravity), never the object's azimuth.
+
+So every place is written as a *cell*: its ring, and how many azimuth steps it lies ahead of where the camera stands,
+``cell = ring * azimuths + steps``. What no table says (it has come to its end, or the best is taken) is left to the
+view farthest from all visited.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import PolicyError
+from nextview.policies.base import EpisodeState, best_in_window
+from nextview.policies.spread import Spread
+from nextview.viewsphere import ViewSphere
+
+
+def cells_from(sphere: ViewSphere) -> NDArray[np.int64]:
+    """The view that lies in each cell, seen from each view, (V, V) int64: ``[view, cell]``."""
+    n = sphere.azimuths
+    return sphere.ring[None] * n + (sphere.azimuth_index[:, None] + sphere.azimuth_index[None]) % n
+
+
+def cells_to(sphere: ViewSphere) -> NDArray[np.int64]:
+    """The cell in which each view lies, seen from each view, (V, V) int64: ``[view, other]``."""
+    n = sphere.azimuths
+    return sphere.ring[None] * n + (sphere.azimuth_index[None] - sphere.azimuth_index[:, None]) % n
+
+
+@dataclass(frozen=True)
+class FixedSequence:
+    """The same moves for every object: a list of cells, each seen from the view before, for each ring to start from.
+
+    Attributes:
+        sphere: the viewpoints.
+        moves: cell of each move, (rings, K) int64.
+        anywhere: whether the moves leave the local window; the views after the last move do as the moves did.
+    """
+
+    sphere: ViewSphere
+    moves: NDArray[np.int64]
+    anywhere: bool = True
+    needs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        on_it = (self.moves >= 0) & (self.moves < len(self.sphere))
+        if self.moves.ndim != 2 or len(self.moves) != self.sphere.rings or not on_it.all():
+            raise PolicyError(f"a sequence needs moves over the sphere from each of its {self.sphere.rings} rings")
+
+    @cached_property
+    def paths(self) -> NDArray[np.int64]:
+        """The views of the whole sequence from each start, (V, K + 1) int64."""
+        views = [np.arange(len(self.sphere))]
+        for move in self.moves[self.sphere.ring].T:
+            views.append(cells_from(self.sphere)[views[-1], move])
+        return np.stack(views, 1)
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See ``Policy.next_views``."""
+        chosen = Spread(self.sphere, self.anywhere).next_views(state, rng)
+        if state.step >= self.paths.shape[1]:
+            return chosen
+        # Where the episode began is not told, but what was visited is: the start is the one whose path led here.
+        so_far = self.paths[:, : state.step]
+        deduplicated = (np.diff(np.sort(so_far, axis=1)) > 0).all(1)
+        led_here = deduplicated & state.visited[:, so_far].all(2) & (so_far[:, -1] == state.current[:, None])
+        following = self.paths[led_here.argmax(1), state.step]
+        free = ~state.visited[np.arange(len(chosen)), following]
+        return np.where(led_here.any(1) & (state.visited.sum(1) == state.step) & free, following, chosen)
+
+
+@dataclass(frozen=True)
+class FixedRing:
+    """Straight to one ring, then round it by the same number of azimuth steps each time.
+
+    Attributes:
+        sphere: the viewpoints.
+        ring: which.
+        steps: from view to view; views that are left out come when it has gone round.
+    """
+
+    sphere: ViewSphere
+    ring: int
+    steps: int = 1
+    needs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.ring < self.sphere.rings or not 1 <= self.steps < self.sphere.azimuths:
+            raise PolicyError(f"there is no ring {self.ring} to be walked in steps of {self.steps}")
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See ``Policy.next_views``."""
+        n, rows = self.sphere.azimuths, np.arange(len(state.current))
+        order = np.concatenate([[0], np.arange(1, n) * self.steps, np.arange(1, n)])
+        ahead = self.ring * n + (self.sphere.azimuth_index[state.current][:, None] + order) % n
+        free = ~state.visited[rows[:, None], ahead]
+        chosen = ahead[rows, free.argmax(1)]
+        return np.where(free.any(1), chosen, Spread(self.sphere).next_views(state, rng))
+
+
+@dataclass(frozen=True)
+class ClassTable:
+    """The unvisited cell with the highest value for the class believed and the ring that the camera is on.
+
+    Attributes:
+        sphere: the viewpoints.
+        values: (classes, rings, V) float64: by believed class, current ring and cell.
+        anywhere: among all views; otherwise among those of the local window.
+    """
+
+    sphere: ViewSphere
+    values: NDArray[np.float64]
+    anywhere: bool = True
+    needs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        wanted = (self.sphere.rings, len(self.sphere))
+        if self.values.ndim != 3 or self.values.shape[1:] != wanted or not np.isfinite(self.values).all():
+            raise PolicyError(f"the table has to hold finite numbers of the shape (classes, {wanted[0]}, {wanted[1]})")
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See ``Policy.next_views``."""
+        rows = np.arange(len(state.current))
+        values = self.values[state.belief.argmax(1), self.sphere.ring[state.current]]
+        scores = values[rows[:, None], cells_to(self.sphere)[state.current]]
+        if self.anywhere:
+            return np.where(state.visited, -np.inf, scores).argmax(1)
+        return best_in_window(self.sphere, state, scores[rows[:, None, None], self.sphere.windows[state.current]])

@@ -1,0 +1,287 @@
+"""An evaluation as a folder: all numbers, the tables, the figures, and one self-contained HTML page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from nextview.benchmark.evaluation import Evaluation
+from nextview.benchmark.published import published_recognisers
+from nextview.data.predictions import Predictions
+from nextview.report import evaluation_figures as drawn
+from nextview.report.elements import (
+    Number,
+    card,
+    cell,
+    description,
+    document,
+    numbers,
+    picture,
+    side_by_side,
+    table,
+)
+from nextview.report.style import to_png
+
+PAGE = "evaluate.html"
+KIND = "evaluation"
+"""Of these results, in their manifest."""
+
+
+def save(
+    folder: Path, e: Evaluation, p: Predictions, settings: dict[str, Any], figures: dict[str, Figure]
+) -> Iterator[int]:
+    """Write results.json, a CSV of each table, a PNG of each figure and evaluate.html.
+
+    Args:
+        folder: a new one, such as ``outputs.written_results`` makes.
+        e: the numbers.
+        p: from which.
+        settings: how they were made.
+        figures: of ``all_figures``.
+
+    Yields:
+        How many figures are written; the page counts as one.
+    """
+    for name, frame in e.tables().items():
+        frame.to_csv(folder / f"{name}.csv", index=False)
+    records = {name: _records(frame) for name, frame in e.tables().items()}
+    results = {"settings": settings, "left_out": e.left_out, **records}
+    (folder / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
+    for done, (name, figure) in enumerate(figures.items()):
+        to_png(figure, folder / f"{name}.png")
+        yield done + 1
+    (folder / PAGE).write_text(page(e, p, settings, figures), encoding="utf-8")
+    yield len(figures) + 1
+
+
+def _records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """One mapping a row; what is not there is left out."""
+    rows = frame.astype(object).to_dict("records")
+    return [{str(k): v for k, v in row.items() if v is not None and v == v} for row in rows]
+
+
+def all_figures(e: Evaluation, p: Predictions, rng: np.random.Generator) -> dict[str, Figure]:
+    """Every figure by the name of its file; the generator draws the examples."""
+    figures = {
+        "fusion": drawn.fusion_curve(e),
+        "class_accuracy": drawn.class_accuracies(e),
+        "reliability": drawn.reliability(e),
+        "confidence": drawn.confidence_curve(e),
+        "confusion_one_view": drawn.confusion(e, 1, p.classes),
+        "confusion_all_views": drawn.confusion(e, len(p.sphere), p.classes),
+    }
+    for name in e.maps["map"].unique():
+        for measure in ("mse", "d0", "d_le_1", "regret"):
+            figures[f"{name}_{measure}"] = drawn.map_classes(e, name, measure)
+        figures[f"{name}_examples"] = drawn.example_maps(p, name, rng)
+    return figures
+
+
+def page(e: Evaluation, p: Predictions, settings: dict[str, Any], figures: dict[str, Figure]) -> str:
+    """The whole page as text."""
+    maps = e.maps["map"].unique()
+    sections = [
+        ("recogniser", "How often it is right", _recogniser(e, p, figures)),
+        ("confusion", "What it takes for what", _confusions(p, figures)),
+        ("calibration", "Is the confidence worth its name?", _calibration(e, figures)),
+        *((name, f"The {escape(name.upper())}", _map(e, name, figures)) for name in maps),
+        ("left-out", "Left out", description(e.left_out) if e.left_out else ""),
+        ("made", "How this was made", description(_facts(p, settings))),
+    ]
+    name = p.models["recogniser"][0] if "recogniser" in p.models else "the recogniser"
+    return document(f"Evaluation of {name}", _headline(e, p, name), sections)
+
+
+def _headline(e: Evaluation, p: Predictions, name: str) -> str:
+    v = len(p.sphere)
+    found = _accuracies(e)
+    one, fused = found[1, "", "accuracy"], found[v, "", "accuracy"]
+    error = e.fusion.set_index("n_views")["calibration_error"]
+    cards = [
+        _share_card("one view", one, f"classes {100 * found[1, '', 'class_accuracy'].value:.1f}&nbsp;%"),
+        _share_card(f"all {v} views fused", fused, f"classes {100 * found[v, '', 'class_accuracy'].value:.1f}&nbsp;%"),
+        card("calibration error", f"{error[1]:.3f}", f"one view; {error[v]:.3f} with all {v} fused"),
+    ]
+    for kind in e.maps["map"].unique():
+        scores = _scores(e, kind)
+        near, loss = scores["network", "", "d_le_1"], scores["network", "", "mse"]
+        cards.append(_share_card(f"{escape(kind.upper())}: peak within one cell", near, f"MSE {loss.value:.4f}"))
+    twice = int(p.conflicting.sum())
+    duplicates = f"; {twice} of them are the very mesh of another object with another label" if twice else ""
+    return (
+        f"<h1>{escape(name)}: {100 * one.value:.1f}&nbsp;% of single views right, {100 * fused.value:.1f}&nbsp;% of "
+        f"objects with all {v} views fused</h1>"
+        f'<p class="lead">{len(p):,} objects of {len(set(p.labels.tolist()))} classes, {v} views each{duplicates}.</p>'
+        "<p>All intervals are 95&nbsp;% bootstrap intervals over objects: views of one object are not independent.</p>"
+        f'<div class="cards">{"".join(cards)}</div>'
+    )
+
+
+def _share_card(title: str, number: Number, small: str) -> str:
+    interval = f"{100 * number.low:.1f} &ndash; {100 * number.high:.1f}&nbsp;%; {small}"
+    return card(title, f"{100 * number.value:.1f}&nbsp;%", interval)
+
+
+def _accuracies(e: Evaluation) -> dict[tuple, Number]:
+    return numbers(e.accuracy, "n_views", "label", "measure")
+
+
+def _scores(e: Evaluation, name: str) -> dict[tuple, Number]:
+    return numbers(e.maps[e.maps["map"] == name], "by", "label", "measure")
+
+
+def _recogniser(e: Evaluation, p: Predictions, figures: dict[str, Figure]) -> str:
+    found, v = _accuracies(e), len(p.sphere)
+    columns = [(n_views, measure) for n_views in (1, v) for measure in ("accuracy", "clean_accuracy")]
+    rows = []
+    counts = np.bincount(p.labels, minlength=len(p.classes))
+    for label in e.accuracy.query("label != ''")["label"].unique():
+        cells = (cell(found[n_views, label, measure]) for n_views, measure in columns)
+        rows.append([escape(label).replace("_", " "), str(counts[p.classes.index(label)]), *cells])
+    for heading, before in (("mean of classes", "class_"), ("mean of objects", "")):
+        cells = (cell(found[n_views, "", before + measure]) for n_views, measure in columns)
+        rows.append([heading, f"{len(p):,}", *cells])
+        if p.of_size is not None:
+            one, fused = (cell(found[n_views, "", f"{before}shape_accuracy"]) for n_views in (1, v))
+            rows.append([f"{heading}<small>size of the objects not known</small>", f"{len(p):,}", one, "", fused, ""])
+    head = ["class", "objects", "one view", "without duplicates", f"all {v} views fused", "without duplicates"]
+    published = published_recognisers(p.classes, v)
+    beside = ""
+    if published:
+        ours = found[1, "", "accuracy"]
+        listed = [[escape(p.models["recogniser"][0]), "", cell(Number(*ours[:3]))]]
+        listed += [[f"{network}, published", str(batch), f"{accuracy:.4f}"] for network, batch, accuracy in published]
+        caption = f"Accuracy from one of {v} views beside the published recognisers (table 6), over objects."
+        beside = table(["network", "batch size", "one view"], listed, caption)
+    curve = e.fusion.set_index("n_views")["accuracy"]
+    shown = ", ".join(f"{k}: {curve[k]:.3f}" for k in (1, 2, 5, 10, v) if k in curve.index)
+    shown = side_by_side(
+        picture(
+            figures["fusion"],
+            f"Accuracy against the number of random views fused. {shown}.",
+            "Logits of random views summed: accuracy against their number. Each object's views come in one random "
+            "order and all its rotations, so every view counts alike at every number.",
+        ),
+        picture(
+            figures["class_accuracy"],
+            "Accuracy of each class from one view and from all; the table has the numbers.",
+            "Accuracy by class.",
+        ),
+    )
+    caption = "Share of right answers. Small print: 95&nbsp;% intervals."
+    duplicates = (
+        "<p><em>Without duplicates</em> leaves out the objects whose very mesh also stands in the data under another "
+        "label: no recogniser can be right on both.</p>"
+    )
+    return shown + duplicates + table(head, rows, caption) + beside
+
+
+def _confusions(p: Predictions, figures: dict[str, Figure]) -> str:
+    caption = "Percent of each true class, as figure 12 of the thesis."
+    return side_by_side(
+        picture(figures["confusion_one_view"], "Confusion matrix of single views.", caption),
+        picture(figures["confusion_all_views"], f"Confusion matrix of all {len(p.sphere)} views fused.", caption),
+    )
+
+
+def _calibration(e: Evaluation, figures: dict[str, Figure]) -> str:
+    curve = e.fusion.set_index("n_views")
+    n_views = list(dict.fromkeys(e.reliability["n_views"].tolist()))
+    shown = ", ".join(f"{curve.calibration_error[k]:.3f} after {k}" for k in n_views)
+    text = (
+        "<p>On the diagonal, an answer of which the belief is 90&nbsp;% sure is right nine times in ten; below it the "
+        f"belief is too sure of itself. Expected calibration error over views: {shown}.</p>"
+    )
+    return text + side_by_side(
+        picture(
+            figures["reliability"],
+            f"Share of right answers against confidence. Calibration error: {shown}.",
+            "Reliability after one random view and more. Bins of fewer than 20 answers are left out.",
+        ),
+        picture(
+            figures["confidence"],
+            "Mean confidence and accuracy against the number of random views fused. "
+            + ", ".join(f"{k}: {curve.confidence[k]:.3f} and {curve.accuracy[k]:.3f}" for k in n_views)
+            + ".",
+            "Mean confidence against accuracy. Views of one object make alike mistakes: a sum of logits takes them "
+            "for independent and grows too sure.",
+        ),
+    )
+
+
+def _map(e: Evaluation, name: str, figures: dict[str, Figure]) -> str:
+    scores = _scores(e, name)
+    measures = list(drawn.MEASURES)
+    head = ["", *(escape(words[0].upper() + words[1:]) for words in drawn.MEASURES.values())]
+
+    def row(heading: str, by: str, label: str = "", before: str = "") -> list[str]:
+        cells = (cell(scores.get((by, label, before + measure)), 4 if measure == "mse" else 3) for measure in measures)
+        return [heading, *cells]
+
+    rows = [row("mean of objects", "network"), row("mean of classes", "network", before="class_")]
+    for by in e.maps["by"].unique():
+        if by != "network":
+            rows.append(row(f"{escape(by)}<small>mean of objects</small>", by))
+            rows.append(row(f"{escape(by)}<small>mean of classes</small>", by, before="class_"))
+    labels = [label for label in e.maps[e.maps["map"] == name]["label"].unique() if label]
+    by_class = [row(escape(label).replace("_", " "), "network", label) for label in labels]
+    truth = {
+        "lem": "the depth-entropy of the neighbouring views, scaled to 0 .. 1 over the object's views",
+        "lcm": "the recogniser's confidence in the neighbouring views, 0 where it is wrong",
+    }[name]
+    return (
+        f"<p>What is true: {truth}. A peak is right where the highest predicted cell is the highest true one, or near "
+        "it; of equal cells the first counts, so where cells tie the exact peak is a toss-up. The <em>regret</em> is "
+        "what following the prediction loses: the highest true value less the true one at the predicted peak. The "
+        "baselines are made from the true maps of these very objects: one map for all views, and one for each class "
+        "and view, which knows the object's class and which way it faces. The published peaks are means over classes, "
+        "the published loss is over objects.</p>"
+        + table(head, rows, "The predicted maps and the baselines. Small print: 95&nbsp;% intervals.")
+        + side_by_side(
+            *(
+                picture(
+                    figures[f"{name}_{measure}"],
+                    f"{drawn.MEASURES[measure]} by class; the table has the numbers.",
+                    f"{escape(drawn.MEASURES[measure].capitalize())}, by class.",
+                )
+                for measure in ("mse", "d0", "d_le_1", "regret")
+            )
+        )
+        + table(head, by_class, "By class, as table 7 of the thesis.")
+        + picture(
+            figures[f"{name}_examples"],
+            "True and predicted maps side by side, five objects of each class from the best to the worst.",
+            "Examples, as figures 25 to 28: one random view of each object was drawn, and those shown stand at equal "
+            "steps of its squared error.",
+            broad=True,
+        )
+    )
+
+
+def _calibration_fact(p: Predictions) -> str:
+    """How the sums of logits became confidences."""
+    c = p.calibration
+    if (c.temperature, c.correlation) == (1, 0):
+        return "none: the softmax of the sum of the logits as it stands"
+    return f"temperature {c.temperature:.3g} for one view, correlation {c.correlation:.3g} between views"
+
+
+def _facts(p: Predictions, settings: dict[str, Any]) -> dict[str, str]:
+    splits = zip(*np.unique(p.splits, return_counts=True), strict=True)
+    conflicting = [name for name, twice in zip(p.names, p.conflicting, strict=True) if twice]
+    return {
+        "predictions": f"{settings['predictions']}, SHA-256 {settings['predictions_sha256']}",
+        **{f"model: {kind}": f"{name}, SHA-256 {sha}" for kind, (name, sha) in p.models.items()},
+        "splits": ", ".join(f"{n} {name or 'unnamed'}" for name, n in splits),
+        "the same mesh under another label": ", ".join(conflicting) or "none",
+        "calibration": _calibration_fact(p),
+        "bootstrap": f"{settings['samples']} samples of objects; seed {settings['seed']}",
+        "calibration error": "15 bins of equal width (Guo et al. 2017)",
+    }

@@ -1,0 +1,276 @@
+"""Views in which nothing is seen: no evidence, no confidence, no answer."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from scipy.special import softmax
+from tests.tiny_models import make_map_network, make_recogniser
+
+from nextview import SimulatedCamera, Stopping, ViewSphere, load_models, make_policy
+from nextview.belief import Calibration
+from nextview.cli.main import main
+from nextview.data.samples import sample_mesh
+from nextview.episode import Episodes
+from nextview.errors import MeshError, ObservationError
+from nextview.mesh import make_mesh
+from nextview.models.inference import MapNetwork, Models, Recogniser
+from nextview.observation import Observation, pinhole
+from nextview.policies.base import Evidence
+from nextview.policies.baselines import Unidirectional
+from nextview.report.episode_figure import draw_episode
+from nextview.session import Session, recognise
+
+SPHERE = ViewSphere.named("40")
+CLASSES = ("box", "ball", "pillar")
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory) -> Models:
+    folder = tmp_path_factory.mktemp("tiny")
+    recogniser = Recogniser(make_recogniser(folder, list(CLASSES), azimuth_bins=8))
+    recogniser.calibration = Calibration(0.8, 1.0, bin_correlation=1.5)  # by no views at all one cannot divide
+    return Models(recogniser, {"lem": MapNetwork(make_map_network(folder))})
+
+
+def features(logits, seen=None, azimuth_bins=None) -> Evidence:
+    return Evidence(np.asarray(logits, float), azimuth_bins=azimuth_bins, seen=None if seen is None else np.array(seen))
+
+
+# Evidence
+
+
+@pytest.mark.parametrize("calibration", [Calibration(), Calibration(0.7, 0.5), Calibration(0.7, 1.0, None, 2.0)])
+def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibration):
+    """Each of 40 episodes has empty views of its own; alone and without them it believes the same."""
+    rng, b, k = np.random.default_rng(0), 40, 6
+    logits, empty = rng.normal(size=(b, k, 3)), rng.random((b, k)) < 0.4
+    empty[0], empty[1] = True, False
+    azimuth_bins = np.log(rng.dirichlet(np.ones(8), (b, k, 3))) if calibration.bin_correlation else None
+    sure = Stopping(1.0, k)
+    together = Episodes(SPHERE, Unidirectional(SPHERE), np.arange(b), sure, np.random.default_rng(0), calibration)
+    for observation in range(k):
+        step = together.update(
+            features(
+                np.where(empty[:, observation, None], np.nan, logits[:, observation]),
+                ~empty[:, observation],
+                None if azimuth_bins is None else azimuth_bins[:, observation],
+            )
+        )  # the log-evidence of an empty view is not even read
+        np.testing.assert_array_equal(step.seen, (~empty[:, : observation + 1]).sum(1))
+    assert (together.outcome.n_views == k).all()
+    views = together.outcome.views
+    for e in range(b):
+        kept = np.flatnonzero(~empty[e])
+        log_evidence = np.zeros((1, 3)) if len(kept) == 0 else logits[e, kept]
+        total = log_evidence.sum(0) / calibration.temperature_after(max(len(kept), 1))
+        if azimuth_bins is not None:
+            zero = np.zeros((3, 8))  # by the azimuth of the object's azimuth bin 0
+            for observation in kept:
+                for side in range(8):
+                    zero[:, (SPHERE.azimuth_index[views[e, observation]] - side) % 8] += azimuth_bins[
+                        e, observation, :, side
+                    ]
+            total = total + np.log(np.exp(zero / (1 + 2.0 * (max(len(kept), 1) - 1))).sum(1))
+        np.testing.assert_allclose(together.steps[-1].belief[e], softmax(total), atol=1e-12)
+    np.testing.assert_array_equal(together.steps[-1].belief[0], np.full(3, 1 / 3))
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1 / 3, 0.9])
+def test_an_empty_view_is_taken_but_never_confident(threshold):
+    episodes = Episodes(
+        SPHERE, Unidirectional(SPHERE), np.array([0, 0]), Stopping(threshold, 3), np.random.default_rng(0)
+    )
+    episodes.update(features([[9, 0, 0], [9, 0, 0]], [False, True]))
+    assert episodes.running.tolist() == [0]
+    episodes.update(features([[9, 0, 0]], [False]))
+    assert episodes.current[0] == 2  # it went on
+    episodes.update(features([[9, 0, 0]], [False]))
+    end = episodes.outcome
+    assert end.n_views.tolist() == [3, 1]
+    assert end.confident.tolist() == [False, True]
+
+
+def test_a_threshold_that_comes_down_does_not_come_down_by_empty_views():
+    stopping = Stopping(0.9, 6, threshold_decay=2.0)
+    episodes = Episodes(SPHERE, Unidirectional(SPHERE), np.array([0]), stopping, np.random.default_rng(0))
+    logits = np.array([[1.5, 0.0]])
+    assert softmax(logits[0]).max() > stopping.threshold_at(2)
+    for seen in (True, False, False, False):
+        assert not episodes.update(features(logits, [seen])).stopped[0]
+    assert episodes.update(features(logits, [True])).stopped[0]
+
+
+class Asked:
+    """Goes round; remembers what it was shown."""
+
+    needs = ("lem", "azimuth_bins")
+
+    def __init__(self):
+        self.states = []
+
+    def next_views(self, state, rng):
+        self.states.append(state)
+        return Unidirectional(SPHERE).next_views(state, rng)
+
+
+def test_policies_are_shown_zeros_and_an_even_belief(tiny):
+    policy = Asked()
+    session = Session(tiny, policy, SPHERE, 5, Stopping(1.0, 3))
+    empty = Observation(np.zeros((16, 16)), session.pose, pinhole(16, 3.0))
+    view = session.update(empty)
+    state = policy.states[0]
+    np.testing.assert_array_equal(state.belief, np.full((1, 3), 1 / 3))
+    np.testing.assert_array_equal(state.evidence.logits, np.zeros((1, 3)))
+    np.testing.assert_array_equal(state.evidence.maps["lem"], np.zeros((1, 5, 3)))
+    np.testing.assert_array_equal(state.azimuth_bins, np.full((1, 3, 8), 1 / 8))
+    assert state.visited[0].nonzero()[0].tolist() == [5]
+    np.testing.assert_array_equal(view.alone, np.full(3, 1 / 3))
+    np.testing.assert_array_equal(view.azimuth_bins, np.full((3, 8), 1 / 8))
+
+
+@pytest.mark.parametrize("name", ["gain", "lem", "lem-peak", "lcm", "random", "furthest", "spread", "spread-local"])
+def test_every_kind_of_policy_goes_on_past_an_empty_view(name):
+    policy = make_policy(name, SPHERE)
+    models = load_models(policy.needs)
+    policy = make_policy(name, SPHERE, models.valley_classes(policy.needs[0]) if policy.needs else (), models.classes)
+    camera = SimulatedCamera(sample_mesh("chair"))
+
+    class Covered:
+        """Sees nothing in the first two views."""
+
+        taken = 0
+
+        def observe(self, pose):
+            self.taken += 1
+            view = camera.observe(pose)
+            return view if self.taken > 2 else replace(view, depth=np.zeros_like(view.depth))
+
+    result = recognise(Covered(), models, policy, SPHERE, 9, Stopping(1.0, 5))
+    assert len({view.index for view in result.views}) == 5
+    np.testing.assert_array_equal(result.views[1].belief, np.full(10, 0.1))
+    np.testing.assert_allclose(result.views[2].belief, result.views[2].alone, atol=1e-6)  # the first that counts
+    assert result.answer == "chair"
+
+
+# Sessions
+
+
+def view_of(depth, pose) -> Observation:
+    return Observation(depth, pose, pinhole(len(depth), 3.0))
+
+
+def test_nothing_seen_is_no_answer(tiny):
+    session = Session(tiny, Unidirectional(SPHERE), SPHERE, 0, Stopping(0.0, 3))
+    while not session.done:
+        session.update(view_of(np.zeros((16, 16)), session.pose))
+    result = session.result
+    assert len(result.views) == 3
+    assert (result.answer, result.confidence, result.confident, result.seen) == (None, 0.0, False, False)
+    assert "nothing is seen" in draw_episode(result, SPHERE, "air").get_suptitle()
+
+
+def test_one_view_that_shows_something_is_an_answer(tiny):
+    session = Session(tiny, Unidirectional(SPHERE), SPHERE, 0, Stopping(1.0, 3))
+    for depth in (np.zeros((16, 16)), np.full((16, 16), 3.0), np.zeros((16, 16))):
+        session.update(view_of(depth, session.pose))
+    result = session.result
+    np.testing.assert_array_equal(result.views[0].belief, np.full(3, 1 / 3))
+    np.testing.assert_array_equal(result.views[1].belief, result.views[2].belief)
+    assert result.answer == CLASSES[result.views[1].belief.argmax()]
+    assert result.confidence == result.views[1].belief.max() > 1 / 3
+
+
+def test_after_a_wrong_observation_the_same_view_can_be_told(tiny):
+    camera = SimulatedCamera(sample_mesh("chair"), 16)
+    done = []
+    for wrong in (False, True):
+        session = Session(tiny, make_policy("random", SPHERE), SPHERE, 7, Stopping(1.0, 4))
+        while not session.done:
+            if wrong:
+                before = session.view
+                for depth in (np.full((15, 15), 3.0), np.full((16, 32), 3.0)):
+                    with pytest.raises(ObservationError):
+                        session.update(view_of(depth, session.pose))
+                assert session.view == before
+            session.update(camera.observe(session.pose))
+        done.append(session.result)
+    assert [view.index for view in done[0].views] == [view.index for view in done[1].views]
+    np.testing.assert_array_equal(done[0].views[-1].belief, done[1].views[-1].belief)
+
+
+@settings(deadline=None)
+@given(
+    npst.arrays(
+        np.float32,
+        (16, 16),
+        elements=st.one_of(st.floats(0, 60, width=32), st.floats(width=32, allow_nan=False, allow_infinity=False)),
+    )
+)
+def test_any_finite_depth_is_refused_or_believed_in_no_more_than_all(tiny, depth):
+    session = Session(tiny, make_policy("lem", SPHERE), SPHERE, 20, Stopping(0.99, 2))
+    try:
+        view = session.update(view_of(depth, session.pose))
+    except ObservationError:
+        assert not session.views
+        return
+    assert view.belief.sum() == pytest.approx(1)
+    assert np.isfinite(view.belief).all()
+    if not view.observation.seen:
+        np.testing.assert_array_equal(view.belief, np.full(3, 1 / 3))
+        assert not session.done
+
+
+# Meshes and the command line
+
+
+def far_apart() -> trimesh.Trimesh:
+    speck = trimesh.creation.box((1e-4, 1e-4, 1e-4))
+    return trimesh.util.concatenate([speck.copy().apply_translation((x, x, x)) for x in (-1, 1)])
+
+
+def test_a_mesh_without_area_is_refused():
+    line = np.array([[0, 0, 0], [1, 2, 3], [2, 4, 6.0]])
+    with pytest.raises(MeshError, match="thing: the mesh has no area"):
+        make_mesh(line, [[0, 1, 2], [0, 0, 1]], "thing")
+    thin = line.copy()
+    thin[1, 2] += 1e-5
+    assert len(make_mesh(thin, [[0, 0, 1]] * 5000 + [[0, 1, 2]]).faces) == 5001  # one face with an area is enough
+
+
+@pytest.mark.parametrize("json_too", [[], ["--json"]])
+def test_the_command_has_no_answer_about_next_to_nothing(tmp_path, capsys, json_too):
+    path = tmp_path / "specks.off"
+    far_apart().export(path)
+    with pytest.raises(SystemExit) as end:
+        main(["recognise", str(path), "--threshold", "0", *json_too])
+    assert end.value.code == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "specks.off: there is no answer" in printed.err
+    assert "any of 5 views" in printed.err
+    assert printed.err.count("\n") == 1
+
+
+def test_the_command_shows_which_views_are_empty(tmp_path, capsys):
+    path = tmp_path / "plate.off"  # seen edge-on it is not seen
+    trimesh.Trimesh([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]]).export(path)
+    arguments = ["recognise", str(path), "--start", "0", "--policy", "unidirectional", "--max-views", "2"]
+    with pytest.raises(SystemExit) as end:  # it goes round on the ring from which the plate is edge-on
+        main(arguments)
+    assert end.value.code == 2
+    capsys.readouterr()
+    arguments[3:6] = ["0", "--policy", "gain"]
+    arguments[-1] = "40"
+    main([*arguments, "--threshold", "1", "--json"])
+    episode = json.loads(capsys.readouterr().out)
+    empty = [observation for observation in episode["views"] if not observation["seen"]]
+    assert sorted(observation["view"] for observation in empty) == list(range(8))
+    assert all(observation["map_peak"] is None and observation["azimuth_bin"] is None for observation in empty)
+    main(arguments)
+    assert "nothing" in capsys.readouterr().out

@@ -1,0 +1,226 @@
+"""What an observation takes, what it refuses, and what it derives."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from nextview.cameras.simulated import SimulatedCamera
+from nextview.cloud import visible_points
+from nextview.data.samples import sample_mesh
+from nextview.errors import ObservationError
+from nextview.mesh import make_mesh
+from nextview.models.inference import see
+from nextview.observation import LEAST_PIXELS, LEAST_SHARE, Observation, pinhole
+from nextview.viewsphere import ViewSphere
+
+POSE = ViewSphere.named("40").poses[13]
+SIZE = 64
+INTRINSICS = pinhole(SIZE, 3.0)
+CHAIR = SimulatedCamera(sample_mesh("chair"), SIZE)
+VIEW = CHAIR.observe(POSE)
+
+
+def observe(**other) -> Observation:
+    return Observation(**({"depth": VIEW.depth, "pose": POSE, "intrinsics": INTRINSICS} | other))
+
+
+# Taking
+
+
+def test_points_and_picture_are_derived_once():
+    view = observe()
+    np.testing.assert_array_equal(view.points, visible_points(VIEW.depth, POSE, INTRINSICS))
+    assert view.points is view.points
+    assert view.picture is view.picture
+    assert view.visible == (VIEW.depth > 0).sum()
+    assert VIEW.picture is VIEW.image
+    empty = replace(view, depth=np.zeros_like(VIEW.depth))  # nothing derived is left over
+    assert not empty.points.any()
+    assert not empty.picture.any()
+    assert empty.visible == 0
+
+
+@pytest.mark.parametrize("name", ["chair", "ball"])
+def test_without_an_image_the_depth_is_lit_as_the_renderer_lights_the_mesh(name):
+    if name == "ball":
+        ball = trimesh.creation.icosphere(subdivisions=5)
+        mesh = make_mesh(ball.vertices, ball.faces)
+    else:
+        mesh = sample_mesh(name)
+    camera = SimulatedCamera(mesh, 224)
+    for pose in ViewSphere.named("40").poses[::7]:
+        view = camera.observe(pose)
+        lit = replace(view, image=None).picture
+        assert lit.dtype == np.uint8
+        np.testing.assert_array_equal(lit > 0, view.image > 0)
+        gap = np.abs(lit.astype(float) - view.image)[view.depth > 0]
+        assert np.median(gap) <= 2
+        assert np.mean(gap > 25) < 0.2  # edges, where the neighbours are on other faces
+
+
+def test_pixels_that_are_not_square_and_images_that_are_neither():
+    """A plane that faces the camera squarely: the cosine is that of the ray and the optical axis."""
+    intrinsics = np.array([[60, 0, 30], [0, 90, 20], [0, 0, 1.0]])
+    lit = Observation(np.full((48, 80), 3.0, np.float32), POSE, intrinsics).picture
+    row, column = np.mgrid[:48, :80] + 0.5
+    cosine = 1 / np.sqrt(((column - 30) / 60) ** 2 + ((row - 20) / 90) ** 2 + 1)
+    np.testing.assert_allclose(lit, 255 * (0.15 + 0.85 * cosine), atol=1)
+
+
+def test_lists_and_other_numbers_are_converted():
+    depth = np.where(VIEW.depth > 0, 3, 0)
+    view = Observation(depth.tolist(), POSE.tolist(), INTRINSICS.tolist(), 0.5, VIEW.image.tolist())
+    assert (view.depth.dtype, view.pose.dtype, view.intrinsics.dtype) == (np.float32, np.float64, np.float64)
+    np.testing.assert_array_equal(view.depth, depth)
+    np.testing.assert_array_equal(view.image, VIEW.image)
+    assert view.image.dtype == np.uint8
+    assert observe(depth=VIEW.depth.astype(np.float64)).depth.dtype == np.float32
+    assert not observe(depth=np.full((SIZE, SIZE), 1e300)).depth.any()  # beyond float32
+
+
+def test_what_is_of_the_right_type_is_not_copied():
+    view = observe(image=VIEW.image)
+    assert view.depth is VIEW.depth
+    assert view.pose is POSE
+    assert view.intrinsics is INTRINSICS
+    assert view.image is VIEW.image
+
+
+@pytest.mark.parametrize("size", [16, 64, 224])
+def test_a_view_shows_something_from_so_many_pixels_on(size):
+    least = {16: 9, 64: 9, 224: 51}[size]
+    for pixels in (0, 1, least - 1, least):
+        depth = np.zeros(size * size, np.float32)
+        depth[:pixels] = 3
+        view = Observation(depth.reshape(size, size), POSE, pinhole(size, 3.0))
+        assert view.seen == (pixels == least)
+    assert least - 1 < max(LEAST_PIXELS, LEAST_SHARE * size**2) <= least
+
+
+# Refusing
+
+
+def turned(**rows) -> np.ndarray:
+    """The pose with some entries replaced."""
+    pose = POSE.copy()
+    for at, value in rows.items():
+        pose[int(at[1]), int(at[2])] = value
+    return pose
+
+
+BAD = {
+    "depth of one row": ({"depth": VIEW.depth[0]}, "the depth is one image of the shape"),
+    "a batch of depth": ({"depth": VIEW.depth[None]}, "not (1, 64, 64)"),
+    "no rows": ({"depth": np.zeros((0, 5))}, "not (0, 5)"),
+    "no columns": ({"depth": [[]]}, "not (1, 0)"),
+    "a number": ({"depth": 3.0}, "not ()"),
+    "nothing": ({"depth": None}, "not of object"),
+    "words": ({"depth": [["near", "far"]]}, "the depth is an array of numbers"),
+    "truths": ({"depth": VIEW.depth > 0}, "not of bool"),
+    "complex": ({"depth": VIEW.depth + 0j}, "not of complex"),
+    "ragged": ({"depth": [[1.0, 2.0], [3.0]]}, "cannot be taken for an array"),
+    "pose 3x4": ({"pose": POSE[:3]}, "not (3, 4)"),
+    "no pose": ({"pose": None}, "the pose is an array of numbers"),
+    "pose of NaN": ({"pose": np.full((4, 4), np.nan)}, "NaN or infinity"),
+    "one infinity": ({"pose": turned(_03=np.inf)}, "NaN or infinity"),
+    "pose of zeros": ({"pose": np.zeros((4, 4))}, "not 0 0 0 1"),
+    "pose transposed": ({"pose": POSE.T}, "transposed"),
+    "scaled": ({"pose": POSE @ np.diag([2.0, 2, 2, 1])}, "not rigid"),
+    "sheared": ({"pose": turned(_01=POSE[0, 1] + 0.01)}, "not rigid"),
+    "zero rotation": ({"pose": np.diag([0.0, 0, 0, 1])}, "not rigid"),
+    "OpenGL's axes, half done": ({"pose": POSE @ np.diag([1.0, 1, -1, 1])}, "mirrored"),
+    "position in millimetres": ({"pose": turned(_03=1500.0)}, "is its position in millimetres"),
+    "intrinsics as a list": ({"intrinsics": [60.0, 60.0, 32.0, 32.0]}, "not (4,)"),
+    "no intrinsics": ({"intrinsics": None}, "the matrix of intrinsics is an array of numbers"),
+    "intrinsics of NaN": ({"intrinsics": np.full((3, 3), np.nan)}, "NaN, infinity"),
+    "intrinsics of infinity": ({"intrinsics": np.full((3, 3), np.inf)}, "infinity"),
+    "zeros": ({"intrinsics": np.zeros((3, 3))}, "not 0 0 1"),
+    "intrinsics transposed": ({"intrinsics": INTRINSICS.T}, "transposed"),
+    "no focal length": ({"intrinsics": np.diag([0.0, 60, 1])}, "not 0 and 60"),
+    "negative focal length": ({"intrinsics": np.diag([60.0, -60, 1])}, "not 60 and -60"),
+    "focal length in metres": ({"intrinsics": np.diag([0.0036, 0.0036, 1])}, "numbers of pixels"),
+    "image of another size": ({"image": np.zeros((32, 32), np.uint8)}, "not (32, 32)"),
+    "colour image": ({"image": np.zeros((64, 64, 3), np.uint8)}, "grey"),
+    "image from 0 to 1": ({"image": VIEW.image / 255}, "not float64"),
+    "image of 16 bits": ({"image": VIEW.image.astype(np.uint16) * 257}, "not uint16"),
+    "no size": ({"radius": 0.0}, "radius is a positive number"),
+    "size of NaN": ({"radius": np.nan}, "radius is a positive number"),
+    "size in words": ({"radius": "1 m"}, "radius is a positive number"),
+    "millimetres": ({"depth": VIEW.depth * 450}, "looks like millimetres"),
+    "whole millimetres": ({"depth": np.rint(VIEW.depth * 450).astype(np.uint16)}, "looks like millimetres"),
+}
+
+
+@pytest.mark.parametrize(("other", "words"), BAD.values(), ids=BAD)
+def test_what_no_camera_gives_is_refused_in_one_sentence(other, words):
+    with pytest.raises(ObservationError) as refusal:
+        observe(**other)
+    assert words in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_pose_written_with_four_digits_is_rigid_enough():
+    observe(pose=np.round(POSE, 4))
+
+
+def test_millimetres_with_a_few_pixels_of_noise_are_refused_still():
+    depth = VIEW.depth * 450
+    depth[np.nonzero(depth)[0][:3], np.nonzero(depth)[1][:3]] = 7
+    with pytest.raises(ObservationError, match="millimetres"):
+        observe(depth=depth)
+
+
+@pytest.mark.parametrize("nothing", [65535.0, 1e10, np.inf, np.nan, -1.0])
+@pytest.mark.parametrize("hidden", [0.5, 1.0])
+def test_one_large_number_for_nothing_is_no_other_unit(nothing, hidden):
+    depth = np.where(VIEW.depth > 0, VIEW.depth, np.float32(nothing))
+    depth.flat[: int(hidden * depth.size)] = nothing
+    assert observe(depth=depth).visible == (depth < 50).sum() - (depth < 0).sum()
+
+
+def test_a_wall_far_behind_the_object_is_no_other_unit():
+    wall = np.linspace(55, 70, SIZE * SIZE, dtype=np.float32).reshape(SIZE, SIZE)
+    np.testing.assert_array_equal(observe(depth=np.where(VIEW.depth > 0, VIEW.depth, wall)).depth, VIEW.depth)
+
+
+def test_a_simulated_camera_refuses_such_poses_too():
+    for pose in (POSE[:3], np.full((4, 4), np.nan), np.zeros((4, 4)), None):
+        with pytest.raises(ObservationError):
+            CHAIR.observe(pose)
+
+
+def test_views_of_two_cameras_are_not_seen_together():
+    for other in (
+        SimulatedCamera(sample_mesh("chair"), 32).observe(POSE),
+        SimulatedCamera(sample_mesh("chair"), SIZE, 4.0).observe(POSE),
+    ):
+        for sees in ("geometry", "image", "cloud"):
+            with pytest.raises(ObservationError, match="from one camera"):
+                see([VIEW, other], sees, 16)
+
+
+images = npst.arrays(
+    st.sampled_from([np.float32, np.float64, np.uint16, np.int8]),
+    npst.array_shapes(min_dims=2, max_dims=2, max_side=20),
+)
+
+
+@settings(deadline=None)
+@given(images)
+def test_any_depth_is_an_object_or_nothing_or_refused(depth):
+    try:
+        view = Observation(depth, POSE, pinhole(max(depth.shape), 3.0))
+    except ObservationError:
+        assert np.count_nonzero(depth >= 50) > 9
+        return
+    assert view.depth.dtype == np.float32
+    kept = view.depth > 0
+    assert (view.depth[kept] < 50).all()
+    np.testing.assert_array_equal(view.depth[kept], depth[kept].astype(np.float32))
+    assert np.isfinite(view.points).all()
+    np.testing.assert_array_equal(view.picture > 0, kept)
