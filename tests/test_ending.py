@@ -1,5 +1,6 @@
 """How commands end: at signals, and where standard output is full or closed; and help in any width."""
 
+import logging
 import os
 import re
 import resource
@@ -82,6 +83,8 @@ def test_a_command_that_does_not_resume_says_nothing_of_it(monkeypatch, capsys):
     def interrupted(*args, **options):
         raise KeyboardInterrupt
 
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # gets back what it is now
+    monkeypatch.setattr(logging.getLogger("asyncio"), "disabled", False)
     monkeypatch.setattr("nextview.models.model_card.bundled_cards", interrupted)
     with pytest.raises(SystemExit, match="130"):
         main(["models"])

@@ -71,7 +71,9 @@ def orderly_end(advice: str) -> Iterator[None]:
             say(f"standard output or a file cannot be written ({error.strerror or 'it is closed'})")
             _forget_output(1)
         except KeyboardInterrupt as interrupt:
-            logging.getLogger("asyncio").disabled = True  # zarr's reads would complain, at great length, of being left
+            # The reads that zarr has begun would complain, at great length, of being left.
+            logging.getLogger("asyncio").disabled = True
+            sys.unraisablehook = lambda unraisable: None
             say(f"stopped; {advice}")
             sys.exit(143 if isinstance(interrupt, Terminated) else 130)
 
