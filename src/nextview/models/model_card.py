@@ -44,7 +44,7 @@ def read_card(path: Path) -> Card:
         card = Card(facts["name"], facts["kind"], path.with_suffix(".onnx"), facts["sha256"], facts)
     except FileNotFoundError:
         raise ModelError(f"{path}: there is no such model card") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ModelError(f"{path}: not a model card ({type(error).__name__}: {error})") from None
     if not card.path.exists():
         raise ModelError(f"{card.path}: the weights of model {card.name} are missing")
