@@ -64,7 +64,7 @@ def read_policy(path: Path, sphere: ViewSphere, classes: Sequence[str] | None = 
         raise PolicyError(f"{path}: there is no such policy card") from None
     except ModelError as error:
         raise PolicyError(str(error)) from None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, MemoryError) as error:
         raise PolicyError(f"{path}: not a policy card ({type(error).__name__}: {error})") from None
     if made is None:
         raise OtherUseError(f"{path}: was learned for {len(place[0])} rings of {place[1]} views, not for this sphere")
