@@ -8,6 +8,7 @@ from typing import Any
 
 import tyro
 
+from nextview import __version__
 from nextview.cli.benchmark import benchmark
 from nextview.cli.check import check
 from nextview.cli.correspond import correspond
@@ -70,6 +71,9 @@ def main(arguments: list[str] | None = None) -> None:
 def _run(arguments: list[str]) -> None:
     commands = COMMANDS
     prog, description = "nextview", "Active 3D object recognition: what it is, and where to look next."
+    if arguments == ["--version"]:
+        print(f"nextview {__version__}")
+        return
     if arguments and isinstance(commands.get(arguments[0]), dict):  # a group, such as nextview train
         prog, description = f"{prog} {arguments[0]}", GROUPS[arguments[0]]
         commands, arguments = commands[arguments[0]], arguments[1:]
