@@ -28,6 +28,7 @@ import warnings
 import zlib
 from collections import Counter
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
@@ -123,7 +124,7 @@ def change_json(rng: np.random.Generator, text: bytes) -> bytes:
         if holder and rng.random() < 0.2:
             del holder[key]
         elif holder:
-            holder[key] = JUNK[rng.integers(len(JUNK))]
+            holder[key] = deepcopy(JUNK[rng.integers(len(JUNK))])
     if rng.random() < 0.02:
         facts = {"deep": "DEEP"} | facts if isinstance(facts, dict) else ["DEEP"]
     return json.dumps(facts).encode().replace(b'"DEEP"', b"[" * 100_000 + b"]" * 100_000)
