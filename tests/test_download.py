@@ -5,15 +5,18 @@ import io
 import stat
 import threading
 import zipfile
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
 
-from nextview.data.downloading import Archive, download
+from nextview.data import downloading
+from nextview.data.downloading import PATIENCE, Archive
 from nextview.data.lock import only_one
 from nextview.errors import DatasetError
 
+download = partial(downloading.download, pause=0)
 MESH = b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 
 
@@ -56,6 +59,8 @@ class Server:
                 announced = plan.get("announce", len(outer.data)) - start
                 if plan.get("length", True):
                     self.send_header("Content-Length", str(announced))
+                for name, value in plan.get("headers", {}).items():
+                    self.send_header(name, value)
                 self.end_headers()
                 self.wfile.write(body[: plan.get("cut", len(body))])
 
@@ -117,6 +122,58 @@ def test_a_server_without_ranges_starts_over(tmp_path):
     with Server(GOOD, {"cut": 200_000}, {"ranges": False}) as server:
         list(download(server.archive(), tmp_path))
     assert (tmp_path / "Shapes/chair/test/noise.bin").read_bytes() == NOISE
+
+
+def test_a_server_without_ranges_that_always_cuts_is_not_asked_for_ever(tmp_path, monkeypatch):
+    waited = []
+    monkeypatch.setattr("time.sleep", waited.append)
+    with Server(GOOD, {"cut": 200_000, "ranges": False}) as server:
+        with pytest.raises(DatasetError, match=rf"the connection .*; 200000 of {len(GOOD)} bytes are kept, try again"):
+            list(downloading.download(server.archive(), tmp_path))
+        assert len(server.ranges) == 1 + PATIENCE
+    assert waited == [1, 2, 4, 8, 16]
+
+
+def test_bytes_that_came_before_do_not_count_as_new(tmp_path):
+    (tmp_path / "Shapes.zip.part").write_bytes(GOOD[:300_000])
+    with Server(GOOD, {"cut": 200_000, "ranges": False}) as server:
+        with pytest.raises(DatasetError, match="try again"):
+            list(download(server.archive(), tmp_path))
+        assert len(server.ranges) == PATIENCE
+
+
+@pytest.mark.parametrize(
+    ("headers", "sentence"),
+    [
+        ({"Content-Length": "many"}, "announces 'many' bytes, which is no number"),
+        ({"Content-Length": "-5"}, "announces '-5' bytes, which is no number"),
+        ({"Content-Length": ""}, "announces '' bytes, which is no number"),
+        ({"Content-Length": "\u0663"}, "which is no number"),
+        ({"Content-Range": "bytes 0-99/100"}, "asked for the bytes from 100 on, the server sends 'bytes 0-99/100'"),
+        ({"Content-Range": "nonsense"}, "the server sends 'nonsense'"),
+    ],
+)
+def test_headers_that_make_no_sense_get_one_sentence(tmp_path, headers, sentence):
+    (tmp_path / "Shapes.zip.part").write_bytes(GOOD[:100])
+    headers = {name: value.encode().decode("latin-1") for name, value in headers.items()}
+    plan = {"headers": headers, "length": "Content-Length" not in headers}
+    with Server(GOOD, plan) as server, pytest.raises(DatasetError, match=sentence) as refusal:
+        list(download(server.archive(), tmp_path))
+    assert "\n" not in str(refusal.value)
+    assert len(server.ranges) == 1
+
+
+def test_a_file_or_an_empty_folder_is_no_dataset(tmp_path):
+    (tmp_path / "Shapes").mkdir()
+    with Server(GOOD) as server:
+        list(download(server.archive(), tmp_path))
+        assert (tmp_path / "Shapes/chair/train/a.off").read_bytes() == MESH
+        (tmp_path / "other").mkdir()
+        (tmp_path / "other/Shapes").write_text("mine")
+        with pytest.raises(DatasetError, match="Shapes: is a file where the dataset's folder has to be; move it away"):
+            list(download(server.archive(), tmp_path / "other"))
+        assert len(server.ranges) == 1
+    assert (tmp_path / "other/Shapes").read_text() == "mine"
 
 
 @pytest.mark.parametrize("announce", [len(GOOD) - 1, len(GOOD) + 1])

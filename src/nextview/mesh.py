@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import MeshError
+from nextview.glb import read_glb
+from nextview.mesh_format import BYTES_PER_FACE, MAX_FACES, VERTICES_PER_FACE, check_faces
 from nextview.obj import read_obj
 from nextview.off import read_off
+from nextview.ply import read_ply
+from nextview.stl import read_stl
 
 FORMATS = (".off", ".obj", ".ply", ".stl", ".glb")
 UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}
@@ -60,7 +64,8 @@ def make_mesh(
         unit: of the positions, one of UNITS; None if it is not known.
 
     Returns:
-        The mesh in the object frame, without the vertices that no face uses.
+        The mesh in the object frame, without the vertices that no face uses, and each triangle once: copies in the same
+        place show nothing new, and a great many of them take a minute a view.
 
     Raises:
         MeshError: no faces, not triangles, an index out of range, a position that is not finite, no extent, or no area.
@@ -74,6 +79,8 @@ def make_mesh(
     if faces.min() < 0 or faces.max() >= len(vertices):
         worst = int(faces.min() if faces.min() < 0 else faces.max())
         raise MeshError(f"{name}: a face refers to vertex {worst}, but there are only {len(vertices)} vertices")
+    places = np.sort(_first_of_equals(vertices)[faces], 1)
+    faces = faces[_first_of_equals(places) == np.arange(len(faces))]
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     if not used.all():
@@ -107,13 +114,25 @@ def _has_area(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> boo
     return False
 
 
-def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None) -> Mesh:
+def _first_of_equals(rows: NDArray) -> NDArray[np.int64]:
+    """For each of some rows, (N, 3), the index of the first that is equal to it, (N,)."""
+    order = np.lexsort(rows.T)  # stable: the first of equals comes first
+    first = np.ones(len(rows), bool)
+    first[1:] = (rows[order[1:]] != rows[order[:-1]]).any(1)
+    found = np.empty(len(rows), np.int64)
+    found[order] = order[first][np.cumsum(first) - 1]
+    return found
+
+
+def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None, max_faces: int = MAX_FACES) -> Mesh:
     """Read an OFF, OBJ, PLY, STL or GLB file; the parts of a scene are joined.
 
     Args:
         path: the file; its suffix tells the format.
         up: the file's up axis, "y" or "z". By default z, but y for GLB, whose standard says so.
         unit: the file's unit of length, one of UNITS; None if it is not known.
+        max_faces: refuse a mesh of more triangles, of more than VERTICES_PER_FACE vertices for each of these, or in a
+            file of more than BYTES_PER_FACE bytes for each.
 
     Returns:
         The mesh in the object frame.
@@ -127,68 +146,45 @@ def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None) 
         raise MeshError(f"{path}: the up axis is y or z, not {up!r}")
     if unit is not None and unit not in UNITS:
         raise MeshError(f"{path}: the unit is one of {', '.join(UNITS)}, not {unit!r}")
-    if path.is_dir():
-        raise MeshError(f"{path}: is a folder, not a mesh file")
-    if not path.exists():
-        raise MeshError(f"{path}: there is no such file")
-    if suffix not in FORMATS:
-        raise MeshError(f"{path}: not a mesh format nextview reads ({', '.join(FORMATS)})")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise MeshError(f"{path}: cannot be read ({error.strerror})") from None
+    data = _read(path, BYTES_PER_FACE * max_faces)
     if not data.strip():
         raise MeshError(f"{path}: the file is empty")
     try:
-        vertices, faces = _READERS[suffix](data) if suffix in _READERS else _read_with_trimesh(data, suffix)
-    except Exception as error:  # parsers raise whatever a broken file makes them raise
-        reason = str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
-        raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({reason})") from None
+        vertices, faces = read_glb(data, max_faces) if suffix == ".glb" else _READERS[suffix](data)
+        check_faces(len(faces), max_faces)
+        if len(vertices) > VERTICES_PER_FACE * max_faces:
+            most = f"{VERTICES_PER_FACE * max_faces:,}"
+            raise MeshError(f"it has {len(vertices):,} vertices, more than {most}; --max-faces (max_faces) allows more")
+    except MemoryError:
+        raise MeshError(f"{path}: too large for this machine's memory") from None
+    except (ValueError, OverflowError) as error:  # Python's own say which word is not a number
+        raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({str(error).rstrip('.')})") from None
     if (up or ("y" if suffix == ".glb" else "z")) == "y":
         vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)
     return make_mesh(vertices, faces, str(path), unit)
 
 
-def _read_with_trimesh(data: bytes, suffix: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    import io
-
-    import trimesh  # a third of a second to import, and OFF and OBJ do not need it
-
-    damage = _DAMAGE.get(suffix, lambda data: None)(data)
-    if damage:
-        raise MeshError(damage)
-    loaded = trimesh.load(io.BytesIO(data), file_type=suffix[1:], process=False)
-    if isinstance(loaded, trimesh.Scene):
-        loaded = loaded.to_mesh()
-    vertices = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
-    if not isinstance(loaded, trimesh.Trimesh):
-        return vertices, np.zeros((0, 3), np.int64)  # a point cloud: no faces
-    return vertices, np.asarray(loaded.faces, np.int64)
-
-
-def _damage_stl(data: bytes) -> str | None:
-    if b"\0" not in data:  # text: a binary file holds zeros, though it may begin with "solid" too
-        unended = re.search(rb"[\r\n]\s*facet\b", data.lower().rpartition(b"endsolid")[2])
-        return "the file is cut short, endsolid is missing" if unended else None
-    if len(data) < 84:
-        return "the file is cut short in its header"
-    facets, room = int.from_bytes(data[80:84], "little"), (len(data) - 84) // 50
-    return f"the file is cut short, {facets} faces announced, {room} found" if facets > room else None
+def _read(path: Path, most: int) -> bytes:
+    """A mesh file's bytes, of a regular file only: a pipe would wait for its writer, a device might never end."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        raise MeshError(f"{path}: there is no such file") from None
+    except OSError as error:
+        raise MeshError(f"{path}: cannot be read ({error.strerror})") from None
+    if stat.S_ISDIR(found.st_mode):
+        raise MeshError(f"{path}: is a folder, not a mesh file")
+    if path.suffix.lower() not in FORMATS:
+        raise MeshError(f"{path}: not a mesh format nextview reads ({', '.join(FORMATS)})")
+    if not stat.S_ISREG(found.st_mode):
+        raise MeshError(f"{path}: is a pipe or a device, not a mesh file")
+    if found.st_size > most:
+        size = f"{found.st_size:,} bytes, more than {most:,}"
+        raise MeshError(f"{path}: the file has {size}; --max-faces (max_faces) allows more")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise MeshError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def _damage_ply(data: bytes) -> str | None:
-    header, _, body = data.partition(b"end_header")
-    if b"format ascii" not in header:
-        return None  # trimesh checks the length of binary files
-    lines = [line for line in body.splitlines() if line.strip()]
-    announced = sum(int(count) for count in re.findall(rb"(?m)^element\s+\S+\s+(\d+)", header))
-    if len(lines) < announced:
-        return f"the file is cut short, {announced} lines announced, {len(lines)} found"
-    faces_last = re.search(rb"element\s+face\s+\d+\s+property\s+list.*\s*$", header)
-    last = lines[-1].split() if lines and faces_last else [b"0"]
-    return "the file is cut short in its last line" if int(last[0]) >= len(last) else None
-
-
-_READERS = {".off": read_off, ".obj": read_obj}
-_DAMAGE = {".stl": _damage_stl, ".ply": _damage_ply}
-"""What trimesh lets pass: for some formats, a function of the file's bytes that says what is wrong with them."""
+_READERS = {".off": read_off, ".obj": read_obj, ".ply": read_ply, ".stl": read_stl}

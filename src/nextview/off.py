@@ -7,11 +7,14 @@ those, comments, blank lines, CRLF, polygons and colour columns are all read.
 from __future__ import annotations
 
 import re
+from array import array
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import MeshError
+from nextview.mesh_format import fan, lines_of_words
 
 
 def read_off(data: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -62,27 +65,27 @@ def _read_plain(body: bytes, vertex_count: int, face_count: int) -> tuple[NDArra
 
 
 def _read_lines(body: bytes, vertex_count: int, face_count: int) -> tuple[NDArray, NDArray]:
-    lines = [line for line in body.splitlines() if line.strip()]
-    if len(lines) < vertex_count + face_count:
-        found = max(len(lines) - vertex_count, 0)
+    lines = lines_of_words(body)
+    positions, corners = array("d"), array("q")
+    found = [0, 0]
+    for columns in islice(lines, vertex_count):
+        if len(columns) < 3:
+            raise MeshError(f"vertex {found[0]} has {len(columns)} of 3 coordinates")
+        positions.extend(map(float, columns[:3]))
+        found[0] += 1
+    for columns in islice(lines, face_count):
+        sides = int(columns[0])
+        if sides < 0 or len(columns) < 1 + sides:
+            raise MeshError(f"face {found[1]} has {len(columns) - 1} of {sides} corners")
+        polygon = list(map(int, columns[1 : 1 + sides]))
+        if polygon and not 0 <= min(polygon) <= max(polygon) < vertex_count:
+            worst = min(polygon) if min(polygon) < 0 else max(polygon)
+            raise MeshError(f"face {found[1]} refers to vertex {worst}, but there are only {vertex_count} vertices")
+        corners.extend(fan(polygon))
+        found[1] += 1
+    if found != [vertex_count, face_count]:
         raise MeshError(
             f"the file is cut short, {vertex_count} vertices and {face_count} faces announced, "
-            f"{min(len(lines), vertex_count)} and {found} found"
+            f"{found[0]} and {found[1]} found"
         )
-    vertices = np.empty((vertex_count, 3))
-    for i, line in enumerate(lines[:vertex_count]):
-        columns = line.split()
-        if len(columns) < 3:
-            raise MeshError(f"vertex {i} has {len(columns)} of 3 coordinates")
-        vertices[i] = [float(c) for c in columns[:3]]
-    triangles: list[tuple[int, int, int]] = []
-    for i, line in enumerate(lines[vertex_count : vertex_count + face_count]):
-        columns = line.split()
-        corners = int(columns[0])
-        if corners < 0 or len(columns) < 1 + corners:
-            raise MeshError(f"face {i} has {len(columns) - 1} of {corners} corners")
-        polygon = [int(c) for c in columns[1 : 1 + corners]]
-        if max(polygon, default=0) >= vertex_count:
-            raise MeshError(f"face {i} refers to vertex {max(polygon)}, but there are only {vertex_count} vertices")
-        triangles += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, corners - 1)]
-    return vertices, np.array(triangles, np.int64).reshape(-1, 3)
+    return np.array(positions).reshape(-1, 3), np.array(corners).reshape(-1, 3)

@@ -6,9 +6,11 @@ import json
 
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
+from nextview.cli.ending import printable
+from nextview.cli.terminal import Terminal
 from nextview.session import Recognition
 from nextview.viewsphere import ViewSphere
 
@@ -43,13 +45,14 @@ def print_episode(result: Recognition, name: str, policy: str) -> None:
             "stop" if view.next_view is None else _angles(sphere, view.next_view),
             f"{view.travel:.2f}",
         )
-    console = Console()
+    console = Terminal()
     console.print(table)
     reason = "threshold reached" if result.confident else "no views left"
-    console.print(
-        f"It is a [bold]{result.answer}[/bold], belief {result.confidence:.3f}, after {len(result.views)} "
-        f"view{'s' * (len(result.views) > 1)} and {result.travel:.2f} cells of travel ({reason})."
+    rest = (
+        f", belief {result.confidence:.3f}, after {len(result.views)} view{'s' * (len(result.views) > 1)} "
+        f"and {result.travel:.2f} cells of travel ({reason})."
     )
+    console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), rest))
 
 
 def as_json(result: Recognition) -> str:

@@ -12,6 +12,7 @@ from nextview.errors import UsageError
 
 if TYPE_CHECKING:
     from rich.table import Table
+    from rich.text import Text
 
     from nextview.benchmark.evaluation import Evaluation
     from nextview.report.elements import Number
@@ -40,10 +41,9 @@ def evaluate(
         samples: of the bootstrap.
         seed: decides the bootstrap, the orders of views and the examples.
     """
-    from rich.console import Console
-
     from nextview.cli.extra import needs_extra
     from nextview.cli.progress import track
+    from nextview.cli.terminal import Terminal
     from nextview.data.predictions import Predictions
     from nextview.models.model_card import file_hash, find_card, write_card
     from nextview.outputs import check_folder, written_results
@@ -86,18 +86,17 @@ def evaluate(
         track(evaluation.save(part, found, table, settings, figures), len(figures) + 1, "writing figures")
     for path, facts in noted.items():
         write_card(path.with_suffix(".json"), facts)
-    console = Console()
+    console = Terminal()
     console.print(_recogniser(found, len(table.sphere)))
     for name in found.maps["map"].unique():
         console.print(_map(found, name))
     for name, why in found.left_out.items():
-        console.print(f"{name}: {why}", highlight=False, markup=False)
-    console.print(f"numbers, figures and {evaluation.PAGE} in {out}", highlight=False, markup=False)
+        console.print(f"{name}: {why}", highlight=False)
+    console.print(f"numbers, figures and {evaluation.PAGE} in {out}", highlight=False)
 
 
 def _recogniser(found: Evaluation, views: int) -> Table:
     """Accuracy of each class and of all."""
-    from rich.markup import escape
     from rich.table import Table
 
     from nextview.report.elements import numbers
@@ -113,7 +112,7 @@ def _recogniser(found: Evaluation, views: int) -> Table:
         lines += [("  size not known", "", "shape_accuracy")]
     for heading, label, measure in lines:
         cells = (_cell(right[n_views, label, measure], 3) for n_views in (1, views))
-        shown.add_row(escape(heading), str(objects[label, measure]), *cells, end_section=label == labels[-1])
+        shown.add_row(heading, str(objects[label, measure]), *cells, end_section=label == labels[-1])
     published = right[1, "", "accuracy"].published
     if isfinite(published):
         shown.add_row("  published", "", f"{published:.3f}")
@@ -143,9 +142,11 @@ def _map(found: Evaluation, name: str) -> Table:
     return shown
 
 
-def _cell(number: Number, digits: int) -> str:
+def _cell(number: Number, digits: int) -> Text:
     """A number and its interval."""
+    from rich.text import Text
+
     if not isfinite(number.value):
-        return "-"
+        return Text("-")
     interval = f" {number.low:.{digits}f}-{number.high:.{digits}f}" if number.high > number.low else ""
-    return f"{number.value:.{digits}f}[dim]{interval}[/]"
+    return Text.assemble(f"{number.value:.{digits}f}", (interval, "dim"))

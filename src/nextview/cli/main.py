@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -15,6 +14,7 @@ from nextview.cli.check import check
 from nextview.cli.correspond import correspond
 from nextview.cli.demo import demo
 from nextview.cli.download import download
+from nextview.cli.ending import orderly_end
 from nextview.cli.evaluate import evaluate
 from nextview.cli.export import export_lcm, export_lem, export_recogniser
 from nextview.cli.fit import fit_calibration, fit_policies, fit_size, fit_valleys
@@ -29,7 +29,6 @@ from nextview.cli.render import render
 from nextview.cli.report import report
 from nextview.cli.train import train_lcm, train_lem, train_recogniser
 from nextview.cli.train_gain import train_gain
-from nextview.errors import NextviewError
 
 COMMANDS: dict[str, Any] = {
     "recognise": recognise,
@@ -63,47 +62,40 @@ GROUPS = {
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command.
+    """Run a command; see ``orderly_end`` for how it may end."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    with orderly_end(_advice(arguments)):
+        _run(arguments)
 
-    A ``NextviewError``, and an OSError that names its file, end in one sentence on standard error and exit status 2.
-    Anything else is a bug: its traceback is shown, and the status is 1.
-    """
+
+def _run(arguments: list[str]) -> None:
     commands = COMMANDS
-    prog, arguments = "nextview", sys.argv[1:] if arguments is None else arguments
     if arguments == ["--version"]:
         print(f"nextview {__version__}")
         return
-    description = "Active 3D object recognition: what it is, and where to look next."
+    prog, description = "nextview", "Active 3D object recognition: what it is, and where to look next."
     if arguments and isinstance(commands.get(arguments[0]), dict):  # a group, such as nextview train
         prog, description = f"{prog} {arguments[0]}", GROUPS[arguments[0]]
         commands, arguments = commands[arguments[0]], arguments[1:]
         commands = {name: with_preset(command, arguments) for name, command in commands.items()}
     else:
         commands = {name: _group(name) if isinstance(c, dict) else c for name, c in commands.items()}
-    try:
-        try:
-            tyro.extras.subcommand_cli_from_dict(
-                commands,
-                prog=prog,
-                description=description,
-                args=arguments,
-                config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-            )
-        except NextviewError as error:
-            print(f"nextview: {error}", file=sys.stderr)
-            sys.exit(2)
-        except OSError as error:
-            if error.filename is None or isinstance(error, BrokenPipeError):
-                raise
-            print(f"nextview: {error.filename}: {error.strerror}", file=sys.stderr)
-            sys.exit(2)
-        finally:
-            sys.stdout.flush()  # here and not at the interpreter's end, also after --help, which exits by itself
-    except BrokenPipeError:  # whoever read this has gone, as head does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still to be flushed goes nowhere
-        sys.exit(1)
-    except KeyboardInterrupt:
-        sys.exit(130)
+    tyro.extras.subcommand_cli_from_dict(
+        commands,
+        prog=prog,
+        description=description,
+        args=arguments,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+
+
+def _advice(arguments: list[str]) -> str:
+    """How to go on with a command that was stopped; those that resume say so in their help."""
+    command: Any = COMMANDS
+    for name in arguments[:2]:
+        command = command.get(name) if isinstance(command, dict) else command
+    resumes = "Resumes" in (getattr(command, "__doc__", None) or "") and not isinstance(command, dict)
+    return "run the same command again" + ("; it resumes" if resumes else "")
 
 
 def _group(name: str) -> Callable[[], None]:

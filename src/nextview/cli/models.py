@@ -13,9 +13,9 @@ def models(name: tyro.conf.Positional[str | None] = None, /) -> None:
     """
     import json
 
-    from rich.console import Console
     from rich.table import Table
 
+    from nextview.cli.terminal import Terminal
     from nextview.models.model_card import bundled_cards, file_hash, find_card
 
     if name:
@@ -34,4 +34,4 @@ def models(name: tyro.conf.Positional[str | None] = None, /) -> None:
         intact = "intact" if file_hash(card.path) == card.sha256 else "DAMAGED"
         size = f"{card.path.stat().st_size / 1e6:.1f}"
         table.add_row(card.name, card.kind, size, "\n".join(tested), intact)
-    Console().print(table)
+    Terminal().print(table)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -17,7 +16,10 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
-console = Console(stderr=True)
+from nextview.cli.ending import printable
+from nextview.cli.terminal import Terminal
+
+console = Terminal(stderr=True)
 
 
 def track(done: Iterable[int], total: int, what: str, before: int = 0, views: int = 0) -> None:
@@ -31,11 +33,13 @@ def track(done: Iterable[int], total: int, what: str, before: int = 0, views: in
         views: if given, the speed is shown too, in objects of so many views.
     """
     # All of it fits into 80 columns, at thousands of objects and views a second too.
-    name = TextColumn("{task.description}", table_column=Column(no_wrap=True, max_width=20, overflow="ellipsis"))
+    name = TextColumn(
+        "{task.description}", markup=False, table_column=Column(no_wrap=True, max_width=20, overflow="ellipsis")
+    )
     columns = [name, BarColumn(8), MofNCompleteColumn(), TimeRemainingColumn(elapsed_when_finished=True)]
     columns += [Speed(views)] if views else []
     with Progress(*columns, console=console) as progress:
-        task = progress.add_task(what, total=total, completed=before)
+        task = progress.add_task(printable(what), total=total, completed=before)
         for n in done:
             progress.update(task, completed=n)
 

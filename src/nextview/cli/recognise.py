@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from nextview.mesh_format import MAX_FACES
+
 if TYPE_CHECKING:
     from nextview.mesh import Mesh
 
@@ -26,6 +28,7 @@ def recognise(
     start: int | None = None,
     up: Literal["y", "z"] | None = None,
     unit: Unit | None = None,
+    max_faces: int = MAX_FACES,
     seed: int = 0,
     figure: Path | None = None,
     json: bool = False,
@@ -45,6 +48,7 @@ def recognise(
         start: first view, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
         up: the file's up axis; z if not given, but y for GLB.
         unit: the file's unit of length, if it is known: how large an object is says something of its class.
+        max_faces: refuse a mesh of more triangles, or a file of more than 60 bytes for each of these.
         seed: decides the first view and whatever the policy draws.
         figure: write a picture of the episode to this file (PNG, PDF or SVG).
         json: print JSON instead of a table.
@@ -53,7 +57,7 @@ def recognise(
     from nextview.mesh import load_mesh
 
     options = {"policy": policy, "threshold": threshold, "risk": risk, "max_views": max_views}
-    show(lambda: load_mesh(mesh, up, unit), mesh.name, models, options, start, seed, figure, json, timing)
+    show(lambda: load_mesh(mesh, up, unit, max_faces), mesh.name, models, options, start, seed, figure, json, timing)
 
 
 def show(

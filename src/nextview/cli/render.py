@@ -8,6 +8,7 @@ from typing import Literal
 import tyro
 
 from nextview.cli.recognise import Unit
+from nextview.mesh_format import MAX_FACES
 
 
 def render(
@@ -21,6 +22,7 @@ def render(
     stretch: float = 0.0,
     turn: bool = False,
     unit: Unit | None = None,
+    max_faces: int = MAX_FACES,
     seed: int = 0,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -38,6 +40,7 @@ def render(
         turn: turn each mesh about the vertical by a random angle.
         unit: of length in the mesh files, so that the store knows how large the objects are (ModelNet: inch). Not
             known by default; a store that was made without can be told later.
+        max_faces: leave out a mesh of more triangles, or a file of more than 60 bytes for each of these.
         seed: decides the stretch and the turn of each mesh.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler to use instead, as tcp://HOST:8786.
@@ -56,7 +59,8 @@ def render(
         views = replace(views, azimuths=azimuths)
     total = sum(split in (None, entry.split) for entry in list_dataset(dataset))
     before = int(ViewStore.open(store).done.sum()) if store.exists() else 0
-    jobs = render_dataset(dataset, store, views, size, seed, Deform(stretch, turn), split, unit, workers, scheduler)
+    new = Deform(stretch, turn)
+    jobs = render_dataset(dataset, store, views, size, seed, new, split, unit, workers, scheduler, max_faces)
     track((before + n for n, _ in enumerate(jobs, 1)), total, f"rendering {store.name}", before, len(views))
 
     made = ViewStore.open(store)

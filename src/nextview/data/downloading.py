@@ -6,6 +6,7 @@ import hashlib
 import http.client
 import shutil
 import stat
+import time
 import urllib.request
 import zipfile
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ from nextview.outputs import written_whole
 
 CHUNK = 1 << 18
 PATIENCE = 5
-"""Connections in a row that may end without a byte before we give up."""
+"""Connections in a row that may bring nothing new before we give up."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,9 @@ ARCHIVES = {
 }
 
 
-def download(archive: Archive, destination: Path, timeout: float = 60) -> Iterator[tuple[str, int, int]]:
+def download(
+    archive: Archive, destination: Path, timeout: float = 60, pause: float = 1
+) -> Iterator[tuple[str, int, int]]:
     """Fetch an archive and unpack it as ``destination / archive.folder``; nothing to do if that is there.
 
     A download that was cut off goes on from the bytes that have arrived. The unpacked
@@ -65,6 +68,7 @@ def download(archive: Archive, destination: Path, timeout: float = 60) -> Iterat
         archive: what to fetch.
         destination: folder to put it into.
         timeout: of one connection without a sign of life, seconds.
+        pause: before a connection is tried again, seconds; twice as long after each one more that brought nothing new.
 
     Yields:
         (what is being done, bytes done, bytes in all).
@@ -76,10 +80,12 @@ def download(archive: Archive, destination: Path, timeout: float = 60) -> Iterat
     try:
         destination.mkdir(parents=True, exist_ok=True)
         with only_one(folder):
-            if folder.exists():
+            if folder.is_dir() and any(folder.iterdir()):
                 return
+            if folder.exists() and not folder.is_dir():
+                raise DatasetError(f"{folder}: is a file where the dataset's folder has to be; move it away")
             part = destination / f"{archive.folder}.zip.part"
-            for done in _fetch(archive, part, timeout):
+            for done in _fetch(archive, part, timeout, pause):
                 yield "downloading", done, archive.size
             for done in _verify(archive, part):
                 yield "verifying", done, archive.size
@@ -90,37 +96,57 @@ def download(archive: Archive, destination: Path, timeout: float = 60) -> Iterat
         raise DatasetError(f"{destination}: cannot be written ({error.strerror or error})") from None
 
 
-def _fetch(archive: Archive, part: Path, timeout: float) -> Iterator[int]:
+def _fetch(archive: Archive, part: Path, timeout: float, pause: float) -> Iterator[int]:
     """Bring ``part`` to the archive's size, over as many connections as it takes; yields its size."""
     failures, reason = 0, ""
-    while (start := part.stat().st_size if part.exists() else 0) < archive.size:
+    furthest = start = part.stat().st_size if part.exists() else 0
+    while start < archive.size:
         if failures == PATIENCE:
             raise DatasetError(f"{archive.url}: {reason}; {start} of {archive.size} bytes are kept, try again later")
+        if reason:
+            time.sleep(pause * 2**failures)
+        failures += 1
         try:
             request = urllib.request.Request(archive.url, headers={"Range": f"bytes={start}-"} if start else {})
             with urllib.request.urlopen(request, timeout=timeout) as answer:
-                if answer.status != 206:
-                    start = 0  # a server that knows no ranges sends everything again
-                length = answer.headers.get("Content-Length")
-                if length is not None and start + int(length) != archive.size:
-                    raise DatasetError(
-                        f"{archive.url}: the server announces {start + int(length)} bytes, "
-                        f"but the published file has {archive.size}"
-                    )
+                start = _announced(archive, answer, start)
                 with part.open("ab" if start else "wb") as file:
                     while data := _read(answer, archive.size - start):
                         file.write(data)
                         start += len(data)
-                        failures = 0
+                        if start > furthest:  # a server that knows no ranges brings the same again, perhaps for ever
+                            furthest, failures = start, 0
                         yield start
             reason = "the connection ends before the file does"
         except HTTPError as error:
             if error.code < 500:
                 raise DatasetError(f"{archive.url}: the server answers {error.code} {error.reason}") from None
             reason = f"the server answers {error.code} {error.reason}"
-        except (http.client.HTTPException, ConnectionError, TimeoutError, URLError) as error:
+        except (http.client.HTTPException, ConnectionError, TimeoutError, URLError, UnicodeError) as error:
             reason = f"the connection fails ({getattr(error, 'reason', error) or type(error).__name__})"
-        failures += 1
+
+
+def _announced(archive: Archive, answer: http.client.HTTPResponse, start: int) -> int:
+    """From which byte on an answer brings the file, 0 if the server knows no ranges.
+
+    Raises:
+        DatasetError: it brings another file, or says of it what makes no sense.
+    """
+    length, given = answer.headers.get("Content-Length"), answer.headers.get("Content-Range", f"bytes {start}-")
+    if answer.status != 206:
+        start = 0
+    elif not given.startswith(f"bytes {start}-"):
+        raise DatasetError(f"{archive.url}: asked for the bytes from {start} on, the server sends {given[:60]!r}")
+    if length is None:
+        return start
+    if not (length.isascii() and length.isdigit()):
+        raise DatasetError(f"{archive.url}: the server announces {length[:60]!r} bytes, which is no number")
+    if start + int(length) != archive.size:
+        raise DatasetError(
+            f"{archive.url}: the server announces {start + int(length)} bytes, "
+            f"but the published file has {archive.size}"
+        )
+    return start
 
 
 def _read(answer: http.client.HTTPResponse, missing: int) -> bytes:

@@ -25,7 +25,7 @@ def list_dataset(root: str | Path) -> list[Entry]:
     """All meshes of a dataset folder, sorted by class, split and name.
 
     Raises:
-        DatasetError: the folder is missing or holds no class folders with meshes.
+        DatasetError: the folder is missing or holds no class folders with meshes, or one whose name cannot be printed.
     """
     root = Path(root)
     if not root.is_dir():
@@ -41,6 +41,9 @@ def list_dataset(root: str | Path) -> list[Entry]:
             entries.append(Entry(path, path.stem, parts[0], ""))
     if not entries:
         raise DatasetError(f"{root}: no meshes in CLASS/MESH or CLASS/train|test/MESH below it")
+    for entry in entries:
+        if not (entry.label + entry.name).isprintable():
+            raise DatasetError(f"{entry.path}: its name holds what cannot be printed; rename it")
     names = [entry.name for entry in entries]
     if len(set(names)) < len(names):  # plain collections number their meshes within each class
         entries = [Entry(e.path, f"{e.label}_{e.name}", e.label, e.split) for e in entries]

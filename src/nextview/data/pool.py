@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import multiprocessing
+import multiprocessing.util
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from types import FrameType
 from typing import TypeVar
 
 from nextview.errors import DatasetError
@@ -72,18 +76,48 @@ def each(
 
 
 def _in_pool(function: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[tuple[Item, Result]]:
-    pool = ProcessPoolExecutor(min(workers, len(items)), multiprocessing.get_context("spawn"), _end_with_parent)
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(min(workers, len(items)), multiprocessing.get_context("spawn"), _begin_worker)
     try:
-        jobs = {pool.submit(function, item): item for item in items}
+        with _signals_wait():
+            jobs = {pool.submit(function, item): item for item in items}
         for job in as_completed(jobs):
             yield jobs[job], job.result()
+    except KeyboardInterrupt:  # what is being worked on counts as not done: wait for none of it
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.terminate()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _end_with_parent() -> None:
-    """A worker whose parent was killed would wait for work forever."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
+@contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Keep SIGINT and SIGTERM for the end of this block, and Ctrl-C for ever from the processes that start in it.
+
+    A process that is left half started complains, and a terminal sends Ctrl-C to all: the parent decides what it means.
+    """
+    if threading.current_thread() is not threading.main_thread():  # signals are none of its business
+        yield
+        return
+    came: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    resource_tracker.ensure_running()  # its start would end the mask of signals
+    before = {number: signal.signal(number, lambda number, frame: came.append(number)) for number in numbers}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # what is started inherits this, and no handlers
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+    for first in came[:1]:
+        signal.raise_signal(first)
+
+
+def _begin_worker() -> None:
+    """End when told to, and with the parent: a worker whose parent was killed would wait for work for ever."""
+    signal.signal(signal.SIGTERM, _stop)
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -92,6 +126,12 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    """End at once, but free what only this process knows of, such as the locks of codecs: Python complains of these."""
+    multiprocessing.util._exit_function()  # type: ignore[attr-defined]
+    os._exit(128 + number)
 
 
 def _on_cluster(

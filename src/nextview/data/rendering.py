@@ -24,6 +24,7 @@ from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, RENDERED, 
 from nextview.errors import DatasetError, MeshError
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.mesh import Mesh, load_mesh, make_mesh
+from nextview.mesh_format import MAX_FACES
 from nextview.viewsphere import ViewSphere
 
 
@@ -83,6 +84,7 @@ def render(
     unit: str | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
+    max_faces: int = MAX_FACES,
 ) -> Iterator[tuple[str, str | None]]:
     """Render every mesh that the store does not hold yet; one that failed before is tried again.
 
@@ -100,6 +102,7 @@ def render(
             one can be told later.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
+        max_faces: leave out larger meshes, see ``load_mesh``.
 
     Yields:
         (name, None) for each object done, (name, reason) for one that cannot be rendered.
@@ -121,7 +124,7 @@ def render(
         todo = [int(i) for i in np.flatnonzero(~store.done)]
         # Largest files first, so that no worker is left with a long one at the end.
         todo.sort(key=lambda i: -entries[i].path.stat().st_size)
-        task = partial(_render_entry, store.path, uuid4().hex, sphere, size, seed, deform)
+        task = partial(_render_entry, store.path, uuid4().hex, sphere, size, seed, deform, max_faces)
         for (i, entry), reason in each(task, [(i, entries[i]) for i in todo], workers, scheduler):
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is done.
@@ -200,13 +203,20 @@ def _arrays(path: Path, run: str) -> dict[str, zarr.Array]:
 
 
 def _render_entry(
-    path: Path, run: str, sphere: ViewSphere, size: int, seed: int, deform: Deform, item: tuple[int, Entry]
+    path: Path,
+    run: str,
+    sphere: ViewSphere,
+    size: int,
+    seed: int,
+    deform: Deform,
+    max_faces: int,
+    item: tuple[int, Entry],
 ) -> str | None:
     """Render one object into the store; the reason if its mesh cannot be used."""
     i, entry = item
     arrays = _arrays(path, run)
     try:
-        mesh = load_mesh(entry.path)
+        mesh = load_mesh(entry.path, max_faces=max_faces)
         if deform != Deform():
             mesh = deform(mesh, seed, entry.name)
         rendered = render_object(mesh, sphere, size)

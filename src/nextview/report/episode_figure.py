@@ -12,6 +12,7 @@ from matplotlib.patches import Rectangle
 from mpl_toolkits.mplot3d import Axes3D
 
 from nextview.errors import UsageError
+from nextview.report.style import PlainFigure
 from nextview.session import Recognition, View
 from nextview.viewsphere import ViewSphere
 
@@ -35,7 +36,7 @@ def draw_episode(result: Recognition, title: str = "") -> Figure:
     views, sphere = result.views, result.sphere
     valued = any(view.values is not None for view in views)
     heights = [2.7, 2.6, 2.9] if valued else [2.7, 2.9]
-    figure = Figure(figsize=(2.5 * len(views) + 5.2, sum(heights)), layout="constrained")
+    figure = PlainFigure(figsize=(2.5 * len(views) + 5.2, sum(heights)), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.5 * len(views), 5.2])[0]
     axes = left.subplots(len(heights), len(views), squeeze=False, gridspec_kw={"height_ratios": heights})
     shown = np.argsort(-np.max([view.belief for view in views], axis=0))[:5]

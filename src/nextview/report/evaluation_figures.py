@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from nextview.benchmark.evaluation import TRUTHS, Evaluation, judged_objects
 from nextview.data.predictions import Predictions
 from nextview.report.diagrams import confusion_matrix, draw_reliability, reliability_figure
-from nextview.report.style import INK, STYLE, legend, new_figure
+from nextview.report.style import INK, STYLE, PlainFigure, legend, new_figure
 
 ONE, ALL, PUBLISHED, FAINT_INK = "#38a0d9", "#0b5fa5", "#d1495b", "#8a949e"
 BLUES = ("#7cc4ec", "#38a0d9", "#0b5fa5", "#1f2933")
@@ -173,7 +173,7 @@ def example_maps(p: Predictions, name: str, rng: np.random.Generator) -> Figure:
     tall = min(1.25, max(0.45, 0.2 * p.sphere.rings))  # of a map, inches, as all lengths here
     width, height = LEFT + EXAMPLES * PITCH, HEAD + len(classes) * (tall + BETWEEN)
     with matplotlib.rc_context(STYLE):
-        figure = Figure((width, height))
+        figure = PlainFigure((width, height))
         axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(0, height))
         axes.axis("off")
         for row, index in enumerate(classes):
@@ -187,7 +187,7 @@ def example_maps(p: Predictions, name: str, rng: np.random.Generator) -> Figure:
                     _draw_map(axes, values, (x, below, tall), true[at], predicted[at])
                 thing = p.names[kept[at]].removeprefix(p.classes[index]).strip("_") or p.names[kept[at]]
                 text: dict[str, Any] = {"y": below + tall + 0.05, "fontsize": 7.5}
-                axes.text(left, s=f"{thing[-12:]} view {view[at]}".replace("$", r"\$"), **text)
+                axes.text(left, s=f"{thing[-12:]} view {view[at]}", **text)
                 axes.text(left + 2 * WIDE + 0.07, s=f"{error[at]:.3f}", ha="right", color=ALL, **text)
         _explain(axes)
     return figure

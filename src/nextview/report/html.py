@@ -278,7 +278,7 @@ def _viewer(results: Results, best: str, at: float, failures: list, pictures: Pi
     scenes = trajectories(results, [best, *(n for n in curves.compared(results) if n != best)], wanted, at, pictures)
     if not scenes["scenes"]:
         return ""
-    data = json.dumps(scenes, separators=(",", ":")).replace("</", "<\\/")
+    data = json.dumps(scenes, separators=(",", ":")).replace("<", "\\u003c")  # no name opens a comment or a tag
     return (
         "<p>The dots are the views, the lighter the higher their depth-entropy; the red ring is the first view. Drag "
         "to turn, and use the buttons or the arrow keys to step.</p>"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from nextview.data.store import RENDERED, ViewStore
 from nextview.outputs import written_whole
+from nextview.report.style import PlainFigure
 from nextview.viewsphere import ViewSphere
 
 BLUE, ORANGE, GREY = "#2f6db3", "#e08a2e", "#8a8a8a"
@@ -37,7 +38,7 @@ def object_figure(store: ViewStore, i: int) -> Figure:
     rows, columns = (2, 1) if wide > 3 else (1, 2)
     views_height = rows * (14 / columns / wide + 0.6)
     maps_height = 2.2 if sphere.rings > 1 else 1.3
-    figure = Figure(figsize=(14, views_height + maps_height), layout="constrained")
+    figure = PlainFigure(figsize=(14, views_height + maps_height), layout="constrained")
     label = store.classes[store.labels[i]]
     figure.suptitle(
         f"{store.names[i]}  ·  {label}{f', {store.splits[i]} split' if store.splits[i] else ''}", fontsize=14
@@ -79,7 +80,7 @@ def object_figure(store: ViewStore, i: int) -> Figure:
 def store_figure(store: ViewStore) -> Figure:
     """Objects of each class and split, what could not be rendered, what the store weighs, the mean entropy map."""
     sphere, done = store.sphere, store.done
-    figure = Figure(figsize=(14, max(5.5, 0.24 * len(store.classes) + 1.5)), layout="constrained")
+    figure = PlainFigure(figsize=(14, max(5.5, 0.24 * len(store.classes) + 1.5)), layout="constrained")
     figure.suptitle(store.path.name, fontsize=14)
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=[1.5, 1], wspace=0.04))
     _class_bars(left.subplots(), store)
@@ -111,7 +112,7 @@ def correspondence_figure(maps: NDArray[np.floating], sphere: ViewSphere, title:
         title: what the maps are.
     """
     rings, azimuths = sphere.rings, sphere.azimuths
-    figure = Figure(figsize=(1.65 * azimuths + 1.2, 1.15 * rings + 1.3), layout="constrained")
+    figure = PlainFigure(figsize=(1.65 * azimuths + 1.2, 1.15 * rings + 1.3), layout="constrained")
     figure.suptitle(title, fontsize=13)
     panels = figure.subplots(rings, azimuths, squeeze=False)
     for view in range(len(sphere)):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 INK, FAINT = "#1f2933", "#d5dbe1"
 STYLE = {
@@ -32,10 +35,20 @@ STYLE = {
 }
 
 
+class PlainFigure(Figure):
+    """A figure that shows names as they are: a dollar begins no formula."""
+
+    def draw(self, renderer: Any) -> None:
+        """Draw, after all texts are known."""
+        for text in self.findobj(Text):
+            text.set_parse_math(False)
+        super().draw(renderer)
+
+
 def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
     """An empty figure with one pair of axes, inches."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure((width, height))
+        figure = PlainFigure((width, height))
         return figure, figure.add_subplot()
 
 
@@ -50,7 +63,7 @@ def to_svg(figure: Figure) -> str:
     text = StringIO()
     with matplotlib.rc_context(STYLE):
         figure.savefig(text, format="svg", bbox_inches="tight", pad_inches=0.05, metadata={"Date": None})
-    return text.getvalue()
+    return re.sub(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", "\ufffd", text.getvalue())  # XML has none of these
 
 
 def to_png(figure: Figure, path: Path) -> None:

@@ -9,7 +9,7 @@ import matplotlib
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from nextview.report.style import INK, STYLE
+from nextview.report.style import INK, STYLE, PlainFigure
 
 TRAINING, VALIDATION = "#38a0d9", "#d1495b"
 SELECTED = {"class_accuracy": max, "validation_mse": min}
@@ -34,7 +34,7 @@ def training_curves(log: dict[str, list[float]]) -> Figure:
     panels = [name for name in log if name not in ("epoch", "step", "seconds") and not _is_twin(name, log)]
     selected = next((name for name in SELECTED if name in log), None)
     with matplotlib.rc_context(STYLE):
-        figure = Figure((4.6, 0.4 + 1.5 * len(panels)), layout="constrained")
+        figure = PlainFigure((4.6, 0.4 + 1.5 * len(panels)), layout="constrained")
         for axes, name in zip(figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0], panels, strict=True):
             duplicate = f"validation_{name}"
             lines = {name: TRAINING} if duplicate in log else {name: INK if name == "rate" else VALIDATION}

@@ -1,0 +1,148 @@
+"""How commands end: at signals, and where standard output is full or closed; and help in any width."""
+
+import logging
+import os
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from nextview.cli.main import main
+from nextview.data.store import ViewStore
+
+COMMAND = [sys.executable, "-m", "nextview.cli.main"]
+
+
+@pytest.fixture
+def meshes(tmp_path):
+    (tmp_path / "meshes/ball").mkdir(parents=True)
+    ball = trimesh.creation.icosphere(4).export(file_type="off")
+    for i in range(16):
+        (tmp_path / f"meshes/ball/ball_{i}.off").write_text(ball)
+    return tmp_path / "meshes"
+
+
+def signalled(command: list[str], number: signal.Signals, ready) -> tuple[int, str]:
+    """Send a signal to a command, to all its processes as a terminal does with Ctrl-C, once it is ready."""
+    running = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    while not ready() and running.poll() is None:
+        time.sleep(0.01)
+    (os.killpg if number == signal.SIGINT else os.kill)(running.pid, number)
+    _, said = running.communicate(timeout=60)
+    assert "Traceback" not in said, said
+    return running.returncode, re.split("[\r\n]", said.strip())[-1]
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_rendering_in_one_line_and_it_resumes(tmp_path, meshes, number, status):
+    store = tmp_path / "v.zarr"
+    command = [*COMMAND, "render", str(meshes), str(store), "--size", "32", "--workers", "2"]
+
+    def rendered() -> int:
+        return len(list(store.glob("image/c/*")))
+
+    # While the workers start, and while they work.
+    for ready in (store.exists, lambda: rendered() > 2):
+        assert rendered() == 0
+        assert signalled(command, number, ready) == (
+            status,
+            "nextview: stopped; run the same command again; it resumes",
+        )
+    main(command[3:])
+    assert ViewStore.open(store).done.all()
+
+
+def test_ctrl_c_while_everything_is_imported_is_quiet(tmp_path):
+    began = tmp_path / "began"
+    code = (
+        "import sys, pathlib; sys.argv = ['nextview', 'models']; import nextview_command;"
+        f"pathlib.Path({str(began)!r}).touch(); nextview_command.main()"
+    )
+    for wait in (0, 0.05, 0.15):
+
+        def ready(wait: float = wait) -> bool:
+            return began.exists() and time.time() > began.stat().st_mtime + wait
+
+        assert signalled([sys.executable, "-c", code], signal.SIGINT, ready) == (
+            130,
+            "nextview: stopped; run the same command again",
+        )
+        began.unlink()
+
+
+def test_a_command_that_does_not_resume_says_nothing_of_it(monkeypatch, capsys):
+    def interrupted(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # gets back what it is now
+    monkeypatch.setattr(logging.getLogger("asyncio"), "disabled", False)
+    monkeypatch.setattr("nextview.models.model_card.bundled_cards", interrupted)
+    with pytest.raises(SystemExit, match="130"):
+        main(["models"])
+    assert capsys.readouterr().err == "nextview: stopped; run the same command again\n"
+
+
+def test_an_ignored_signal_stays_ignored():
+    code = (
+        "import signal, sys, os; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        "import nextview.models.model_card as card; cards = card.bundled_cards\n"
+        "card.bundled_cards = lambda: os.kill(os.getpid(), signal.SIGTERM) or cards()\n"
+        "from nextview.cli.main import main; main(['models'])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+@pytest.mark.parametrize("arguments", [["models"], ["models", "--help"]], ids=" ".join)
+@pytest.mark.parametrize(("where", "reason"), [(">/dev/full", "No space left on device"), (">&-", "it is closed")])
+def test_output_that_cannot_be_written_gets_one_sentence(arguments, where, reason):
+    line = ["bash", "-c", f'"$@" {where}', "bash", *COMMAND, *arguments]
+    done = subprocess.run(line, text=True, stderr=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (1, f"nextview: standard output or a file cannot be written ({reason})\n")
+
+
+def test_nothing_is_written_into_a_file_that_got_the_place_of_closed_output(tmp_path):
+    """The first file opened after ``>&-`` gets the number of standard output."""
+    trimesh.creation.box([1, 2, 3]).export(tmp_path / "box.off")
+    options = ["--max-views", "1", "--figure", str(tmp_path / "e.svg")]
+    line = ["bash", "-c", '"$@" >&- 2>&-', "bash", *COMMAND, "recognise", str(tmp_path / "box.off"), *options]
+    assert subprocess.run(line).returncode == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["box.off"]
+
+
+def test_without_standard_error_a_refusal_keeps_its_status():
+    for where in ("2>&-", "2>/dev/full"):
+        line = ["bash", "-c", f'"$@" {where}', "bash", *COMMAND, "recognise", "none.off"]
+        done = subprocess.run(line, stdout=subprocess.PIPE)
+        assert (done.returncode, done.stdout) == (2, b"")
+
+
+@pytest.mark.parametrize("columns", ["1", "5", "1000000000", "0", "-3", "wide"])
+def test_help_and_tables_in_any_width(columns):
+    for arguments in (["recognise", "--help"], ["models"]):
+        done = subprocess.run(
+            [*COMMAND, *arguments],
+            env=os.environ | {"COLUMNS": columns},
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30)),
+            timeout=60,
+            capture_output=True,
+        )
+        assert (done.returncode, done.stderr) == (0, b"")
+        assert 100 < len(done.stdout) < 100_000
+
+
+def test_the_terminal_is_left_as_it_was(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "3")
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+    main(["models"])
+    assert (os.environ["COLUMNS"], shutil.get_terminal_size().columns) == ("3", 3)
+    assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
