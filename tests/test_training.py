@@ -36,7 +36,7 @@ from nextview.training.checkpoints import load_exported, load_run  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.lite import LiteNet  # noqa: E402
-from nextview.training.map_training import MapModule, Windows  # noqa: E402
+from nextview.training.maps.map_module import MapModule, Windows  # noqa: E402
 from nextview.training.onnx_export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
 
@@ -168,8 +168,10 @@ def test_a_shape_that_was_copied_judges_training_once(trained, tmp_path, monkeyp
     def judged_on(objects: np.ndarray) -> None:
         raise Judged([store.names[i] for i in objects])
 
-    monkeypatch.setattr("nextview.training.recogniser.train", lambda *given: judged_on(given[3]))
-    monkeypatch.setattr("nextview.training.maps.train", lambda *given: judged_on(given[4]))
+    monkeypatch.setattr(
+        "nextview.training.recogniser.recogniser_training.fit_recogniser", lambda *given: judged_on(given[3])
+    )
+    monkeypatch.setattr("nextview.training.maps.map_training.fit_map", lambda *given: judged_on(given[4]))
     for what in ("recogniser", "lem"):
         command = ["train", what, str(trained / "views.zarr"), str(tmp_path / what)]
         with pytest.raises(Judged) as judged:

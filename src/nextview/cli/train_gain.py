@@ -47,8 +47,8 @@ def train_gain(
     from nextview.models.model_card import file_hash
     from nextview.policies.gain import MAPS, Gain
     from nextview.training.folds import hold_out
+    from nextview.training.gain.gain_networks import averaged, best_epoch, train, walk
     from nextview.training.gain_export import write_gain
-    from nextview.training.gain_training import averaged, best_epoch, train, walk
 
     if out.suffix != ".json":
         raise UsageError(f"{out}: the card of a policy is called NAME.json")
