@@ -309,7 +309,7 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
     assert unseen[0] & unseen[1] == {views.names[i] for i in validation}
     out = trained / "unseen.npz"
     cards = [str(models / f"fold{k}.json") for k in range(2)]
-    main(["predict", str(store), str(out), "--unseen", "--maps", "--recogniser", *cards, "--workers", "1"])
+    main(["predict", str(store), str(out), "--held-out", "--maps", "--recogniser", *cards, "--workers", "1"])
     predictions = Predictions.load(out)
     assert set(predictions.names) == unseen[0] | unseen[1]
     for k, card in enumerate(cards):  # each network judged what it has not seen, and nothing else
@@ -332,14 +332,14 @@ def test_valley_classes_are_fitted_to_objects_that_neither_network_has_seen(trai
     store, models, out = str(trained / "views.zarr"), trained / "models", trained / "validation.npz"
     card = models / "tiny-lem.json"
     cards = ["--maps", f"lem={card}", "--recogniser", str(models / "tiny.json"), "--workers", "1"]
-    main(["predict", store, str(out), "--unseen", *cards])
+    main(["predict", store, str(out), "--held-out", *cards])
     main(["fit", "valleys", str(out), str(card)])
     facts, p = json.loads(card.read_text()), Predictions.load(out).deduplicate()
     gains = valley_gains(p.sphere, p.logits, p.maps["lem"], p.labels)
     assert facts["valley_classes"] == [p.classes[c] for c, gain in gains.items() if gain > 0]
     assert facts["valley_gain"] == {p.classes[c]: round(gain, 4) for c, gain in gains.items()}
     assert f"{len(p)} objects" in facts["valley_fitted_to"]
-    main(["predict", store, str(out), "--unseen", *cards])  # takes up what the card says now
+    main(["predict", store, str(out), "--held-out", *cards])  # takes up what the card says now
     assert Predictions.load(out).valley_classes == {"lem": tuple(facts["valley_classes"])}
     for wrong, sentence in ((models / "tiny.json", "holds no maps by"), (models / "none.json", "no such model card")):
         with pytest.raises(SystemExit) as end:
