@@ -62,7 +62,7 @@ def bins_told(p: Predictions, store: ViewStore) -> tuple[float, float]:
         p: of a recogniser that tells azimuth bins.
         store: that they are of. The planes from which bins are counted come from its training split.
     """
-    from nextview.training.azimuth_bins import azimuth_bins, mirror_planes
+    from nextview.training.recogniser.azimuth_bins import azimuth_bins, mirror_planes
 
     if p.azimuth_bins is None:
         raise PredictionsError("these predictions tell no azimuth bins: their recogniser was not taught them")

@@ -31,7 +31,7 @@ from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.gain import INPUTS, MAPS, Gain, features, mirrored, mirrored_features
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import make_policy
-from nextview.training.perceptrons import Perceptrons
+from nextview.training.gain.perceptrons import Perceptrons
 from nextview.training.recipes import GainRecipe
 
 CLASSES = 4
@@ -400,7 +400,7 @@ print(*make_policy("gain", sphere).next_views(state, np.random.default_rng(0)))
 
 torch = pytest.importorskip("torch")
 
-from nextview.training.gain_training import Networks, averaged, best_epoch, train  # noqa: E402
+from nextview.training.gain.gain_networks import Networks, averaged, best_epoch, train  # noqa: E402
 
 
 def test_what_ships_says_what_torch_says(tmp_path):
@@ -468,7 +468,7 @@ def test_folds_judge_policies_that_have_not_seen_them_and_are_averaged(monkeypat
         asked.append((table, policy))
         return judge(table, policy, *rest, **options)
 
-    monkeypatch.setattr("nextview.training.gain_training.judge", listen)
+    monkeypatch.setattr("nextview.training.gain.gain_networks.judge", listen)
     trainings = [train(parts[0], recipe, k) for k in range(2)]
     *_, (policies, value) = best_epoch(trainings, parts[1:], recipe)
     assert [table is parts[1 + k % 2] for k, (table, _) in enumerate(asked)] == [True] * 4
@@ -538,7 +538,7 @@ def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsy
         ([str(unseen), str(tmp_path / "mine")], "NAME.json"),
         ([str(tmp_path / "none.npz"), str(card)], "no such file"),
         ([str(unseen), str(card), "--inputs", "belief", "lcm"], "holds no map 'lcm'"),
-        ([str(tmp_path / "sideless.npz"), str(card)], "says nothing of azimuth bins"),
+        ([str(tmp_path / "sideless.npz"), str(card)], "holds no azimuth bins"),
     ]:
         with pytest.raises(SystemExit) as end:
             main(["train", "gain", *arguments])

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nextview.cli.main import main
 from nextview.models.inference import Recogniser
 from nextview.models.model_card import write_card
 
@@ -151,18 +150,3 @@ def test_it_goes_on_from_its_export_also_beside_another(tmp_path, bits):
     write_card(tmp_path / "two.json", facts | {"network": "EfficientNet-Lite0 + EfficientNet-Lite2"})
     with pytest.raises(ModelError, match=r"two\.json: there is no EfficientNet-Lite2"):
         exported_networks(tmp_path / "two.json", 4, x)
-
-
-@pytest.mark.parametrize(
-    ("options", "log_evidence"),
-    [
-        (["--network", "lite0", "--depth", "34"], "only a ResNet has a --depth"),
-        (["--dropout", "0.2"], "only EfficientNet-Lite0 drops features"),
-        (["--network", "lite0", "--dropout", "1"], "--dropout is a chance, 0 or more and less than 1, not 1.0"),
-    ],
-)
-def test_options_of_another_network_are_refused(tmp_path, capsys, options, output):
-    command = ["train", "recogniser", str(tmp_path / "no.zarr"), str(tmp_path / "run")]
-    with pytest.raises(SystemExit):
-        main([*command, *options])
-    assert output in " ".join(capsys.readouterr().err.split())

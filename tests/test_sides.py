@@ -16,12 +16,12 @@ from nextview.errors import ModelError  # noqa: E402
 from nextview.mesh import make_mesh  # noqa: E402
 from nextview.models.inference import RECOGNISER, MapNetwork, Recogniser  # noqa: E402
 from nextview.models.model_card import find_card  # noqa: E402
-from nextview.training import map_training as maps  # noqa: E402
 from nextview.training.architectures import ResNet, ViewMap  # noqa: E402
-from nextview.training.azimuth_bins import azimuth_bins, mirror_planes, side_loss  # noqa: E402
 from nextview.training.checkpoints import exported_networks, load_exported, refuse_seen  # noqa: E402
 from nextview.training.hardware import Hardware  # noqa: E402
+from nextview.training.maps import map_module as maps  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
+from nextview.training.recogniser.azimuth_bins import azimuth_bins, mirror_planes, side_loss  # noqa: E402
 from nextview.viewsphere import ViewSphere  # noqa: E402
 
 SPHERE = ViewSphere((0.0, 30.0), 8, 3.0)
@@ -142,7 +142,7 @@ def test_a_map_network_starts_from_what_the_recogniser_knows(boxes, tmp_path):
     recipe = MapRecipe(epochs=1, views=4, batch=4, lr=1e-9)
     objects = np.arange(4)
     hardware = Hardware(precision="32-true")
-    network = maps.train(seen, values, sphere, objects[:3], objects[3:], recipe, tmp_path, hardware, bundled())
+    network = maps.fit_map(seen, values, sphere, objects[:3], objects[3:], recipe, tmp_path, hardware, bundled())
     begun = ResNet(18, 10, 4)
     load_exported(begun, bundled(), torch.from_numpy(boxes[:, :, ::2, ::2].copy()).float() / 255)
     for name in ("conv1", "layer2.0.conv1", "layer4.1.conv2"):
@@ -151,7 +151,7 @@ def test_a_map_network_starts_from_what_the_recogniser_knows(boxes, tmp_path):
     assert network.resnet.fc.weight.shape == (40, 512)
     cloud = replace(recipe, input="cloud")
     with pytest.raises(ModelError, match="a PointNet cannot start from a ResNet"):
-        maps.train(seen, values, sphere, objects[:3], objects[3:], cloud, tmp_path / "cloud", hardware, bundled())
+        maps.fit_map(seen, values, sphere, objects[:3], objects[3:], cloud, tmp_path / "cloud", hardware, bundled())
 
 
 def test_a_map_network_goes_on_from_an_exported_one(boxes, tmp_path):
@@ -167,7 +167,7 @@ def test_a_map_network_goes_on_from_an_exported_one(boxes, tmp_path):
     seen = np.random.default_rng(0).choice(boxes[:, :, ::2, ::2], (4, 40))
     recipe = MapRecipe(epochs=1, views=4, batch=4, lr=1e-9, around="sphere")
     hardware = Hardware(precision="32-true")
-    network = maps.train(seen, values, sphere, np.arange(3), np.array([3]), recipe, tmp_path, hardware, lem)
+    network = maps.fit_map(seen, values, sphere, np.arange(3), np.array([3]), recipe, tmp_path, hardware, lem)
     assert torch.allclose(network.resnet.fc.weight, begun.resnet.fc.weight, atol=1e-6)
 
 

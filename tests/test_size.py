@@ -93,7 +93,7 @@ def test_the_weight_is_the_most_likely_one():
 def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     views, card, honest = str(shop / "views.zarr"), str(shop / "tiny.json"), str(tmp_path / "held-out.npz")
     assert np.isnan(ViewStore.open(views).radii).all()
-    main(["predict", views, honest, "--unseen", "--recogniser", card, "--maps"])
+    main(["predict", views, honest, "--held-out", "--recogniser", card, "--maps"])
     with pytest.raises(SystemExit):
         main(["fit", "size", views, honest, card])
     assert "--unit" in capsys.readouterr().err

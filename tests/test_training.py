@@ -36,7 +36,7 @@ from nextview.training.checkpoints import load_exported, load_run  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.lite import LiteNet  # noqa: E402
-from nextview.training.map_training import MapModule, Windows  # noqa: E402
+from nextview.training.maps.map_module import MapModule, Windows  # noqa: E402
 from nextview.training.onnx_export import export_onnx, fit_temperature  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
 
@@ -168,8 +168,10 @@ def test_a_shape_that_was_copied_judges_training_once(trained, tmp_path, monkeyp
     def judged_on(objects: np.ndarray) -> None:
         raise Judged([store.names[i] for i in objects])
 
-    monkeypatch.setattr("nextview.training.recogniser.train", lambda *given: judged_on(given[3]))
-    monkeypatch.setattr("nextview.training.maps.train", lambda *given: judged_on(given[4]))
+    monkeypatch.setattr(
+        "nextview.training.recogniser.recogniser_training.fit_recogniser", lambda *given: judged_on(given[3])
+    )
+    monkeypatch.setattr("nextview.training.maps.map_training.fit_map", lambda *given: judged_on(given[4]))
     for what in ("recogniser", "lem"):
         command = ["train", what, str(trained / "views.zarr"), str(tmp_path / what)]
         with pytest.raises(Judged) as judged:
@@ -307,7 +309,7 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
     assert unseen[0] & unseen[1] == {views.names[i] for i in validation}
     out = trained / "unseen.npz"
     cards = [str(models / f"fold{k}.json") for k in range(2)]
-    main(["predict", str(store), str(out), "--unseen", "--maps", "--recogniser", *cards, "--workers", "1"])
+    main(["predict", str(store), str(out), "--held-out", "--maps", "--recogniser", *cards, "--workers", "1"])
     predictions = Predictions.load(out)
     assert set(predictions.names) == unseen[0] | unseen[1]
     for k, card in enumerate(cards):  # each network judged what it has not seen, and nothing else
@@ -330,14 +332,14 @@ def test_valley_classes_are_fitted_to_objects_that_neither_network_has_seen(trai
     store, models, out = str(trained / "views.zarr"), trained / "models", trained / "validation.npz"
     card = models / "tiny-lem.json"
     cards = ["--maps", f"lem={card}", "--recogniser", str(models / "tiny.json"), "--workers", "1"]
-    main(["predict", store, str(out), "--unseen", *cards])
+    main(["predict", store, str(out), "--held-out", *cards])
     main(["fit", "valleys", str(out), str(card)])
     facts, p = json.loads(card.read_text()), Predictions.load(out).deduplicate()
     gains = valley_gains(p.sphere, p.logits, p.maps["lem"], p.labels)
     assert facts["valley_classes"] == [p.classes[c] for c, gain in gains.items() if gain > 0]
     assert facts["valley_gain"] == {p.classes[c]: round(gain, 4) for c, gain in gains.items()}
     assert f"{len(p)} objects" in facts["valley_fitted_to"]
-    main(["predict", store, str(out), "--unseen", *cards])  # takes up what the card says now
+    main(["predict", store, str(out), "--held-out", *cards])  # takes up what the card says now
     assert Predictions.load(out).valley_classes == {"lem": tuple(facts["valley_classes"])}
     for wrong, sentence in ((models / "tiny.json", "holds no maps by"), (models / "none.json", "no such model card")):
         with pytest.raises(SystemExit) as end:

@@ -13,7 +13,7 @@ from nextview.errors import ModelError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from nextview.training.targets import Target
+    from nextview.training.maps.map_targets import Target
 
 
 SEEN = {
@@ -58,8 +58,8 @@ def export_recogniser(
     from nextview.models.inference import Recogniser
     from nextview.models.model_card import write_card
     from nextview.training.inputs import load_inputs
-    from nextview.training.members import member, member_networks
     from nextview.training.onnx_export import CalibratedRecogniser, answer, export_onnx, fit_temperature
+    from nextview.training.recogniser.members import member, member_networks
 
     views = ViewStore.open(store)
     members = [member(source, views) for source in (run, *also)]
@@ -144,7 +144,7 @@ def export_lem(
         note: what else the card should say.
     """
     from nextview.data.store import ViewStore
-    from nextview.training.targets import entropy_target
+    from nextview.training.maps.map_targets import entropy_target
 
     target = entropy_target(ViewStore.open(store))
     what = "depth-entropy, 0 .. 1 over the object's views"
@@ -176,7 +176,7 @@ def export_lcm(
     """
     from nextview.data.predictions import Predictions
     from nextview.data.store import ViewStore
-    from nextview.training.targets import confidence_target
+    from nextview.training.maps.map_targets import confidence_target
 
     target = confidence_target(ViewStore.open(store), Predictions.load(predictions))
     what = "the recogniser's confidence where it is right, else 0"

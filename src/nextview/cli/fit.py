@@ -24,7 +24,7 @@ def fit_calibration(
     the objects are is left aside.
 
     Args:
-        predictions: of the training split (nextview predict --unseen, or --split train).
+        predictions: of the training split (nextview predict --held-out, or --split train).
         card: of the recogniser; "calibration" is written into it. Those objects are taken that it calls unseen.
         validation: take this part of every class instead, as training kept it out of the whole split; 1 for
             out-of-fold predictions. A card that names no unseen objects needs it.
@@ -80,7 +80,7 @@ def fit_size(
     Args:
         store: view store that knows the unit of its meshes (nextview render --unit); its training objects teach, except
             those in the predictions.
-        predictions: of training objects that the recogniser has not seen (nextview predict --unseen); they decide how
+        predictions: of training objects that the recogniser has not seen (nextview predict --held-out); they decide how
             much the size counts beside the shape.
         card: of the recogniser; "size" is written into it.
     """
@@ -130,7 +130,7 @@ def fit_valleys(
 
     Args:
         predictions: of the training split; those of objects are taken that the map network was not trained on. Let
-            neither be the recogniser (nextview predict --unseen).
+            neither be the recogniser (nextview predict --held-out).
         card: of the map network; "valley_classes" is written into it.
     """
     from nextview.calibration.fitting_set import FittingSet, held_out_by

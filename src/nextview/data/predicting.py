@@ -45,7 +45,7 @@ def predict(
     recognisers: Sequence[Card],
     maps: dict[str, Card],
     split: str | None = None,
-    unseen: bool = False,
+    held_out: bool = False,
     size: bool = True,
     batch: int = 8,
     workers: int | None = None,
@@ -58,11 +58,11 @@ def predict(
     Args:
         path: the view store.
         out: the .npz file to make.
-        recognisers: cards; each object is judged by the first of them, or see ``unseen``.
+        recognisers: cards; each object is judged by the first of them, or see ``held_out``.
         maps: card of the network for each map.
         split: only this split.
-        unseen: let each object be judged by a recogniser that has not seen it in training, and leave out those that
-            all have seen.
+        held_out: let each object be judged by a recogniser from whose training it was held out, and leave out those
+            that all were trained on.
         size: let the recogniser know how large the objects are, where store and card tell.
         batch: views a call of the networks.
         workers: processes; one for each core by default.
@@ -84,10 +84,10 @@ def predict(
     chosen = np.flatnonzero(store.done & (True if split is None else store.splits == split))
     if len(chosen) == 0:
         raise DatasetError(f"{path}: holds no rendered object" + (f" of the split {split!r}" if split else ""))
-    judge = judges(recognisers, [store.names[i] for i in chosen]) if unseen else np.zeros(len(chosen), np.int64)
+    judge = judges(recognisers, [store.names[i] for i in chosen]) if held_out else np.zeros(len(chosen), np.int64)
     chosen, judge = chosen[judge >= 0], judge[judge >= 0]
     if len(chosen) == 0:
-        raise DatasetError(f"{path}: holds no object that one of these recognisers has not seen in training")
+        raise DatasetError(f"{path}: holds no object that was held out from the training of one of these recognisers")
     recogniser = recognisers[0]
     classes = tuple(recogniser.facts["classes"])
     unknown = sorted({store.classes[label] for label in store.labels[chosen]} - set(classes))
@@ -185,19 +185,19 @@ def map_shapes(name: str, card: Card, sphere: ViewSphere) -> list[tuple[str, tup
 
 
 def judges(recognisers: Sequence[Card], names: Sequence[str]) -> NDArray[np.int64]:
-    """Which recogniser judges each object: the first that has not seen it in training; -1 for none.
+    """Which recogniser judges each object: the first from whose training it was held out; -1 for none.
 
     Raises:
-        DatasetError: one of them does not say what it has not seen, or they do not know the same classes.
+        DatasetError: one of them does not name what was held out, or they do not know the same classes.
     """
     for card in recognisers:
         if "unseen" not in card.facts:
-            raise DatasetError(f"recogniser {card.name} does not say which objects it has not seen in training")
+            raise DatasetError(f"recogniser {card.name} does not name the objects that were held out from its training")
         for what in ("classes", "azimuth_bins"):
             if card.facts.get(what) != recognisers[0].facts.get(what):
                 raise DatasetError(f"recognisers {recognisers[0].name} and {card.name} do not know the same {what}")
-    unseen = np.array([np.isin(names, card.facts["unseen"]) for card in recognisers])
-    return np.where(unseen.any(0), unseen.argmax(0), -1)
+    held_out = np.array([np.isin(names, card.facts["unseen"]) for card in recognisers])
+    return np.where(held_out.any(0), held_out.argmax(0), -1)
 
 
 def identity(cards: Sequence[Card]) -> tuple[str, str]:

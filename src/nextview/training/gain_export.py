@@ -17,7 +17,7 @@ from nextview.outputs import written_whole
 from nextview.policies.gain import Gain
 from nextview.policies.gain_weights import FEATURES_INPUT
 from nextview.policies.policy_card import write_policy
-from nextview.training.perceptrons import Perceptrons
+from nextview.training.gain.perceptrons import Perceptrons
 
 OPSET = 18
 IR_VERSION = 8

@@ -143,7 +143,7 @@ class MapModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def train(
+def fit_map(
     seen: NDArray[Any] | PackedViews,
     values: NDArray[np.float32],
     sphere: ViewSphere,
