@@ -159,7 +159,7 @@ def test_splits_are_never_mixed(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "log_evidence"),
+    ("change", "printed"),
     [
         ({"logits": np.full((6, 40, 3), np.nan, np.float32)}, "not a finite number"),
         ({"logits": np.zeros((6, 40, 2), np.float32)}, "shape"),

@@ -9,9 +9,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from nextview.benchmark import statistics as st
+from nextview.benchmark.experiment import Grid
 from nextview.benchmark.published import published
 from nextview.benchmark.replay import Outcomes, truncate
-from nextview.benchmark.run import Grid
 
 Float = NDArray[np.float64]
 

@@ -52,8 +52,8 @@ def benchmark(
 
     from nextview.belief import PLAIN_SUM, Stopping
     from nextview.benchmark.entries import default_entries
+    from nextview.benchmark.experiment import Grid, run_grid
     from nextview.benchmark.replay import make_specs
-    from nextview.benchmark.run import Grid, run_grid
     from nextview.cli.extra import needs_extra
     from nextview.cli.progress import console, track
     from nextview.data.predictions import Predictions
