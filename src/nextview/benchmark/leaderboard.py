@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import pandas as pd
 
@@ -25,21 +26,59 @@ def headline_threshold(thresholds: Sequence[float]) -> float:
     return min(thresholds, key=lambda t: abs(t - 0.97))
 
 
-def leaderboard(tables: Tables, threshold: float) -> pd.DataFrame:
-    """The policies under one threshold, the most accurate first and those that no robot could follow last.
+class Standing(NamedTuple):
+    """A policy under one threshold; difference and p_holm, to the reference, are NaN for the reference itself.
 
-    Returns:
-        policy, oracle, accuracy, low, high, class_accuracy, n_views, travel_all (grid cells, over all episodes), and
-        difference and p_holm, of the accuracy against the reference; these are NaN for the reference itself.
+    Accuracy has a 95 % interval, low to high; travel is in grid cells, over all episodes.
     """
+
+    policy: str
+    accuracy: float
+    low: float
+    high: float
+    class_accuracy: float
+    n_views: float
+    travel: float
+    difference: float
+    p_holm: float
+
+    @property
+    def differs(self) -> bool:
+        """Whether its accuracy differs significantly from that of the reference."""
+        return self.p_holm < SIGNIFICANT
+
+
+def leaderboard(tables: Tables, threshold: float) -> list[Standing]:
+    """The policies under one threshold, the most accurate first and those that no robot could follow last."""
     rows = tables.summary[tables.summary["threshold"] == threshold]
     table = rows.pivot(index="policy", columns="measure", values="value")
-    table = table[["accuracy", "class_accuracy", "n_views", "travel_all"]]
-    interval = rows[rows["measure"] == "accuracy"].set_index("policy")[["low", "high"]]
-    tested = _tests(tables, threshold).set_index("policy")[["difference", "p_holm"]]
-    table = table.join(interval).join(tested).reset_index()
-    table.insert(1, "oracle", table["policy"].map(is_oracle))
-    return table.sort_values(["oracle", "accuracy"], ascending=[True, False], kind="stable", ignore_index=True)
+    table = table.join(rows[rows["measure"] == "accuracy"].set_index("policy")[["low", "high"]])
+    table = table.join(_tests(tables, threshold).set_index("policy")[["difference", "p_holm"]]).reset_index()
+    columns = ["policy", "accuracy", "low", "high", "class_accuracy", "n_views", "travel_all", "difference", "p_holm"]
+    standings = [Standing(*row) for row in table[columns].to_numpy(object).tolist()]
+    return sorted(standings, key=lambda s: (is_oracle(s.policy), -s.accuracy))
+
+
+class PromisedRisk(NamedTuple):
+    """An error rate that was promised of those who stop early, and the measured one with its 95 % interval."""
+
+    policy: str
+    risk: float
+    threshold: float
+    error: float
+    low: float
+    high: float
+    confident: float
+
+    @property
+    def broken(self) -> bool:
+        """Whether more of them were wrong than was promised."""
+        return self.error > self.risk
+
+
+def promised_risks(tables: Tables) -> list[PromisedRisk]:
+    """Every promise that was put to the test."""
+    return [PromisedRisk(*row) for row in tables.risks.to_numpy(object).tolist()]
 
 
 def nothing_differs(tables: Tables, threshold: float, reference: str) -> str | None:

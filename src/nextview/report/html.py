@@ -101,7 +101,7 @@ def page(results: Results, pictures: Pictures) -> str:
         curve_figures=_curves(results, at),
         reliability=_reliability(results, best, at),
         calibration=tables.calibration(results, curves.followed(results)),
-        risks=None,
+        risks=tables.risks(results),
         class_figures=_classes(results, best, at),
         class_tables=[tables.per_class(results, measure, at) for measure in ("accuracy", "travel_moved")],
         fixed_views=tables.five_views(results),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nextview.benchmark.leaderboard import is_oracle
+from nextview.benchmark.leaderboard import is_oracle, promised_risks
 from nextview.benchmark.published import COLUMNS, published_threshold
 from nextview.benchmark.results import Results
 from nextview.report.elements import NONE, Cell, Table, cell, label, numbers, percent
@@ -71,6 +71,22 @@ def calibration(results: Results, policies: Sequence[str]) -> Table:
     ]
     caption = "Share of right answers among the episodes that reached the threshold, and how many did."
     return Table(["policy", *(f"{t:g}" for t in thresholds)], rows, caption)
+
+
+def risks(results: Results) -> Table | None:
+    """Promised and measured error rates; None if none were promised."""
+    rows: list[list[Cell | str]] = [
+        [
+            named(row.policy),
+            percent(row.risk),
+            f"{row.threshold:.4g}",
+            Cell(percent(row.error), (f"{100 * row.low:.1f} {NONE} {percent(row.high)}",)),
+            percent(row.confident),
+        ]
+        for row in promised_risks(results.tables)
+    ]
+    caption = "Promised error rates of those who stop early, and measured ones."
+    return Table(["policy", "promised", "threshold", "measured", "stopped early"], rows, caption) if rows else None
 
 
 def per_class(results: Results, measure: str, fallback: float) -> Table:
