@@ -306,3 +306,12 @@ class Stopping:
             return np.full(np.shape(n_views), float(self.threshold))
         odds = np.log(self.threshold / (1 - self.threshold)) / (1 + self.threshold_decay * (np.asarray(n_views) - 1))
         return 1 / (1 + np.exp(-odds))
+
+
+@dataclass(frozen=True)
+class FixedLength(Stopping):
+    """Stop after ``max_views`` views and never before, however sure the belief is; the threshold counts for nothing."""
+
+    def threshold_at(self, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
+        """Infinity, which no belief reaches, same shape."""
+        return np.full(np.shape(n_views), np.inf)
