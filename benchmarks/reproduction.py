@@ -16,9 +16,9 @@ import tyro
 
 from nextview.belief import PLAIN_SUM
 from nextview.benchmark.entries import default_entries
+from nextview.benchmark.experiment import THRESHOLDS, Grid, run_grid
 from nextview.benchmark.published import published, published_threshold
 from nextview.benchmark.replay import make_specs
-from nextview.benchmark.run import THRESHOLDS, Grid, run_grid
 from nextview.benchmark.summary import Tables, summarise
 from nextview.data.predictions import Predictions
 from nextview.models.model_card import file_hash

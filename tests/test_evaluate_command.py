@@ -127,7 +127,7 @@ def test_copies_of_a_shape_are_judged_once_where_that_is_asked_for(tmp_path):
     p = some_predictions(6)
     rows = np.array([0, 1, 2, 3, 4, 0])
     replace(p, depth_entropy=p.depth_entropy[rows], labels=p.labels[rows]).save(tmp_path / "p.npz")
-    for more, objects in (([], 6), (["--each-shape-once"], 5)):
+    for more, objects in (([], 6), (["--deduplicate"], 5)):
         main(["evaluate", str(tmp_path / "p.npz"), "--out", str(tmp_path / "out"), "--samples", "5", *more])
         settings = json.loads((tmp_path / "out" / "results.json").read_text())["settings"]
         assert settings["objects"] == objects

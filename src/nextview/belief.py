@@ -335,3 +335,16 @@ class Stopping:
         first, second = self.threshold_at(np.arange(1, 3))
         last = f", {float(self.threshold_at(self.max_views)):.2g} at view {self.max_views}" * (self.max_views > 2)
         return f"threshold {first:.3g} at the first view, {second:.2g} at the second{last}"
+
+
+@dataclass(frozen=True)
+class FixedLength(Stopping):
+    """Stop after ``max_views`` views and never before, however sure the belief is; the threshold counts for nothing."""
+
+    def threshold_at(self, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
+        """Infinity, which no belief reaches, same shape."""
+        return np.full(np.shape(n_views), np.inf)
+
+    def __str__(self) -> str:
+        """In words."""
+        return f"{self.max_views} views"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -9,9 +10,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from nextview.benchmark import statistics as st
+from nextview.benchmark.entries import ORACLES
+from nextview.benchmark.experiment import Grid
 from nextview.benchmark.published import published
 from nextview.benchmark.replay import Outcomes, truncate
-from nextview.benchmark.run import Grid
 
 Float = NDArray[np.float64]
 
@@ -40,6 +42,8 @@ class Tables:
         areas: policy, budget (n_views or travel_all), value: mean accuracy over all budgets, low, high, and the
             difference to the reference with difference_low, difference_high, p and p_holm.
         reliability: policy, threshold, bin, confidence, accuracy, episodes.
+        risks: policy, risk (an error rate that was promised), threshold that promises it, error (measured among the
+            episodes that reached it), low, high, confident (their share): only of policies a robot could follow.
     """
 
     summary: pd.DataFrame
@@ -48,13 +52,16 @@ class Tables:
     sweep: pd.DataFrame
     areas: pd.DataFrame
     reliability: pd.DataFrame
+    risks: pd.DataFrame
 
     def named(self) -> dict[str, pd.DataFrame]:
         """The tables by name."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
-def summarise(grid: Grid, reference: str, samples: int, rng: np.random.Generator) -> Tables:
+def summarise(
+    grid: Grid, reference: str, samples: int, rng: np.random.Generator, promised: Mapping[float, float] | None = None
+) -> Tables:
     """All tables of a grid.
 
     Args:
@@ -62,13 +69,15 @@ def summarise(grid: Grid, reference: str, samples: int, rng: np.random.Generator
         reference: the policy that the others are compared with.
         samples: of the bootstrap.
         rng: draws them; the same ones for all policies, which pairs the differences.
+        promised: the threshold for each error rate that the calibration promises, among those of the grid.
     """
     weights = st.resample(len(grid.specs.predictions), samples, rng)
     cells = list(grid.cells())
     summary, drawn = _summary(grid, cells, weights)
     sweep, areas = _areas(grid, reference, weights[:500])
     tests = _tests(grid, cells, summary, drawn, reference)
-    return Tables(summary, _per_class(grid, cells, weights), tests, sweep, areas, _reliability(grid, cells))
+    per_class, risks = _per_class(grid, cells, weights), _risks(summary, promised or {})
+    return Tables(summary, per_class, tests, sweep, areas, _reliability(grid, cells), risks)
 
 
 def _measures(grid: Grid, ends: Outcomes) -> dict[str, tuple[Float, Float]]:
@@ -214,6 +223,18 @@ def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
         sure, accuracy, count = st.reliability(ends.confidence, grid.right(ends.answer).ravel())
         rows += [(policy, threshold, i, sure[i], accuracy[i], count[i]) for i in np.flatnonzero(count)]
     return _frame(rows, ["policy", "threshold", "bin", "confidence", "accuracy", "episodes"])
+
+
+def _risks(summary: pd.DataFrame, promised: Mapping[float, float]) -> pd.DataFrame:
+    rows = []
+    for risk, threshold in promised.items():
+        at = summary[summary["threshold"] == threshold]
+        right, share = (at[at["measure"] == measure] for measure in ("confident_accuracy", "confident"))
+        measured = right[["value", "high", "low"]].to_numpy(float)  # the upper end of accuracy is the lower of error
+        for policy, (mean, high, low), stopped in zip(right["policy"], measured, share["value"], strict=True):
+            if policy not in ORACLES:
+                rows.append((policy, risk, threshold, 1 - mean, 1 - high, 1 - low, stopped))
+    return _frame(rows, ["policy", "risk", "threshold", "error", "low", "high", "confident"])
 
 
 def _frame(rows: list, columns: list[str]) -> pd.DataFrame:

@@ -76,7 +76,8 @@ def predict(
             writing ``out``.
         PredictionsError: ``out`` is there and comes from another store or other models, or an object kills its process.
             Where it comes from the same, only what the cards say beside the networks (valley classes, sizes,
-            calibration) is brought up to date. Or what lies in the folder beside it is not of such a run.
+            calibration) and the place of the store are brought up to date. Or what lies in the folder beside it is not
+            of such a run.
         ResultsError: ``out`` cannot be written.
     """
     check_file(out)
@@ -103,12 +104,14 @@ def predict(
         there = Predictions.load(out)
         if (there.names, there.models) != (names, models) or not np.array_equal(there.depth_entropy, entropy):
             raise PredictionsError(f"{out}: was made from other objects or models; give another name or remove it")
-        renewed = (valleys, calibration, None if of_size is None else of_size.tobytes())
-        known = (there.valley_classes, there.calibration, None if there.of_size is None else there.of_size.tobytes())
+        renewed = (valleys, calibration, str(path.resolve()), None if of_size is None else of_size.tobytes())
+        size_there = None if there.of_size is None else there.of_size.tobytes()
+        known = (there.valley_classes, there.calibration, there.store, size_there)
         if renewed != known:
             seen = there.by_shape()
             logits = seen.logits if of_size is None else seen.logits + of_size[:, None]
-            replace(seen, logits=logits, of_size=of_size, valley_classes=valleys, calibration=calibration).save(out)
+            fresh = replace(seen, logits=logits, of_size=of_size, valley_classes=valleys, calibration=calibration)
+            replace(fresh, store=str(path.resolve())).save(out)
         yield len(names), len(names)
         return
 
@@ -156,6 +159,7 @@ def predict(
             calibration,
             np.array(arrays["azimuth_bins"]) if azimuth_bins else None,
             of_size,
+            str(path.resolve()),
         ).save(out)
         _end(out.with_name(out.name + ".part"), shapes)
 

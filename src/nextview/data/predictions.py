@@ -43,6 +43,8 @@ class Predictions:
             ``Evidence``; None if it cannot tell them.
         of_size: what the size of the object has added to the logits of each of its views, (N, C) float32; None if the
             recogniser knows nothing of sizes.
+        store: absolute path of the view store they were made from; empty if it is not known. ``depth_entropy`` tells
+            whether what lies there is still the same.
 
     Raises:
         PredictionsError: shapes that do not fit, nothing inside, or a number that is not finite.
@@ -62,6 +64,7 @@ class Predictions:
     calibration: Calibration = PLAIN_SUM
     azimuth_bins: NDArray[np.float32] | None = None
     of_size: NDArray[np.float32] | None = None
+    store: str = ""
 
     def __post_init__(self) -> None:
         n, v, c = len(self.names), len(self.sphere), len(self.classes)
@@ -144,6 +147,7 @@ class Predictions:
             "azimuths": self.sphere.azimuths,
             "distance": self.sphere.distance,
             "calibration": np.array(json.dumps(self.calibration.facts())),
+            "store": np.array(self.store),
             "models": np.array([(kind, *model) for kind, model in self.models.items()]).reshape(-1, 3),
         }
         arrays |= {f"map/{name}": values for name, values in self.maps.items()}
@@ -191,6 +195,7 @@ class Predictions:
                 Calibration.of_facts(json.loads(str(f["calibration"])) if "calibration" in f else None),
                 f.get("azimuth_bins"),
                 f.get("of_size"),
+                str(f.get("store", "")),
             )
         except KeyError as error:
             raise PredictionsError(f"{path}: {error.args[0]}") from None
