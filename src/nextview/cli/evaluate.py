@@ -40,6 +40,8 @@ def evaluate(
         samples: of the bootstrap.
         seed: decides the bootstrap, the orders of views and the examples.
     """
+    from dataclasses import replace
+
     from rich.console import Console
 
     from nextview.cli.extra import needs_extra
@@ -67,9 +69,7 @@ def evaluate(
         known = "" if table.of_size is None else ", of known size"
         things = "shapes" if deduplicate else "objects"
         of = f"{split or table.splits[0] or 'all'} ({len(table)} {things}{known})"
-        noted[card.path] = card.facts | {
-            "scores": card.facts.get("scores", {}) | {of: judge.scores_for_card(card, table)}
-        }
+        noted[card.path] = replace(card, scores={**card.scores, of: judge.scores_for_card(card, table)})
     with written_results(out, evaluation.KIND) as part:
         found = judge.evaluate(table, samples, np.random.default_rng([seed, 0]))
         settings = {
@@ -84,8 +84,8 @@ def evaluate(
         }
         figures = evaluation.all_figures(found, table, np.random.default_rng([seed, 1]))
         track(evaluation.save(part, found, table, settings, figures), len(figures) + 1, "writing figures")
-    for path, facts in noted.items():
-        write_card(path.with_suffix(".json"), facts)
+    for path, card in noted.items():
+        write_card(path.with_suffix(".json"), card)
     console = Console()
     console.print(_recogniser(found, len(table.sphere)))
     for name in found.maps["map"].unique():

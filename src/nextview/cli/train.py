@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from nextview.command_line import command_line
 from nextview.errors import DatasetError, ModelError
 from nextview.training.hardware import Hardware
 from nextview.training.recipes import MapRecipe, RecogniserRecipe
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from nextview.data.store import ViewStore
+    from nextview.models.network_input import InputKind
     from nextview.training.packed import PackedViews
     from nextview.training.recogniser import Source
     from nextview.training.targets import Target
@@ -56,7 +58,7 @@ def train_recogniser(
     from nextview.training.azimuth_bins import mirror_planes
     from nextview.training.checkpoints import refuse_seen
     from nextview.training.folds import hold_out
-    from nextview.training.runs import begin, finish, is_done
+    from nextview.training.runs import begin, finish, is_done, training_commands
 
     if fold is not None and not 0 <= fold < folds:
         raise ModelError(f"there is no fold {fold} of {folds}: they are counted from 0")
@@ -81,8 +83,19 @@ def train_recogniser(
     if weights and weights.suffix == ".json":
         for held in runs.values():
             refuse_seen(weights, [views.names[i] for i in [*validation, *held]])
+    command = command_line(
+        "train recogniser",
+        store,
+        out,
+        deformed=deformed,
+        weights=weights,
+        folds=folds or None,
+        fold=fold,
+        recipe=recipe,
+    )
+    commands = training_commands(command, [ViewStore.open(path) for path in (store, *deformed)], weights)
     for run, held in runs.items():
-        with begin(run, recipe, weights):
+        with begin(run, recipe, weights, commands):
             if is_done(run):
                 console.print(f"{run}: is trained already", soft_wrap=True)
                 continue
@@ -117,7 +130,7 @@ def _source(
     return Source(inputs, rows, None if planes is None else azimuth_bins(store, views.sphere.azimuths, planes))
 
 
-def _prepared(path: Path, store: ViewStore, size: int, kind: str) -> PackedViews:
+def _prepared(path: Path, store: ViewStore, size: int, kind: InputKind) -> PackedViews:
     """Inputs of a store (N, V, C, size, size), prepared if they are not yet."""
     import time
 
@@ -163,9 +176,14 @@ def train_lem(
         hardware: on what.
     """
     from nextview.data.store import ViewStore
+    from nextview.training.runs import training_commands
     from nextview.training.targets import entropy_target
 
-    _train_map(store, entropy_target(ViewStore.open(store)), out, weights, recipe, hardware)
+    views = ViewStore.open(store)
+    commands = training_commands(
+        command_line("train lem", store, out, weights=weights, recipe=recipe), [views], weights
+    )
+    _train_map(store, entropy_target(views), out, weights, recipe, hardware, commands)
 
 
 def train_lcm(
@@ -191,14 +209,23 @@ def train_lcm(
     """
     from nextview.data.predictions import Predictions
     from nextview.data.store import ViewStore
+    from nextview.training.runs import training_commands
     from nextview.training.targets import confidence_target
 
-    target = confidence_target(ViewStore.open(store), Predictions.load(predictions))
-    _train_map(store, target, out, weights, recipe, hardware)
+    views, predicted = ViewStore.open(store), Predictions.load(predictions)
+    command = command_line("train lcm", store, predictions, out, weights=weights, recipe=recipe)
+    commands = training_commands(command, [views, predicted], weights)
+    _train_map(store, confidence_target(views, predicted), out, weights, recipe, hardware, commands)
 
 
 def _train_map(
-    store: Path, target: Target, out: Path, weights: Path | None, recipe: MapRecipe, hardware: Hardware
+    store: Path,
+    target: Target,
+    out: Path,
+    weights: Path | None,
+    recipe: MapRecipe,
+    hardware: Hardware,
+    commands: tuple[str, ...],
 ) -> None:
     from nextview.cli.progress import console
     from nextview.data.splits import deduplicate, split_training
@@ -211,7 +238,7 @@ def _train_map(
     training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
     if weights:
         refuse_seen(weights, [views.names[i] for i in validation])
-    with begin(out, recipe, weights):
+    with begin(out, recipe, weights, commands):
         if is_done(out):
             console.print(f"{out}: is trained already", soft_wrap=True)
             return

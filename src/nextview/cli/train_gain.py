@@ -43,9 +43,11 @@ def train_gain(
 
     from nextview.calibration.rollout import ReplayTable, Value, fit_travel_weight
     from nextview.cli.progress import console, track
+    from nextview.command_line import command_line
     from nextview.data.predictions import Predictions
     from nextview.models.model_card import file_hash
     from nextview.policies.gain import MAPS, Gain
+    from nextview.policies.policy_card import LearnedFrom, PolicyCard
     from nextview.training.folds import hold_out
     from nextview.training.gain_export import write_gain
     from nextview.training.gain_training import averaged, best_epoch, train, walk
@@ -83,7 +85,8 @@ def train_gain(
 
     track(epochs(), recipe.epochs, "training")
     best, value = found[-1]
-    policies = [replace(policy, anywhere=not local) for policy in best]
+    policies = [replace(policy, scope="local" if local else "global") for policy in best]
+    asked_travel_weight = travel_weight
     if travel_weight is None:
         judged = list(zip(checked, policies, strict=True))
         travel_weight = fit_travel_weight(judged, recipe.n_views, recipe.outcome, recipe.seed)
@@ -92,20 +95,32 @@ def train_gain(
     chosen = f"{len(other)} others" if validation else f"the same, each judged by networks of {folds - 1} other folds"
     out.parent.mkdir(parents=True, exist_ok=True)
     sources = [(path, source) for path, source in ((predictions, table), (validation, other)) if path is not None]
-    facts = {
-        "kind": "gain",
-        "anywhere": policy.anywhere,
-        "elevations": table.sphere.elevations,
-        "azimuths": table.sphere.azimuths,
-        "classes": table.classes,
-        "learned_from": f"{learners} objects of the training split, classes weighted evenly; epoch and travel weight "
+    command = command_line(
+        "train gain",
+        predictions,
+        out,
+        validation=validation,
+        folds=folds,
+        travel_weight=asked_travel_weight,
+        local=local,
+        recipe=recipe,
+    )
+    about = PolicyCard(
+        "gain",
+        policy.scope,
+        table.sphere.elevations,
+        table.sphere.azimuths,
+        table.classes,
+        {},
+        f"{learners} objects of the training split, classes weighted evenly; epoch and travel weight "
         f"chosen on {chosen}",
-        "predictions": [{"sha256": file_hash(path), "models": source.models} for path, source in sources],
-        "calibration": [[c.temperature, c.correlation] for c in (part.calibration for part in learned)],
-        "settings": asdict(recipe),
-    }
+        tuple(LearnedFrom(file_hash(path), source.models) for path, source in sources),
+        tuple((part.calibration.temperature, part.calibration.correlation) for part in learned),
+        asdict(recipe),
+        tuple(dict.fromkeys((*(line for _, source in sources for line in source.commands), command))),
+    )
     seen = np.concatenate([walk(part, [policy], recipe, rng).features for part in checked])
-    difference = write_gain(out, replace(policy, travel_weight=travel_weight), facts, seen)
+    difference = write_gain(out, replace(policy, travel_weight=travel_weight), about, seen)
     console.print(
         f"learned from {learners} objects; on {chosen} the {recipe.outcome} after 2, 3, ... views is "
         f"{', '.join(f'{x:.4f}' for x in value.outcome)} at travel weight 0; travel weight {travel_weight:g}: {out}"
