@@ -200,9 +200,7 @@ def test_after_a_wrong_observation_the_same_view_can_be_told(tiny):
                 assert session.view == before
             session.update(camera.observe(session.pose))
         done.append(session.result)
-    assert [view.index for view in done[0].views] == [
-        view.index for view in done[1].views
-    ]
+    assert [view.index for view in done[0].views] == [view.index for view in done[1].views]
     np.testing.assert_array_equal(done[0].views[-1].belief, done[1].views[-1].belief)
 
 

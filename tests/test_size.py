@@ -156,7 +156,7 @@ def test_a_unit_is_one_of_a_few(shop):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"weight": None}, "sizes that cannot be read"),
+        ({"weight": None}, "'weight' of the size is not a finite number"),
         ({"weight": -1}, "not a finite number"),
         ({"radii_m": [1, 0.5]}, "do not fit together"),
         ({"log_density": [[0, 0]]}, "sizes of 1 classes, not 2"),

@@ -16,8 +16,12 @@ LARGEST = 64 * 2**20
 MISSING: Any = object()
 
 
-def read_object(path: Path) -> dict[str, Any]:
+def read_object(path: Path, what: str) -> dict[str, Any]:
     """The JSON object in a file.
+
+    Args:
+        path: the file.
+        what: it should be, "a model card".
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -29,20 +33,20 @@ def read_object(path: Path) -> dict[str, Any]:
 
     try:
         if path.stat().st_size > LARGEST:
-            raise ModelError(f"{path}: not a card, which takes {LARGEST >> 20} MB at most")
+            raise ModelError(f"{path}: not {what}, which takes {LARGEST >> 20} MB at most")
         values = json.loads(path.read_bytes(), parse_constant=refuse)
     except FileNotFoundError:
         raise
     except OSError as error:
         raise ModelError(f"{path}: cannot be read ({error.strerror})") from None
     except RecursionError:
-        raise ModelError(f"{path}: not a card (its JSON is nested too deeply)") from None
+        raise ModelError(f"{path}: not {what} (its JSON is nested too deeply)") from None
     except ModelError:
         raise
     except ValueError as error:
-        raise ModelError(f"{path}: not a card ({error})") from None
+        raise ModelError(f"{path}: not {what} ({error})") from None
     if not isinstance(values, dict):
-        raise ModelError(f"{path}: not a card (it holds no JSON object)")
+        raise ModelError(f"{path}: not {what} (it holds no JSON object)")
     return values
 
 

@@ -217,13 +217,13 @@ def read_card(path: Path) -> ModelCard:
         ModelError: the card or its weights are missing, or the card is not one.
     """
     try:
-        values = read_object(path)
+        values = read_object(path, "a model card")
     except FileNotFoundError:
         raise ModelError(f"{path}: there is no such model card") from None
     try:
         card = ModelCard.from_dict(values, path.with_suffix(".onnx"))
     except ModelError as error:
-        raise ModelError(f"{path}: {error}") from None
+        raise ModelError(f"{path}: not a model card ({error})") from None
     if not card.path.exists():
         raise ModelError(f"{card.path}: the weights of model {card.name} are missing")
     return card

@@ -112,10 +112,11 @@ class PolicyCard:
             "classes": list(self.classes),
             "learned_from": self.learned_from,
             "predictions": sources,
-            "calibration": [*map(list, self.calibration)],
             "settings": dict(self.settings or {}),
             "commands": list(self.commands),
         }
+        if self.calibration:
+            values["calibration"] = [*map(list, self.calibration)]
         return values | ({"sha256": self.sha256} if self.sha256 else {}) | {"table": dict(self.table)}
 
     def make(self, sphere: ViewSphere, weights: Path) -> Policy:
@@ -179,7 +180,7 @@ def read_policy_card(path: Path) -> PolicyCard:
         PolicyError: there is none, or it is damaged.
     """
     try:
-        values = read_object(path)
+        values = read_object(path, "a policy card")
     except FileNotFoundError:
         raise PolicyError(f"{path}: there is no such policy card") from None
     except ModelError as error:
