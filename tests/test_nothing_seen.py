@@ -152,9 +152,9 @@ def test_every_kind_of_policy_goes_on_past_an_empty_view(name):
             return view if self.taken > 2 else replace(view, depth=np.zeros_like(view.depth))
 
     result = recognise(Covered(), models, policy, SPHERE, 9, Stopping(1.0, 5))
-    assert len({observation.view for observation in result.n_views}) == 5
-    np.testing.assert_array_equal(result.n_views[1].belief, np.full(10, 0.1))
-    np.testing.assert_allclose(result.n_views[2].belief, result.n_views[2].guess, atol=1e-6)  # the first that counts
+    assert len({view.index for view in result.views}) == 5
+    np.testing.assert_array_equal(result.views[1].belief, np.full(10, 0.1))
+    np.testing.assert_allclose(result.views[2].belief, result.views[2].alone, atol=1e-6)  # the first that counts
     assert result.answer == "chair"
 
 
@@ -170,7 +170,7 @@ def test_nothing_seen_is_no_answer(tiny):
     while not session.done:
         session.update(view_of(np.zeros((16, 16)), session.pose))
     result = session.result
-    assert len(result.n_views) == 3
+    assert len(result.views) == 3
     assert (result.answer, result.confidence, result.confident, result.seen) == (None, 0.0, False, False)
     assert "nothing is seen" in draw_episode(result, SPHERE, "air").get_suptitle()
 
@@ -180,10 +180,10 @@ def test_one_view_that_shows_something_is_an_answer(tiny):
     for depth in (np.zeros((16, 16)), np.full((16, 16), 3.0), np.zeros((16, 16))):
         session.update(view_of(depth, session.pose))
     result = session.result
-    np.testing.assert_array_equal(result.n_views[0].belief, np.full(3, 1 / 3))
-    np.testing.assert_array_equal(result.n_views[1].belief, result.n_views[2].belief)
-    assert result.answer == CLASSES[result.n_views[1].belief.argmax()]
-    assert result.confidence == result.n_views[1].belief.max() > 1 / 3
+    np.testing.assert_array_equal(result.views[0].belief, np.full(3, 1 / 3))
+    np.testing.assert_array_equal(result.views[1].belief, result.views[2].belief)
+    assert result.answer == CLASSES[result.views[1].belief.argmax()]
+    assert result.confidence == result.views[1].belief.max() > 1 / 3
 
 
 def test_after_a_wrong_observation_the_same_view_can_be_told(tiny):
@@ -200,10 +200,8 @@ def test_after_a_wrong_observation_the_same_view_can_be_told(tiny):
                 assert session.view == before
             session.update(camera.observe(session.pose))
         done.append(session.result)
-    assert [observation.view for observation in done[0].n_views] == [
-        observation.view for observation in done[1].n_views
-    ]
-    np.testing.assert_array_equal(done[0].n_views[-1].belief, done[1].n_views[-1].belief)
+    assert [view.index for view in done[0].views] == [view.index for view in done[1].views]
+    np.testing.assert_array_equal(done[0].views[-1].belief, done[1].views[-1].belief)
 
 
 @settings(deadline=None)
@@ -219,7 +217,7 @@ def test_any_finite_depth_is_refused_or_believed_in_no_more_than_all(tiny, depth
     try:
         view = session.update(view_of(depth, session.pose))
     except ObservationError:
-        assert not session.n_views
+        assert not session.views
         return
     assert view.belief.sum() == pytest.approx(1)
     assert np.isfinite(view.belief).all()
@@ -271,8 +269,8 @@ def test_the_command_shows_which_views_are_empty(tmp_path, capsys):
     arguments[-1] = "40"
     main([*arguments, "--threshold", "1", "--json"])
     episode = json.loads(capsys.readouterr().out)
-    empty = [observation for observation in episode["n_views"] if not observation["seen"]]
+    empty = [observation for observation in episode["views"] if not observation["seen"]]
     assert sorted(observation["view"] for observation in empty) == list(range(8))
-    assert all(observation["map_peak"] is None and observation["side"] is None for observation in empty)
+    assert all(observation["map_peak"] is None and observation["azimuth_bin"] is None for observation in empty)
     main(arguments)
     assert "nothing" in capsys.readouterr().out

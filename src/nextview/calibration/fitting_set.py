@@ -12,7 +12,7 @@ from nextview.belief import log_evidence_of
 from nextview.data.predictions import Predictions
 from nextview.data.splits import deduplicated, divide
 from nextview.errors import PredictionsError
-from nextview.models.model_card import Card
+from nextview.models.model_card import ModelCard
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.viewsphere import ViewSphere
 
@@ -68,10 +68,10 @@ class FittingSet:
         return len(self) / ((count > 0).sum() * count[self.labels])
 
 
-def held_out_by(card: Card, predictions: Predictions) -> NDArray[np.int64]:
+def held_out_by(card: ModelCard, predictions: Predictions) -> NDArray[np.int64]:
     """Objects on which a network was not trained, as its card says, duplicates left out: their indices."""
     once = deduplicated(predictions.labels, predictions.depth_entropy)
-    return once[np.isin(np.array(predictions.names)[once], card.facts.get("unseen", []))]
+    return once[np.isin(np.array(predictions.names)[once], card.held_out)]
 
 
 def fitting_set(predictions: Predictions, validation: float, seed: int) -> FittingSet:
