@@ -13,7 +13,8 @@ from test_predictions import some_predictions
 from test_report import Page
 
 from nextview.cli.main import main
-from nextview.models.model_card import file_hash, write_card
+from nextview.models.model_card import ModelCard, file_hash, write_card
+from nextview.models.network_input import InputSpec
 
 TABLES = ("accuracy", "fusion", "confusion", "reliability", "maps")
 
@@ -201,7 +202,10 @@ def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(t
     p = some_predictions(30, seed=1)
     for kind, name in (("recogniser", "net"), ("lem", "map"), ("lem", "other")):
         (tmp_path / f"{name}.onnx").write_bytes(name.encode())
-        write_card(tmp_path / f"{name}.json", {"name": name, "kind": kind, "scores": {"validation": 1}})
+        weights = tmp_path / f"{name}.onnx"
+        classes = ("a", "b", "c") if kind == "recogniser" else ()
+        card = ModelCard(name, kind, InputSpec("geometry", 16), file_hash(weights), weights, classes=classes)
+        write_card(tmp_path / f"{name}.json", replace(card, scores={"validation": 1}))
     models = {"recogniser": "net", "lem": "map"}
     models = {kind: (name, file_hash(tmp_path / f"{name}.onnx")) for kind, name in models.items()}
     replace(p, models=models, splits=np.full(30, "test")).save(tmp_path / "p.npz")

@@ -236,7 +236,7 @@ def test_a_card_that_was_calibrated_since_brings_predictions_up_to_date(shop):
     (recogniser, maps), out = cards(shop), shop / "calibrated.npz"
     list(predict(shop / "views.zarr", out, [recogniser], maps, workers=1))
     before = Predictions.load(out)
-    later = replace(recogniser, facts={**recogniser.facts, "calibration": Calibration(0.5, 0.25).facts()})
+    later = replace(recogniser, calibration=Calibration(0.5, 0.25))
     assert list(predict(shop / "views.zarr", out, [later], maps, workers=1)) == [(6, 6)]
     after = Predictions.load(out)
     assert (before.calibration, after.calibration) == (Calibration(), Calibration(0.5, 0.25))

@@ -284,11 +284,11 @@ def test_published_recipe_on_images_by_the_command(store, tmp_path, capsys):
 def test_going_on_from_a_network_that_has_seen_the_validation_objects_is_refused(store, what, tmp_path, capsys):
     views = ViewStore.open(store)
     kept = [views.names[i] for i in split_training(views, 0.25, 0)[1]]
-    unseen = kept if "--folds" in what else kept[:1]  # every object is held out for some fold
+    held_out = kept if "--folds" in what else kept[:1]  # every object is held out for some fold
     bundled = Path(find_card(RECOGNISER).path)
-    facts = json.loads(bundled.with_suffix(".json").read_text())
+    card = json.loads(bundled.with_suffix(".json").read_text())
     (tmp_path / "mine.onnx").write_bytes(bundled.read_bytes())
-    (tmp_path / "mine.json").write_text(json.dumps(facts | {"name": "mine", "unseen": unseen}))
+    (tmp_path / "mine.json").write_text(json.dumps(card | {"name": "mine", "held_out": held_out}))
     command = ["train", what[0], str(store), str(tmp_path / "out"), *what[1:], "--weights", str(tmp_path / "mine.json")]
     with pytest.raises(SystemExit):
         main([*command, *FAST])
@@ -412,9 +412,9 @@ def test_two_devices_train_one_network(store, tmp_path):
 
 
 GUIDE = (Path(__file__).parent.parent / "docs/training.md").read_text()
-TRAINED = {name: card.facts["training"] for name, card in bundled_cards().items()}
+TRAINED = {name: card.training for name, card in bundled_cards().items()}
 COMMAND_LINES = [*re.findall(r"^nextview .*?(?=  +#|$)", GUIDE, re.M)]
-COMMAND_LINES += [line for training in TRAINED.values() for line in training["commands"]]
+COMMAND_LINES += [line for training in TRAINED.values() for line in training.commands]
 
 
 @pytest.mark.parametrize("line", dict.fromkeys(COMMAND_LINES))
@@ -431,6 +431,6 @@ def test_the_guide_and_the_cards_name_commands_and_options_that_exist(line, caps
 @pytest.mark.parametrize("name", TRAINED)
 def test_the_recipes_of_the_cards_are_recipes_of_this_version(name):
     training = TRAINED[name]
-    kind = RecogniserRecipe if "recipes" in training else MapRecipe
-    for noted in training.get("recipes") or [training["recipe"]]:
+    kind = RecogniserRecipe if name.startswith("recogniser") else MapRecipe
+    for noted in training.recipes:
         assert asdict(kind(**noted)) == noted

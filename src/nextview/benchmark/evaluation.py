@@ -17,7 +17,7 @@ from nextview.benchmark.published import published_map, published_recognisers
 from nextview.benchmark.scores import map_errors, map_scores, recogniser_scores
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError
-from nextview.models.model_card import Card
+from nextview.models.model_card import ModelCard
 
 Float = NDArray[np.float64]
 
@@ -263,7 +263,7 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
     return pd.DataFrame(rows, columns=columns).astype({"published": "float64"}), left_out
 
 
-def scores_for_card(card: Card, p: Predictions) -> dict[str, Any]:
+def scores_for_card(card: ModelCard, p: Predictions) -> dict[str, Any]:
     """The scores of one of the models that made some predictions, as its card notes them.
 
     Raises:

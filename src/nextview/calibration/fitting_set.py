@@ -13,7 +13,7 @@ from nextview.data.predictions import Predictions
 from nextview.data.splits import deduplicated, divide
 from nextview.episode import run_episodes
 from nextview.errors import PredictionsError
-from nextview.models.model_card import Card
+from nextview.models.model_card import ModelCard
 from nextview.policies.base import Evidence, Policy
 from nextview.viewsphere import ViewSphere
 
@@ -69,10 +69,10 @@ class FittingSet:
         return len(self) / ((count > 0).sum() * count[self.labels])
 
 
-def held_out_by(card: Card, predictions: Predictions) -> NDArray[np.int64]:
+def held_out_by(card: ModelCard, predictions: Predictions) -> NDArray[np.int64]:
     """Objects on which a network was not trained, as its card says, duplicates left out: their indices."""
     once = deduplicated(predictions.labels, predictions.depth_entropy)
-    return once[np.isin(np.array(predictions.names)[once], card.facts.get("unseen", []))]
+    return once[np.isin(np.array(predictions.names)[once], card.held_out)]
 
 
 def fitting_set(predictions: Predictions, validation: float, seed: int) -> FittingSet:

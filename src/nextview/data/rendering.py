@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.cloud import POINTS
+from nextview.command_line import command_line
 from nextview.data.folders import Entry, list_dataset
 from nextview.data.lock import only_one
 from nextview.data.pool import each
@@ -25,7 +26,7 @@ from nextview.errors import DatasetError, MeshError
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.mesh import Mesh, load_mesh, make_mesh
 from nextview.mesh_format import MAX_FACES
-from nextview.viewsphere import ViewSphere
+from nextview.viewsphere import LAYOUTS, ViewSphere
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,10 @@ def render(
             f"{farthest - 1:.2f} at most, not {sphere.distance:g}"
         )
     with only_one(path), writing(path):
-        store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit)
+        store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit, dataset.absolute().name)
+        command = _command(dataset, path, sphere, size, seed, deform, split, unit)
+        if command not in store.commands:
+            store.group.attrs["commands"] = [*store.commands, command]
         todo = [int(i) for i in np.flatnonzero(~store.done)]
         # Largest files first, so that no worker is left with a long one at the end.
         todo.sort(key=lambda i: -entries[i].path.stat().st_size)
@@ -135,11 +139,39 @@ def render(
             yield entry.name, None if reason is None else f"{reason}"
 
 
+def _command(
+    dataset: Path,
+    path: Path,
+    sphere: ViewSphere,
+    size: int,
+    seed: int,
+    deform: Deform,
+    split: str | None,
+    unit: str | None,
+) -> str:
+    """The command that renders so; of a sphere that has no name, the part that the command line can say."""
+    names = [name for name in LAYOUTS if LAYOUTS[name].elevations == sphere.elevations]
+    azimuths = None if names and LAYOUTS[names[0]].azimuths == sphere.azimuths else sphere.azimuths
+    return command_line(
+        "render",
+        dataset,
+        path,
+        sphere=names[0] if names else None,
+        azimuths=azimuths,
+        size=size,
+        split=split,
+        stretch=deform.stretch,
+        turn=deform.turn,
+        unit=unit,
+        seed=seed,
+    )
+
+
 def turns(store: ViewStore) -> NDArray[np.float64]:
     """By how much each object of a store was turned about z when it was rendered, radians, (N,)."""
-    facts = store.group.attrs
-    deform = Deform(float(facts.get("stretch", 0.0)), bool(facts.get("turn", False)))
-    return np.array([deform.draw(int(facts.get("seed", 0)), name)[1] for name in store.names])
+    recipe = store.group.attrs
+    deform = Deform(float(recipe.get("stretch", 0.0)), bool(recipe.get("turn", False)))
+    return np.array([deform.draw(int(recipe.get("seed", 0)), name)[1] for name in store.names])
 
 
 @contextmanager
@@ -153,14 +185,21 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def _begin(
-    path: Path, entries: list[Entry], sphere: ViewSphere, size: int, seed: int, deform: Deform, unit: str | None
+    path: Path,
+    entries: list[Entry],
+    sphere: ViewSphere,
+    size: int,
+    seed: int,
+    deform: Deform,
+    unit: str | None,
+    dataset: str,
 ) -> ViewStore:
     """The store as an earlier run left it, if that had the same meshes and settings, or a new one."""
     with ThreadPoolExecutor() as pool:
         hashes = list(pool.map(_file_hash, [e.path for e in entries]))
     recipe = {"seed": seed, "stretch": deform.stretch, "turn": deform.turn, "sha256": hashes}
     if not path.exists():
-        return ViewStore.create(path, entries, sphere, size, recipe | {"unit": unit})
+        return ViewStore.create(path, entries, sphere, size, recipe | {"unit": unit, "dataset": dataset})
     store = ViewStore.open(path)
     wanted = {
         "names": [e.name for e in entries],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -159,6 +160,20 @@ class ViewStore:
     def splits(self) -> NDArray[np.str_]:
         """ "train", "test" or "" for each object, (N,)."""
         return np.array(self.group.attrs["splits"])
+
+    @property
+    def dataset(self) -> str:
+        """What the objects are called together, in lower case: the name of the folder of their meshes.
+
+        That of the store if it was made before this was noted.
+        """
+        name = self.group.attrs.get("dataset") or self.path.stem
+        return re.sub(r"[^a-z0-9_.]+", "-", name.lower()).strip("-") or "objects"
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """That made it, in order; () if it was made before this was noted."""
+        return tuple(self.group.attrs.get("commands", ()))
 
     @property
     def sphere(self) -> ViewSphere:

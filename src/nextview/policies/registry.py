@@ -23,7 +23,7 @@ POLICIES: dict[str, Callable[[ViewSphere, tuple[int, ...]], Policy]] = {
     "furthest": lambda sphere, valleys: Furthest(sphere),
     "unidirectional": lambda sphere, valleys: Unidirectional(sphere),
     "spread": lambda sphere, valleys: Spread(sphere),
-    "spread-local": lambda sphere, valleys: Spread(sphere, anywhere=False),
+    "spread-local": lambda sphere, valleys: Spread(sphere, "local"),
     "lem": lambda sphere, valleys: MapPeak(sphere, "lem", valleys),
     "lem-peak": lambda sphere, valleys: MapPeak(sphere, "lem"),
     "lcm": lambda sphere, valleys: MapPeak(sphere, "lcm", valleys),

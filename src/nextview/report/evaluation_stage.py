@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def write_evaluation(
         known = "" if table.of_size is None else ", of known size"
         things = "shapes" if deduplicate else "objects"
         of = f"{split or table.splits[0] or 'all'} ({len(table)} {things}{known})"
-        noted[card.path] = card.facts | {"scores": card.facts.get("scores", {}) | {of: scores_for_card(card, table)}}
+        noted[card.path] = replace(card, scores={**card.scores, of: scores_for_card(card, table)})
     settings = {
         "predictions": predictions.name,
         "predictions_sha256": file_hash(predictions),
@@ -74,6 +75,6 @@ def write_evaluation(
         found = evaluate(table, samples, np.random.default_rng([seed, 0]))
         figures = all_figures(found, table, np.random.default_rng([seed, 1]))
         track(save(part, found, table, settings, figures), len(figures) + 1, "writing figures")
-    for path, facts in noted.items():
-        write_card(path.with_suffix(".json"), facts)
+    for path, card in noted.items():
+        write_card(path.with_suffix(".json"), card)
     return found

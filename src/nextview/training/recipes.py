@@ -123,7 +123,7 @@ class MapRecipe:
         depth: of the ResNet.
         size: side of the ResNet's input image, pixels.
         points: drawn from each cloud in training; validation and use take all 1,024.
-        around: what the network predicts: the local window alone, or all views of the sphere, of which the window is a
+        output: what the network predicts: the local window alone, or all views of the sphere, of which the window is a
             part; the others are of use to policies that look farther.
         epochs: passes over the training objects.
         views: views of each object in one epoch, drawn at random.
@@ -147,7 +147,7 @@ class MapRecipe:
     depth: Literal[18, 34, 50, 101, 152] = 18
     size: int = 56
     points: int = 256
-    around: Literal["window", "sphere"] = "sphere"
+    output: Literal["window", "sphere"] = "sphere"
     epochs: int = 8
     views: int = 12
     batch: int = 64
@@ -177,7 +177,7 @@ class MapRecipe:
 THESIS_MAP = MapRecipe(
     input="cloud",
     points=1024,
-    around="window",
+    output="window",
     epochs=15,
     views=40,
     batch=16,

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.calibration.rollout import ReplayTable, Value, fit_travel_weight
+from nextview.command_line import command_line
 from nextview.data.predictions import Predictions
 from nextview.errors import PredictionsError, UsageError
 from nextview.models.model_card import file_hash
 from nextview.policies.gain import MAPS, Gain
+from nextview.policies.policy_card import LearnedFrom, PolicyCard
 from nextview.tracking import Track, silently
 from nextview.training.folds import hold_out
 from nextview.training.gain.gain_networks import averaged, best_epoch, train, walk
@@ -97,27 +99,34 @@ def train_gain(
     learned = [ReplayTable.of(table, part, rng) for part in learning]
     validated = [ReplayTable.of(other, part, rng) for part in validating]
     best, value = _best_epoch(learned, validated, recipe, track)
-    policies = [replace(policy, anywhere=not local) for policy in best]
+    policies = [replace(policy, scope="local" if local else "global") for policy in best]
+    asked_travel_weight = travel_weight
     if travel_weight is None:
         judged = list(zip(validated, policies, strict=True))
         travel_weight = fit_travel_weight(judged, recipe.n_views, recipe.outcome, recipe.seed)
     policy = averaged(policies)
     objects = len(np.unique(np.concatenate(learning)))
-    facts = {
-        "kind": "gain",
-        "anywhere": policy.anywhere,
-        "elevations": table.sphere.elevations,
-        "azimuths": table.sphere.azimuths,
-        "classes": table.classes,
-        "learned_from": f"{objects} objects of the training split, classes weighted evenly; epoch and travel weight "
+    command = command_line(
+        "train gain", predictions, card,
+        validation=validation, folds=folds, travel_weight=asked_travel_weight, local=local, recipe=recipe,
+    )  # fmt: skip
+    about = PolicyCard(
+        "gain",
+        policy.scope,
+        table.sphere.elevations,
+        table.sphere.azimuths,
+        table.classes,
+        {},
+        f"{objects} objects of the training split, classes weighted evenly; epoch and travel weight "
         f"chosen on {validated_on}",
-        "predictions": [{"sha256": file_hash(path), "models": p.models} for path, p in sources],
-        "calibration": [[c.temperature, c.correlation] for c in (part.calibration for part in learned)],
-        "settings": asdict(recipe),
-    }
+        tuple(LearnedFrom(file_hash(path), p.models) for path, p in sources),
+        tuple((part.calibration.temperature, part.calibration.correlation) for part in learned),
+        asdict(recipe),
+        tuple(dict.fromkeys((*(line for _, p in sources for line in p.commands), command))),
+    )
     states = np.concatenate([walk(part, [policy], recipe, rng).features for part in validated])
     card.parent.mkdir(parents=True, exist_ok=True)
-    difference = write_gain(card, replace(policy, travel_weight=travel_weight), facts, states)
+    difference = write_gain(card, replace(policy, travel_weight=travel_weight), about, states)
     return TrainedGain(card, objects, validated_on, value.outcome, travel_weight, len(states), difference)
 
 

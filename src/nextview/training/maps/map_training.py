@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
+from nextview.command_line import command_line
 from nextview.data.predictions import Predictions
 from nextview.data.splits import deduplicate, split_training
 from nextview.data.store import ViewStore
@@ -18,7 +20,7 @@ from nextview.training.maps.map_module import fit_map
 from nextview.training.maps.map_targets import Target, confidence_target, entropy_target
 from nextview.training.packed import PackedViews
 from nextview.training.recipes import MapRecipe
-from nextview.training.runs import begin, finish, is_done
+from nextview.training.runs import begin, finish, is_done, training_commands
 
 
 def train_lem(
@@ -31,8 +33,11 @@ def train_lem(
     track: Track = silently,
 ) -> Path:
     """Train the LEM, the local map of the depth-entropy, on a store's training split; see ``train_map``."""
-    target = entropy_target(ViewStore.open(store))
-    return train_map(store, target, out, recipe, weights=weights, hardware=hardware, track=track)
+    views = ViewStore.open(store)
+    command = command_line("train lem", store, out, weights=weights, recipe=recipe)
+    commands = training_commands(command, [views], weights)
+    target = entropy_target(views)
+    return train_map(store, target, out, recipe, weights=weights, hardware=hardware, commands=commands, track=track)
 
 
 def train_lcm(
@@ -59,8 +64,11 @@ def train_lcm(
     Raises:
         PredictionsError: the predictions are of other views.
     """
-    target = confidence_target(ViewStore.open(store), Predictions.load(predictions))
-    return train_map(store, target, out, recipe, weights=weights, hardware=hardware, track=track)
+    views, predicted = ViewStore.open(store), Predictions.load(predictions)
+    command = command_line("train lcm", store, predictions, out, weights=weights, recipe=recipe)
+    commands = training_commands(command, [views, predicted], weights)
+    target = confidence_target(views, predicted)
+    return train_map(store, target, out, recipe, weights=weights, hardware=hardware, commands=commands, track=track)
 
 
 def train_map(
@@ -71,6 +79,7 @@ def train_map(
     *,
     weights: Path | None = None,
     hardware: Hardware = Hardware(),
+    commands: Sequence[str] = (),
     track: Track = silently,
 ) -> Path:
     """Train a network that predicts the local map of a target. A second call resumes what was cut off.
@@ -82,6 +91,7 @@ def train_map(
         recipe: how to train.
         weights: card (.json) of the same depth and input from which a ResNet starts, a recogniser's or a map network's.
         hardware: on what.
+        commands: that lead to this training, its own last; noted in the folder.
         track: follows the preparation of the inputs.
 
     Returns:
@@ -95,7 +105,7 @@ def train_map(
     training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
     if weights:
         refuse_seen(weights, [views.names[i] for i in validation])
-    with begin(out, recipe, weights):
+    with begin(out, recipe, weights, commands):
         if is_done(out):
             return out
         inputs: NDArray[Any] | PackedViews

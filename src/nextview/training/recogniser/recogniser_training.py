@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.command_line import command_line
 from nextview.data.splits import deduplicate, split_training
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError
@@ -20,7 +21,7 @@ from nextview.training.inputs import ready_inputs
 from nextview.training.recipes import RecogniserRecipe
 from nextview.training.recogniser.azimuth_bins import azimuth_bins, mirror_planes
 from nextview.training.recogniser.recogniser_module import Source, fit_recogniser
-from nextview.training.runs import begin, finish, is_done
+from nextview.training.runs import begin, finish, is_done, training_commands
 
 
 def train_recogniser(
@@ -71,9 +72,20 @@ def train_recogniser(
     if weights and weights.suffix == ".json":
         for held in held_out.values():
             refuse_seen(weights, [views.names[i] for i in [*validation, *held]])
+    command = command_line(
+        "train recogniser",
+        store,
+        out,
+        deformed=tuple(deformed),
+        weights=weights,
+        folds=folds or None,
+        fold=fold,
+        recipe=recipe,
+    )
+    commands = training_commands(command, [ViewStore.open(path) for path in (store, *deformed)], weights)
     validating = deduplicate(views, validation)  # copies of one mesh count once
     for run, held in held_out.items():
-        with begin(run, recipe, weights):
+        with begin(run, recipe, weights, commands):
             if is_done(run):
                 continue
             (run / "held_out.json").write_text(json.dumps([views.names[i] for i in held]) + "\n")
