@@ -84,7 +84,9 @@ def written_results(folder: Path, kind: str) -> Iterator[Path]:
         with _disk_full_is_said(folder):
             new.mkdir()
             yield new
-            files = {entry.name: _size_and_hash(Path(entry.path)) for entry in sorted(os.scandir(new), key=lambda e: e.name)}
+            files = {
+                entry.name: _size_and_hash(Path(entry.path)) for entry in sorted(os.scandir(new), key=lambda e: e.name)
+            }
             _write_manifest(new, kind, files)
         cleanup.pop_all()  # from here on, whatever happens, the new results are kept
         _swap(folder, place, aside, kind)

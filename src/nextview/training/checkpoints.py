@@ -190,7 +190,7 @@ def load_exported(
             norm.weight.fill_(1 / scale)
             norm.bias.copy_(exported(f"{name}.weight_bias", norm.bias.shape))
             norms.append(norm)
-        for name in ("fc", "azimuth_bin"):
+        for name in ("fc", "side"):
             layer = getattr(network, name)
             if not last or layer is None:
                 continue
