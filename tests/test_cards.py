@@ -12,6 +12,7 @@ from nextview.errors import ModelError, PolicyError
 from nextview.models.inference import MapNetwork, Recogniser
 from nextview.models.model_card import bundled_cards, read_card, write_card
 from nextview.policies.policy_card import bundled_policies, read_policy_card, write_policy_card
+from nextview.training.recipes import MapRecipe
 
 CLASSES = [f"class{k}" for k in range(10)]
 
@@ -64,9 +65,10 @@ def test_a_card_that_makes_no_sense_is_refused_in_one_sentence(tmp_path, values,
         read_card(card)
 
 
-@pytest.mark.parametrize(
-    "content", [b"[" * 10**6, b"\xff\xfe{}", b"", b"[]", b'{"schema": 1', b'{"schema": 1' + b"0" * 9999]
-)
+NO_CARDS = [b"[" * 10**6, b"\xff\xfe{}", b"", b"[]", b'{"schema": 1', b'{"schema": 1' + b"0" * 9999]
+
+
+@pytest.mark.parametrize("content", NO_CARDS)
 def test_a_file_that_is_no_card_is_refused_in_one_sentence(tmp_path, content):
     path = tmp_path / "card.json"
     path.write_bytes(content)
@@ -97,19 +99,9 @@ def test_a_card_of_other_classes_or_inputs_than_its_network_is_refused_when_that
 
 
 def test_commands_are_what_a_shell_reads_as_the_same_words():
-    line = command_line(
-        "fit size", Path("a b.zarr"), "x", flag=True, off=False, none=None, several=(1, "two 2"), n_views=0
-    )
-    assert shlex.split(line) == [
-        "nextview",
-        "fit",
-        "size",
-        "a b.zarr",
-        "x",
-        "--flag",
-        "--several",
-        "1",
-        "two 2",
-        "--n-views",
-        "0",
-    ]
+    several = (1, "two 2")
+    line = command_line("fit size", Path("a b.zarr"), flag=True, off=False, none=None, several=several, n_views=0)
+    words = ["nextview", "fit", "size", "a b.zarr", "--flag", "--several", "1", "two 2", "--n-views", "0"]
+    assert shlex.split(line) == words
+    line = command_line("train lem", "out", recipe=MapRecipe(mirror=False, reach=1))
+    assert line == "nextview train lem out --reach 1 --no-mirror"
