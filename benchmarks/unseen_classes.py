@@ -15,12 +15,12 @@ import numpy as np
 import tyro
 
 from nextview.benchmark.evaluation import baselines
-from nextview.benchmark.scores import map_scores
-from nextview.benchmark.statistics import interval, ratio, resample
+from nextview.benchmark.statistics import interval, resample
 from nextview.cli.progress import track
 from nextview.data.input_views import input_views
 from nextview.data.store import ViewStore
 from nextview.measures.depth_entropy import normalise_per_object
+from nextview.metrics import map_scores, ratio
 from nextview.models.inference import MapNetwork
 
 PUBLISHED = "published LEM, trained on 10 classes, tested on its own unseen ones (table 4): d <= 1 0.364"

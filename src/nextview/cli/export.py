@@ -51,10 +51,10 @@ def export_recogniser(
 
     import numpy as np
 
-    from nextview.benchmark.scores import recogniser_scores
     from nextview.cli.progress import console
     from nextview.data.splits import deduplicate
     from nextview.data.store import ViewStore
+    from nextview.metrics import recogniser_scores
     from nextview.models.inference import Recogniser
     from nextview.models.model_card import write_card
     from nextview.training.inputs import load_inputs
@@ -199,11 +199,11 @@ def _export_map(
 
     import numpy as np
 
-    from nextview.benchmark.scores import map_scores
     from nextview.cli.progress import console
     from nextview.data.input_views import input_views
     from nextview.data.splits import deduplicate, split_training
     from nextview.data.store import ViewStore
+    from nextview.metrics import map_scores
     from nextview.models.inference import MapNetwork
     from nextview.models.model_card import write_card
     from nextview.training.architectures import map_network
