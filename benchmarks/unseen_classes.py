@@ -15,11 +15,11 @@ import numpy as np
 import tyro
 
 from nextview.benchmark.evaluation import baselines
-from nextview.benchmark.scores import map_scores
-from nextview.benchmark.statistics import interval, ratio, resample
+from nextview.benchmark.statistics import interval, resample
 from nextview.cli.progress import track
 from nextview.data.store import ViewStore
 from nextview.measures.depth_entropy import normalise_per_object
+from nextview.metrics import map_scores, ratio
 from nextview.models.inference import MapNetwork
 from nextview.models.network_input import from_store
 

@@ -17,10 +17,10 @@ from nextview.benchmark.leaderboard import is_oracle, leaderboard, nothing_diffe
 from nextview.benchmark.published import ACCURACY, TRAVEL, published, read_table
 from nextview.benchmark.replay import make_specs, replay, truncate
 from nextview.benchmark.run import run_benchmark
-from nextview.benchmark.statistics import calibration_error
 from nextview.cli.benchmark import benchmark
 from nextview.cli.report import report
 from nextview.errors import EntryError, PredictionsError
+from nextview.metrics import calibration_error
 from nextview.policies.baselines import Random
 from nextview.policies.registry import make_policy
 from nextview.viewsphere import ViewSphere

@@ -148,6 +148,7 @@ def test_predictions_are_what_the_networks_say_of_each_look(shop):
     assert last == (6, 6)
     found, store = Predictions.load(shop / "all.npz"), ViewStore.open(shop / "views.zarr")
     assert found.names == tuple(store.names)
+    assert found.store == str((shop / "views.zarr").resolve())
     assert found.models["lem"] == ("tiny-lem", maps["lem"].sha256)
     assert found.valley_classes == {"lem": ("box",)}
     i, v = 3, 17

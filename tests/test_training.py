@@ -28,7 +28,7 @@ from nextview.viewsphere import ViewSphere
 
 torch = pytest.importorskip("torch")
 
-from nextview.benchmark.scores import map_scores, recogniser_scores  # noqa: E402
+from nextview.metrics import map_scores, recogniser_scores  # noqa: E402
 from nextview.models.model_card import find_card  # noqa: E402
 from nextview.models.network_input import InputSpec, from_store  # noqa: E402
 from nextview.training.architectures import PointNet, ResNet, orthogonality  # noqa: E402

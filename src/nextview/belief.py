@@ -34,6 +34,7 @@ def fuse(logits: NDArray[np.floating], temperature: float = 1.0) -> NDArray[np.f
 
 
 def _softmax(logs: NDArray[np.floating]) -> Float:
+    # As SciPy's; recognising an object imports no SciPy, which keeps its start short.
     values = np.exp(logs - logs.max(-1, keepdims=True))
     return values / values.sum(-1, keepdims=True)
 

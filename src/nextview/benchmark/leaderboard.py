@@ -72,8 +72,8 @@ class PromisedRisk(NamedTuple):
 
     @property
     def broken(self) -> bool:
-        """Whether more of them were wrong than was promised."""
-        return self.error > self.risk
+        """Whether more were wrong than was promised, and chance does not explain it: the whole interval lies above."""
+        return self.low > self.risk
 
 
 def promised_risks(tables: Tables) -> list[PromisedRisk]:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from nextview import metrics
 from nextview.benchmark import statistics as st
 from nextview.benchmark.entries import ORACLES
 from nextview.benchmark.experiment import Grid
@@ -119,12 +120,12 @@ def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFram
     labels, classes = grid.specs.predictions.labels, grid.specs.predictions.classes
     duplicate_groups = np.ones((1, weights.shape[1]))
     keys, top, bottom = _columns(grid, cells)
-    value, drawn = st.ratio(top, bottom, duplicate_groups)[0], st.ratio(top, bottom, weights)
+    value, drawn = metrics.ratio(top, bottom, duplicate_groups)[0], metrics.ratio(top, bottom, weights)
     per_class = [i for i, key in enumerate(keys) if key[2] in ("accuracy", "travel_moved", "n_views")]
     keys += [(keys[i][0], keys[i][1], f"class_{keys[i][2]}") for i in per_class]
     top, bottom = top[:, per_class], bottom[:, per_class]
-    value = np.concatenate([value, st.class_mean(top, bottom, labels, duplicate_groups)[0]])
-    drawn = np.concatenate([drawn, st.class_mean(top, bottom, labels, weights)], 1)
+    value = np.concatenate([value, metrics.class_mean(top, bottom, labels, duplicate_groups)[0]])
+    drawn = np.concatenate([drawn, metrics.class_mean(top, bottom, labels, weights)], 1)
     low, high = st.interval(drawn)
     rows = []
     for i, (policy, threshold, measure) in enumerate(keys):
@@ -132,7 +133,7 @@ def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFram
         rows.append((policy, threshold, measure, value[i], low[i], high[i], beside))
     for policy, threshold, ends in cells:
         right = grid.right(ends.answer)
-        error = st.calibration_error(ends.confidence, right.ravel())
+        error = metrics.calibration_error(ends.confidence, right.ravel())
         between = np.std([right[:, labels == label].mean() for label in np.unique(labels)])
         rows.append((policy, threshold, "calibration_error", error, np.nan, np.nan, None))
         rows.append((policy, threshold, "class_accuracy_std", between, np.nan, np.nan, None))
@@ -146,8 +147,8 @@ def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
     rows = []
     for index in np.unique(p.labels):
         here, label = p.labels == index, p.classes[index]
-        value = st.ratio(top[here], bottom[here], np.ones((1, int(here.sum()))))[0]
-        low, high = st.interval(st.ratio(top[here], bottom[here], weights[:, here]))
+        value = metrics.ratio(top[here], bottom[here], np.ones((1, int(here.sum()))))[0]
+        low, high = st.interval(metrics.ratio(top[here], bottom[here], weights[:, here]))
         for i, (policy, threshold, measure) in enumerate(keys):
             beside = published(policy, threshold, measure, p.classes, label)
             rows.append((policy, threshold, label, measure, value[i], low[i], high[i], beside))
@@ -220,7 +221,7 @@ def _holm(table: pd.DataFrame, family: str, column: str) -> pd.Series:
 def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
     rows = []
     for policy, threshold, ends in cells:
-        sure, accuracy, count = st.reliability(ends.confidence, grid.right(ends.answer).ravel())
+        sure, accuracy, count = metrics.reliability(ends.confidence, grid.right(ends.answer).ravel())
         rows += [(policy, threshold, i, sure[i], accuracy[i], count[i]) for i in np.flatnonzero(count)]
     return _frame(rows, ["policy", "threshold", "bin", "confidence", "accuracy", "episodes"])
 

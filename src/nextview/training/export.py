@@ -10,12 +10,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.benchmark.scores import map_scores, recogniser_scores
 from nextview.command_line import command_line
 from nextview.data.predictions import Predictions
 from nextview.data.splits import deduplicate, split_training
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError
+from nextview.metrics import map_scores, recogniser_scores
 from nextview.models.inference import MapNetwork, Recogniser
 from nextview.models.model_card import ModelCard, Training, file_hash, write_card
 from nextview.models.network_input import InputSpec, from_store
