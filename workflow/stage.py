@@ -22,6 +22,8 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 ROOT = Path(__file__).resolve().parent.parent
 """Of the repository."""
 
@@ -75,6 +77,32 @@ def runnable(command: str) -> str:
     return command
 
 
+def run(out: Path, commands: list[str], needs: list[Path], state: str) -> None:
+    """Make a stage, or go on making it.
+
+    Args:
+        out: file or folder that it makes.
+        commands: that make it.
+        needs: the .done files of the stages that it needs.
+        state: of whatever else it needs.
+    """
+    needed = {str(path): json.loads(path.read_text())["sha256"] for path in needs}
+    begun = {"commands": commands, "needs": needed, "state": state}
+    note = beside(out, "begun")
+    if not note.exists() or json.loads(note.read_text()) != begun:
+        for path in (out, beside(out, "part")):
+            remove(path)
+        note.write_text(json.dumps(begun, indent=1) + "\n")
+    for command in commands:
+        print(f"$ {command}", flush=True)
+        status = subprocess.run(["bash", "-o", "pipefail", "-c", runnable(command)]).returncode
+        if status:
+            sys.exit(status if status > 0 else 128 - status)
+    done, part = beside(out, "done"), beside(out, "done.part")
+    part.write_text(json.dumps({"commands": commands, "sha256": content_hash(out)}, indent=1) + "\n")
+    os.replace(part, done)
+
+
 def main() -> None:
     """Read the command line and run the stage."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -85,22 +113,12 @@ def main() -> None:
     given = parser.parse_args()
 
     out: Path = given.out
-    needed = {str(path): json.loads(path.read_text())["sha256"] for path in given.needs}
-    begun = {"commands": given.commands, "needs": needed, "state": given.state}
-    note = beside(out, "begun")
-    if not note.exists() or json.loads(note.read_text()) != begun:
-        for path in (out, beside(out, "part")):
-            remove(path)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        note.write_text(json.dumps(begun, indent=1) + "\n")
-    for command in given.commands:
-        print(f"$ {command}", flush=True)
-        status = subprocess.run(["bash", "-o", "pipefail", "-c", runnable(command)]).returncode
-        if status:
-            sys.exit(status if status > 0 else 128 - status)
-    done, part = beside(out, "done"), beside(out, "done.part")
-    part.write_text(json.dumps({"commands": given.commands, "sha256": content_hash(out)}, indent=1) + "\n")
-    os.replace(part, done)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(beside(out, "begun.lock"), blocking=False):
+            run(out, given.commands, given.needs, given.state)
+    except Timeout:
+        sys.exit(f"{out}: another process is at work on this stage; wait for it or stop it")
 
 
 if __name__ == "__main__":
