@@ -64,6 +64,11 @@ def p_value(p: float) -> str:
     return "" if not isfinite(p) else "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
+def called(policy: str) -> str:
+    """What a policy is called here: the card of one of ours by its name."""
+    return Path(policy).stem if policy.endswith(".json") else policy
+
+
 def recogniser(stage: Path) -> Iterator[str]:
     """Accuracy of single views and of all of them."""
     tables = {split: pd.read_csv(stage / split / "accuracy.csv", keep_default_na=False) for split in SPLITS}
@@ -149,8 +154,9 @@ def comparison(stage: Path) -> Iterator[str]:
     decay = settings["threshold_decay"]
     yield f"{settings['runs']} first views an object, the same for every policy; threshold {THRESHOLD} at the first"
     yield f"view, which comes down with the views (threshold decay {decay:g}); at most {settings['max_views']} views."
-    yield "Travel is the mean over all episodes, those that never moved included. p: bootstrap test of the accuracy against"
-    yield f"`{settings['reference']}`, corrected by Holm over all policies and thresholds. `summary.csv`, `tests.csv`."
+    yield "Travel is the mean over all episodes, those that never moved included. p: bootstrap test of the accuracy"
+    yield f"against `{settings['reference']}`, corrected by Holm over all policies and thresholds."
+    yield "`summary.csv`, `tests.csv`."
     yield ""
     found = cells(summary[summary["threshold"] == THRESHOLD], "policy", "measure")
     at = tests[(tests["threshold"] == THRESHOLD) & (tests["measure"] == "accuracy")].set_index("policy")
@@ -159,8 +165,8 @@ def comparison(stage: Path) -> Iterator[str]:
         numbers = [("accuracy", 3), ("class_accuracy", 3), ("n_views", 2), ("travel_all", 2), ("arc_all", 2)]
         row = [shown(found.get((policy, m)), d, m != "class_accuracy") for m, d in numbers]
         test = at.loc[policy] if policy in at.index else None
-        difference = "" if test is None else f"{100 * test['difference']:+.1f}"
-        rows.append([policy, *row, difference, "" if test is None else p_value(test["p_holm"])])
+        difference = "" if test is None else f"{round(100 * test['difference'], 1) + 0.0:+.1f}"
+        rows.append([called(policy), *row, difference, "" if test is None else p_value(test["p_holm"])])
     yield from markdown(
         ["policy", "accuracy", "mean of classes", "views", "travel, cells", "travel, radians",
          f"points over {settings['reference']}", "p"], rows)  # fmt: skip
@@ -180,13 +186,17 @@ def risk(stage: Path) -> Iterator[str]:
     yield "at most that share of those who stop early is wrong. On the test split:"
     yield ""
     rows = []
-    for policy in [name for name in ("random", "random-all", "lem", "lcm", "gain") if name in settings["policies"]]:
+    for policy in [
+        name for name in settings["policies"] if called(name) in ("random", "random-all", "lem", "lcm", "gain")
+    ]:
         for promised, threshold in settings["risks"].items():
             near = next(t for _, t, _ in found if abs(t - threshold) < 1e-9)
             right, early, views = (found[policy, near, m] for m in ("confident_accuracy", "confident", "n_views"))
             wrong = f"{1 - right[0]:.3f} ({1 - right[2]:.3f}-{1 - right[1]:.3f})"
             cell = shown(found[policy, near, "accuracy"])
-            rows.append([policy, promised, f"{threshold:.4f}", f"{early[0]:.3f}", wrong, cell, f"{views[0]:.2f}"])
+            rows.append(
+                [called(policy), promised, f"{threshold:.4f}", f"{early[0]:.3f}", wrong, cell, f"{views[0]:.2f}"]
+            )
     yield from markdown(
         ["policy", "promised", "threshold", "stop early", "wrong among those", "accuracy of all", "views"], rows
     )
