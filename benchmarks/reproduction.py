@@ -147,7 +147,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         "`nextview benchmark predictions.npz --uncalibrated`; `summary.csv`.",
         "",
-        "| policy | accuracy | without duplicates | looks | travel, all episodes | arc, radians |",
+        "| policy | accuracy | without duplicates | views | travel, all episodes | arc, radians |",
         "|---|---|---|---|---|---|",
     ]
     for name in dict.fromkeys((*BASELINES, *lems, *sorted(ran))):
@@ -200,7 +200,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         "`summary.csv`, rows without a threshold. Published: tables 3 and 12, from a network for 40 classes.",
         "",
-        "| views | accuracy | class accuracy | published | looks |",
+        "| views | accuracy | class accuracy | published | views |",
         "|---|---|---|---|---|",
     ]
     for name, paths in grid.paths.items():

@@ -25,7 +25,7 @@ from nextview.models.inference import MapNetwork, Models, Recogniser
 from nextview.models.model_card import read_card
 from nextview.policies.base import Evidence
 from nextview.policies.registry import make_policy
-from nextview.session import recognise
+from nextview.session import Session
 from nextview.viewsphere import ViewSphere
 
 
@@ -340,7 +340,7 @@ def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(meshes, 
             label = classes[p.labels[i]]
             mesh = load_mesh(tmp_path / "meshes" / label / "test" / f"{p.names[i]}.off")
             camera = SimulatedCamera(mesh, 64, sphere.distance)
-            live = recognise(camera, models, policy, sphere, int(start), Stopping(threshold))
+            live = Session(models, policy, sphere, int(start), Stopping(threshold)).run(camera)
             assert [view.index for view in live.views] == paths.views[e, : ends.n_views[e]].tolist()
             assert live.answer == classes[ends.answer[e]]
             assert live.confident == ends.confident[e]

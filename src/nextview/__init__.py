@@ -1,40 +1,81 @@
 """nextview: active 3D object recognition. What the object is, and where to look next.
 
+>>> import nextview
 >>> from nextview.data.samples import sample_mesh
->>> models = load_models()
->>> sphere = ViewSphere.named("40")
->>> policy = make_policy("lem", sphere, models.valley_classes("lem"))
->>> result = recognise(SimulatedCamera(sample_mesh("chair")), models, policy, sphere, start=3)
->>> result.answer
+>>> nextview.recognise(sample_mesh("chair"), start=3).answer
 'chair'
 """
 
+from typing import Any
+
 from nextview.belief import Stopping
-from nextview.cameras.simulated import SimulatedCamera
+from nextview.errors import (
+    DatasetError,
+    EntryError,
+    MeshError,
+    MissingExtraError,
+    ModelError,
+    NextviewError,
+    ObservationError,
+    OtherUseError,
+    PolicyError,
+    PredictionsError,
+    ResultsError,
+    RiskError,
+    SessionError,
+    UsageError,
+)
 from nextview.mesh import Mesh, load_mesh
-from nextview.models.inference import Models, load_models
+from nextview.models.inference import Models
 from nextview.observation import Camera, Observation
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.registry import make_policy
-from nextview.session import Recognition, Session, View, recognise
+from nextview.session import Recognition, Session, View
+from nextview.system import System, load, recognise
 from nextview.viewsphere import ViewSphere
+
+__version__ = "0.2.0"
 
 __all__ = [
     "Camera",
+    "DatasetError",
+    "EntryError",
     "EpisodeState",
     "Evidence",
     "Mesh",
+    "MeshError",
+    "MissingExtraError",
+    "ModelError",
     "Models",
+    "NextviewError",
     "Observation",
+    "ObservationError",
+    "OtherUseError",
     "Policy",
+    "PolicyError",
+    "PredictionsError",
     "Recognition",
+    "ResultsError",
+    "RiskError",
     "Session",
+    "SessionError",
     "SimulatedCamera",
     "Stopping",
+    "System",
+    "UsageError",
     "View",
     "ViewSphere",
+    "load",
     "load_mesh",
-    "load_models",
     "make_policy",
     "recognise",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """The simulated camera, imported when it is used: a robot does without."""
+    if name == "SimulatedCamera":
+        from nextview.cameras.simulated import SimulatedCamera
+
+        return SimulatedCamera
+    raise AttributeError(f"module 'nextview' has no attribute {name!r}")

@@ -300,9 +300,38 @@ class Stopping:
         if not 0 <= self.threshold_decay < np.inf:
             raise UsageError(f"the threshold decay is a number from 0 on, not {self.threshold_decay}")
 
+    @classmethod
+    def of(
+        cls, calibration: Calibration, threshold: float = 0.97, risk: float | None = None, max_views: int = 5
+    ) -> Stopping:
+        """The rule that goes with a recogniser's calibration. Everything that stops an episode begins here.
+
+        Args:
+            calibration: the threshold decays with its correlation.
+            threshold: of the belief, at the first view.
+            risk: instead, the lowest threshold at which at most this share of those who stop early is wrong. That is
+                promised for a threshold that does not decay.
+            max_views: views at most.
+
+        Raises:
+            RiskError: the error rate cannot be promised.
+            UsageError: see ``Stopping``.
+        """
+        if risk is not None:
+            return cls(calibration.threshold(risk, max_views), max_views)
+        return cls(threshold, max_views, calibration.correlation)
+
     def threshold_at(self, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
         """The belief at which to stop after so many views, same shape."""
         if self.threshold_decay == 0 or self.threshold in (0, 1):
             return np.full(np.shape(n_views), float(self.threshold))
         odds = np.log(self.threshold / (1 - self.threshold)) / (1 + self.threshold_decay * (np.asarray(n_views) - 1))
         return 1 / (1 + np.exp(-odds))
+
+    def __str__(self) -> str:
+        """The thresholds in words: "threshold 0.97 at the first view, 0.86 at the second"."""
+        if self.threshold_decay == 0 or self.max_views == 1:
+            return f"threshold {self.threshold:.3g}"
+        first, second = self.threshold_at(np.arange(1, 3))
+        last = f", {float(self.threshold_at(self.max_views)):.2g} at view {self.max_views}" * (self.max_views > 2)
+        return f"threshold {first:.3g} at the first view, {second:.2g} at the second{last}"

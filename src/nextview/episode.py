@@ -25,8 +25,9 @@ class Step:
         belief: fused after it, (A, classes).
         stopped: whether the episode ended here, (A,) bool.
         next_views: where it goes next, (A,) int64; -1 where it ended.
-        total: sum of the log-evidence in it and before, (A, D), see ``recognition.log_evidence_of``.
+        total: sum of the log-evidence in it and before, (A, D), see ``belief.log_evidence_of``.
         seen: views so far in which anything was seen, (A,) int64.
+        state: what the policy was shown of the episodes that go on; None where all ended.
     """
 
     episodes: NDArray[np.int64]
@@ -37,6 +38,7 @@ class Step:
     next_views: NDArray[np.int64]
     total: NDArray[np.float64]
     seen: NDArray[np.int64]
+    state: EpisodeState | None = None
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ class Episodes:
         if n_views >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
         going = ~stopped
-        next_views = np.full(len(now), -1)
+        next_views, state = np.full(len(now), -1), None
         if going.any():
             left, azimuth_bins = now[going], None
             if "azimuth_bins" in self.policy.needs:
@@ -136,7 +138,7 @@ class Episodes:
                 azimuth_bins,
             )
             next_views[going] = self._choose(state)
-        step = Step(now, views, evidence, belief, stopped, next_views, total, counted)
+        step = Step(now, views, evidence, belief, stopped, next_views, total, counted, state)
         if not self.steps:
             self._total = np.zeros((len(self.current), total.shape[1]))
         self._total[now], self._visited[now], self._seen[now] = total, visited, counted

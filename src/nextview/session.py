@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nextview.belief import Stopping, fuse
-from nextview.episode import Episodes
+from nextview.episode import Episodes, Step
 from nextview.errors import SessionError
 from nextview.models.inference import Models
 from nextview.observation import Camera, Observation
-from nextview.policies.base import Policy, maps_among
+from nextview.policies.base import Policy, ValuesViews, maps_among
 from nextview.viewsphere import ViewSphere
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -29,8 +34,10 @@ class View:
         next_view: where to look next; None where the episode ends.
         travel: so far, in grid cells.
         arc: so far, in radians.
-        azimuth_bins: belief, over all views, in the side of the object that is seen from here, for each class,
-            (classes, azimuth bins), in even steps of azimuth; None if the recogniser was not taught them.
+        azimuth_bins: belief, over all views, in the azimuth from which the object is seen here, for each class,
+            (classes, azimuth bins), in even steps; None if the recogniser was not taught them.
+        values: what the policy valued each candidate view at, (V,) float64, NaN for those that it did not consider;
+            None where the episode ends, and for policies that value nothing.
     """
 
     index: int
@@ -42,6 +49,7 @@ class View:
     travel: float
     arc: float
     azimuth_bins: NDArray[np.float64] | None = None
+    values: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -52,11 +60,15 @@ class Recognition:
         views: in order.
         classes: their names.
         confident: whether the threshold was reached (else the views ran out); never if nothing was seen.
+        sphere: the candidate viewpoints.
+        stopping: the rule that ended it.
     """
 
     views: tuple[View, ...]
     classes: tuple[str, ...]
     confident: bool
+    sphere: ViewSphere
+    stopping: Stopping
 
     @property
     def seen(self) -> bool:
@@ -80,20 +92,46 @@ class Recognition:
         """Of the whole episode, in grid cells."""
         return self.views[-1].travel
 
+    def __repr__(self) -> str:
+        """One line: ``chair (belief 0.998, 2 views, 1.41 cells of travel, confident)``."""
+        views = f"{len(self.views)} view{'s' * (len(self.views) > 1)}, {self.travel:.2f} cells of travel"
+        if self.answer is None:
+            return f"nothing is seen ({views})"
+        sure = "confident" if self.confident else "not confident"
+        return f"{self.answer} (belief {self.confidence:.3f}, {views}, {sure})"
+
+    def plot(self, path: str | Path | None = None, title: str = "") -> Figure:
+        """Draw the episode: images, what the policy valued the views at, beliefs and the path on the sphere.
+
+        Args:
+            path: write it to this file too (PNG, PDF or SVG).
+            title: of the picture.
+
+        Raises:
+            UsageError: the file cannot be written, or its suffix is not a picture's.
+        """
+        from nextview.report.episode_figure import draw_episode, save_figure
+
+        figure = draw_episode(self, title)
+        if path is not None:
+            save_figure(figure, Path(path))
+        return figure
+
 
 class Session:
     """One object under way; the caller moves the camera.
 
-    >>> session = Session(models, policy, sphere, start=0)                      # doctest: +SKIP
+    >>> session = nextview.load().session()                                     # doctest: +SKIP
     >>> while not session.done:                                                 # doctest: +SKIP
     ...     view = session.update(my_camera.observe(session.pose))
+    >>> session.result                                                          # doctest: +SKIP
 
     Args:
         models: recogniser and map networks.
         policy: chooses the next view.
         sphere: the viewpoints.
         start: the first view.
-        stopping: when to stop.
+        stopping: when to stop; by default the rule that goes with the recogniser, see ``Stopping.of``.
         rng: for policies that draw; seed 0 by default.
     """
 
@@ -103,7 +141,7 @@ class Session:
         policy: Policy,
         sphere: ViewSphere,
         start: int = 0,
-        stopping: Stopping = Stopping(),
+        stopping: Stopping | None = None,
         rng: np.random.Generator | None = None,
     ) -> None:
         if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:
@@ -113,11 +151,12 @@ class Session:
         missing = [name for name in maps_among(policy.needs) if name.removesuffix("-sphere") not in models.maps]
         if missing:
             raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")
-        self.models, self.sphere = models, sphere
+        self.models, self.policy, self.sphere = models, policy, sphere
         self.views: list[View] = []
         rng = rng or np.random.default_rng(0)
         calibration = models.recogniser.calibration
-        self._episodes = Episodes(sphere, policy, np.array([start]), stopping, rng, calibration)
+        self.stopping = stopping or Stopping.of(calibration)
+        self._episodes = Episodes(sphere, policy, np.array([start]), self.stopping, rng, calibration)
 
     @property
     def done(self) -> bool:
@@ -161,9 +200,22 @@ class Session:
             travel,
             arc,
             None if azimuth_bins is None else azimuth_bins[0],
+            self._values(step),
         )
         self.views.append(view)
         return view
+
+    def run(self, camera: Camera) -> Recognition:
+        """Go on to the end with a camera that goes where it is told."""
+        while not self.done:
+            self.update(camera.observe(self.pose))
+        return self.result
+
+    def _values(self, step: Step) -> NDArray[np.float64] | None:
+        """What the policy valued the views at when it chose."""
+        if step.state is None or not isinstance(self.policy, ValuesViews):
+            return None
+        return self.policy.view_values(step.state)[0]
 
     @property
     def result(self) -> Recognition:
@@ -172,20 +224,10 @@ class Session:
         Raises:
             SessionError: it has not.
         """
-        return Recognition(tuple(self.views), self.models.classes, bool(self._episodes.outcome.confident[0]))
-
-
-def recognise(
-    camera: Camera,
-    models: Models,
-    policy: Policy,
-    sphere: ViewSphere,
-    start: int = 0,
-    stopping: Stopping = Stopping(),
-    rng: np.random.Generator | None = None,
-) -> Recognition:
-    """Look at an object until its class is believed or the views run out. Arguments as for ``Session``."""
-    session = Session(models, policy, sphere, start, stopping, rng)
-    while not session.done:
-        session.update(camera.observe(session.pose))
-    return session.result
+        return Recognition(
+            tuple(self.views),
+            self.models.classes,
+            bool(self._episodes.outcome.confident[0]),
+            self.sphere,
+            self.stopping,
+        )

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from nextview.mesh import Mesh
@@ -36,6 +34,9 @@ class SimulatedCamera:
         self.radius = mesh.metres
         vertices = mesh.vertices.astype(np.float32)
         self._corners = np.ascontiguousarray(vertices.T)
+        from embreex.mesh_construction import TriangleMesh  # only who simulates a camera pays for the import
+        from embreex.rtcore_scene import EmbreeScene
+
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, vertices, np.ascontiguousarray(mesh.faces, dtype=np.int32))
         centres = (np.arange(size, dtype=np.float32) + 0.5 - size / 2) / self.intrinsics[0, 0].astype(np.float32)

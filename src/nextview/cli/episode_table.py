@@ -9,8 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from nextview.belief import Stopping
-from nextview.session import Recognition, View
+from nextview.session import Recognition
 from nextview.viewsphere import ViewSphere
 
 
@@ -19,60 +18,52 @@ def _angles(sphere: ViewSphere, view: int) -> str:
     return f"{view}\n{elevation:.0f}°, {azimuth:.0f}°"
 
 
-def _peak(sphere: ViewSphere, view: View) -> tuple[int, float] | None:
-    """View and value of the highest cell of the view's predicted map; None without a map, or if nothing is seen."""
-    if not view.observation.seen:
-        return None
-    for predicted in view.maps.values():
-        cell = int(predicted.argmax())
-        return int(sphere.window(view.index).flat[cell]), float(predicted.flat[cell])
-    return None
-
-
-def print_episode(result: Recognition, sphere: ViewSphere, name: str, stopping: Stopping) -> None:
+def print_episode(result: Recognition, name: str, policy: str) -> None:
     """Print each view and the answer."""
+    sphere = result.sphere
     table = Table(
         box=box.SIMPLE,
         show_lines=True,
         pad_edge=False,
         padding=(0, 1, 0, 0),
-        title=f"Looking at {name}",
-        caption="view: number, elevation, azimuth; travel: grid cells",
+        title=f"Looking at {name}, next views by {policy}",
+        caption=f"view: number, elevation, azimuth; travel: grid cells; stops at {result.stopping}",
     )
-    for column in ("step", "view", "this view alone", "belief, top 3", "map's peak", "next", "travel"):
+    for column in ("step", "view", "this view alone", "belief, top 3", "stops at", "next", "travel"):
         table.add_column(column, justify="right" if column in ("step", "travel") else "left", no_wrap=True)
     for step, view in enumerate(result.views, 1):
         top = np.argsort(-view.belief)[:3]
         own = int(view.alone.argmax())
-        peak = _peak(sphere, view)
         table.add_row(
             str(step),
             _angles(sphere, view.index),
             f"{result.classes[own]}\n{view.alone[own]:.3f}" if view.observation.seen else "nothing\nis seen",
             "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top),
-            "-" if peak is None else f"{_angles(sphere, peak[0])}\n{peak[1]:.2f}",
+            f"{float(result.stopping.threshold_at(step)):.2f}",
             "stop" if view.next_view is None else _angles(sphere, view.next_view),
             f"{view.travel:.2f}",
         )
     console = Console()
     console.print(table)
-    threshold = float(stopping.threshold_at(len(result.views)))
-    reason = f"threshold {threshold:.3g} reached" if result.confident else "no views left"
+    reason = "threshold reached" if result.confident else "no views left"
     console.print(
         f"It is a [bold]{result.answer}[/bold], belief {result.confidence:.3f}, after {len(result.views)} "
         f"view{'s' * (len(result.views) > 1)} and {result.travel:.2f} cells of travel ({reason})."
     )
 
 
-def as_json(result: Recognition, sphere: ViewSphere) -> str:
+def as_json(result: Recognition) -> str:
     """Everything the table shows, and the whole beliefs and maps, as one JSON object."""
 
+    sphere = result.sphere
+
     def rounded(values: np.ndarray) -> list:
-        return np.round(np.asarray(values, float), 6).tolist()
+        """As JSON has them: what is no number becomes null."""
+        found = np.round(np.asarray(values, float), 6)
+        return [None if np.isnan(x) else x for x in found.tolist()] if found.ndim == 1 else found.tolist()
 
     views = []
-    for view in result.views:
-        peak = _peak(sphere, view)
+    for step, view in enumerate(result.views, 1):
         bins = (
             None if view.azimuth_bins is None or not view.observation.seen else view.azimuth_bins[view.belief.argmax()]
         )
@@ -88,7 +79,8 @@ def as_json(result: Recognition, sphere: ViewSphere) -> str:
                 if bins is None
                 else {"degrees": 360 * int(bins.argmax()) / len(bins), "belief": round(float(bins.max()), 6)},
                 "maps": {name: rounded(values) for name, values in view.maps.items()},
-                "map_peak": None if peak is None else peak[0],
+                "values": None if view.values is None else rounded(view.values),
+                "threshold": round(float(result.stopping.threshold_at(step)), 6),
                 "next_view": view.next_view,
                 "travel_cells": round(view.travel, 6),
                 "travel_radians": round(view.arc, 6),

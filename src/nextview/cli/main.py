@@ -9,6 +9,7 @@ from typing import Any
 
 import tyro
 
+from nextview import __version__
 from nextview.cli.benchmark import benchmark
 from nextview.cli.check import check
 from nextview.cli.correspond import correspond
@@ -69,6 +70,9 @@ def main(arguments: list[str] | None = None) -> None:
     """
     commands = COMMANDS
     prog, arguments = "nextview", sys.argv[1:] if arguments is None else arguments
+    if arguments == ["--version"]:
+        print(f"nextview {__version__}")
+        return
     description = "Active 3D object recognition: what it is, and where to look next."
     if arguments and isinstance(commands.get(arguments[0]), dict):  # a group, such as nextview train
         prog, description = f"{prog} {arguments[0]}", GROUPS[arguments[0]]

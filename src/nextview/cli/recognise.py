@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from nextview.cli.timing import Stopwatch
     from nextview.mesh import Mesh
 
 Unit = Literal["mm", "cm", "inch", "foot", "m"]
@@ -19,7 +18,8 @@ Unit = Literal["mm", "cm", "inch", "foot", "m"]
 def recognise(
     mesh: tyro.conf.Positional[Path],
     /,
-    policy: str = "gain",
+    models: str = "modelnet10",
+    policy: str | None = None,
     threshold: float = 0.97,
     risk: float | None = None,
     max_views: int = 5,
@@ -35,9 +35,10 @@ def recognise(
 
     Args:
         mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
-        policy: how the next view is chosen: gain (what a view is worth less its travel weight), lem, lem-peak, lcm,
-            lcm-peak, random, random-all, furthest, unidirectional, spread, spread-local, another learned one that is
-            bundled, or the card of one (.json).
+        models: bundled models by name, or a folder with models of your own.
+        policy: how the next view is chosen: gain (the predicted gain of a view less its weighted travel; the default),
+            lem, lem-peak, lcm, lcm-peak, random, random-all, furthest, unidirectional, spread, spread-local, another
+            learned one, the card of one (.json), or MODULE:CLASS for your own.
         threshold: stop when the belief in one class reaches this after one view, less after several.
         risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
         max_views: stop after so many views.
@@ -49,58 +50,38 @@ def recognise(
         json: print JSON instead of a table.
         timing: also print where the time went, from the start of the process.
     """
-    from nextview.cli.timing import Stopwatch
-
-    watch = Stopwatch()
     from nextview.mesh import load_mesh
 
-    def load() -> Mesh:
-        return load_mesh(mesh, up, unit)
-
-    show(load, mesh.name, watch, policy, threshold, max_views, start, seed, figure, json, timing, risk)
+    options = {"policy": policy, "threshold": threshold, "risk": risk, "max_views": max_views}
+    show(lambda: load_mesh(mesh, up, unit), mesh.name, models, options, start, seed, figure, json, timing)
 
 
 def show(
     load: Callable[[], Mesh],
     name: str,
-    watch: Stopwatch,
-    policy: str = "gain",
-    threshold: float = 0.97,
-    max_views: int = 5,
-    start: int | None = None,
-    seed: int = 0,
-    figure: Path | None = None,
+    models: str,
+    options: dict,
+    start: int | None,
+    seed: int,
+    figure: Path | None,
     json: bool = False,
     timing: bool = False,
-    risk: float | None = None,
 ) -> None:
-    """Recognise what ``load`` returns and print the episode; the rest as for ``recognise``."""
-    import numpy as np
-
-    from nextview.belief import Stopping
+    """Recognise what ``load`` returns and print the episode; ``options`` are those of ``nextview.load``."""
+    from nextview import system
     from nextview.cameras.simulated import SimulatedCamera
+    from nextview.cli.episode_table import as_json, print_episode
+    from nextview.cli.timing import Stopwatch
     from nextview.errors import ObservationError
-    from nextview.models.inference import load_models
-    from nextview.policies.registry import make_policy
-    from nextview.session import Session
-    from nextview.viewsphere import ViewSphere
+    from nextview.policies.registry import own_modules
 
-    Stopping(threshold, max_views)  # says what is wrong with it
-    sphere = ViewSphere.named("40")
-    rng = np.random.default_rng(seed)
-    drawn = int(rng.integers(len(sphere)))
+    watch = Stopwatch()
     watch.lap("importing")
     camera = SimulatedCamera(load())
     watch.lap("building the scene")
-    needs = make_policy(policy, sphere).needs
-    models = load_models(needs)
-    valleys = models.valley_classes(needs[0]) if needs else ()
-    chosen = make_policy(policy, sphere, valleys, models.classes)
-    calibration = models.recogniser.calibration
-    stopping = Stopping(threshold, max_views, calibration.correlation)
-    if risk is not None:
-        stopping = Stopping(calibration.threshold(risk, max_views), max_views)
-    session = Session(models, chosen, sphere, drawn if start is None else start, stopping, rng)
+    with own_modules():
+        opened = system.load(models, **options)
+    session = opened.session(start, seed)
     watch.lap("loading the models")
     while not session.done:
         seen = camera.observe(session.pose)
@@ -113,16 +94,11 @@ def show(
             f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.views)} views; "
             "is it made of a few small parts far apart?"
         )
-
-    from nextview.cli.episode_table import as_json, print_episode
-
     if json:
-        print(as_json(result, sphere))
+        print(as_json(result))
     else:
-        print_episode(result, sphere, name, stopping)
+        print_episode(result, name, opened.policy_name)
     if timing:
         watch.show()
     if figure:
-        from nextview.report.episode_figure import save_episode
-
-        save_episode(result, sphere, figure, name)
+        result.plot(figure, name)

@@ -60,8 +60,8 @@ def sample_mesh(name: str) -> Mesh:
 def boxes_mesh(boxes: list[Box], name: str) -> Mesh:
     """A mesh of axis-aligned boxes, each closed by twelve triangles."""
     corner = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
-    azimuth_bins = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)])
-    triangles = np.concatenate([azimuth_bins[:, [0, 1, 2]], azimuth_bins[:, [0, 2, 3]]])
+    sides = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)])
+    triangles = np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
     spans: NDArray[np.float64] = np.sort(np.array(boxes, float), axis=1)  # (boxes, low and high, xyz)
     vertices = np.where(corner[None], spans[:, 1:2], spans[:, 0:1])
     faces = triangles[None] + 8 * np.arange(len(boxes))[:, None, None]

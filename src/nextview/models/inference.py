@@ -187,7 +187,9 @@ class Models:
     def valley_classes(self, map_name: str) -> tuple[int, ...]:
         """Classes (indices) for which a map's valley is the better view, as its card says; none without that map."""
         network = self.maps.get(map_name)
-        return () if network is None else tuple(self.classes.index(c) for c in network.valley_classes)
+        return (
+            () if network is None else tuple(self.classes.index(c) for c in network.valley_classes if c in self.classes)
+        )
 
     def evidence(self, observations: Sequence[Observation]) -> Evidence:
         """What the models say of views from one camera."""

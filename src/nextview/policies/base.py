@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,15 @@ class Policy(Protocol):
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """The next view of each episode, (B,) int64: one not visited yet, as long as there is any."""
+        ...
+
+
+@runtime_checkable
+class ValuesViews(Protocol):
+    """A policy that can show what it decides by. Optional: nothing but pictures depends on it."""
+
+    def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
+        """What each candidate view is valued at, (B, V) float64; NaN for those that are not considered."""
         ...
 
 

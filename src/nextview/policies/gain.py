@@ -193,9 +193,13 @@ class Gain:
         cells -= 1e-9 * np.arange(len(self.sphere))  # cells that are mirror images may tie; the first of them is taken
         return np.take_along_axis(cells, cells_to(self.sphere)[origin(self.sphere, state, self.frame)], 1)
 
+    def view_values(self, state: EpisodeState) -> Float:
+        """Predicted gain of each view less the weighted travel there, (B, V); differences between views count."""
+        return self.gains(state) - self.travel_weight * self.sphere.travel[state.current]
+
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
-        scores = self.gains(state) - self.travel_weight * self.sphere.travel[state.current]
+        scores = self.view_values(state)
         if self.anywhere:
             return np.where(state.visited, -np.inf, scores).argmax(1)
         rows = np.arange(len(scores))[:, None, None]

@@ -53,6 +53,13 @@ class MapPeak:
         """The map that is climbed."""
         return (self.map_name,)
 
+    def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
+        """The predicted map where it lies on the sphere, (B, V); NaN outside the window."""
+        found = np.full(state.visited.shape, np.nan)
+        window = self.sphere.windows[state.current].reshape(len(found), -1)
+        np.put_along_axis(found, window, np.asarray(state.evidence.maps[self.map_name]).reshape(len(found), -1), 1)
+        return found
+
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)

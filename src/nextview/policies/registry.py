@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,6 +58,17 @@ def make_policy(
     if ":" in name:
         return _import_policy(name, sphere)
     raise PolicyError(f"no policy is called {name!r}; there are {', '.join([*POLICIES, *learned])}")
+
+
+@contextmanager
+def own_modules() -> Iterator[None]:
+    """Within, a user's own modules in the working folder can be imported, as Python itself lets a script do."""
+    folder = str(Path.cwd())
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        sys.path.remove(folder)
 
 
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:

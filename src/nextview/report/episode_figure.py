@@ -1,4 +1,4 @@
-"""A picture of one episode: what was seen, what the map promised, what was believed, and the path on the sphere."""
+"""A picture of one episode: what was seen, what the policy decided by, what was believed, and the path."""
 
 from __future__ import annotations
 
@@ -18,39 +18,34 @@ from nextview.viewsphere import ViewSphere
 INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
 
 
-def save_episode(result: Recognition, sphere: ViewSphere, path: Path, title: str) -> None:
-    """Draw an episode into a PNG, PDF or SVG file.
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure into a PNG, PDF or SVG file.
 
     Raises:
         UsageError: the file cannot be written, or its suffix is not a picture's.
     """
-    figure = draw_episode(result, sphere, title)
     try:
         figure.savefig(path, dpi=110, facecolor="white")
     except (OSError, ValueError) as error:
         raise UsageError(f"{path}: the figure cannot be written ({error})") from None
 
 
-def draw_episode(result: Recognition, sphere: ViewSphere, title: str) -> Figure:
-    """One column for each view (image, predicted map with the choice marked, belief), and the sphere beside them."""
-    views = result.views
-    heights = [2.7, 2.6, 2.9] if views[0].maps else [2.7, 2.9]
+def draw_episode(result: Recognition, title: str = "") -> Figure:
+    """One column for each view (image, what the policy valued the views at, belief), and the sphere beside them."""
+    views, sphere = result.views, result.sphere
+    valued = any(view.values is not None for view in views)
+    heights = [2.7, 2.6, 2.9] if valued else [2.7, 2.9]
     figure = Figure(figsize=(2.5 * len(views) + 5.2, sum(heights)), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.5 * len(views), 5.2])[0]
     axes = left.subplots(len(heights), len(views), squeeze=False, gridspec_kw={"height_ratios": heights})
     shown = np.argsort(-np.max([view.belief for view in views], axis=0))[:5]
     for k, view in enumerate(views):
         _draw_image(axes[0, k], view, sphere, k + 1)
-        if view.maps:
-            _draw_map(axes[1, k], view, sphere, first=k == 0)
-        _draw_belief(axes[-1, k], view, result.classes, shown, first=k == 0)
+        if valued:
+            _draw_values(axes[1, k], view, sphere, [v.index for v in views[:k]], first=k == 0)
+        _draw_belief(axes[-1, k], view, result, k + 1, shown)
     _draw_path(right.add_subplot(projection="3d"), views, sphere)
-    figure.suptitle(
-        f"{title}: {result.answer or 'nothing is seen'}, belief {result.confidence:.3f}, "
-        f"{len(views)} view{'s' * (len(views) > 1)}, {result.travel:.2f} cells of travel",
-        color=INK,
-        fontsize=14,
-    )
+    figure.suptitle(f"{title}: {result!r}" if title else repr(result), color=INK, fontsize=13)
     return figure
 
 
@@ -61,38 +56,48 @@ def _draw_image(axis: Axes, view: View, sphere: ViewSphere, step: int) -> None:
     axis.axis("off")
 
 
-def _draw_map(axis: Axes, view: View, sphere: ViewSphere, first: bool) -> None:
-    name, predicted = next(iter(view.maps.items()))
-    axis.imshow(predicted, cmap="viridis", vmin=0, vmax=1, origin="lower", aspect="auto")
-    window = sphere.window(view.index)
-    for ring, column in np.ndindex(window.shape):
-        value = predicted[ring, column]
-        axis.text(
-            column, ring, f"{value:.2f}", ha="center", va="center", fontsize=8, color="white" if value < 0.7 else INK
-        )
-    for index, colour, label in ((view.index, "white", "here"), (view.next_view, ACCENT, "next")):
-        for ring, column in np.argwhere(window == index)[:1] if index is not None else ():
+def _draw_values(axis: Axes, view: View, sphere: ViewSphere, visited: list[int], first: bool) -> None:
+    """What the policy valued each candidate view at, ring over azimuth, with here, next and the visited marked."""
+    if view.values is None:
+        axis.axis("off")
+        axis.text(0.5, 0.5, "no other view needed", ha="center", va="center", fontsize=9, color=INK)
+        return
+    values = view.values.reshape(sphere.rings, sphere.azimuths)
+    axis.imshow(np.ma.masked_invalid(values), cmap="viridis", origin="lower", aspect="auto")
+    axis.set_facecolor(FAINT)  # views that were not considered
+    marks = [(index, FAINT, "x") for index in visited] + [(view.index, "white", "here")]
+    if view.next_view is not None:
+        marks.append((view.next_view, ACCENT, "next"))
+    for index, colour, label in marks:
+        ring, column = divmod(index, sphere.azimuths)
+        if label != "x":
             corner = (column - 0.46, ring - 0.46)
             axis.add_patch(Rectangle(corner, 0.92, 0.92, fill=False, edgecolor=colour, linewidth=2.2))
-            axis.text(column, ring - 0.33, label, ha="center", va="center", fontsize=7, color=colour, weight="bold")
-    axis.set_xticks(range(3), ["-1", "0", "+1"], fontsize=8)
+        axis.text(column, ring, label, ha="center", va="center", fontsize=6, color=colour, weight="bold")
+    step = 360 / sphere.azimuths
+    ticks = range(0, sphere.azimuths, 2)
+    axis.set_xticks(ticks, [f"{step * k:.0f}°" for k in ticks], fontsize=8)
     axis.set_yticks(range(sphere.rings), [f"{e:.0f}°" for e in sphere.elevations] if first else [], fontsize=8)
-    axis.set_title(f"predicted {name.upper()}" + ("" if view.next_view is not None else " (not needed)"), fontsize=9)
+    axis.set_title("value of each view", fontsize=9)
     if first:
         axis.set_ylabel("elevation")
-    axis.set_xlabel("azimuth step", fontsize=8)
+    axis.set_xlabel("azimuth", fontsize=8)
 
 
-def _draw_belief(axis: Axes, view: View, classes: tuple[str, ...], shown: np.ndarray, first: bool) -> None:
-    rows = np.arange(len(shown))[::-1]
+def _draw_belief(axis: Axes, view: View, result: Recognition, step: int, shown: np.ndarray) -> None:
+    rows, classes = np.arange(len(shown))[::-1], result.classes
     axis.barh(rows + 0.18, view.belief[shown], 0.36, color=ACCENT, label="belief after this view")
-    axis.barh(rows - 0.18, view.alone[shown], 0.36, color=FAINT, label="this image alone")
+    axis.barh(rows - 0.18, view.alone[shown], 0.36, color=FAINT, label="this view alone")
+    threshold = float(result.stopping.threshold_at(step))
+    axis.axvline(threshold, color=INK, linewidth=1, linestyle=":", label="threshold")
     axis.set_xlim(0, 1)
-    axis.set_yticks(rows, [classes[c].replace("_", " ") for c in shown] if first else [])
+    axis.set_yticks(rows, [classes[c].replace("_", " ") for c in shown] if step == 1 else [])
     axis.spines[["top", "right"]].set_visible(False)
     best = int(view.belief.argmax())
-    axis.set_title(f"{classes[best].replace('_', ' ')} {view.belief[best]:.3f}", fontsize=10, color=ACCENT)
-    if first:
+    believed = f"{classes[best].replace('_', ' ')} {view.belief[best]:.3f}"
+    axis.set_title(believed if view.observation.seen else "nothing is seen", fontsize=10, color=ACCENT)
+    axis.set_xlabel(f"threshold {threshold:.2f}", fontsize=8)
+    if step == 1:
         axis.legend(fontsize=7, loc="lower right", frameon=False)
 
 
@@ -103,7 +108,8 @@ def _draw_path(axis: Axes3D, views: tuple[View, ...], sphere: ViewSphere) -> Non
         around = np.linspace(0, 2 * np.pi, 91)
         ring = np.cos(elevation) * np.cos(around), np.cos(elevation) * np.sin(around), 0 * around + np.sin(elevation)
         axis.plot(*ring, color=FAINT, linewidth=0.6)
-    cloud = np.concatenate([view.observation.points[::3] for view in views])
+    seen = [view.observation.points[::3] for view in views if view.observation.seen]
+    cloud = np.concatenate([np.zeros((0, 3)), *seen])
     axis.scatter(*cloud.T, s=1, color=INK, alpha=0.35, depthshade=False)
     path = [view.index for view in views]
     for a, b in itertools.pairwise(d[path]):

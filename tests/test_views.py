@@ -1,4 +1,4 @@
-"""The comparison at fixed numbers of views against the benchmark itself, one number of looks at a time."""
+"""The comparison at fixed numbers of views against the benchmark itself, one number of views at a time."""
 
 import runpy
 from itertools import combinations
@@ -14,7 +14,7 @@ from test_predictions import some_predictions
 from nextview.benchmark import results
 from nextview.cli.benchmark import benchmark
 
-VIEW_COUNTS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "looks.py"))
+VIEW_COUNTS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "views.py"))
 NAMES = ("lem", "furthest", "spread", "orbit-4", "best-4")
 
 
@@ -27,12 +27,12 @@ def made(tmp_path_factory):
 
 
 @pytest.mark.parametrize("n_views", [2, 4])
-def test_the_numbers_are_those_of_a_benchmark_with_so_many_looks(made, n_views):
+def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
     names = ("random", "random-all", "lem", "furthest", "spread", "oracle-gain")
     out = made / f"benchmark{n_views}"
     benchmark(made / "p.npz", out=out, policies=names, thresholds=(1.0,), runs=3, max_views=n_views, samples=200)
     tables = results.load(out).tables
-    found = pd.read_csv(made / "out" / "looks.csv").set_index(["policy", "n_views", "measure"]).sort_index()
+    found = pd.read_csv(made / "out" / "views.csv").set_index(["policy", "n_views", "measure"]).sort_index()
     for ours, theirs in (("accuracy", "accuracy"), ("travel", "travel_all")):
         summary = tables.summary[tables.summary["measure"] == theirs].set_index("policy")
         for name in names:
@@ -45,7 +45,7 @@ def test_the_numbers_are_those_of_a_benchmark_with_so_many_looks(made, n_views):
 
 
 def test_the_gap_is_that_between_random_and_one_step_of_foresight(made):
-    found = pd.read_csv(made / "out" / "looks.csv").set_index(["measure", "n_views", "policy"])["value"].sort_index()
+    found = pd.read_csv(made / "out" / "views.csv").set_index(["measure", "n_views", "policy"])["value"].sort_index()
     for n_views in (2, 4):
         accuracy, share = found["accuracy", n_views], found["share_of_gap", n_views]
         assert (share["random"], share["oracle-gain"]) == (0, pytest.approx(1))
@@ -53,8 +53,8 @@ def test_the_gap_is_that_between_random_and_one_step_of_foresight(made):
         assert share["spread"] == pytest.approx((accuracy["spread"] - floor) / (top - floor))
 
 
-def test_the_table_has_a_row_for_every_policy_and_a_column_for_every_number_of_looks(made):
-    text = (made / "out" / "looks.md").read_text().splitlines()
+def test_the_table_has_a_row_for_every_policy_and_a_column_for_every_number_of_views(made):
+    text = (made / "out" / "views.md").read_text().splitlines()
     assert [line.split(" | ")[0] for line in text[2:]] == [f"| {name}" for name in ("random", "random-all", *NAMES,
                                                                                   "oracle-gain")]  # fmt: skip
     assert text[0].startswith("| policy | 2 views | 4 views | travel at 2, 4 |")
@@ -63,12 +63,12 @@ def test_the_table_has_a_row_for_every_policy_and_a_column_for_every_number_of_l
 
 def test_policies_may_be_compared_with_others_than_the_random_ones(made):
     VIEW_COUNTS["main"](made / "p.npz", made / "against", ("furthest",), (2,), runs=3, samples=50, against=("lem",))
-    found = pd.read_csv(made / "against" / "looks.csv").set_index(["policy", "measure"]).sort_index()
+    found = pd.read_csv(made / "against" / "views.csv").set_index(["policy", "measure"]).sort_index()
     for reference in ("random", "lem"):
         difference = found.loc[("furthest", "accuracy"), "value"] - found.loc[(reference, "accuracy"), "value"]
         assert found.loc[("furthest", f"to_{reference}"), "value"] == pytest.approx(difference)
     assert np.isnan(found.loc[("lem", "to_lem"), "p"])
-    head = (made / "against" / "looks.md").read_text().splitlines()[0]
+    head = (made / "against" / "views.md").read_text().splitlines()[0]
     assert "points over random at 2 | points over lem at 2 |" in head
     with pytest.raises(ValueError, match="not all"):
         VIEW_COUNTS["main"](made / "p.npz", made / "against", (), (2,), runs=1, samples=20, against=("lcm",))
@@ -77,14 +77,14 @@ def test_policies_may_be_compared_with_others_than_the_random_ones(made):
 def test_views_that_end_before_the_last_look_are_left_out_with_a_sentence(made):
     with pytest.raises(ValueError, match="not all"):
         VIEW_COUNTS["main"](made / "p.npz", made / "short", ("orbit-3", "lem"), (2, 4), runs=1, samples=20)
-    text = (made / "short" / "looks.md").read_text()
+    text = (made / "short" / "views.md").read_text()
     assert "Left out: orbit-3 is over before view 4" in text
     assert "| orbit-3" not in text
     assert "| lem |" in text
 
 
 @pytest.mark.parametrize("n_views", [(), (0, 2), (41,)])
-def test_a_number_of_looks_that_nobody_can_take_is_refused(made, n_views):
+def test_a_number_of_views_that_nobody_can_take_is_refused(made, n_views):
     with pytest.raises(ValueError, match="1 to 40 views"):
         VIEW_COUNTS["main"](made / "p.npz", made / "bad", n_views=n_views)
 

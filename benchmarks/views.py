@@ -1,15 +1,16 @@
 """Compare policies at a fixed number of views: nobody stops early, and each view and each cell of travel is counted.
 
-    python benchmarks/looks.py test.npz --out looks [--policies gain@0.01 ...] [--looks 2 3 5] [--against lem ...]
+    python benchmarks/views.py test.npz --out views [--policies gain@0.01 ...] [--n-views 2 3 5] [--against lem ...]
 
-Writes looks.md (the table), looks.csv (every number in a row of its own) and front.png (accuracy against travel) into
+Writes views.md (the table), views.csv (every number in a row of its own) and front.png (accuracy against travel) into
 the folder, and prints the table. A policy chooses without knowing how many views there will be, so it is run once and
 its path cut after each number of views; the numbers are those of
 
     nextview benchmark test.npz --thresholds 1 --max-views 2
 
-and so on. Intervals are 95 % bootstrap intervals over objects; p is McNemar's test over objects, for each comparison by
-itself (not corrected for how many there are). The gap is that between random and oracle-gain, which sees what every
+and so on. Intervals are 95 % bootstrap intervals over objects; p is McNemar's test over objects,
+corrected by Holm's method for all comparisons of the run: every policy that chooses without the truth, with every
+reference, after every number of views. The gap is that between random and oracle-gain, which sees what every
 view of the window would say.
 """
 
@@ -29,13 +30,13 @@ import tyro
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import MaxNLocator, PercentFormatter
 from matplotlib.transforms import Bbox
 
 from nextview.benchmark.entries import EpisodeSpecs, entry_policy
 from nextview.benchmark.replay import Outcomes, Trajectories, make_specs, truncate
 from nextview.benchmark.run import Grid, run_grid
-from nextview.benchmark.statistics import interval, mcnemar, ratio, resample
+from nextview.benchmark.statistics import holm, interval, mcnemar, ratio, resample
 from nextview.cli.progress import track
 from nextview.data.predictions import Predictions
 from nextview.report.curves import COLOURS, OWN, is_oracle
@@ -71,7 +72,7 @@ def after(paths: Trajectories, n_views: int) -> Outcomes:
 
 
 def measured(grid: Grid, n_views: Sequence[int], samples: int, references: Sequence[str] = REFERENCES) -> pd.DataFrame:
-    """Every number: policy, looks, measure, value, low, high, p.
+    """Every number: policy, n_views, measure, value, low, high, p, p_holm.
 
     The measures: ``accuracy``; ``travel``, grid cells; ``to_random`` and so on, differences of accuracy to references;
     ``share_of_gap``, how much of what ``oracle-gain`` has over ``random`` the policy has too. The bootstrap samples are
@@ -100,11 +101,14 @@ def measured(grid: Grid, n_views: Sequence[int], samples: int, references: Seque
         for name in names:
             share = value[name, "to_random"] / gap if gap > 0 else np.nan
             rows.append((name, k, "share_of_gap", share, np.nan, np.nan, np.nan))
-    return pd.DataFrame(rows, columns=["policy", "n_views", "measure", "value", "low", "high", "p"])
+    table = pd.DataFrame(rows, columns=["policy", "n_views", "measure", "value", "low", "high", "p"])
+    blind = ~table["policy"].map(knows)
+    table["p_holm"] = holm(np.where(blind, table["p"], np.nan))
+    return table
 
 
-Numbers = dict[tuple[str, int, str], tuple[float, float, float, float]]
-"""Value, low, high and p by policy, looks and measure."""
+Numbers = dict[tuple[str, int, str], tuple[float, float, float, float, float]]
+"""Value, low, high, p and p after Holm's correction, by policy, number of views and measure."""
 
 
 def by_key(table: pd.DataFrame) -> Numbers:
@@ -119,9 +123,12 @@ def markdown(table: pd.DataFrame, left_out: Sequence[str], references: Sequence[
     def difference(name: str, k: int, reference: str) -> str:
         value, *_, p = found[name, k, f"to_{reference}"]
         # rounded first: no minus before a zero
-        return f"{round(100 * value, 1) + 0.0:+.1f} (p {'< 0.0001' if p < 1e-4 else f'{p:.2g}'})"
+        shown = f"{round(100 * value, 1) + 0.0:+.1f}"
+        if np.isnan(p):  # a ceiling is no rival
+            return shown
+        return f"{shown} (p {'< 0.0001' if p < 1e-4 else f'{p:.2g}'})"
 
-    head = ["policy", *(f"{k} look{'s' * (k > 1)}" for k in n_views), f"travel{at}"]
+    head = ["policy", *(f"{k} view{'s' * (k > 1)}" for k in n_views), f"travel{at}"]
     head += [f"points over {reference}{at}" for reference in references] + [f"of the gap{at}"]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for name in table["policy"].unique():
@@ -156,22 +163,23 @@ def families(names: Sequence[str], specs: EpisodeSpecs) -> dict[str, list[tuple[
 def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]]) -> Figure:
     """Accuracy against travel, a panel for each number of views; what takes the truth is only named above it.
 
-    A line joins the travel weights of one policy. Dots are filled where McNemar's p against random is under 0.05.
+    A line joins the travel weights of one policy. Dots are filled where McNemar's p against random, corrected, is under
+    0.05.
     """
     found, n_views = by_key(table), table["n_views"].unique().tolist()
     at_prices = {name for members in travel_weights.values() for _, name in members}
     drawn = [name for name in table["policy"].unique() if not knows(name)]
     names = [name for name in drawn if name in at_prices or name.partition("@")[0] not in travel_weights]
     colour = {name: COLOURS.get(name, "#4a5560") for name in names}
-    log_evidence = {name: Path(name).name for name in names}
+    text_of = {name: Path(name).name for name in names}
     for own, (family, members) in zip(OWN * len(travel_weights), travel_weights.items(), strict=False):
         for travel_weight, name in members:
-            colour[name], log_evidence[name] = (
+            colour[name], text_of[name] = (
                 own,
                 f"{Path(family).name}@{travel_weight:g}" if name == family else f"@{travel_weight:g}",
             )
-        if family not in log_evidence:
-            log_evidence[members[0][1]] = Path(members[0][1]).name
+        if family not in text_of:
+            text_of[members[0][1]] = Path(members[0][1]).name
     with matplotlib.rc_context(STYLE):
         figure = Figure((3.7 * len(n_views), 4.4), dpi=160, layout="constrained")
         FigureCanvasAgg(figure)  # measures text
@@ -184,10 +192,11 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
                 axes.plot(*zip(*line, strict=True), color=colour[members[0][1]], linewidth=1.2, zorder=2)
                 lines.append((axes, line))
             for name, (x, y) in place.items():
-                clear = found[name, k, "to_random"][3] < 0.05
+                clear = found[name, k, "to_random"][4] < 0.05
                 axes.plot(x, y, "o", color=colour[name], markersize=5, zorder=3,
                           markerfacecolor=colour[name] if clear else "white")  # fmt: skip
             axes.margins(0.16, 0.1)
+            axes.yaxis.set_major_locator(MaxNLocator(steps=[1, 2, 5, 10]))
             axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=1))
             axes.set_xlabel("mean travel, grid cells")
             above = [
@@ -195,24 +204,29 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
                 for name in table["policy"].unique()
                 if knows(name)
             ]
-            axes.set_title(f"{k} look{'s' * (k > 1)}", loc="left", fontweight="bold", fontsize=10, y=1.0,
+            axes.set_title(f"{k} view{'s' * (k > 1)}", loc="left", fontweight="bold", fontsize=10, y=1.0,
                            pad=8 + 11 * len(above))  # fmt: skip
             axes.annotate("\n".join(above), (0, 1), xytext=(0, 5), xycoords="axes fraction",
                           textcoords="offset points", fontsize=8, va="bottom")  # fmt: skip
         panels[0].set_ylabel("accuracy")
-        figure.supxlabel("filled: differs from random by McNemar's test (p < 0.05)", fontsize=8, x=0.99, ha="right")
+        figure.supxlabel(
+            "filled: differs from random by McNemar's test, corrected for all comparisons (p < 0.05)",
+            fontsize=8,
+            x=0.99,
+            ha="right",
+        )
         figure.canvas.draw()  # settles where the points are
         figure.set_layout_engine("none")
         for axes, k in zip(panels, n_views, strict=True):
             points = {name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0]) for name in names}
-            label(axes, points, log_evidence, colour, [line for of, line in lines if of is axes])
+            label(axes, points, text_of, colour, [line for of, line in lines if of is axes])
     return figure
 
 
 def label(
     axes: Axes,
     points: dict[str, tuple[float, float]],
-    log_evidence: dict[str, str],
+    text_of: dict[str, str],
     colour: dict[str, str],
     lines: Sequence[Sequence[tuple[float, float]]],
 ) -> None:
@@ -230,7 +244,7 @@ def label(
     crowd = {name: np.sort(np.hypot(*(everyone - at).T))[:4].sum() for name, at in dots.items()}
     for name in sorted(dots, key=crowd.__getitem__):
         at = dots[name]
-        text = axes.annotate(log_evidence[name], points[name], xytext=(0, 0), textcoords="offset points", va="bottom",
+        text = axes.annotate(text_of[name], points[name], xytext=(0, 0), textcoords="offset points", va="bottom",
                              fontsize=7.5, color=colour[name], zorder=4)  # fmt: skip
         size = np.array(text.get_window_extent().size)
         tries = []
@@ -261,7 +275,7 @@ def _overlap(a: Bbox, b: Bbox) -> float:
 
 def main(
     predictions: tyro.conf.Positional[Path],
-    out: Path = Path("n_views"),
+    out: Path = Path("views"),
     policies: tuple[str, ...] = (),
     n_views: tuple[int, ...] = (2, 3, 5),
     split: Literal["train", "test"] | None = None,
@@ -274,7 +288,7 @@ def main(
 
     Args:
         predictions: made by nextview predict.
-        out: folder for views.md, looks.csv and front.png.
+        out: folder for views.md, views.csv and front.png.
         policies: names, or MODULE:CLASS for your own, beside random, random-all and oracle-gain; by default a choice of
             those that the predictions allow.
         n_views: after how many the policies are compared.
@@ -290,21 +304,21 @@ def main(
     elif len(set(table.splits)) > 1:
         raise ValueError(f"{predictions}: holds training and test objects; choose with --split which are compared")
     if not n_views or not 1 <= min(n_views) <= max(n_views) <= len(table.sphere):
-        raise ValueError(f"policies are compared after 1 to {len(table.sphere)} looks, not {n_views}")
+        raise ValueError(f"policies are compared after 1 to {len(table.sphere)} views, not {n_views}")
     specs = make_specs(table, runs, seed)
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
     names = list(dict.fromkeys([*REFERENCES, *against, *(policies or POLICIES), CEILING]))
     grid = Grid(specs, runs, (), max(n_views), seed)
     track(run_grid(grid, names), len(names), "replaying policies")
     for name in [name for name, paths in grid.paths.items() if paths.views.shape[1] < max(n_views) and paths.fixed]:
-        grid.failures[name] = f"{name} is over before look {max(n_views)}"
+        grid.failures[name] = f"{name} is over before view {max(n_views)}"
         del grid.paths[name]
     compared = [name for name in dict.fromkeys((REFERENCES[0], *against)) if name in grid.paths]
     found = measured(grid, sorted(set(n_views)), samples, compared)
     text = markdown(found, list(grid.failures.values()), compared)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "looks.md").write_text(text, encoding="utf-8")
-    found.to_csv(out / "looks.csv", index=False)
+    (out / "views.md").write_text(text, encoding="utf-8")
+    found.to_csv(out / "views.csv", index=False)
     choosing = [name for name, paths in grid.paths.items() if not paths.fixed]
     to_png(front(found, families(choosing, specs)), out / "front.png")
     print(text, end="")
@@ -316,5 +330,5 @@ if __name__ == "__main__":
     try:
         tyro.cli(main)
     except ValueError as error:
-        print(f"looks.py: {error}", file=sys.stderr)
+        print(f"views.py: {error}", file=sys.stderr)
         sys.exit(2)

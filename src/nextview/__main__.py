@@ -1,0 +1,5 @@
+"""``python -m nextview`` is the ``nextview`` command."""
+
+from nextview.cli.main import main
+
+main()

@@ -1,0 +1,100 @@
+"""``Session``: one object under way, the caller moves the camera."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import nextview
+from nextview import Session, SimulatedCamera, Stopping, UsageError
+from nextview.belief import log_evidence_of
+from nextview.data.samples import sample_mesh
+from nextview.errors import PolicyError, SessionError
+from nextview.models.inference import Models
+
+
+@pytest.fixture(scope="module")
+def system():
+    return nextview.load()
+
+
+@pytest.fixture(scope="module")
+def camera():
+    return SimulatedCamera(sample_mesh("chair"))
+
+
+def test_a_session_stops_by_the_same_rule_unless_told_otherwise():
+    system = nextview.load()
+    alone = nextview.Session(system.models, system.policy, system.sphere)
+    assert alone.stopping == system.stopping
+
+
+def test_it_asks_for_views_until_it_is_done(system, camera):
+    session = system.session(start=3)
+    asked = []
+    while not session.done:
+        np.testing.assert_array_equal(session.pose, system.sphere.poses[session.view])
+        asked.append(session.view)
+        view = session.update(camera.observe(session.pose))
+        assert (view.next_view is None) == session.done
+    assert asked == [view.index for view in session.result.views]
+    assert session.result.answer == "chair"
+    with pytest.raises(SessionError, match="has ended"):
+        session.update(camera.observe(system.sphere.poses[0]))
+
+
+def test_there_is_no_result_before_the_end(system):
+    with pytest.raises(SessionError):
+        _ = system.session().result
+
+
+def test_travel_and_belief_are_those_of_the_views(system, camera):
+    session = Session(system.models, system.policy, system.sphere, 9, Stopping(1.0, 4))
+    result = session.run(camera)
+    path = [view.index for view in result.views]
+    assert len(set(path)) == 4
+    assert result.travel == pytest.approx(sum(system.sphere.travel[a, b] for a, b in itertools.pairwise(path)))
+    for view in result.views:
+        assert view.belief.sum() == pytest.approx(1)
+    # The belief after the last view is that of all views at once, whatever their order.
+    total, calibration = 0.0, system.models.recogniser.calibration
+    for view in reversed(result.views):
+        e = system.models.evidence([view.observation])
+        total = total + log_evidence_of(e.logits, e.azimuth_bins, system.sphere.turn[[view.index]]).astype(np.float64)
+    np.testing.assert_allclose(calibration.belief(total, 4, len(system.classes))[0], result.views[-1].belief, atol=1e-9)
+
+
+def test_a_wrong_first_view_is_refused(system):
+    for start in (-1, 40):
+        with pytest.raises(UsageError, match="0 to 39"):
+            system.session(start)
+
+
+def test_a_policy_without_its_map_is_refused(system):
+    with pytest.raises(SessionError, match="needs the map"):
+        Session(Models(system.models.recogniser, {}), nextview.make_policy("lem", system.sphere), system.sphere)
+
+
+def test_a_policy_that_fails_leaves_the_session_usable(system, camera):
+    class Once:
+        needs = ()
+        failed = False
+
+        def next_views(self, state, rng):
+            if not self.failed:
+                self.failed = True
+                raise RuntimeError("a bug of one's own")
+            return (~state.visited).argmax(1)
+
+    session = Session(system.models, Once(), system.sphere, 7, Stopping(1.0, 2))
+    seen = camera.observe(session.pose)
+    with pytest.raises(PolicyError, match="a bug of one's own"):
+        session.update(seen)
+    assert session.update(seen).index == 7
+    assert session.view == 0
+
+
+def test_the_same_seed_gives_the_same_episode(camera):
+    random = nextview.load(policy="random-all", threshold=1.0)
+    paths = [[view.index for view in random.recognise(camera, seed=s).views] for s in (1, 1, 2)]
+    assert paths[0] == paths[1] != paths[2]

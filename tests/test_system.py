@@ -1,0 +1,151 @@
+"""The front door: what ``load`` puts together, and that the command line goes through it too."""
+
+import itertools
+import json
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.tiny_models import make_map_network, make_recogniser
+
+import nextview
+from nextview.belief import Stopping
+from nextview.cli.main import main
+from nextview.data.samples import SAMPLES, sample_mesh
+
+SAMPLE = Path(__file__).parent.parent / "samples" / "chair.off"
+
+
+def test_one_call_answers_in_one_line():
+    result = nextview.recognise(SAMPLE)
+    assert result.answer == "chair"
+    assert str(result).startswith("chair (belief 0.")
+    assert "\n" not in repr(result)
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_sample_files_are_the_sample_meshes(name):
+    read, made = nextview.load_mesh(SAMPLE.with_stem(name)), sample_mesh(name)
+    np.testing.assert_allclose(read.vertices, made.vertices, atol=1e-6)
+    np.testing.assert_array_equal(read.faces, made.faces)
+
+
+def test_python_and_command_line_stop_alike(capsys):
+    system = nextview.load()
+    for start in range(0, 40, 7):
+        main(["recognise", str(SAMPLE.with_stem("table")), "--start", str(start), "--json"])
+        printed = json.loads(capsys.readouterr().out)
+        result = system.recognise(SAMPLE.with_stem("table"), start=start)
+        assert [view["view"] for view in printed["views"]] == [view.index for view in result.views]
+        assert (printed["answer"], printed["threshold_reached"]) == (result.answer, result.confident)
+
+
+def test_the_threshold_decays_with_the_recognisers_correlation():
+    system = nextview.load(threshold=0.9)
+    c = system.models.recogniser.calibration.correlation
+    assert c > 0
+    at_third = 1 / (1 + np.exp(-np.log(9) / (1 + 2 * c)))
+    assert system.stopping.threshold_at(3) == pytest.approx(at_third)
+    assert str(Stopping(0.97, 5, 0.0)) == "threshold 0.97"
+    assert "0.9 at the first view" in str(system.stopping)
+
+
+def test_a_folder_of_ones_own_models(tmp_path, capsys):
+    make_recogniser(tmp_path, ["box", "chair"])
+    system = nextview.load(tmp_path)
+    assert system.classes == ("box", "chair")
+    assert system.policy_name == "spread"  # no gain policy was learned for these classes
+    assert system.recognise(SAMPLE).answer in system.classes
+    make_map_network(tmp_path)
+    mine = nextview.load(tmp_path, policy="lem-peak")
+    assert mine.models.maps["lem"].card.path.parent == tmp_path
+    main(["recognise", str(SAMPLE), "--models", str(tmp_path), "--json"])
+    assert json.loads(capsys.readouterr().out)["answer"] in system.classes
+
+
+@pytest.mark.parametrize("wrong", ["nobody", "."])
+def test_what_is_no_collection_of_models_is_refused(wrong, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(nextview.ModelError):
+        nextview.load(wrong)
+
+
+def test_a_policy_in_the_working_folder(tmp_path, monkeypatch, capsys):
+    (tmp_path / "my_policy_for_a_test.py").write_text(
+        "class Next:\n"
+        "    needs = ()\n"
+        "    def __init__(self, sphere): pass\n"
+        "    def next_views(self, state, rng): return (~state.visited).argmax(1)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    arguments = ["--policy", "my_policy_for_a_test:Next", "--start", "5", "--threshold", "1", "--max-views", "3"]
+    main(["recognise", str(SAMPLE), *arguments, "--json"])
+    assert [view["view"] for view in json.loads(capsys.readouterr().out)["views"]] == [5, 0, 1]
+
+
+def test_what_gain_valued_is_what_it_followed():
+    views = nextview.load(threshold=1.0).recognise(SAMPLE, start=3).views
+    for view, following in itertools.pairwise(views):
+        unvisited = np.setdiff1d(np.arange(40), [v.index for v in views[: views.index(view) + 1]])
+        assert view.next_view == following.index == unvisited[view.values[unvisited].argmax()]
+    assert views[-1].values is None
+
+
+def test_a_map_policy_values_its_window_alone():
+    view = nextview.load(policy="lem-peak", threshold=1.0).recognise(SAMPLE, start=3).views[0]
+    window = nextview.ViewSphere.named("40").window(3)
+    np.testing.assert_array_equal(np.flatnonzero(np.isfinite(view.values)), np.sort(window.ravel()))
+    np.testing.assert_allclose(view.values[window], view.maps["lem"])
+
+
+def test_a_system_is_pickled_as_how_it_was_loaded():
+    system = nextview.load(policy="unidirectional", threshold=0.5, max_views=2)
+    again = pickle.loads(pickle.dumps(system))
+    assert repr(again) == repr(system)
+    assert str(again.recognise(SAMPLE, start=1)) == str(system.recognise(SAMPLE, start=1))
+    assert len(pickle.dumps(system)) < 1000
+
+
+def test_the_picture_of_an_episode(tmp_path):
+    result = nextview.recognise(SAMPLE.with_stem("table"), start=33)
+    result.plot(tmp_path / "episode.png")
+    assert (tmp_path / "episode.png").stat().st_size > 10_000
+    with pytest.raises(nextview.UsageError, match="cannot be written"):
+        result.plot(tmp_path / "episode.docx")
+
+
+@pytest.mark.parametrize("how", ["--version", "attribute"])
+def test_the_version(how):
+    command = ["-m", "nextview", how] if how == "--version" else ["-c", "import nextview; print(nextview.__version__)"]
+    printed = subprocess.run([sys.executable, *command], capture_output=True, text=True, check=True).stdout
+    assert printed.split()[-1] == nextview.__version__
+
+
+def test_importing_and_a_robot_need_no_ray_caster():
+    code = "import sys; sys.modules['embreex'] = None; import nextview; nextview.load().session().pose"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.skipif(not os.environ.get("NEXTVIEW_DATA"), reason="NEXTVIEW_DATA names no folder with ModelNet10")
+def test_the_bundled_models_keep_their_accuracy():
+    """The card says that 0.907 of single views are right; of 30 objects fewer than 0.8 are so by chance in 1 of 40."""
+    meshes = sorted(Path(os.environ["NEXTVIEW_DATA"], "ModelNet10").glob("*/test/*.off"))[:30]
+    system = nextview.load()
+    right = [system.recognise(path, seed=k).answer == path.parts[-3] for k, path in enumerate(meshes)]
+    assert len(right) >= 10
+    assert np.mean(right) >= 0.8
+
+
+def test_the_sample_meshes_are_told_apart_from_any_view():
+    """Falls where the bundled models do."""
+    system = nextview.load()
+    right = [
+        system.recognise(SAMPLE.with_stem(name), start=start).answer == name
+        for name in SAMPLES
+        for start in range(0, 40, 3)
+    ]
+    assert np.mean(right) > 0.9
