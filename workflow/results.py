@@ -215,7 +215,7 @@ def thesis(stage: Path) -> Iterator[str]:
         for r in beside.itertuples()
     ]  # fmt: skip
     yield from markdown(["policy", "threshold", "measure", "here", "published"], rows)
-    beside = classes[classes["published"].notna()]
+    beside = classes[classes["published"].notna()].fillna({"threshold": 0})  # of fixed views
     for measure, title in {"accuracy": "Accuracy", "travel_moved": "Travel of those that moved, cells"}.items():
         of = beside[beside["measure"] == measure]
         policies = of[["policy", "threshold"]].drop_duplicates().itertuples(index=False, name=None)
@@ -231,7 +231,7 @@ def thesis(stage: Path) -> Iterator[str]:
             rows.append(
                 [label.replace("_", " ")] + ["" if r is None else f"{r.value:.3f} / {r.published:.3f}" for r in row]
             )
-        yield from markdown(["class", *(f"{name} at {threshold:g}" for name, threshold in policies)], rows)
+        yield from markdown(["class", *(f"{name} at {t:g}" if t else name for name, t in policies)], rows)
 
 
 def page_as_is(stage: Path) -> Iterator[str]:
