@@ -185,7 +185,8 @@ def load_exported(
             assert isinstance(norm, nn.BatchNorm2d)
             weight = exported(f"{name}.weight", module.weight.shape)
             # A norm forgets the scale of what it is given: bring it to where training begins, as the rate expects.
-            scale = float((2 / (weight.shape[0] * weight[0, 0].numel())) ** 0.5 / weight.std())
+            spread = float(weight.std()) or 1.0  # all zero where a block has hardly been trained
+            scale = (2 / (weight.shape[0] * weight[0, 0].numel())) ** 0.5 / spread
             module.weight.copy_(weight * scale)
             norm.weight.fill_(1 / scale)
             norm.bias.copy_(exported(f"{name}.weight_bias", norm.bias.shape))
