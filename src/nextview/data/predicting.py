@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from nextview.belief import Calibration
 from nextview.data.input_views import input_views
-from nextview.data.lock import only_one
+from nextview.data.lock import only_one, writing
 from nextview.data.pool import WorkerDied, each
 from nextview.data.predictions import Predictions
 from nextview.data.splits import duplicate_groups
@@ -68,7 +69,7 @@ def predict(
 
     Raises:
         DatasetError: the store holds no such objects, or a class that the recogniser does not know, or another run is
-            writing ``out``.
+            writing ``out``, or it cannot be written.
         PredictionsError: ``out`` is there and comes from another store or other models, or an object kills its process.
             Where it comes from the same, only what the cards say beside the networks (valley classes, sizes,
             calibration) is brought up to date.
@@ -96,12 +97,14 @@ def predict(
         there = Predictions.load(out)
         if (there.names, there.models) != (names, models) or not np.array_equal(there.depth_entropy, entropy):
             raise PredictionsError(f"{out}: was made from other objects or models; give another name or remove it")
-        renewed = (valleys, calibration, None if of_size is None else of_size.tobytes())
+        new = (valleys, calibration, None if of_size is None else of_size.tobytes())
         known = (there.valley_classes, there.calibration, None if there.of_size is None else there.of_size.tobytes())
-        if renewed != known:
+        if new != known:
             seen = there.by_shape()
             logits = seen.logits if of_size is None else seen.logits + of_size[:, None]
-            replace(seen, logits=logits, of_size=of_size, valley_classes=valleys, calibration=calibration).save(out)
+            renewed = replace(seen, logits=logits, of_size=of_size, valley_classes=valleys, calibration=calibration)
+            with writing(out):
+                renewed.save(out)
         yield len(names), len(names)
         return
 
@@ -113,7 +116,8 @@ def predict(
         optional = {"azimuth_bins": (n, v, len(classes), azimuth_bins)} if azimuth_bins else {}
         maps_of = {f"map_{name}": (n, v, *shape) for name, shape in windows.items()}
         shapes = {"logits": (n, v, len(classes)), **optional, **maps_of}
-        arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
+        with writing(out):
+            arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
         # Logits are written last: an object counts as done when none of its logits is the NaN that the file began with.
         todo = np.flatnonzero(np.isnan(arrays["logits"]).any((1, 2)))
         total = n - len(todo)
@@ -134,7 +138,7 @@ def predict(
             yield total, n
 
         seen_logits = np.array(arrays["logits"])
-        Predictions(
+        predictions = Predictions(
             seen_logits if of_size is None else seen_logits + of_size[:, None],
             {name: np.array(arrays[f"map_{name}"]) for name in windows},
             entropy,
@@ -149,7 +153,9 @@ def predict(
             calibration,
             np.array(arrays["azimuth_bins"]) if azimuth_bins else None,
             of_size,
-        ).save(out)
+        )
+        with writing(out):
+            predictions.save(out)
         shutil.rmtree(out.with_name(out.name + ".part"))
 
 
@@ -209,11 +215,27 @@ def _begin(part: Path, recipe: dict, shapes: dict[str, tuple[int, ...]]) -> dict
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     arrays = {}
-    for name, shape in shapes.items():
-        arrays[name] = np.lib.format.open_memmap(part / f"{name}.npy", "w+", np.float32, shape)
-        arrays[name][:] = np.nan
-    note.write_text(json.dumps(recipe))
+    try:
+        for name, shape in shapes.items():
+            arrays[name] = np.lib.format.open_memmap(part / f"{name}.npy", "w+", np.float32, shape)
+            _claim(part / f"{name}.npy")
+            arrays[name][:] = np.nan
+        note.write_text(json.dumps(recipe))
+    except OSError:
+        shutil.rmtree(part, ignore_errors=True)  # nothing is in it yet, and the disk is full
+        raise
     return arrays
+
+
+def _claim(file: Path) -> None:
+    """Have the disk set aside room for a file with holes: one that fills later would kill whoever writes through a map.
+
+    Raises:
+        OSError: there is not that much room.
+    """
+    if hasattr(os, "posix_fallocate"):
+        with file.open("r+b") as whole:
+            os.posix_fallocate(whole.fileno(), 0, file.stat().st_size)
 
 
 @lru_cache(maxsize=1)
