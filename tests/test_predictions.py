@@ -1,3 +1,4 @@
+import os
 import signal
 import subprocess
 import sys
@@ -199,6 +200,31 @@ def test_a_killed_run_goes_on_where_it_was(shop):
     assert not out.with_name("again.npz.part").exists()
     list(predict(shop / "views.zarr", shop / "whole.npz", [recogniser], maps, workers=1))
     np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(shop / "whole.npz").logits)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="mounts a small disk")
+@pytest.mark.parametrize(("room", "kept"), [("40k", 0), ("56k", 6)], ids=["for no arrays", "for the arrays alone"])
+def test_a_full_disk_is_one_sentence_and_loses_nothing(shop, tmp_path, room, kept):
+    """In processes of their own, for a disk that is full under a memory map kills."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", disk]).returncode:
+        pytest.skip("only root can mount a small disk")
+    command = [sys.executable, "-m", "nextview.cli.main", "predict", shop / "views.zarr", disk / "p.npz"]
+    command += ["--recogniser", shop / "tiny.json", "--maps", f"lem={shop / 'tiny-lem.json'}", "--workers", "1"]
+    try:
+        full = subprocess.run(command, stderr=subprocess.PIPE, text=True)
+        assert full.returncode == 2
+        last = full.stderr.splitlines()[-1]
+        assert last.startswith(f"nextview: {disk}/p.npz: cannot be written (No space left on device)")
+        assert "Traceback" not in full.stderr
+        subprocess.run(["mount", "-o", "remount,size=100m", disk], check=True)
+        recogniser, maps = cards(shop)
+        assert next(predict(shop / "views.zarr", disk / "p.npz", [recogniser], maps, workers=1)) == (kept, 6)
+        subprocess.run(command, check=True)
+        assert len(Predictions.load(disk / "p.npz")) == 6
+    finally:
+        subprocess.run(["umount", disk], check=True)
 
 
 def test_predictions_of_other_models_or_views_are_not_overwritten(shop):

@@ -36,6 +36,7 @@ def made(tmp_path_factory):
     store = ViewStore.create(folder / "views.zarr", entries, p.sphere, 32, {})
     store.group["image"][:] = np.random.default_rng(0).integers(0, 255, store.group["image"].shape, np.uint8)
     store.group["measures/depth_entropy"][:] = p.depth_entropy
+    store.group["points"][:] = np.random.default_rng(1).integers(-9, 9, store.group["points"].shape, np.int16)
     store.group["status"][:] = DONE
     report(folder / "out")
     return folder

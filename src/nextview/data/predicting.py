@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.command_line import command_line
-from nextview.data.lock import only_one
+from nextview.data.lock import only_one, writing
 from nextview.data.pool import WorkerDied, each
 from nextview.data.predictions import Predictions
 from nextview.data.splits import duplicate_groups
@@ -74,7 +74,7 @@ def predict(
 
     Raises:
         DatasetError: the store holds no such objects, or a class that the recogniser does not know, or another run is
-            writing ``out``.
+            writing ``out``, or it cannot be written.
         PredictionsError: ``out`` is there and comes from another store or other models, or an object kills its process.
             Where it comes from the same, only what the cards say beside the networks (valley classes, sizes,
             calibration) and the place of the store are brought up to date. Or what lies in the folder beside it is not
@@ -122,7 +122,8 @@ def predict(
             seen = there.by_shape()
             logits = seen.logits if of_size is None else seen.logits + of_size[:, None]
             fresh = replace(seen, logits=logits, of_size=of_size, valley_classes=valleys, calibration=calibration)
-            replace(fresh, store=str(path.resolve())).save(out)
+            with writing(out):
+                replace(fresh, store=str(path.resolve())).save(out)
         yield len(names), len(names)
         return
 
@@ -134,7 +135,8 @@ def predict(
         optional = {"azimuth_bins": (n, v, len(classes), azimuth_bins)} if azimuth_bins else {}
         maps_of = {f"map_{name}": (n, v, *shape) for name, shape in windows.items()}
         shapes = {"logits": (n, v, len(classes)), **optional, **maps_of}
-        arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
+        with writing(out):
+            arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
         # Logits are written last: an object counts as done when none of its logits is the NaN that the file began with.
         todo = np.flatnonzero(np.isnan(arrays["logits"]).any((1, 2)))
         total = n - len(todo)
@@ -155,7 +157,7 @@ def predict(
             yield total, n
 
         seen_logits = np.array(arrays["logits"])
-        Predictions(
+        predictions = Predictions(
             seen_logits if of_size is None else seen_logits + of_size[:, None],
             {name: np.array(arrays[f"map_{name}"]) for name in windows},
             entropy,
@@ -172,7 +174,9 @@ def predict(
             of_size,
             str(path.resolve()),
             commands,
-        ).save(out)
+        )
+        with writing(out):
+            predictions.save(out)
         _end(out.with_name(out.name + ".part"), shapes)
 
 
@@ -255,7 +259,9 @@ def _begin(part: Path, recipe: dict, shapes: dict[str, tuple[int, ...]]) -> dict
         with written_whole(part) as begun:
             begun.mkdir()
             for name, shape in shapes.items():
-                np.lib.format.open_memmap(begun / f"{name}.npy", "w+", np.float32, shape)[:] = np.nan
+                array = np.lib.format.open_memmap(begun / f"{name}.npy", "w+", np.float32, shape)
+                _claim(begun / f"{name}.npy")
+                array[:] = np.nan
             (begun / RECIPE).write_text(json.dumps(recipe))
     try:
         same = not part.is_symlink() and json.loads((part / RECIPE).read_bytes()) == recipe
@@ -277,6 +283,17 @@ def _end(part: Path, names: Iterable[str]) -> None:
         file.unlink()
     with suppress(OSError):
         part.rmdir()
+
+
+def _claim(file: Path) -> None:
+    """Have the disk set aside room for a file with holes: one that fills later would kill whoever writes through a map.
+
+    Raises:
+        OSError: there is not that much room.
+    """
+    if hasattr(os, "posix_fallocate"):
+        with file.open("r+b") as whole:
+            os.posix_fallocate(whole.fileno(), 0, file.stat().st_size)
 
 
 @lru_cache(maxsize=1)
