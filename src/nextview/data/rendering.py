@@ -143,7 +143,7 @@ def render(
         store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit, dataset.absolute().name)
         command = _command(dataset, path, sphere, size, seed, deform, split, unit)
         if command not in store.commands:
-            store.group.attrs["commands"] = [*store.commands, command]
+            store.note(commands=[*store.commands, command])
         todo = [int(i) for i in np.flatnonzero(~store.done)]
         # Largest files first, so that no worker is left with a long one at the end.
         todo.sort(key=lambda i: -entries[i].path.stat().st_size)
