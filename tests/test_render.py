@@ -256,7 +256,7 @@ def test_identical_meshes_are_known_by_their_bytes(tmp_path):
     (meshes / "box/train/twin.off").write_bytes((meshes / "ball/train/thing_01.off").read_bytes())
     list(render(meshes, tmp_path / "views.zarr", SPHERE, SIZE, workers=0))
     store = ViewStore.open(tmp_path / "views.zarr")
-    assert [{store.names[i] for i in group} for group in store.duplicates] == [{"thing_01", "duplicate"}]
+    assert [{store.names[i] for i in group} for group in store.duplicates] == [{"thing_01", "twin"}]
 
 
 def test_a_box_is_stored_as_it_is_seen(tmp_path):

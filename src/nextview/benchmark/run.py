@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +32,7 @@ def run_benchmark(
     predictions: Path,
     out: Path,
     policies: Sequence[str] = (),
+    own: Mapping[str, Path] | None = None,
     thresholds: Sequence[float] = THRESHOLDS,
     risks: Sequence[float] = (),
     threshold_decay: float | None = None,
@@ -53,6 +54,7 @@ def run_benchmark(
         predictions: made by ``data.predicting.predict``.
         out: folder for the results; earlier results there are replaced.
         policies: see ``entries``; all that the predictions allow by default. The reference is run in any case.
+        own: cards of policies that take part too, or are meant where ``policies`` names them.
         thresholds: of the belief.
         risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too.
         threshold_decay: how fast a threshold comes down with the views, see ``Stopping``; by default with the
@@ -96,7 +98,9 @@ def run_benchmark(
         raise UsageError(f"{predictions}: knows no class {unknown[0]!r}; there are {', '.join(table.classes)}")
     valleys = None if valley_classes is None else tuple(map(table.classes.index, valley_classes))
     specs = make_specs(table, runs, seed, valleys)
-    names = list(dict.fromkeys([*([reference] if policies else []), *(policies or default_entries(specs))]))
+    own = own or {}
+    wanted = [str(own.get(name, name)) for name in policies] or [*default_entries(specs), *map(str, own.values())]
+    names = list(dict.fromkeys([*([reference] if policies else []), *wanted]))
     grid = Grid(specs, runs, tuple(sorted({*thresholds, *promised.values()})), max_views, seed, threshold_decay)
     with written_results(out, results.KIND) as part:
         track(run_grid(grid, names), len(names), "replaying policies")

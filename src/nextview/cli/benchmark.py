@@ -15,6 +15,7 @@ def benchmark(
     /,
     out: Path = Path("benchmark"),
     policies: tuple[str, ...] = (),
+    models: str = "modelnet10",
     thresholds: tuple[float, ...] = (0.85, 0.9, 0.95, 0.97, 0.99),
     risks: tuple[float, ...] = (),
     threshold_decay: float | None = None,
@@ -35,6 +36,7 @@ def benchmark(
         predictions: made by nextview predict.
         out: folder for the results; earlier results there are replaced, anything else is refused.
         policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
+        models: a folder with models of your own: the policies learned for them take part, by their names.
         thresholds: of the belief.
         risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too.
         threshold_decay: how fast a threshold comes down with the views; by default with the recogniser's correlation,
@@ -50,13 +52,15 @@ def benchmark(
     """
     from nextview.cli.extra import needs_extra
     from nextview.cli.progress import console, track
+    from nextview.models.collection import find_models
 
     with needs_extra("benchmark"):
         from nextview.benchmark.run import run_benchmark
         from nextview.cli.leaderboard_table import print_leaderboard
 
+    own = find_models(models).policies
     results = run_benchmark(
-        predictions, out, policies, thresholds, risks, threshold_decay, uncalibrated, split, runs, max_views,
+        predictions, out, policies, own, thresholds, risks, threshold_decay, uncalibrated, split, runs, max_views,
         reference, valley_classes, samples, seed, track,
     )  # fmt: skip
     print_leaderboard(results)

@@ -98,6 +98,8 @@ RULES: dict[str, tuple[bool, Callable[[Any], bool], str]] = {
     "turn": (False, lambda v: isinstance(v, bool), "true or false"),
     "sha256": (False, _texts, "a list of hashes"),
     "unit": (False, lambda v: v is None or (isinstance(v, str) and v in UNITS), f"one of {', '.join(UNITS)}"),
+    "dataset": (False, lambda v: isinstance(v, str), "the name of the mesh folder"),
+    "commands": (False, _texts, "a list of commands"),
     CHECKSUM: (False, lambda v: isinstance(v, str), "a hash"),
 }
 """Of each attribute: whether it has to be there, whether a value will do, and what it has to be, in words."""
