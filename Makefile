@@ -1,7 +1,7 @@
 # Two commands do everything on a machine with Python 3.11+, pip and make: `make demo` and `make test`.
 PYTHON ?= python3
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint reproduce reproduce-small clean
 
 demo: .venv/installed  ## look at a sample object, with the base installation (no torch)
 	.venv/bin/nextview demo --figure nextview_demo.png
@@ -14,6 +14,17 @@ lint: .venv-test/installed  ## style and types
 	.venv-test/bin/ruff format --check .
 	.venv-test/bin/mypy
 
+DATA ?= data/ModelNet10
+OUT ?= reproduction
+# Snakemake's locks outlive a run that was killed; each stage has one of its own that does not.
+SNAKEMAKE = .venv-test/bin/snakemake -s workflow/Snakefile --cores all --nolock --rerun-incomplete --quiet rules
+
+reproduce: .venv-test/installed  ## all models, tables and figures from DATA; resumes; CONFIG=models=bundled: tables alone
+	$(SNAKEMAKE) --directory $(OUT) --config data=$(abspath $(DATA)) $(CONFIG)
+
+reproduce-small: .venv-test/installed  ## the same on three meshes a class, or on box furniture where DATA is not there
+	$(SNAKEMAKE) --directory $(OUT)-small --configfile workflow/small.yaml --config data=$(abspath $(wildcard $(DATA))) $(CONFIG)
+
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	.venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
@@ -21,7 +32,7 @@ lint: .venv-test/installed  ## style and types
 
 .venv-test/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv-test
-	.venv-test/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,benchmark,cluster,dev]'
+	.venv-test/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,benchmark,cluster,dev,workflow]'
 	touch $@
 
 clean:

@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 
 from nextview.belief import Calibration
 from nextview.benchmark.evaluation import fused_views
-from nextview.benchmark.statistics import interval, ratio, resample
+from nextview.benchmark.statistics import interval, resample
 from nextview.calibration.fitting_set import FittingSet
 from nextview.calibration.temperature import fit_temperature
 from nextview.data.predictions import Predictions
 from nextview.data.splits import split_training
 from nextview.data.store import ViewStore
 from nextview.errors import NextviewError, PredictionsError
+from nextview.metrics import mean_over_classes, ratio
 
 Float = NDArray[np.float64]
 VIEWS = (1, 2, 3, 5, 8, 15, 40)
@@ -51,7 +52,7 @@ def table(before: Float, after: Float, labels: NDArray[np.int64], ways: tuple[st
     yield "|---|---|---|---|"
     for k in [k for k in VIEWS if k <= len(before)]:
         both = before[k - 1], after[k - 1]
-        cells = [f"{r.mean():.3f} ({np.mean([r[labels == c].mean() for c in np.unique(labels)]):.3f})" for r in both]
+        cells = [f"{r.mean():.3f} ({mean_over_classes(r, labels):.3f})" for r in both]
         yield f"| {k} | {cells[0]} | {cells[1]} | {in_points(*both) if (both[0] != both[1]).any() else ''} |"
 
 
@@ -62,7 +63,7 @@ def bins_told(p: Predictions, store: ViewStore) -> tuple[float, float]:
         p: of a recogniser that tells azimuth bins.
         store: that they are of. The planes from which bins are counted come from its training split.
     """
-    from nextview.training.azimuth_bins import azimuth_bins, mirror_planes
+    from nextview.training.recogniser.azimuth_bins import azimuth_bins, mirror_planes
 
     if p.azimuth_bins is None:
         raise PredictionsError("these predictions tell no azimuth bins: their recogniser was not taught them")

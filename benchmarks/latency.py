@@ -19,14 +19,14 @@ import tyro
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, shape_inference
 
-from nextview.models.inference import open_weights, sight
-from nextview.models.model_card import Card, bundled_cards, find_card
+from nextview.models.inference import open_weights
+from nextview.models.model_card import ModelCard, bundled_cards, find_card
 
 SIDE = 2048
 """Of the matrices of the baselines."""
 
 
-def flops(card: Card, shape: tuple[int, ...]) -> float:
+def flops(card: ModelCard, shape: tuple[int, ...]) -> float:
     """Multiplications and additions of one forward pass, an input of (1, ...), in convolutions and matrix products."""
     model = onnx.load(card.path)
     for size, dimension in zip(shape, model.graph.input[0].type.tensor_type.shape.dim, strict=True):
@@ -87,7 +87,7 @@ def main(models: tuple[str, ...] = (), threads: int = 2, rounds: int = 200, seed
     print(f"{'':22}{'ms a view':>10}{'95 %':>8}{'MFLOP':>9}{'GFLOP/s':>9}{'of a matrix product':>21}")
     for card in map(find_card, models or bundled_cards()):
         session = open_weights(card, threads)
-        sees, size = sight(card)
+        sees, size = card.input.kind, card.input.size
         channels = session.get_inputs()[0].shape[1]
         seen: NDArray = rng.random((1, 1024, 3), np.float32)
         if sees != "cloud":

@@ -18,8 +18,8 @@ import tyro
 
 from nextview.belief import Calibration
 from nextview.benchmark.entries import default_entries
+from nextview.benchmark.experiment import THRESHOLDS, Grid, run_grid
 from nextview.benchmark.replay import make_specs
-from nextview.benchmark.run import THRESHOLDS, Grid, run_grid
 from nextview.benchmark.summary import summarise
 from nextview.data.predictions import Predictions
 from nextview.viewsphere import ViewSphere

@@ -16,9 +16,10 @@ import tyro
 
 from nextview.belief import PLAIN_SUM
 from nextview.benchmark.entries import default_entries
+from nextview.benchmark.experiment import THRESHOLDS, Grid, run_grid
+from nextview.benchmark.leaderboard import SIGNIFICANT, nothing_differs
 from nextview.benchmark.published import published, published_threshold
 from nextview.benchmark.replay import make_specs
-from nextview.benchmark.run import THRESHOLDS, Grid, run_grid
 from nextview.benchmark.summary import Tables, summarise
 from nextview.data.predictions import Predictions
 from nextview.models.model_card import file_hash
@@ -36,6 +37,7 @@ LEMS = {
     "lcm": "predicted confidence map, valley by the believed class",
     "lcm-peak": "predicted confidence map, its peak",
     "true-lcm": "true confidence map, its peak (an oracle)",
+    "gain": "what a view is worth less its travel, learned (the default)",
     "random-all": "any unvisited view of the sphere",
     "oracle-gain": "the ceiling: sees what every view would say",
 }
@@ -55,7 +57,7 @@ class Compared(NamedTuple):
     @property
     def verdict(self) -> str:
         """In words."""
-        if self.p >= 0.05:
+        if self.p >= SIGNIFICANT:
             return "cannot be told apart from"
         return "is more accurate than" if self.difference > 0 else "is less accurate than"
 
@@ -98,8 +100,9 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         f"{len(table)} objects, {len(table.classes)} classes, 10 first views each, at most 5 views; the same first "
         "views for every policy and threshold. In brackets: 95 % bootstrap intervals over objects. p-values are of the "
-        "paired bootstrap, Holm-corrected over all policies and thresholds. Differences of accuracy are in percentage "
-        "points.",
+        "paired bootstrap, after one Holm correction over all that is compared with the same policy: every other one, "
+        "published, learned or oracle, at every threshold, as in `nextview benchmark`. Differences of accuracy are in "
+        "percentage points.",
         "",
         "`python benchmarks/reproduction.py predictions.npz docs/reproduction.md` makes this page, verdicts and all.",
         f"The predictions (SHA-256 `{file_hash(predictions)[:16]}...`) come from `nextview predict modelnet10.zarr "
@@ -112,7 +115,9 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "## In short",
         "",
     ]
-    for name in ("oracle-valley", "lem", "lcm-oracle-valley", "lcm", "true-oracle-valley", "true-lem"):
+    if nothing := nothing_differs(tables["random"], AT, "random"):
+        out.append(f"- {nothing}")
+    for name in ("oracle-valley", "lem", "lcm-oracle-valley", "lcm", "true-oracle-valley", "true-lem", "gain"):
         if name in ran:
             log_evidence = "; ".join(f"{test[b][name, AT].verdict} {b}: {test[b][name, AT]}" for b in BASELINES)
             out.append(f"- **{name}** ({LEMS[name]}) at {AT}: {log_evidence}.")

@@ -15,13 +15,13 @@ import numpy as np
 import tyro
 
 from nextview.benchmark.evaluation import baselines
-from nextview.benchmark.scores import map_scores
-from nextview.benchmark.statistics import interval, ratio, resample
+from nextview.benchmark.statistics import interval, resample
 from nextview.cli.progress import track
-from nextview.data.input_views import input_views
 from nextview.data.store import ViewStore
 from nextview.measures.depth_entropy import normalise_per_object
+from nextview.metrics import map_scores, ratio
 from nextview.models.inference import MapNetwork
+from nextview.models.network_input import from_store
 
 PUBLISHED = "published LEM, trained on 10 classes, tested on its own unseen ones (table 4): d <= 1 0.364"
 
@@ -41,7 +41,7 @@ def main(store: tyro.conf.Positional[Path], card: str = "lem-modelnet10", sample
 
     def predict() -> object:
         for row, i in enumerate(objects):
-            maps[row] = network.from_inputs(input_views(views, int(i), *network.sees))[network.card.kind]
+            maps[row] = network.from_inputs(from_store(network.card.input, views, int(i)))[network.card.kind]
             yield row + 1
 
     track(predict(), len(objects), f"maps of {views.path.name}")

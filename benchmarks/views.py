@@ -34,11 +34,12 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from matplotlib.transforms import Bbox
 
 from nextview.benchmark.entries import EpisodeSpecs, entry_policy
+from nextview.benchmark.experiment import Grid, run_grid
 from nextview.benchmark.replay import Outcomes, Trajectories, make_specs, truncate
-from nextview.benchmark.run import Grid, run_grid
-from nextview.benchmark.statistics import holm, interval, mcnemar, ratio, resample
+from nextview.benchmark.statistics import holm, interval, mcnemar, resample
 from nextview.cli.progress import track
 from nextview.data.predictions import Predictions
+from nextview.metrics import ratio
 from nextview.report.curves import COLOURS, OWN, is_oracle
 from nextview.report.html_tables import KNOWING
 from nextview.report.style import STYLE, to_png

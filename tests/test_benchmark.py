@@ -1,8 +1,10 @@
 import json
 import runpy
+import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -11,11 +13,17 @@ from test_predictions import some_predictions
 
 from nextview.belief import Calibration, RiskBounds
 from nextview.benchmark import results
+from nextview.benchmark.leaderboard import is_oracle, leaderboard, nothing_differs, promised_risks, too_few
 from nextview.benchmark.published import ACCURACY, TRAVEL, published, read_table
 from nextview.benchmark.replay import make_specs, replay, truncate
-from nextview.benchmark.statistics import calibration_error
+from nextview.benchmark.run import run_benchmark
 from nextview.cli.benchmark import benchmark
+from nextview.cli.report import report
 from nextview.errors import EntryError, PredictionsError
+from nextview.metrics import calibration_error
+from nextview.policies.baselines import Random
+from nextview.policies.registry import make_policy
+from nextview.viewsphere import ViewSphere
 
 TEN = tuple(read_table(ACCURACY[10]))
 
@@ -242,3 +250,92 @@ def test_published_values_stand_only_beside_the_cells_they_were_published_for():
     assert published("best-5", None, "accuracy", TEN, "table") == 1.0
     forty = tuple(read_table(ACCURACY[40]))
     assert published("furthest", 0.99, "accuracy", forty, "sink") == 0.89
+
+
+def test_all_policies_and_thresholds_stand_in_one_comparison_with_the_reference(folder):
+    tests = pd.read_csv(folder / "out" / "tests.csv")
+    for measure, rows in tests.groupby("measure"):
+        policies = set(pd.read_csv(folder / "out" / "sweep.csv").policy) - {"random"}
+        assert set(rows.policy) == policies  # the published ones, the learned ones and the oracles
+        assert len(rows) == 2 * len(policies)
+        ranks = rows.p.rank(method="first").astype(int)
+        by_hand = [  # Holm: the k-th smallest of m by m - k + 1, never below a smaller one's
+            min(1, max(q * (len(rows) - rank + 1) for q, rank in zip(rows.p, ranks, strict=True) if rank <= mine))
+            for mine in ranks
+        ]
+        assert rows.p_holm.to_numpy() == pytest.approx(by_hand), measure
+
+
+def test_the_leaderboard_has_the_best_first_and_oracles_last(folder):
+    tables = results.load(folder / "out").tables
+    board = leaderboard(tables, 0.9)
+    of = tables.summary.query("threshold == 0.9").set_index(["policy", "measure"])["value"]
+    robots = [s for s in board if not is_oracle(s.policy)]
+    assert board[: len(robots)] == robots
+    assert {s.policy for s in board} == set(tables.sweep.policy)
+    for group in (robots, board[len(robots) :]):
+        assert [s.accuracy for s in group] == sorted((of[s.policy, "accuracy"] for s in group), reverse=True)
+    for s in board:
+        assert (s.class_accuracy, s.n_views, s.travel) == tuple(
+            of[s.policy, measure] for measure in ("class_accuracy", "n_views", "travel_all")
+        )
+        assert np.isnan(s.difference) == (s.policy == "random")
+
+
+def test_it_is_printed_with_a_sentence_where_nothing_differs_and_a_warning_where_objects_are_few(folder, capsys):
+    benchmark(folder / "p.npz", out=folder / "board", policies=("lem", "oracle-gain"), runs=3, samples=200)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    shown = " ".join(" ".join(lines).split())
+    of = results.load(folder / "board").tables.summary.query("threshold == 0.97").set_index(["policy", "measure"])
+    lem = of.loc["lem", "accuracy"]
+    assert f"lem {lem.value:.3f} ({lem.low:.3f}-{lem.high:.3f})" in shown
+    assert "< 0.001 *" in next(line for line in lines if "oracle-gain" in line)
+    assert "No policy that a robot could follow differs significantly from random" in shown
+    assert "Too few objects to tell: there are 40" in shown
+
+
+def some_tests(half, p=0.5):
+    """Tables of two policies whose differences of accuracy are known to plus or minus ``half``."""
+    rows = [(name, 0.97, "accuracy", -half, half, p, p) for name in ("lem", "gain")]
+    rows.append(("oracle-gain", 0.97, "accuracy", 0.0, 2.0, 0.0, 0.0))  # no oracle counts
+    tests = pd.DataFrame(rows, columns=["policy", "threshold", "measure", "low", "high", "p", "p_holm"])
+    return SimpleNamespace(tests=tests)
+
+
+def test_when_objects_are_too_few_to_tell():
+    assert too_few(some_tests(0.029), 0.97, 200) is None
+    assert "there are 199 and differences in accuracy are known to ±2.9" in too_few(some_tests(0.029), 0.97, 199)
+    assert "±3.1 points" in too_few(some_tests(0.031), 0.97, 1000)
+    assert nothing_differs(some_tests(0.01), 0.97, "random").startswith("No policy that a robot could follow")
+    assert nothing_differs(some_tests(0.01, p=0.04), 0.97, "random") is None
+
+
+def test_measured_error_rates_stand_beside_the_promised_ones(folder, predictions, capsys):
+    bounds = RiskBounds((0.7, 0.8), ((0.2, 0.1),) * 5, 0.1)
+    replace(predictions, calibration=Calibration(1.0, 0.0, bounds)).save(folder / "r.npz")
+    found = run_benchmark(
+        folder / "r.npz", folder / "rates", ("random", "lem", "oracle-gain"), risks=(0.1, 0.2), runs=4, samples=50
+    )
+    rows = pd.read_parquet(folder / "rates" / "episodes.parquet")
+    risks = found.tables.risks
+    assert set(zip(risks.policy, risks.risk, risks.threshold, strict=True)) == {
+        (name, *promise) for name in ("random", "lem") for promise in ((0.1, 0.8), (0.2, 0.7))
+    }
+    for row in risks.itertuples():
+        cell = rows[(rows.policy == row.policy) & (rows.threshold == row.threshold)]
+        stopped = cell[cell.confidence >= row.threshold]
+        assert row.error == pytest.approx((stopped.answer.astype(str) != stopped.label.astype(str)).mean())
+        assert row.confident == pytest.approx(len(stopped) / len(cell))
+        assert row.low <= row.error <= row.high
+    assert any(promise.broken for promise in promised_risks(found.tables))  # the logits are noise
+    assert capsys.readouterr().out == ""  # the library prints nothing
+    report(folder / "rates")
+    assert "Promised error rates" in (folder / "rates" / "report.html").read_text()
+
+
+def test_a_policy_in_the_working_folder_is_found(folder, tmp_path, monkeypatch):
+    (tmp_path / "mine_alone.py").write_text("from nextview.policies.baselines import Random\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [entry for entry in sys.path if entry not in ("", str(tmp_path))])
+    assert isinstance(make_policy("mine_alone:Random", ViewSphere.named("40")), Random)

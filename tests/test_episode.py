@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import softmax
 
-from nextview.belief import PLAIN_SUM, Calibration, Stopping
+from nextview.belief import PLAIN_SUM, Calibration, FixedLength, Stopping
 from nextview.episode import Episodes, run_episodes, select
 from nextview.errors import PolicyError
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.baselines import Random, RandomAll, Unidirectional
+from nextview.policies.fixed import ViewList
 from nextview.policies.maps import MapPeak
 from nextview.viewsphere import ViewSphere
 
@@ -300,3 +301,16 @@ def test_a_look_that_fails_is_not_taken_in():
     step = episodes.update(observation)
     assert step.belief[0, 0] == pytest.approx(1 / (1 + np.exp(-1)))
     assert step.next_views.tolist() == [4]
+
+
+def test_an_episode_of_fixed_length_goes_on_however_sure_it_is():
+    sure = Evidence(np.tile([900.0, 0.0, 0.0], (4, 1)))  # the belief is exactly 1
+    views = np.array([[3, 1, 2], [0, 7, 4], [5, 6, 1], [2, 0, 3]])
+    sphere = ViewSphere.named("40")
+    done = run_episodes(
+        lambda episodes, _: select(sure, np.isin(np.arange(4), episodes)),
+        sphere, ViewList(views), views[:, 0], FixedLength(max_views=3), np.random.default_rng(0),
+    )  # fmt: skip
+    np.testing.assert_array_equal(done.outcome.views, views)
+    assert done.steps[0].belief.max() == 1
+    assert not done.outcome.confident.any()

@@ -13,7 +13,8 @@ from test_predictions import some_predictions
 from test_report import Page
 
 from nextview.cli.main import main
-from nextview.models.model_card import file_hash, write_card
+from nextview.models.model_card import ModelCard, file_hash, write_card
+from nextview.models.network_input import InputSpec
 
 TABLES = ("accuracy", "fusion", "confusion", "reliability", "maps")
 
@@ -127,7 +128,7 @@ def test_copies_of_a_shape_are_judged_once_where_that_is_asked_for(tmp_path):
     p = some_predictions(6)
     rows = np.array([0, 1, 2, 3, 4, 0])
     replace(p, depth_entropy=p.depth_entropy[rows], labels=p.labels[rows]).save(tmp_path / "p.npz")
-    for more, objects in (([], 6), (["--each-shape-once"], 5)):
+    for more, objects in (([], 6), (["--deduplicate"], 5)):
         main(["evaluate", str(tmp_path / "p.npz"), "--out", str(tmp_path / "out"), "--samples", "5", *more])
         settings = json.loads((tmp_path / "out" / "results.json").read_text())["settings"]
         assert settings["objects"] == objects
@@ -159,7 +160,7 @@ def test_splits_are_never_mixed(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "log_evidence"),
+    ("change", "printed"),
     [
         ({"logits": np.full((6, 40, 3), np.nan, np.float32)}, "not a finite number"),
         ({"logits": np.zeros((6, 40, 2), np.float32)}, "shape"),
@@ -201,7 +202,10 @@ def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(t
     p = some_predictions(30, seed=1)
     for kind, name in (("recogniser", "net"), ("lem", "map"), ("lem", "other")):
         (tmp_path / f"{name}.onnx").write_bytes(name.encode())
-        write_card(tmp_path / f"{name}.json", {"name": name, "kind": kind, "scores": {"validation": 1}})
+        weights = tmp_path / f"{name}.onnx"
+        classes = ("a", "b", "c") if kind == "recogniser" else ()
+        card = ModelCard(name, kind, InputSpec("geometry", 16), file_hash(weights), weights, classes=classes)
+        write_card(tmp_path / f"{name}.json", replace(card, scores={"validation": 1}))
     models = {"recogniser": "net", "lem": "map"}
     models = {kind: (name, file_hash(tmp_path / f"{name}.onnx")) for kind, name in models.items()}
     replace(p, models=models, splits=np.full(30, "test")).save(tmp_path / "p.npz")

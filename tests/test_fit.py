@@ -15,10 +15,10 @@ L = pytest.importorskip("lightning")
 from nextview.models.model_card import ModelError  # noqa: E402
 from nextview.report.training_curves import read_log, training_curves  # noqa: E402
 from nextview.training import loop as fitting  # noqa: E402
-from nextview.training import recogniser  # noqa: E402
 from nextview.training.ahead import Ahead  # noqa: E402
 from nextview.training.hardware import Hardware  # noqa: E402
 from nextview.training.recipes import RecogniserRecipe  # noqa: E402
+from nextview.training.recogniser import recogniser_module as recogniser  # noqa: E402
 
 RECIPE = RecogniserRecipe(size=32, epochs=3, views=4, batch=8)
 
@@ -62,7 +62,7 @@ def train(out, recipe=RECIPE, hardware=Hardware(), stop=None):
         recogniser.RecogniserModule.training_step = fatal
     try:
         objects = np.arange(len(labels))
-        return recogniser.train(sources, labels, objects[:9], objects[9:], recipe, out, None, hardware)
+        return recogniser.fit_recogniser(sources, labels, objects[:9], objects[9:], recipe, out, None, hardware)
     finally:
         recogniser.recogniser_network = usual
         if stop:

@@ -29,9 +29,9 @@ from nextview.errors import PolicyError
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.gain import INPUTS, MAPS, Gain, features, mirrored, mirrored_features
-from nextview.policies.policy_card import bundled_policies
+from nextview.policies.policy_card import PolicyCard, bundled_policies
 from nextview.policies.registry import make_policy
-from nextview.training.perceptrons import Perceptrons
+from nextview.training.gain.perceptrons import Perceptrons
 from nextview.training.recipes import GainRecipe
 
 CLASSES = 4
@@ -62,13 +62,13 @@ def some_state(sphere=SPHERE, episodes=60, seed=0):
 # The contract
 
 
-@pytest.mark.parametrize("anywhere", [True, False])
+@pytest.mark.parametrize("scope", ["global", "local"])
 @pytest.mark.parametrize(
     ("inputs", "frame"),
     [(INPUTS, "camera"), (INPUTS, "object"), (("belief",), "camera"), (("view", "place"), "object")],
 )
-def test_an_unvisited_view_is_chosen_in_each_episode_by_itself(anywhere, inputs, frame):
-    state, policy = some_state(), some_gain(inputs=inputs, frame=frame, anywhere=anywhere)
+def test_an_unvisited_view_is_chosen_in_each_episode_by_itself(scope, inputs, frame):
+    state, policy = some_state(), some_gain(inputs=inputs, frame=frame, scope=scope)
     chosen = policy.next_views(state, np.random.default_rng(0))
     free = ~state.visited.all(1)
     assert free.sum() > 40
@@ -252,9 +252,9 @@ from nextview.training.gain_export import gain_graph, write_gain  # noqa: E402
 
 def write_card(card, policy, state=None):
     """The card of a policy, and the ONNX file beside it."""
-    facts = {"kind": "gain", "anywhere": policy.anywhere, "elevations": SPHERE.elevations, "azimuths": SPHERE.azimuths}
     seen = features(SPHERE, state or some_state(), policy.inputs)
-    return write_gain(card, policy, facts | {"classes": ["a", "b", "c", "d"]}, seen.astype(np.float32))
+    about = PolicyCard("gain", policy.scope, SPHERE.elevations, SPHERE.azimuths, ("a", "b", "c", "d"), {})
+    return write_gain(card, policy, about, seen.astype(np.float32))
 
 
 def shipped(folder, policy) -> Gain:
@@ -288,12 +288,12 @@ def test_a_mirrored_object_gets_the_mirrored_choice(travel_weight, tmp_path):
     np.testing.assert_array_equal(mirror[going], flip[chosen][going])
 
 
-@pytest.mark.parametrize("anywhere", [True, False])
+@pytest.mark.parametrize("scope", ["global", "local"])
 @pytest.mark.parametrize("inputs", [INPUTS, ("belief",), ("view", "place")])
-def test_the_file_chooses_as_the_networks_do(anywhere, inputs, tmp_path):
-    state, policy = some_state(episodes=300), some_gain(inputs=inputs, anywhere=anywhere, travel_weight=0.1)
+def test_the_file_chooses_as_the_networks_do(scope, inputs, tmp_path):
+    state, policy = some_state(episodes=300), some_gain(inputs=inputs, scope=scope, travel_weight=0.1)
     other = shipped(tmp_path, policy)
-    assert (other.inputs, other.anywhere, other.travel_weight) == (inputs, anywhere, 0.1)
+    assert (other.inputs, other.scope, other.travel_weight) == (inputs, scope, 0.1)
     seen = features(SPHERE, state, inputs)
     np.testing.assert_allclose(other.score(seen.astype(np.float32)), policy.score(seen), atol=1e-5)
     random = np.random.default_rng(0)
@@ -340,7 +340,7 @@ FAULTS = {
     "other inputs": (
         lambda w: onnx.save(gain_graph(some_gain(inputs=("belief",)).score), w),
         True,
-        "not told (batch, ",
+        "has told (batch, ",
     ),
     "nan": (lambda w: set_number(w, "weights0", np.nan), True, "a weight is not a finite number"),
     "infinite": (lambda w: set_number(w, "weights2", np.inf), True, "a weight is not a finite number"),
@@ -364,14 +364,14 @@ def test_damaged_weights_are_refused_in_one_sentence(fault, tmp_path):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("lost", ["sha256", "table", "anywhere"])
+@pytest.mark.parametrize("lost", ["sha256", "table", "scope"])
 def test_a_card_that_lacks_something_is_refused(lost, tmp_path):
     card = tmp_path / "mine.json"
     write_card(card, some_gain())
-    facts = json.loads(card.read_text())
-    facts.pop(lost)
-    card.write_text(json.dumps(facts))
-    with pytest.raises(PolicyError, match=rf"mine\.json: not a policy card \(KeyError: '{lost}'\)"):
+    values = json.loads(card.read_text())
+    values.pop(lost)
+    card.write_text(json.dumps(values))
+    with pytest.raises(PolicyError, match=rf"mine\.json: not a policy card \(the card lacks '{lost}'\)"):
         make_policy(str(card), SPHERE)
 
 
@@ -400,7 +400,7 @@ print(*make_policy("gain", sphere).next_views(state, np.random.default_rng(0)))
 
 torch = pytest.importorskip("torch")
 
-from nextview.training.gain_training import Networks, averaged, best_epoch, train  # noqa: E402
+from nextview.training.gain.gain_networks import Networks, averaged, best_epoch, train  # noqa: E402
 
 
 def test_what_ships_says_what_torch_says(tmp_path):
@@ -468,7 +468,7 @@ def test_folds_judge_policies_that_have_not_seen_them_and_are_averaged(monkeypat
         asked.append((table, policy))
         return judge(table, policy, *rest, **options)
 
-    monkeypatch.setattr("nextview.training.gain_training.judge", listen)
+    monkeypatch.setattr("nextview.training.gain.gain_networks.judge", listen)
     trainings = [train(parts[0], recipe, k) for k in range(2)]
     *_, (policies, value) = best_epoch(trainings, parts[1:], recipe)
     assert [table is parts[1 + k % 2] for k, (table, _) in enumerate(asked)] == [True] * 4
@@ -497,12 +497,12 @@ def unseen(tmp_path):
 def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, capsys):
     card = tmp_path / "mine.json"
     main(["train", "gain", str(unseen), str(card), "--epochs", "2", "--inputs", "belief", "place", "--frame", "camera"])
-    facts = json.loads(card.read_text())
-    assert "90 objects" in facts["learned_from"]
-    assert "each judged by networks of 19 other folds" in facts["learned_from"]
+    values = json.loads(card.read_text())
+    assert "90 objects" in values["learned_from"]
+    assert "each judged by networks of 19 other folds" in values["learned_from"]
     policy = make_policy(str(card), SPHERE, classes=("ball", "box", "pillar"))
     assert isinstance(policy, Gain)
-    assert policy.travel_weight == facts["table"]["travel_weight"]
+    assert policy.travel_weight == values["table"]["travel_weight"]
     assert make_policy(f"{card}@0.5", SPHERE).travel_weight == 0.5
     assert policy.needs == ()
     for wrong in ("-1", "much", "nan", ""):
@@ -516,7 +516,7 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
     assert "its answers differ from the networks' by" in " ".join(capsys.readouterr().err.split())
     main(["train", "gain", str(unseen), str(card), "--epochs", "1", "--local", "--travel-weight", "0.2"])
     policy = make_policy(str(card), SPHERE)
-    assert (policy.anywhere, policy.travel_weight, policy.needs) == (False, 0.2, ("lem-sphere", "azimuth_bins"))
+    assert (policy.scope, policy.travel_weight, policy.needs) == ("local", 0.2, ("lem-sphere", "azimuth_bins"))
     assert policy.frame == "object"
 
 
@@ -538,7 +538,7 @@ def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsy
         ([str(unseen), str(tmp_path / "mine")], "NAME.json"),
         ([str(tmp_path / "none.npz"), str(card)], "no such file"),
         ([str(unseen), str(card), "--inputs", "belief", "lcm"], "holds no map 'lcm'"),
-        ([str(tmp_path / "sideless.npz"), str(card)], "says nothing of azimuth bins"),
+        ([str(tmp_path / "sideless.npz"), str(card)], "holds no azimuth bins"),
     ]:
         with pytest.raises(SystemExit) as end:
             main(["train", "gain", *arguments])

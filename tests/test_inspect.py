@@ -43,12 +43,12 @@ def test_summary_counts(views):
 def test_sizes_are_told_where_the_unit_is_known(views, tmp_path, capsys):
     store = ViewStore.open(views)
     assert median_radii(store) == {}
-    store.group.attrs["unit"] = "cm"
+    store.note(unit="cm")
     boxes = [np.sqrt(1 + 4 + (3 + i) ** 2) / 2 / 100 for i in (0, 1, 2)]
     assert median_radii(store) == {"ball": pytest.approx(0.01), "box": pytest.approx(boxes[1])}
     main(["inspect", str(views), str(tmp_path / "views.png")])
     assert "median radius, m       ball 0.01, box 0.02" in capsys.readouterr().err
-    del store.group.attrs["unit"]
+    store.note(unit=None)
 
 
 def test_bars_are_as_long_as_the_classes(views):

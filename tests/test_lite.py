@@ -1,20 +1,21 @@
 """EfficientNet-Lite0: its shape, its checkpoints, and what its export keeps."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from nextview.cli.main import main
 from nextview.models.inference import Recogniser
-from nextview.models.model_card import write_card
+from nextview.models.model_card import ModelCard, file_hash, write_card
+from nextview.models.network_input import InputSpec
 
 torch = pytest.importorskip("torch")
 
 from nextview.models.model_card import ModelError  # noqa: E402
 from nextview.training.checkpoints import exported_networks, load_checkpoint, load_exported  # noqa: E402
 from nextview.training.lite import Depthwise, InvertedBottleneck, LiteNet  # noqa: E402
-from nextview.training.onnx_export import CalibratedRecogniser, export_onnx  # noqa: E402
+from nextview.training.onnx_export import ShippedRecogniser, export_onnx  # noqa: E402
 
 LITE0 = ((16, 3, 1), (24, 3, 2), (40, 5, 2), (80, 3, 3), (112, 5, 3), (192, 5, 4), (320, 3, 1))
 """Width, kernel and blocks of the stages."""
@@ -134,11 +135,12 @@ def test_it_goes_on_from_its_export_also_beside_another(tmp_path, bits):
         checkpoint(tmp_path / "lite.pth", 2, seed)
         load_checkpoint(network, tmp_path / "lite.pth")
     views = np.random.default_rng(0).integers(0, 256, (16, 4, 64, 64)).astype(np.uint8)
-    shipped = CalibratedRecogniser(networks, 1.0).eval()
+    shipped = ShippedRecogniser(networks).eval()
     export_onnx(shipped, views[:2], "input", shipped.outputs, tmp_path / "two.onnx", bits)
-    facts = {"name": "two", "kind": "recogniser", "input_size": 64, "sees": "geometry", "temperature": 1.0}
-    facts |= {"classes": ["a", "b"], "azimuth_bins": 8, "network": "EfficientNet-Lite0 + EfficientNet-Lite0"}
-    write_card(tmp_path / "two.json", facts)
+    weights, spec = tmp_path / "two.onnx", InputSpec("geometry", 64)
+    card = ModelCard("two", "recogniser", spec, file_hash(weights), weights, classes=("a", "b"), azimuth_bins=8)
+    card = replace(card, network="EfficientNet-Lite0 + EfficientNet-Lite0")
+    write_card(tmp_path / "two.json", card)
     x = torch.from_numpy(views).float() / 255
     again = exported_networks(tmp_path / "two.json", 4, x)
     with torch.no_grad():
@@ -148,21 +150,6 @@ def test_it_goes_on_from_its_export_also_beside_another(tmp_path, bits):
     assert np.ptp(exact) > 0.1
     with pytest.raises(ModelError, match="not one network of this depth and input"):
         load_exported(LiteNet(2, 4, 8), tmp_path / "two.json", x)
-    write_card(tmp_path / "two.json", facts | {"network": "EfficientNet-Lite0 + EfficientNet-Lite2"})
+    write_card(tmp_path / "two.json", replace(card, network="EfficientNet-Lite0 + EfficientNet-Lite2"))
     with pytest.raises(ModelError, match=r"two\.json: there is no EfficientNet-Lite2"):
         exported_networks(tmp_path / "two.json", 4, x)
-
-
-@pytest.mark.parametrize(
-    ("options", "log_evidence"),
-    [
-        (["--network", "lite0", "--depth", "34"], "only a ResNet has a --depth"),
-        (["--dropout", "0.2"], "only EfficientNet-Lite0 drops features"),
-        (["--network", "lite0", "--dropout", "1"], "--dropout is a chance, 0 or more and less than 1, not 1.0"),
-    ],
-)
-def test_options_of_another_network_are_refused(tmp_path, capsys, options, output):
-    command = ["train", "recogniser", str(tmp_path / "no.zarr"), str(tmp_path / "run")]
-    with pytest.raises(SystemExit):
-        main([*command, *options])
-    assert output in " ".join(capsys.readouterr().err.split())

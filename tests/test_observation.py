@@ -14,7 +14,7 @@ from nextview.cloud import visible_points
 from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError
 from nextview.mesh import make_mesh
-from nextview.models.inference import see
+from nextview.models.network_input import InputSpec, from_observations
 from nextview.observation import LEAST_PIXELS, LEAST_SHARE, Observation, pinhole
 from nextview.viewsphere import ViewSphere
 
@@ -199,9 +199,9 @@ def test_views_of_two_cameras_are_not_seen_together():
         SimulatedCamera(sample_mesh("chair"), 32).observe(POSE),
         SimulatedCamera(sample_mesh("chair"), SIZE, 4.0).observe(POSE),
     ):
-        for sees in ("geometry", "image", "cloud"):
+        for spec in (InputSpec("geometry", 16), InputSpec("image", 16), InputSpec("cloud")):
             with pytest.raises(ObservationError, match="from one camera"):
-                see([VIEW, other], sees, 16)
+                from_observations(spec, [VIEW, other])
 
 
 images = npst.arrays(

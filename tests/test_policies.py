@@ -88,12 +88,10 @@ def policies(sphere, rng):
     yield OracleValley(sphere, labels, (1,))
     log_evidence = rng.normal(size=(50, len(sphere), 2 * 9))
     yield OracleGain(sphere, log_evidence, 2, labels, objects)
-    yield OracleGain(
-        sphere, log_evidence, 2, labels, objects, anywhere=True, calibration=Calibration(bin_correlation=0.1)
-    )
-    for anywhere in (True, False):
-        yield FixedSequence(sphere, rng.integers(len(sphere), size=(sphere.rings, 4)), anywhere)
-        yield ClassTable(sphere, rng.random((2, sphere.rings, len(sphere))), anywhere)
+    yield OracleGain(sphere, log_evidence, 2, labels, objects, "global", calibration=Calibration(bin_correlation=0.1))
+    for scope in ("global", "local"):
+        yield FixedSequence(sphere, rng.integers(len(sphere), size=(sphere.rings, 4)), scope)
+        yield ClassTable(sphere, rng.random((2, sphere.rings, len(sphere))), scope)
     yield FixedRing(sphere, sphere.rings - 1, 2)
 
 
@@ -193,7 +191,7 @@ def test_random_is_uniform_over_what_is_free(policy):
 
 def test_random_draws_from_the_generator_handed_in():
     state = state_of(SPHERE, np.zeros(200, int))
-    for policy in (Random(SPHERE), RandomAll(SPHERE), Furthest(SPHERE), Spread(SPHERE, anywhere=False)):
+    for policy in (Random(SPHERE), RandomAll(SPHERE), Furthest(SPHERE), Spread(SPHERE, "local")):
         a, b, c = (policy.next_views(state, np.random.default_rng(seed)) for seed in (1, 1, 2))
         np.testing.assert_array_equal(a, b)
         assert (a != c).any()
@@ -239,13 +237,13 @@ def test_unidirectional_passes_over_what_was_visited():
 
 
 @settings(deadline=None, max_examples=20)
-@given(spheres, st.booleans(), st.integers(0, 2**32))
-def test_spread_is_the_free_view_farthest_from_all_visited(sphere, anywhere, seed):
+@given(spheres, st.sampled_from(["global", "local"]), st.integers(0, 2**32))
+def test_spread_is_the_free_view_farthest_from_all_visited(sphere, scope, seed):
     rng = np.random.default_rng(seed)
     state = random_state(sphere, rng)
-    chosen = Spread(sphere, anywhere).next_views(state, rng)
+    chosen = Spread(sphere, scope).next_views(state, rng)
     for row, view in enumerate(state.current):
-        reachable = range(len(sphere)) if anywhere else sphere.window(view).ravel()
+        reachable = range(len(sphere)) if scope == "global" else sphere.window(view).ravel()
         seen = sphere.directions[state.visited[row]]
         apart = {v: np.arccos(np.clip(seen @ sphere.directions[v], -1, 1)).min() for v in reachable}
         free = {v: arc for v, arc in apart.items() if not state.visited[row, v]}
@@ -280,11 +278,11 @@ def test_cells_turn_with_the_camera_and_keep_their_ring(sphere):
 
 
 @settings(deadline=None, max_examples=20)
-@given(st.integers(0, 2**32), st.booleans())
-def test_a_fixed_sequence_makes_the_moves_of_the_ring_it_began_on(seed, anywhere):
+@given(st.integers(0, 2**32), st.sampled_from(["global", "local"]))
+def test_a_fixed_sequence_makes_the_moves_of_the_ring_it_began_on(seed, scope):
     rng = np.random.default_rng(seed)
     moves = np.array([rng.permutation(40)[:4] for _ in range(5)])
-    policy = FixedSequence(SPHERE, moves, anywhere)
+    policy = FixedSequence(SPHERE, moves, scope)
     starts = np.arange(40)
     state = state_of(SPHERE, starts)
     lost = np.zeros(40, bool)  # a random sequence may come back to where it was; what follows then is another matter
@@ -311,14 +309,14 @@ def test_a_fixed_ring_is_entered_where_the_camera_is_and_walked_in_its_steps():
     assert walked[8][0] != 54.0  # round: on to another
 
 
-@pytest.mark.parametrize("anywhere", [True, False])
-def test_a_class_table_takes_the_best_free_cell_of_the_believed_class(anywhere):
+@pytest.mark.parametrize("scope", ["global", "local"])
+def test_a_class_table_takes_the_best_free_cell_of_the_believed_class(scope):
     rng = np.random.default_rng(0)
     values = rng.random((2, 5, 40))
     state = random_state(SPHERE, rng)
-    chosen = ClassTable(SPHERE, values, anywhere).next_views(state, rng)
+    chosen = ClassTable(SPHERE, values, scope).next_views(state, rng)
     for row, view in enumerate(state.current):
-        reachable = range(40) if anywhere else SPHERE.window(view).ravel()
+        reachable = range(40) if scope == "global" else SPHERE.window(view).ravel()
         of = {}
         for other in reachable:
             if not state.visited[row, other]:

@@ -1,3 +1,4 @@
+import os
 import signal
 import subprocess
 import sys
@@ -201,6 +202,7 @@ def test_predictions_are_what_the_networks_say_of_each_look(shop):
     assert last == (6, 6)
     found, store = Predictions.load(shop / "all.npz"), ViewStore.open(shop / "views.zarr")
     assert found.names == tuple(store.names)
+    assert found.store == str((shop / "views.zarr").resolve())
     assert found.models["lem"] == ("tiny-lem", maps["lem"].sha256)
     assert found.valley_classes == {"lem": ("box",)}
     i, v = 3, 17
@@ -253,6 +255,31 @@ def test_a_killed_run_goes_on_where_it_was(shop):
     np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(shop / "whole.npz").logits)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="mounts a small disk")
+@pytest.mark.parametrize(("room", "kept"), [("40k", 0), ("56k", 6)], ids=["for no arrays", "for the arrays alone"])
+def test_a_full_disk_is_one_sentence_and_loses_nothing(shop, tmp_path, room, kept):
+    """In processes of their own, for a disk that is full under a memory map kills."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", disk]).returncode:
+        pytest.skip("only root can mount a small disk")
+    command = [sys.executable, "-m", "nextview.cli.main", "predict", shop / "views.zarr", disk / "p.npz"]
+    command += ["--recogniser", shop / "tiny.json", "--maps", f"lem={shop / 'tiny-lem.json'}", "--workers", "1"]
+    try:
+        full = subprocess.run(command, stderr=subprocess.PIPE, text=True)
+        assert full.returncode == 2
+        last = full.stderr.splitlines()[-1]
+        assert last.startswith(f"nextview: {disk}/p.npz: cannot be written (No space left on device)")
+        assert "Traceback" not in full.stderr
+        subprocess.run(["mount", "-o", "remount,size=100m", disk], check=True)
+        recogniser, maps = cards(shop)
+        assert next(predict(shop / "views.zarr", disk / "p.npz", [recogniser], maps, workers=1)) == (kept, 6)
+        subprocess.run(command, check=True)
+        assert len(Predictions.load(disk / "p.npz")) == 6
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
 def test_predictions_of_other_models_or_views_are_not_overwritten(shop):
     recogniser, maps = cards(shop)
     out = shop / "kept.npz"
@@ -289,7 +316,7 @@ def test_a_card_that_was_calibrated_since_brings_predictions_up_to_date(shop):
     (recogniser, maps), out = cards(shop), shop / "calibrated.npz"
     list(predict(shop / "views.zarr", out, [recogniser], maps, workers=1))
     before = Predictions.load(out)
-    later = replace(recogniser, facts={**recogniser.facts, "calibration": Calibration(0.5, 0.25).facts()})
+    later = replace(recogniser, calibration=Calibration(0.5, 0.25))
     assert list(predict(shop / "views.zarr", out, [later], maps, workers=1)) == [(6, 6)]
     after = Predictions.load(out)
     assert (before.calibration, after.calibration) == (Calibration(), Calibration(0.5, 0.25))

@@ -124,11 +124,12 @@ def test_bundled_models_are_what_their_cards_say():
     assert {path.suffix for path in BUNDLED.iterdir()} <= {".onnx", ".json"}
     assert sum(card.path.stat().st_size for card in cards.values()) < 60e6
     for card in cards.values():
-        training = set(card.facts["training"])
-        assert {"data", "commands"} <= training
-        assert training & {"recipe", "recipes"}
-        judged = [of.split(" (")[0] for of in card.facts["scores"]]
-        assert judged == (["validation", "test", "test"] if "size" in card.facts else ["validation", "test"])
+        training = card.training
+        assert training.data
+        assert training.commands
+        assert training.recipes
+        judged = [of.split(" (")[0] for of in card.scores]
+        assert judged == (["validation", "test", "test"] if card.size else ["validation", "test"])
 
 
 def copy_model(folder, change):

@@ -68,12 +68,11 @@ def test_calibrated_belief_is_the_posterior_of_equally_correlated_looks(correlat
 def test_a_calibration_survives_the_card():
     bounds = RiskBounds((0.5, 0.9), ((0.2, 0.1), (0.3, 0.15)), 0.1)
     for calibration in (Calibration(), Calibration(0.7, 0.25), Calibration(1.2, 0.8, bounds)):
-        assert Calibration.of_facts(json.loads(json.dumps(calibration.facts()))) == calibration
-    assert Calibration.of_facts(None) == Calibration()
+        assert Calibration.from_dict(json.loads(json.dumps(calibration.to_dict()))) == calibration
 
 
 @pytest.mark.parametrize(
-    "facts",
+    "values",
     [
         {"temperature": 0, "correlation": 0},
         {"temperature": 1, "correlation": -0.1},
@@ -84,9 +83,9 @@ def test_a_calibration_survives_the_card():
         "calibrated",
     ],
 )
-def test_a_calibration_that_makes_no_sense_is_refused(facts):
+def test_a_calibration_that_makes_no_sense_is_refused(values):
     with pytest.raises(ValueError, match="calibration"):
-        Calibration.of_facts(facts)
+        Calibration.from_dict(values)
 
 
 @given(st.lists(st.floats(0.01, 0.5), min_size=1, max_size=8), st.floats(0.02, 0.4))
@@ -216,6 +215,6 @@ def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
 
 def test_the_correlation_of_sides_is_kept_with_the_calibration():
     calibration = Calibration(0.7, 0.5, bin_correlation=0.2)
-    assert Calibration.of_facts(json.loads(json.dumps(calibration.facts()))) == calibration
+    assert Calibration.from_dict(json.loads(json.dumps(calibration.to_dict()))) == calibration
     with pytest.raises(ValueError, match="no calibration"):
         Calibration(bin_correlation=-0.1)

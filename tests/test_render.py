@@ -1,6 +1,7 @@
 """The store survives what happens to long jobs, done for real: kills, full disks, broken meshes, second runs."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from nextview.cli.main import main
 from nextview.data.folders import list_dataset
 from nextview.data.lock import only_one
 from nextview.data.pool import WorkerDied, each
@@ -185,6 +187,54 @@ def test_views_from_too_far_for_the_store_are_refused(dataset, tmp_path):
     assert 4.5 <= depth[depth > 0].min() <= depth.max() <= 6.5
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["--stretch", "nan"],
+        ["--stretch", "inf"],
+        ["--stretch", "-2"],
+        ["--size", "0"],
+        ["--size", "-3"],
+        ["--size", "99999"],
+        ["--seed", "-1"],
+        ["--azimuths", "0"],
+        ["--workers", "-1"],
+        ["--split", "test"],
+    ],
+    ids=" ".join,
+)
+def test_settings_that_make_no_views_are_refused_before_anything_is_written(tmp_path, capsys, settings):
+    meshes = make_dataset(tmp_path / "meshes", 2)
+    shutil.rmtree(meshes / "box")  # which is all of the test split
+    with pytest.raises(SystemExit) as end:
+        main(["render", str(meshes), str(tmp_path / "out/views.zarr"), *settings])
+    assert end.value.code == 2
+    *threshold_at, message = capsys.readouterr().err.splitlines()
+    assert message.startswith("nextview: ")
+    assert len(threshold_at) <= 1
+    assert [path.name for path in tmp_path.iterdir()] == ["meshes"]
+
+
+def test_a_store_without_any_object_ends_with_status_2(tmp_path, capsys):
+    (tmp_path / "meshes/box").mkdir(parents=True)
+    (tmp_path / "meshes/box/broken.off").write_text("OFF\n")
+    with pytest.raises(SystemExit) as end:
+        main(["render", str(tmp_path / "meshes"), str(tmp_path / "views.zarr"), "--workers", "1"])
+    assert end.value.code == 2
+    assert "none of the 1 meshes can be used" in capsys.readouterr().err
+
+
+def test_what_lies_beside_or_in_the_place_of_a_store_is_left_alone(dataset, tmp_path):
+    (tmp_path / "views.zarr.part").mkdir()
+    (tmp_path / "views.zarr.part/thesis.tex").write_text("all of it")
+    list(render(dataset, tmp_path / "views.zarr", SPHERE, 16, split="test", workers=0))
+    assert (tmp_path / "views.zarr.part/thesis.tex").read_text() == "all of it"
+    with pytest.raises(DatasetError, match="is there, and is no view store; give another name"):
+        list(render(dataset, tmp_path / "views.zarr.part", SPHERE, 16, split="test", workers=0))
+    assert [p.name for p in (tmp_path / "views.zarr.part").iterdir()] == ["thesis.tex"]
+    assert sorted(p.name for p in tmp_path.iterdir() if p.suffix != ".lock") == ["views.zarr", "views.zarr.part"]
+
+
 def test_broken_meshes_are_recorded_and_tried_again(tmp_path):
     meshes = make_dataset(tmp_path / "meshes", 3)
     broken = meshes / "box/train/thing_02.off"
@@ -206,7 +256,7 @@ def test_identical_meshes_are_known_by_their_bytes(tmp_path):
     (meshes / "box/train/twin.off").write_bytes((meshes / "ball/train/thing_01.off").read_bytes())
     list(render(meshes, tmp_path / "views.zarr", SPHERE, SIZE, workers=0))
     store = ViewStore.open(tmp_path / "views.zarr")
-    assert [{store.names[i] for i in group} for group in store.duplicates] == [{"thing_01", "duplicate"}]
+    assert [{store.names[i] for i in group} for group in store.duplicates] == [{"thing_01", "twin"}]
 
 
 def test_a_box_is_stored_as_it_is_seen(tmp_path):
@@ -272,6 +322,16 @@ def test_plain_class_folders_and_repeated_names(tmp_path):
     assert [(e.name, e.label, e.split) for e in list_dataset(tmp_path)] == [("cup_1", "cup", ""), ("jar_1", "jar", "")]
     with pytest.raises(DatasetError, match="no such folder"):
         list_dataset(tmp_path / "nowhere")
+
+
+def test_meshes_of_one_name_are_told_apart_or_refused(tmp_path):
+    for place in ("cup/train/1.off", "cup/test/1.off", "jar/train/1.off"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).write_text("OFF\n")
+    assert [e.name for e in list_dataset(tmp_path)] == ["cup_train_1", "cup_test_1", "jar_train_1"]
+    (tmp_path / "jar/train/1.obj").write_text("")
+    with pytest.raises(DatasetError, match=r"1\.obj and .*1\.off would both be called jar_train_1; rename one"):
+        list_dataset(tmp_path)
 
 
 def die_on_three(item: int) -> int:

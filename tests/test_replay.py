@@ -12,8 +12,8 @@ from tiny_models import make_map_network, make_recogniser
 
 from nextview.belief import Calibration, Stopping
 from nextview.benchmark.entries import default_entries, true_lcm, true_lem
+from nextview.benchmark.experiment import Grid, run_grid
 from nextview.benchmark.replay import make_specs, replay, truncate
-from nextview.benchmark.run import Grid, run_grid
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
@@ -322,7 +322,7 @@ def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(meshes, 
     list(render(tmp_path / "meshes", tmp_path / "views.zarr", sphere, 64, workers=1))
     classes = sorted(path.name for path in (tmp_path / "meshes").iterdir())
     recogniser = make_recogniser(tmp_path, classes, size=32, azimuth_bins=8)
-    calibrated = json.loads(recogniser.read_text()) | {"calibration": Calibration(0.6, 0.7).facts()}
+    calibrated = json.loads(recogniser.read_text()) | {"calibration": Calibration(0.6, 0.7).to_dict()}
     recogniser.write_text(json.dumps(calibrated))
     lem = make_map_network(tmp_path, valleys=(classes[0],))
     cards = [read_card(recogniser)], {"lem": read_card(lem)}

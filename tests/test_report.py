@@ -1,3 +1,4 @@
+import json
 import re
 import shutil
 import subprocess
@@ -15,9 +16,10 @@ from nextview.cli.benchmark import benchmark
 from nextview.cli.report import report
 from nextview.data.folders import Entry
 from nextview.data.store import DONE, ViewStore
-from nextview.errors import EntryError
+from nextview.errors import EntryError, ResultsError
 from nextview.report import curves
-from nextview.report.html import headline_policy
+from nextview.report.html import headline_policy, write_report
+from nextview.report.trajectories import Pictures
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -27,14 +29,16 @@ def made(tmp_path_factory):
     """Results and a store with pictures, one object of which has a name that would break careless HTML."""
     folder = tmp_path_factory.mktemp("report")
     p = some_predictions(20, seed=1)
-    p = replace(p, names=("<script>alert(1)</script>&", *p.names[1:]))
+    p = replace(p, names=("<script>alert(1)</script>&", *p.names[1:]), store=str(folder / "views.zarr"))
     p.save(folder / "p.npz")
     benchmark(folder / "p.npz", out=folder / "out", thresholds=(0.8, 0.97), runs=3, samples=100)
     entries = [Entry(Path("none"), name, p.classes[i], "test") for name, i in zip(p.names, p.labels, strict=True)]
     store = ViewStore.create(folder / "views.zarr", entries, p.sphere, 32, {})
     store.group["image"][:] = np.random.default_rng(0).integers(0, 255, store.group["image"].shape, np.uint8)
+    store.group["measures/depth_entropy"][:] = p.depth_entropy
+    store.group["points"][:] = np.random.default_rng(1).integers(-9, 9, store.group["points"].shape, np.int16)
     store.group["status"][:] = DONE
-    report(folder / "out", store=folder / "views.zarr")
+    report(folder / "out")
     return folder
 
 
@@ -138,15 +142,15 @@ def drawn(figure):
     return [text.get_text().split("  ")[0] for text in figure.axes[0].get_legend().get_texts()]
 
 
-def test_of_a_crowd_the_curves_show_the_reference_the_best_eight_and_two_oracles(crowd):
+def test_of_a_crowd_the_curves_show_the_reference_the_users_own_the_best_others_and_two_oracles(crowd):
     of = crowd.tables.summary.query("measure == 'accuracy' and threshold == 0.97").set_index("policy")["value"]
     shown = curves.compared(crowd)
     assert shown[-2:] == ["oracle-valley", "oracle-gain"]
-    best, left = set(shown[:-2]) - {"random"}, set(ROBOTS) - set(shown)
-    assert "random" in shown
-    assert (len(shown), len(best), len(left)) == (11, 8, 4)
+    assert {"random", *OWN} <= set(shown)
+    best, left = set(shown[:-2]) - {"random", *OWN}, set(ROBOTS) - set(shown)
+    assert (len(shown), len(best), len(left)) == (11, 3, 4)
     assert min(of[list(best)]) >= max(of[list(left)])
-    assert headline_policy(crowd, 0.97) in best
+    assert headline_policy(crowd, 0.97) in {*best, *OWN}
     assert drawn(curves.threshold_curve(crowd)) == drawn(curves.budget_curve(crowd, "n_views")) == shown
     n_views = [curves.look_of(name, crowd) for name in shown]
     assert len({(observation["color"], observation["linestyle"]) for observation in n_views}) == len(shown)
@@ -160,6 +164,65 @@ def test_a_reference_that_is_the_worst_of_a_crowd_is_drawn_all_the_same(crowd):
     shown = curves.compared(replace(crowd, settings={**crowd.settings, "reference": worst}))
     assert worst in shown
     assert len(shown) == 11
+
+
+def test_the_default_policy_is_drawn_however_bad_it_is(crowd, monkeypatch):
+    of = crowd.tables.summary.query("measure == 'accuracy' and threshold == 0.97").set_index("policy")["value"]
+    worst = min(set(ROBOTS) - {"random", *OWN}, key=of.__getitem__)
+    assert worst not in curves.compared(crowd)
+    monkeypatch.setattr(curves, "DEFAULT", worst)
+    assert worst in curves.compared(crowd)
+    assert len(curves.compared(crowd)) == 11
+
+
+def test_the_viewer_comes_first_and_few_objects_are_warned_of(made):
+    text = (made / "out" / "report.html").read_text()
+    page = Page(text)
+    assert next(link for link in page.links if link.startswith("#")) == "#episodes"
+    assert text.index('id="viewer"') < text.index("<table")
+    assert "Too few objects to tell: there are 20 and" in text
+
+
+def test_the_data_of_the_viewer_are_json_and_hold_no_markup(made):
+    text = (made / "out" / "report.html").read_text()
+    data = re.search(r'<script type="application/json" id="trajectories">(.*?)</script>', text, re.S)[1]
+    assert "<" not in data
+    scenes = json.loads(data)["scenes"]
+    assert {scene["name"] for scene in scenes} <= set(results.load(made / "out").predictions.names)
+    assert all(scene["pictures"] and scene["cloud"] for scene in scenes)
+
+
+def test_pictures_come_from_the_store_of_the_predictions_while_it_is_the_same(made, tmp_path):
+    p = results.load(made / "out").predictions
+    assert Pictures.of(p).store is not None
+    gone = Pictures.of(replace(p, store=str(tmp_path / "gone.zarr")))
+    assert (gone.store, "no view store at" in gone.why_not) == (None, True)
+    unknown = Pictures.of(replace(p, store=""))
+    assert (unknown.store, "do not name" in unknown.why_not) == (None, True)
+    other = p.depth_entropy.copy()
+    other[3, 5] += 0.5
+    changed = Pictures.of(replace(p, depth_entropy=other))
+    assert (changed.store, "has changed since" in changed.why_not) == (None, True)
+    assert Pictures.of(replace(p, depth_entropy=other), made / "views.zarr").store is not None  # as the user says
+    with pytest.raises(ResultsError, match="no views of these objects"):
+        Pictures.of(replace(p, names=tuple(f"other {name}" for name in p.names)), made / "views.zarr")
+
+
+def test_a_page_without_pictures_says_so(made, tmp_path):
+    write_report(results.load(made / "out"), tmp_path / "bare.html", Pictures(None, "No pictures: none."))
+    text = (tmp_path / "bare.html").read_text()
+    assert text.count("No pictures: none.") == 2
+    assert "image/webp" not in text
+
+
+def test_ticks_are_round_numbers(crowd):
+    for figure in (curves.threshold_curve(crowd), curves.budget_curve(crowd, "n_views")):
+        figure.canvas.draw()
+        axis = figure.axes[0].yaxis
+        for at, text in zip(axis.get_ticklocs(), axis.get_ticklabels(), strict=True):
+            assert float(text.get_text().removesuffix(" %")) == pytest.approx(100 * at)  # not 92 % at 0.925
+        steps = np.diff(axis.get_ticklocs())
+        assert float(f"{steps[0]:.1e}".split("e")[0]) in (1, 2, 5)
 
 
 def test_captions_tell_where_the_rest_of_a_crowd_is(crowd, made):
@@ -205,9 +268,9 @@ def test_the_viewer_steps_through_an_episode_in_a_browser(made):
     for step in (0, 1):
         page = browse(made / "out" / "report.html", f"#scene=1&policy=unidirectional&step={step}")
         verdict = re.search(r'id="verdict".*?>(.*?)<', page)[1]
-        assert verdict.startswith(f"unidirectional, look {step + 1} of ")
+        assert verdict.startswith(f"unidirectional, view {step + 1} of ")
         start = re.search(r'<option value="1"[^>]*>.*? from view (\d+)<', page)[1]
-        views = re.findall(r"Look \d+: view (\d+), elevation", page)
+        views = re.findall(r"\d+: view (\d+), elevation", page)
         ring, azimuth = divmod(int(start), 8)
         assert list(map(int, views[:2])) == [int(start), ring * 8 + (azimuth + 1) % 8]
         assert page.count('aria-current="step"') == 1

@@ -266,3 +266,42 @@ def test_real_meshes_seen_as_by_casting_every_ray():
         camera = SimulatedCamera(mesh, 96)
         for pose in SPHERE.poses[::13]:
             assert_same_but_at_edges(camera.observe(pose).depth, cast_all(mesh, pose, 96, camera.intrinsics))
+
+
+def seen_from_the_edge(pose: np.ndarray, size: int, rng: np.random.Generator) -> Mesh:
+    """Triangles in planes through the camera and a row or a column of pixels, inside the unit sphere."""
+    focal = pinhole(size, 3.0)[0, 0]
+    triangles = []
+    while len(triangles) < 20:
+        depth, across = rng.uniform(2.2, 3.8, 3), rng.uniform(-0.9, 0.9, 3)
+        inside = (rng.integers(size // 4, 3 * size // 4) + 0.5 - size / 2) / focal * depth
+        flat = np.stack([inside, across, depth] if rng.random() < 0.5 else [across, inside, depth], 1)
+        triangle = flat @ pose[:3, :3].T + pose[:3, 3]
+        if np.linalg.norm(triangle, axis=1).max() < 1:
+            triangles.append(triangle)
+    tips = np.repeat(np.concatenate([np.eye(3), -np.eye(3)]), 3, axis=0)  # no area; keep the frame as it is
+    vertices = np.concatenate([*triangles, tips])
+    return make_mesh(vertices, np.arange(len(vertices)).reshape(-1, 3))
+
+
+@pytest.mark.parametrize("view", [0, 3, 13, 25])
+def test_triangles_seen_from_the_edge_are_no_farther_than_they_are(view):
+    """There the plane of the triangle holds the ray, and rounding alone decides where the two meet."""
+    pose = SPHERE.poses[view]
+    mesh = seen_from_the_edge(pose, 64, np.random.default_rng(view))
+    wild = cast_all(mesh, pose, 64, pinhole(64, 3.0))
+    assert wild.max() > 4.1 or 0 < wild[wild > 0].min() < 1.9  # the unit sphere ends at 2 and at 4
+    observation = SimulatedCamera(mesh, 64).observe(pose)
+    np.testing.assert_array_equal(observation.image > 0, observation.depth > 0)
+    assert observation.depth.max() < 4.001
+    assert observation.depth[observation.depth > 0].min(initial=3) > 1.999
+    assert np.abs(observation.points).max() < 1.001
+
+
+def test_a_needle_is_object_in_both_pictures():
+    """The square of its normal is smaller than any float32."""
+    needle = np.array([[3e-8, -1e-23, 1], [6e-8, -2e-23, 1], [-3e-8, 1, -1]])
+    mesh = make_mesh(np.concatenate([needle, -needle]), np.arange(6).reshape(2, 3))
+    observation = SimulatedCamera(mesh, 225).observe(SPHERE.poses[0])
+    assert np.count_nonzero(observation.depth) > 50
+    np.testing.assert_array_equal(observation.image > 0, observation.depth > 0)

@@ -43,8 +43,8 @@ def shop(tmp_path_factory):
             trimesh.creation.icosphere(2, radius * rng.uniform(0.8, 1.25)).export(path)
     list(render(folder / "meshes", folder / "views.zarr", SPHERE, 32, workers=1))
     make_recogniser(folder, CLASSES)
-    facts = json.loads((folder / "tiny.json").read_text())
-    (folder / "tiny.json").write_text(json.dumps(facts | {"unseen": ["big_0", "big_1", "small_0", "small_1"]}))
+    card = json.loads((folder / "tiny.json").read_text())
+    (folder / "tiny.json").write_text(json.dumps(card | {"held_out": ["big_0", "big_1", "small_0", "small_1"]}))
     return folder
 
 
@@ -93,7 +93,7 @@ def test_the_weight_is_the_most_likely_one():
 def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     views, card, honest = str(shop / "views.zarr"), str(shop / "tiny.json"), str(tmp_path / "held-out.npz")
     assert np.isnan(ViewStore.open(views).radii).all()
-    main(["predict", views, honest, "--unseen", "--recogniser", card, "--maps"])
+    main(["predict", views, honest, "--held-out", "--recogniser", card, "--maps"])
     with pytest.raises(SystemExit):
         main(["fit", "size", views, honest, card])
     assert "--unit" in capsys.readouterr().err
@@ -109,7 +109,7 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     by_shape = Predictions.load(test)
     assert by_shape.of_size is None
     main(["fit", "size", views, honest, card])
-    assert read_card(Path(card)).facts["size"]["learned_from"] == "8 objects of the training split"
+    assert read_card(Path(card)).fitted_to["size"].startswith("8 objects of the training split, ")
     list(predict(Path(views), test, [read_card(Path(card))], {}, "test", workers=1))  # nothing is predicted again
     known = Predictions.load(test)
     assert (known.logits.argmax(2) == known.labels[:, None]).all()
@@ -156,7 +156,7 @@ def test_a_unit_is_one_of_a_few(shop):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"weight": None}, "sizes that cannot be read"),
+        ({"weight": None}, "'weight' of the size is not a finite number"),
         ({"weight": -1}, "not a finite number"),
         ({"radii_m": [1, 0.5]}, "do not fit together"),
         ({"log_density": [[0, 0]]}, "sizes of 1 classes, not 2"),

@@ -1,14 +1,16 @@
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
+from nextview import metrics
 from nextview.benchmark import statistics as st
 
 
 def test_intervals_agree_with_scipy():
     values = np.random.default_rng(0).exponential(size=300)
     weights = st.resample(300, 4000, np.random.default_rng(1))
-    low, high = st.interval(st.ratio(values[:, None], np.ones((300, 1)), weights))
+    low, high = st.interval(metrics.ratio(values[:, None], np.ones((300, 1)), weights))
     theirs = stats.bootstrap(
         (values,), np.mean, n_resamples=4000, method="percentile", rng=np.random.default_rng(2)
     ).confidence_interval
@@ -21,7 +23,7 @@ def test_ratios_and_class_means_agree_with_plain_loops():
     top, bottom, labels = rng.random((12, 2)), rng.integers(0, 3, (12, 2)).astype(float), rng.integers(0, 3, 12)
     draws = rng.integers(12, size=(5, 12))
     weights = np.stack([np.bincount(draw, minlength=12) for draw in draws]).astype(float)
-    ratio, mean = st.ratio(top, bottom, weights), st.class_mean(top, bottom, labels, weights)
+    ratio, mean = metrics.ratio(top, bottom, weights), metrics.class_mean(top, bottom, labels, weights)
     for s, draw in enumerate(draws):
         for m in range(2):
             assert ratio[s, m] == pytest.approx(top[draw, m].sum() / bottom[draw, m].sum())
@@ -31,7 +33,7 @@ def test_ratios_and_class_means_agree_with_plain_loops():
 
 
 def test_a_quantity_without_any_episode_has_no_interval():
-    nothing = st.ratio(np.zeros((4, 1)), np.zeros((4, 1)), st.resample(4, 10, np.random.default_rng(0)))
+    nothing = metrics.ratio(np.zeros((4, 1)), np.zeros((4, 1)), st.resample(4, 10, np.random.default_rng(0)))
     assert np.isnan(st.interval(nothing)).all()
 
 
@@ -71,11 +73,11 @@ def test_bootstrap_p_agrees_with_the_paired_t_test():
 
 
 def test_calibration_error_is_the_gap_between_confidence_and_accuracy():
-    assert st.calibration_error(np.full(8, 0.75), np.arange(8) < 4) == pytest.approx(0.25)
+    assert metrics.calibration_error(np.full(8, 0.75), np.arange(8) < 4) == pytest.approx(0.25)
     rng = np.random.default_rng(0)
     confidence = rng.uniform(0.1, 1, 200_000)
-    assert st.calibration_error(confidence, rng.random(200_000) < confidence) < 0.01
-    sure, accuracy, count = st.reliability(np.array([0.0, 1.0]), np.array([False, True]), bins=4)
+    assert metrics.calibration_error(confidence, rng.random(200_000) < confidence) < 0.01
+    sure, accuracy, count = metrics.reliability(np.array([0.0, 1.0]), np.array([False, True]), bins=4)
     np.testing.assert_array_equal(count, [1, 0, 0, 1])
     np.testing.assert_array_equal([sure[3], accuracy[3]], [1, 1])
 
@@ -85,3 +87,10 @@ def test_area_is_the_mean_height_with_level_ends():
     assert st.area(x, x, 1, 3) == pytest.approx(2)
     assert st.area(x, x, 1, 5) == pytest.approx((2 * 2 + 2 * 3) / 4)  # level at 3 after x = 3
     assert st.area(x, x, 1.2, 1.3) == pytest.approx(1.25)
+
+
+def test_the_mean_over_classes_agrees_with_pandas():
+    rng = np.random.default_rng(4)
+    labels, right = rng.integers(0, 3, (50, 4)) * 2, rng.random((50, 4)) < 0.6  # classes 1 and 3 have nothing
+    by_class = pd.DataFrame({"label": labels.ravel(), "right": right.ravel()}).groupby("label")["right"].mean()
+    assert metrics.mean_over_classes(right, labels) == pytest.approx(by_class.mean())

@@ -1,18 +1,21 @@
 """A store knows when it is damaged or lacks a part, and a store of the first layout is still read."""
 
+import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from tiny_models import make_map_network, make_recogniser
 
 from nextview.cli.main import main
+from nextview.data.attributes import checksum
 from nextview.data.checking import check
 from nextview.data.correspond import correspond
 from nextview.data.measuring import measure
 from nextview.data.rendering import render
-from nextview.data.store import RENDERED, ViewStore
+from nextview.data.store import PENDING, RENDERED, ViewStore
 from nextview.errors import DatasetError
 from nextview.measures.registry import MEASURES
 from nextview.viewsphere import ViewSphere
@@ -20,13 +23,25 @@ from nextview.viewsphere import ViewSphere
 SPHERE = ViewSphere.named("12")
 
 
-@pytest.fixture
-def views(tmp_path) -> Path:
+def boxes(folder: Path) -> Path:
     for name in ("a", "b", "c"):
-        path = tmp_path / "meshes/box" / f"{name}.off"
+        path = folder / "meshes/box" / f"{name}.off"
         path.parent.mkdir(parents=True, exist_ok=True)
         trimesh.creation.box([1, 2, 1 + ord(name) % 5]).export(path)
-    list(render(tmp_path / "meshes", tmp_path / "views.zarr", SPHERE, 48, workers=0))
+    list(render(folder / "meshes", folder / "views.zarr", SPHERE, 48, workers=0))
+    return folder / "views.zarr"
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory) -> Path:
+    """Three boxes; no test changes them."""
+    return boxes(tmp_path_factory.mktemp("rendered"))
+
+
+@pytest.fixture
+def views(rendered, tmp_path) -> Path:
+    """A store of three boxes, and their meshes beside it, to be damaged."""
+    shutil.copytree(rendered.parent, tmp_path, dirs_exist_ok=True)
     return tmp_path / "views.zarr"
 
 
@@ -37,11 +52,28 @@ def flip_a_byte(path: Path) -> None:
 
 
 def chunk(views: Path, name: str, i: int) -> Path:
-    return next(p for p in (views / name / "c" / str(i)).rglob("*") if p.is_file())
+    place = views / name / "c" / str(i)
+    return place if place.is_file() else next(p for p in place.rglob("*") if p.is_file())
 
 
 def test_a_sound_store_is_found_sound(views):
     assert sorted(check(views, workers=0)) == [("a", None), ("b", None), ("c", None)]
+
+
+def test_a_fresh_store_of_plates_seen_from_the_edge_is_sound(tmp_path):
+    """Planes through a camera and a column of its pixels: rounding puts hits hundreds of radii away."""
+    rng, sphere = np.random.default_rng(0), ViewSphere((0.0,), 4)
+    depth, across = rng.uniform(2.4, 3.6, (90, 1)), rng.uniform(-0.6, 0.6, (90, 1))
+    column = (np.repeat(rng.integers(16, 48, (30, 1)), 3, axis=0) + 0.5 - 32) / (32 * np.sqrt(8))
+    plates = np.concatenate([depth, column * depth, across], 1) - [3, 0, 0]  # seen from x = -3: view 2
+    vertices = np.concatenate([plates, np.repeat(np.concatenate([np.eye(3), -np.eye(3)]), 3, axis=0)])
+    (tmp_path / "meshes/plate").mkdir(parents=True)
+    trimesh.Trimesh(vertices, np.arange(len(vertices)).reshape(-1, 3), process=False).export(
+        tmp_path / "meshes/plate/plate.off"
+    )
+    list(render(tmp_path / "meshes", tmp_path / "views.zarr", sphere, 64, workers=0))
+    assert list(check(tmp_path / "views.zarr", workers=0)) == [("plate", None)]
+    assert ViewStore.open(tmp_path / "views.zarr").depth(0).max() < 4.001
 
 
 def test_other_measures_are_checked_where_they_are_made(views):
@@ -72,6 +104,108 @@ def test_damage_is_found_and_repaired_by_rendering(views, name, damage):
     assert list(render(views.parent / "meshes", views, SPHERE, 48, workers=0)) == [("b", None)]
     for n, values in before.items():
         np.testing.assert_array_equal(ViewStore.open(views).group[n][:], values)
+
+
+@pytest.mark.parametrize("name", [name for name in RENDERED if name != "status"])
+@pytest.mark.parametrize("damage", ["flipped", "cut", "lost", "folder lost"])
+def test_every_read_of_a_damaged_chunk_names_it(views, name, damage):
+    store = ViewStore.open(views)
+    store.note(unit="cm")
+    file = chunk(views, name, 1)
+    match damage:
+        case "flipped":
+            flip_a_byte(file)
+        case "cut":
+            file.write_bytes(file.read_bytes()[:-3])
+        case "lost":
+            file.unlink()
+        case "folder lost" if name == "radius":
+            return  # its chunks are files
+        case "folder lost":
+            shutil.rmtree(views / name / "c" / "1")
+    reads = {
+        "image": lambda: store.image(1),
+        "depth": lambda: store.depth(1),
+        "points": lambda: store.points(1),
+        "measures/depth_entropy": store.measure,
+        "radius": lambda: store.radii,
+    }
+    wrong = "is missing" if "lost" in damage else "cannot be read"
+    for read in (reads[name], lambda: store.rows(name)):
+        with pytest.raises(DatasetError, match=rf"{name} of b {wrong}.*; nextview .* makes it"):
+            read()
+    for other in (0, 2):
+        assert store.read(name, other) is not None
+    # The damage of an object that is not rendered hurts nobody.
+    store.group["status"][1] = PENDING
+    sound = [0, 2]
+    assert np.isfinite(store.rows(name)[sound]).all()
+    assert (store.rows(name)[sound] != 0).any()
+
+
+def test_all_clouds_notice_a_missing_one(views):
+    ViewStore.open(views).all_points()
+    shutil.rmtree(views / "points" / "c" / "2")
+    with pytest.raises(DatasetError, match="points of c is missing"):
+        ViewStore.open(views).all_points()
+
+
+def test_an_object_without_anything_is_damaged(views):
+    """Blank arrays agree with each other."""
+    for name in ("image", "depth", "points", "measures/depth_entropy"):
+        shutil.rmtree(views / name / "c" / "1")
+    assert [name for name, problem in check(views, workers=0) if problem] == ["b"]
+
+
+def test_a_missing_chunk_ends_every_command_that_reads_it(views, capsys):
+    shutil.rmtree(views / "depth" / "c" / "1")
+    out = views.parent / "out.npz"
+    recogniser, maps = make_recogniser(views.parent, ["box"]), make_map_network(views.parent, rings=1)
+    for command in (
+        ["predict", views, out, "--recogniser", recogniser, "--maps", f"lem={maps}", "--workers", 1],
+        ["measure", views, "max_depth", "--workers", 1],
+        ["inspect", views, views.parent / "b.png", "--object", "b"],
+    ):
+        message = refused(capsys, *command)
+        assert f"{views}: depth of b is missing; nextview check {views} --repair" in message
+        assert "nextview render" in message
+    assert not out.exists()
+    with pytest.raises(SystemExit) as end:
+        main(["check", str(views), "--workers", "1"])
+    assert end.value.code == 2
+    assert "b: depth is missing" in capsys.readouterr().err
+
+
+def test_measure_makes_damaged_measures_anew(views):
+    list(measure(views, workers=0))
+    before = {name: ViewStore.open(views).measure(name) for name in MEASURES}
+    shutil.rmtree(views / "measures/depth_entropy/c/0")
+    flip_a_byte(chunk(views, "measures/max_depth", 2))
+    assert list(measure(views, workers=0)) == [(1, 3), (2, 3), (3, 3)]
+    for name, values in before.items():
+        np.testing.assert_array_equal(ViewStore.open(views).measure(name), values)
+
+
+@pytest.mark.parametrize("healer", ["check", "render"])
+def test_a_damaged_status_costs_one_object_and_is_healed(views, capsys, caplog, healer):
+    flip_a_byte(chunk(views, "status", 1))
+    assert ViewStore.open(views).done.tolist() == [True, False, True]
+    assert ViewStore.open(views).done.tolist() == [True, False, True]
+    assert ["status of b cannot be read" in line for line in caplog.messages] == [True]
+    assert dict(check(views, workers=0)) == {"a": None, "b": "status cannot be read", "c": None}
+    main(["measure", str(views), "--workers", "1"])
+    with pytest.raises(SystemExit) as end:
+        main(["check", str(views), "--workers", "1"])
+    assert end.value.code == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert "b: status cannot be read" in message
+    assert "2 objects are sound, 1 damaged, 0 not rendered yet" in message
+    if healer == "check":
+        list(check(views, repair=True, workers=0))
+        assert ViewStore.open(views).doubtful == []
+        assert ViewStore.open(views).done.tolist() == [True, False, True]
+    assert list(render(views.parent / "meshes", views, SPHERE, 48, workers=0)) == [("b", None)]
+    assert dict(check(views, workers=0)) == {"a": None, "b": None, "c": None}
 
 
 def test_wrong_values_with_a_right_checksum_are_found(views):
@@ -170,7 +304,7 @@ def test_damaged_attributes_are_one_sentence(views, capsys, place, content):
 
 def test_arrays_of_another_length_are_refused(views):
     ViewStore.open(views).group["points"].resize((2, 12, 1024, 3))
-    with pytest.raises(DatasetError, match="points is of 2 objects, not 3"):
+    with pytest.raises(DatasetError, match=r"points is not one of \(3, 12, 1024, 3\) int16"):
         list(check(views, workers=0))
 
 
@@ -182,10 +316,152 @@ def test_what_is_no_store_is_refused(tmp_path, views):
         list(check(views, workers=0))
 
 
-def test_a_store_without_hashes_and_failures_is_still_read(views):
+def test_a_store_from_before_checksums_and_digests_is_read_and_completed(views):
     store = ViewStore.open(views)
-    kept = {k: v for k, v in store.group.attrs.items() if k not in ("sha256", "failures")}
-    store.group.attrs.put(kept)
+    before = {name: store.rows(name) for name in RENDERED}
+    later = ("sha256", "failures", "checksum", "unit", "stretch", "turn", "seed")
+    store.group.attrs.put({k: v for k, v in store.group.attrs.items() if k not in later})
+    store.group["status"][1] = PENDING
+    shutil.rmtree(views / "digest")
     old = ViewStore.open(views)
     assert (old.failures, old.duplicates) == ({}, [])
-    assert list(render(views.parent / "meshes", views, SPHERE, 48, workers=0)) == []
+    assert np.isnan(old.radii).all()
+    assert list(check(views, workers=0)) == [("a", None), ("c", None)]
+    assert list(render(views.parent / "meshes", views, SPHERE, 48, workers=0)) == [("b", None)]
+    for name, values in before.items():
+        np.testing.assert_array_equal(ViewStore.open(views).rows(name), values)
+    assert [ViewStore.open(views).has("digest", i) for i in range(3)] == [False, True, False]
+    assert {problem for _, problem in check(views, workers=0)} == {None}
+
+
+BAD = {
+    "names": [None, [], ["a", "b"], ["a", "b", "b"], ["a", "b", 3], ["a", "b", ""], "abc"],
+    "labels": [None, ["box", "box"], ["box", "box", 1], ["box", "box", ""], "box"],
+    "splits": [None, ["", ""], ["", "", "validation"], [[], "", ""]],
+    "elevations": [None, [], [np.nan], ["45"], [91.0], 45.0, [True]],
+    "azimuths": [None, 0, 2, 12.0, "12", True],
+    "distance": [None, 1, 0.5, -3, np.inf, np.nan, "3"],
+    "size": [None, 0, -48, 48.5, "48"],
+    "failures": [[], {"nobody": "reason"}, {"a": 3}],
+    "seed": [-1, 0.5, "0"],
+    "stretch": [np.nan, -2, "0"],
+    "turn": [0, "no"],
+    "sha256": [["0"], [0, 0, 0], "0"],
+    "unit": ["parsec", 3, []],
+    "checksum": [3, "0" * 64],
+    "format": [None, 1, "2", [2]],
+}
+
+
+@pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in BAD.items() for value in values])
+@pytest.mark.parametrize("checked", [True, False], ids=["with checksum", "without"])
+def test_attributes_that_are_not_what_they_should_be_are_one_sentence(views, capsys, key, value, checked):
+    file = views / "zarr.json"
+    whole = json.loads(file.read_text())
+    facts = whole["attributes"]
+    facts[key] = value
+    if value is None:
+        del facts[key]
+    if not checked:
+        facts["checksum"] = checksum(facts)  # as if it had been written so
+        if key == "checksum":
+            return
+    file.write_text(json.dumps(whole))
+    for command in (["check", views], ["inspect", views, views.parent / "x.png"], ["measure", views]):
+        message = refused(capsys, *command)
+        assert str(views) in message
+        assert key in message
+
+
+def test_one_changed_letter_of_the_attributes_is_found_and_mended(views, capsys):
+    file = views / "zarr.json"
+    ViewStore.open(views).note(unit="cm")
+    whole = file.read_bytes()
+    meshes = views.parent / "meshes"
+    for old, new in (
+        (b'"c"', b'"d"'),
+        (b'"box"', b'"bax"'),
+        (b'"distance": 3.0', b'"distance": 3.5'),
+        (b'"size": 48', b'"size": 24'),
+        (b'"turn": false', b'"turn": true'),
+        (b'"checksum": "', b'"checksum": "0'),
+        (b'"failures": {}', b'"failures": []'),
+        (b'"splits"', b'"splitz"'),
+        (b'"unit": "cm"', b'"unit": "cn"'),
+        (b'"unit": "cm"', b'"unit": "m"'),
+    ):
+        assert old in whole
+        file.write_bytes(whole.replace(old, new, 1))
+        assert "zarr.json is damaged" in refused(capsys, "check", views)
+        assert "render restores it" in refused(capsys, "inspect", views)
+        with pytest.raises(DatasetError, match="not begun with these meshes and settings"):
+            list(render(meshes, views, SPHERE, 47, workers=0))
+        main(["render", str(meshes), str(views), "--sphere", "12", "--size", "48", "--workers", "1"])
+        capsys.readouterr()
+        mended, was = (json.loads(b)["attributes"] for b in (file.read_bytes(), whole))
+        for later in ("commands", "checksum"):  # the command that mended it is noted too
+            del mended[later], was[later]
+        assert mended == was
+        assert dict(check(views, workers=0)) == {"a": None, "b": None, "c": None}
+
+
+@pytest.mark.parametrize("name", ["image", "depth", "points", "radius"])
+def test_chunks_of_one_object_under_another_are_found(views, name):
+    """Boxes of two sizes, one stretched copy: their checksums are right, and radii tell nothing else of a store."""
+    first, second = chunk(views, name, 0), chunk(views, name, 1)
+    kept = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(kept)
+    found = dict(check(views, workers=0))
+    assert found.pop("c") is None
+    assert all(found.values())
+
+
+def test_objects_that_changed_places_are_found(views):
+    for array in (*RENDERED, "digest"):
+        first, second = chunk(views, array, 0), chunk(views, array, 1)
+        kept = first.read_bytes()
+        first.write_bytes(second.read_bytes())
+        second.write_bytes(kept)
+    found = dict(check(views, workers=0))
+    assert found["a"] == found["b"] == "image, depth, points, radius and name are not together what was rendered"
+
+
+@pytest.mark.parametrize("place", [*(f"{name}/zarr.json" for name in RENDERED), "measures/zarr.json"])
+@pytest.mark.parametrize("damage", ["{", '{"zarr_format": 3}', None])
+def test_arrays_that_cannot_be_opened_are_mended_and_keep_what_they_hold(views, capsys, place, damage):
+    before = {name: ViewStore.open(views).rows(name) for name in RENDERED}
+    file = views / place
+    file.unlink() if damage is None else file.write_text(damage)
+    message = refused(capsys, "check", views)
+    assert (
+        "nextview measure" in message
+        if place.startswith("measures/d")
+        else f"nextview check {views} --repair" in message
+    )
+    main(["check", str(views), "--repair", "--workers", "1"])
+    assert "3 objects are sound, 0 damaged, 0 not rendered yet" in " ".join(capsys.readouterr().err.split())
+    for name, values in before.items():
+        np.testing.assert_array_equal(ViewStore.open(views).rows(name), values)
+
+
+@pytest.mark.parametrize("place", ["measures", "measures/depth_entropy", "measures/max_depth"])
+def test_measure_mends_what_it_writes(views, place):
+    list(measure(views, workers=0))
+    before = {name: ViewStore.open(views).measure(name) for name in MEASURES}
+    (views / place / "zarr.json").write_text("{")
+    assert ViewStore.open(views).measures == sorted(MEASURES)
+    list(measure(views, workers=0))
+    for name, values in before.items():
+        np.testing.assert_array_equal(ViewStore.open(views).measure(name), values)
+    assert dict(check(views, workers=0)) == {"a": None, "b": None, "c": None}
+
+
+def test_a_lost_array_is_made_and_filled_again(views, capsys):
+    before = ViewStore.open(views).all_points()
+    shutil.rmtree(views / "points")
+    with pytest.raises(SystemExit):
+        main(["check", str(views), "--repair", "--workers", "1"])
+    assert "b: points is missing" in capsys.readouterr().err
+    assert len(list(render(views.parent / "meshes", views, SPHERE, 48, workers=0))) == 3
+    np.testing.assert_array_equal(ViewStore.open(views).all_points(), before)

@@ -18,7 +18,7 @@ torch = pytest.importorskip("torch")
 
 from nextview.cli.main import COMMANDS, main  # noqa: E402
 from nextview.cli.presets import with_preset  # noqa: E402
-from nextview.cli.train import train_recogniser  # noqa: E402
+from nextview.cli.train_recogniser import train_recogniser  # noqa: E402
 from nextview.data.folders import Entry  # noqa: E402
 from nextview.data.lock import only_one  # noqa: E402
 from nextview.data.splits import split_training  # noqa: E402
@@ -28,11 +28,11 @@ from nextview.models.image_input import image_input  # noqa: E402
 from nextview.models.inference import RECOGNISER  # noqa: E402
 from nextview.models.model_card import bundled_cards, find_card  # noqa: E402
 from nextview.training.architectures import ResNet  # noqa: E402
-from nextview.training.grid import published_cells  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.packed import load_packed, pack, save_packed  # noqa: E402
 from nextview.training.recipes import THESIS_RECOGNISER, MapRecipe, RecogniserRecipe  # noqa: E402
-from nextview.training.recogniser import RecogniserModule, Source, ValidationViews, Views, augment  # noqa: E402
+from nextview.training.recogniser.grid_training import published_cells  # noqa: E402
+from nextview.training.recogniser.recogniser_module import RecogniserModule, Source, ValidationViews, Views, augment  # noqa: E402
 from nextview.training.runs import begin  # noqa: E402
 from nextview.viewsphere import ViewSphere  # noqa: E402
 
@@ -272,7 +272,7 @@ def test_published_recipe_on_images_by_the_command(store, tmp_path, capsys):
 
     before = (run / "network.pt").read_bytes()
     main(["train", "recogniser", str(store), str(run), "--preset", "thesis", "--depth", "18", *FAST])
-    assert "is trained already" in capsys.readouterr().err
+    assert "is trained" in capsys.readouterr().err
     assert (run / "network.pt").read_bytes() == before
     with pytest.raises(SystemExit) as stopped:
         main(["train", "recogniser", str(store), str(run), "--preset", "thesis", *FAST])
@@ -284,11 +284,11 @@ def test_published_recipe_on_images_by_the_command(store, tmp_path, capsys):
 def test_going_on_from_a_network_that_has_seen_the_validation_objects_is_refused(store, what, tmp_path, capsys):
     views = ViewStore.open(store)
     kept = [views.names[i] for i in split_training(views, 0.25, 0)[1]]
-    unseen = kept if "--folds" in what else kept[:1]  # every object is held out for some fold
+    held_out = kept if "--folds" in what else kept[:1]  # every object is held out for some fold
     bundled = Path(find_card(RECOGNISER).path)
-    facts = json.loads(bundled.with_suffix(".json").read_text())
+    card = json.loads(bundled.with_suffix(".json").read_text())
     (tmp_path / "mine.onnx").write_bytes(bundled.read_bytes())
-    (tmp_path / "mine.json").write_text(json.dumps(facts | {"name": "mine", "unseen": unseen}))
+    (tmp_path / "mine.json").write_text(json.dumps(card | {"name": "mine", "held_out": held_out}))
     command = ["train", what[0], str(store), str(tmp_path / "out"), *what[1:], "--weights", str(tmp_path / "mine.json")]
     with pytest.raises(SystemExit):
         main([*command, *FAST])
@@ -370,7 +370,9 @@ def test_the_grid_holds_the_networks_of_table_6():
 
 
 def test_the_grid_is_one_command(store, tmp_path, monkeypatch):
-    monkeypatch.setattr("nextview.training.grid.published_cells", lambda *_: {(18, 4): [0.5, 0.75], (34, 4): []})
+    monkeypatch.setattr(
+        "nextview.training.recogniser.grid_training.published_cells", lambda *_: {(18, 4): [0.5, 0.75], (34, 4): []}
+    )
     command = ["train", "grid", str(store), str(tmp_path), "--depths", "18", *FAST, "--augment"]
     main(command)
     rows = list(csv.DictReader((tmp_path / "grid.csv").read_text().splitlines()))
@@ -410,9 +412,9 @@ def test_two_devices_train_one_network(store, tmp_path):
 
 
 GUIDE = (Path(__file__).parent.parent / "docs/training.md").read_text()
-TRAINED = {name: card.facts["training"] for name, card in bundled_cards().items()}
+TRAINED = {name: card.training for name, card in bundled_cards().items()}
 COMMAND_LINES = [*re.findall(r"^nextview .*?(?=  +#|$)", GUIDE, re.M)]
-COMMAND_LINES += [line for training in TRAINED.values() for line in training["commands"]]
+COMMAND_LINES += [line for training in TRAINED.values() for line in training.commands]
 
 
 @pytest.mark.parametrize("line", dict.fromkeys(COMMAND_LINES))
@@ -429,6 +431,6 @@ def test_the_guide_and_the_cards_name_commands_and_options_that_exist(line, caps
 @pytest.mark.parametrize("name", TRAINED)
 def test_the_recipes_of_the_cards_are_recipes_of_this_version(name):
     training = TRAINED[name]
-    kind = RecogniserRecipe if "recipes" in training else MapRecipe
-    for noted in training.get("recipes") or [training["recipe"]]:
+    kind = RecogniserRecipe if name.startswith("recogniser") else MapRecipe
+    for noted in training.recipes:
         assert asdict(kind(**noted)) == noted

@@ -18,7 +18,6 @@ from tests.test_readme import write_off
 from nextview.calibration.valleys import valley_gains
 from nextview.cli.main import main
 from nextview.data import splits
-from nextview.data.input_views import input_views
 from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
 from nextview.data.store import ViewStore
@@ -29,15 +28,16 @@ from nextview.viewsphere import ViewSphere
 
 torch = pytest.importorskip("torch")
 
-from nextview.benchmark.scores import map_scores, recogniser_scores  # noqa: E402
+from nextview.metrics import map_scores, recogniser_scores  # noqa: E402
 from nextview.models.model_card import find_card  # noqa: E402
+from nextview.models.network_input import InputSpec, from_store  # noqa: E402
 from nextview.training.architectures import PointNet, ResNet, orthogonality  # noqa: E402
 from nextview.training.checkpoints import load_exported, load_run  # noqa: E402
 from nextview.training.folds import hold_out  # noqa: E402
 from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.lite import LiteNet  # noqa: E402
-from nextview.training.map_training import MapModule, Windows  # noqa: E402
-from nextview.training.onnx_export import export_onnx, fit_temperature  # noqa: E402
+from nextview.training.maps.map_module import MapModule, Windows  # noqa: E402
+from nextview.training.onnx_export import export_onnx  # noqa: E402
 from nextview.training.recipes import MapRecipe  # noqa: E402
 
 
@@ -56,14 +56,6 @@ def test_orthogonality_of_rotations_and_scalings():
     rotation = torch.linalg.qr(torch.randn(4, 3, 3)).Q
     assert orthogonality(rotation) < 1e-5
     assert orthogonality(2 * torch.eye(64).expand(2, 64, 64)).item() == pytest.approx(3 * math.sqrt(64))
-
-
-def test_temperature_is_recovered():
-    rng = np.random.default_rng(0)
-    logits = 3 * rng.normal(size=(20_000, 4))
-    labels = (softmax(logits, 1).cumsum(1) > rng.random((20_000, 1))).argmax(1)
-    for temperature in (0.5, 1.0, 2.5):
-        assert fit_temperature(temperature * logits, labels) == pytest.approx(temperature, rel=0.05)
 
 
 def test_export_keeps_the_answers(tmp_path):
@@ -168,8 +160,10 @@ def test_a_shape_that_was_copied_judges_training_once(trained, tmp_path, monkeyp
     def judged_on(objects: np.ndarray) -> None:
         raise Judged([store.names[i] for i in objects])
 
-    monkeypatch.setattr("nextview.training.recogniser.train", lambda *given: judged_on(given[3]))
-    monkeypatch.setattr("nextview.training.maps.train", lambda *given: judged_on(given[4]))
+    monkeypatch.setattr(
+        "nextview.training.recogniser.recogniser_training.fit_recogniser", lambda *given: judged_on(given[3])
+    )
+    monkeypatch.setattr("nextview.training.maps.map_training.fit_map", lambda *given: judged_on(given[4]))
     for what in ("recogniser", "lem"):
         command = ["train", what, str(trained / "views.zarr"), str(tmp_path / what)]
         with pytest.raises(Judged) as judged:
@@ -198,7 +192,7 @@ def test_the_published_map_network_trains_on_clouds_and_predicts_the_window(trai
     recipe = json.loads((run / "recipe.json").read_text())
     assert (recipe["input"], recipe["batch"], recipe["schedule"]) == ("cloud", 16, "tenth")
     main(["export", "lem", str(run), store, str(trained / "models"), "--name", "published"])
-    cloud = input_views(ViewStore.open(trained / "views.zarr"), 0, "cloud", 0)[:2]
+    cloud = from_store(InputSpec("cloud"), ViewStore.open(trained / "views.zarr"), 0)[:2]
     assert {k: v.shape for k, v in MapNetwork(trained / "models/published.json").from_inputs(cloud).items()} == {
         "lem": (2, 5, 3)
     }
@@ -297,21 +291,21 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
     store, runs, models = trained / "views.zarr", trained / "runs", trained / "models"
     small = ["--epochs", "1", "--views", "2", "--batch", "8", "--validation", "0.25"]
     main(["train", "recogniser", str(store), str(runs / "folds"), "--folds", "2", *small])
-    unseen = []
+    held_out = []
     for k in range(2):
         main(["export", "recogniser", str(runs / f"folds/fold{k}"), str(store), str(models), "--name", f"fold{k}"])
-        unseen.append(set(json.loads((models / f"fold{k}.json").read_text())["unseen"]))
+        held_out.append(set(json.loads((models / f"fold{k}.json").read_text())["held_out"]))
     views = ViewStore.open(store)
     training, validation = splits.split_training(views, 0.25, 0)
-    assert unseen[0] | unseen[1] == {views.names[i] for i in [*training, *validation]}
-    assert unseen[0] & unseen[1] == {views.names[i] for i in validation}
+    assert held_out[0] | held_out[1] == {views.names[i] for i in [*training, *validation]}
+    assert held_out[0] & held_out[1] == {views.names[i] for i in validation}
     out = trained / "unseen.npz"
     cards = [str(models / f"fold{k}.json") for k in range(2)]
-    main(["predict", str(store), str(out), "--unseen", "--maps", "--recogniser", *cards, "--workers", "1"])
+    main(["predict", str(store), str(out), "--held-out", "--maps", "--recogniser", *cards, "--workers", "1"])
     predictions = Predictions.load(out)
-    assert set(predictions.names) == unseen[0] | unseen[1]
+    assert set(predictions.names) == held_out[0] | held_out[1]
     for k, card in enumerate(cards):  # each network judged what it has not seen, and nothing else
-        name = sorted(unseen[k] - unseen[1 - k])[0]
+        name = sorted(held_out[k] - held_out[1 - k])[0]
         inputs = load_inputs(store, 112)[views.names.index(name)]
         assert predictions.logits[predictions.names.index(name)] == pytest.approx(
             Recogniser(card).from_inputs(inputs).logits, abs=1e-4
@@ -323,22 +317,22 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
     main(["export", "lcm", str(runs / "lcm"), str(store), str(out), str(models), "--name", "tiny-lcm"])
     card = MapNetwork(models / "tiny-lcm.json").card
     assert card.kind == "lcm"
-    assert set(card.facts["unseen"]) == {views.names[i] for i in validation}  # also of which it could not be judged
+    assert set(card.held_out) == {views.names[i] for i in validation}  # also of which it could not be judged
 
 
 def test_valley_classes_are_fitted_to_objects_that_neither_network_has_seen(trained, capsys):
     store, models, out = str(trained / "views.zarr"), trained / "models", trained / "validation.npz"
     card = models / "tiny-lem.json"
     cards = ["--maps", f"lem={card}", "--recogniser", str(models / "tiny.json"), "--workers", "1"]
-    main(["predict", store, str(out), "--unseen", *cards])
+    main(["predict", store, str(out), "--held-out", *cards])
     main(["fit", "valleys", str(out), str(card)])
-    facts, p = json.loads(card.read_text()), Predictions.load(out).deduplicate()
+    values, p = json.loads(card.read_text()), Predictions.load(out).deduplicate()
     gains = valley_gains(p.sphere, p.logits, p.maps["lem"], p.labels)
-    assert facts["valley_classes"] == [p.classes[c] for c, gain in gains.items() if gain > 0]
-    assert facts["valley_gain"] == {p.classes[c]: round(gain, 4) for c, gain in gains.items()}
-    assert f"{len(p)} objects" in facts["valley_fitted_to"]
-    main(["predict", store, str(out), "--unseen", *cards])  # takes up what the card says now
-    assert Predictions.load(out).valley_classes == {"lem": tuple(facts["valley_classes"])}
+    assert values["valley_classes"] == [p.classes[c] for c, gain in gains.items() if gain > 0]
+    assert values["valley_gain"] == {p.classes[c]: round(gain, 4) for c, gain in gains.items()}
+    assert f"{len(p)} objects" in values["fitted_to"]["valleys"]
+    main(["predict", store, str(out), "--held-out", *cards])  # takes up what the card says now
+    assert Predictions.load(out).valley_classes == {"lem": tuple(values["valley_classes"])}
     for wrong, sentence in ((models / "tiny.json", "holds no maps by"), (models / "none.json", "no such model card")):
         with pytest.raises(SystemExit) as end:
             main(["fit", "valleys", str(out), str(wrong)])
@@ -390,14 +384,12 @@ def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
     run, store, models = trained / "runs/recogniser", trained / "views.zarr", trained / "models"
     command = ["export", "recogniser", str(run), str(store), str(models)]
     main([*command, "--name", "two", "--also", str(models / "tiny.json")])
-    x = input_views(ViewStore.open(store), 0, "geometry", 112)[:3]
+    x = from_store(InputSpec("geometry", 112), ViewStore.open(store), 0)[:3]
     alone, joined = Recogniser(models / "tiny.json"), Recogniser(models / "two.json")
-    facts = joined.card.facts
-    assert facts["network"] == "ResNet-18 + ResNet-18"
-    assert facts["unseen"] == alone.card.facts["unseen"]
-    assert len(facts["training"]["recipes"]) == 2
-    raw, output = alone.from_inputs(x).logits * alone.card.facts["temperature"], joined.from_inputs(x)
-    assert output.logits * facts["temperature"] == pytest.approx(raw, abs=2e-2)
+    assert joined.card.network == "ResNet-18 + ResNet-18"
+    assert joined.card.held_out == alone.card.held_out
+    assert len(joined.card.training.recipes) == 2
+    assert joined.from_inputs(x).logits == pytest.approx(alone.from_inputs(x).logits, abs=2e-2)
     with pytest.raises(SystemExit):
         main([*command, "--name", "three", "--also", str(models / "two.json")])
     with pytest.raises(ModelError, match="not one network"):
@@ -406,8 +398,8 @@ def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
     with pytest.raises(SystemExit):
         main([*command, "--also", str(models / "tiny-lem.json")])
     assert "not a recogniser" in capsys.readouterr().err
-    facts = json.loads((models / "tiny.json").read_text())
-    for name, features in (("foreign", facts | {"unseen": ["chair_9"]}), ("silent", facts | {"training": {}})):
+    values = json.loads((models / "tiny.json").read_text())
+    for name, features in (("foreign", values | {"held_out": ["chair_9"]}), ("silent", values | {"training": {}})):
         (models / f"{name}.json").write_text(json.dumps(features))
         shutil.copy(models / "tiny.onnx", models / f"{name}.onnx")
         with pytest.raises(SystemExit):
@@ -456,15 +448,15 @@ def test_a_lite_network_goes_from_a_checkpoint_to_a_card_that_it_shares(trained,
     command = ["train", "recogniser", store, str(run), *small, "--network", "lite0", "--dropout", "0.2"]
     main([*command, "--weights", str(tmp_path / "imagenet.pth")])
     main(["export", "recogniser", str(run), store, str(models), "--name", "pair", "--also", str(models / "tiny.json")])
-    facts = find_card(models / "pair.json").facts
-    assert facts["network"] == "EfficientNet-Lite0 + ResNet-18"
-    assert [recipe["network"] for recipe in facts["training"]["recipes"]] == ["lite0", "resnet"]
-    x = input_views(ViewStore.open(trained / "views.zarr"), 0, "geometry", 112)[:3]
+    card = find_card(models / "pair.json")
+    assert card.network == "EfficientNet-Lite0 + ResNet-18"
+    assert [recipe["network"] for recipe in card.training.recipes] == ["lite0", "resnet"]
+    x = from_store(InputSpec("geometry", 112), ViewStore.open(trained / "views.zarr"), 0)[:3]
     alone, pair = Recogniser(models / "tiny.json"), Recogniser(models / "pair.json")
     with torch.no_grad():
         logits, bins = (output.numpy() for output in load_run(LiteNet(2, 4, 8), run)(torch.from_numpy(x).float() / 255))
-    mean = (logits + alone.from_inputs(x).logits * alone.card.facts["temperature"]) / 2
-    assert pair.from_inputs(x).logits * facts["temperature"] == pytest.approx(mean, abs=2e-2)
+    mean = (logits + alone.from_inputs(x).logits) / 2
+    assert pair.from_inputs(x).logits == pytest.approx(mean, abs=2e-2)
     both = np.exp((bins + alone.from_inputs(x).azimuth_bins) / 2)
     assert np.exp(pair.from_inputs(x).azimuth_bins) == pytest.approx(both / both.sum(2, keepdims=True), abs=2e-2)
     main([*command[:3], str(trained / "runs/on"), *command[4:], "--weights", str(models / "pair.json")])

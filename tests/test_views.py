@@ -14,7 +14,7 @@ from test_predictions import some_predictions
 from nextview.benchmark import results
 from nextview.cli.benchmark import benchmark
 
-VIEW_COUNTS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "views.py"))
+VIEWS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "views.py"))
 NAMES = ("lem", "furthest", "spread", "orbit-4", "best-4")
 
 
@@ -22,7 +22,7 @@ NAMES = ("lem", "furthest", "spread", "orbit-4", "best-4")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("n_views")
     some_predictions(24, seed=2).save(folder / "p.npz")
-    VIEW_COUNTS["main"](folder / "p.npz", folder / "out", NAMES, (4, 2), runs=3, samples=200)
+    VIEWS["main"](folder / "p.npz", folder / "out", NAMES, (4, 2), runs=3, samples=200)
     return folder
 
 
@@ -62,7 +62,7 @@ def test_the_table_has_a_row_for_every_policy_and_a_column_for_every_number_of_v
 
 
 def test_policies_may_be_compared_with_others_than_the_random_ones(made):
-    VIEW_COUNTS["main"](made / "p.npz", made / "against", ("furthest",), (2,), runs=3, samples=50, against=("lem",))
+    VIEWS["main"](made / "p.npz", made / "against", ("furthest",), (2,), runs=3, samples=50, against=("lem",))
     found = pd.read_csv(made / "against" / "views.csv").set_index(["policy", "measure"]).sort_index()
     for reference in ("random", "lem"):
         difference = found.loc[("furthest", "accuracy"), "value"] - found.loc[(reference, "accuracy"), "value"]
@@ -71,12 +71,12 @@ def test_policies_may_be_compared_with_others_than_the_random_ones(made):
     head = (made / "against" / "views.md").read_text().splitlines()[0]
     assert "points over random at 2 | points over lem at 2 |" in head
     with pytest.raises(ValueError, match="not all"):
-        VIEW_COUNTS["main"](made / "p.npz", made / "against", (), (2,), runs=1, samples=20, against=("lcm",))
+        VIEWS["main"](made / "p.npz", made / "against", (), (2,), runs=1, samples=20, against=("lcm",))
 
 
 def test_views_that_end_before_the_last_look_are_left_out_with_a_sentence(made):
     with pytest.raises(ValueError, match="not all"):
-        VIEW_COUNTS["main"](made / "p.npz", made / "short", ("orbit-3", "lem"), (2, 4), runs=1, samples=20)
+        VIEWS["main"](made / "p.npz", made / "short", ("orbit-3", "lem"), (2, 4), runs=1, samples=20)
     text = (made / "short" / "views.md").read_text()
     assert "Left out: orbit-3 is over before view 4" in text
     assert "| orbit-3" not in text
@@ -86,7 +86,7 @@ def test_views_that_end_before_the_last_look_are_left_out_with_a_sentence(made):
 @pytest.mark.parametrize("n_views", [(), (0, 2), (41,)])
 def test_a_number_of_views_that_nobody_can_take_is_refused(made, n_views):
     with pytest.raises(ValueError, match="1 to 40 views"):
-        VIEW_COUNTS["main"](made / "p.npz", made / "bad", n_views=n_views)
+        VIEWS["main"](made / "p.npz", made / "bad", n_views=n_views)
 
 
 def test_no_name_in_the_figure_covers_another_and_only_robots_have_a_dot():
@@ -98,8 +98,10 @@ def test_no_name_in_the_figure_covers_another_and_only_robots_have_a_dot():
         x, y = (2, 0.97) if name == "oracle-gain" else (rng.uniform(2, 2.6), rng.uniform(0.91, 0.914))
         rows += [(name, 2, "accuracy", y, y, y, np.nan), (name, 2, "travel", x, x, x, np.nan)]
         rows += [(name, 2, "to_random", 0.0, 0.0, 0.0, 0.01)]
-    table = pd.DataFrame(rows, columns=["policy", "n_views", "measure", "value", "low", "high", "p"])
-    figure = VIEW_COUNTS["front"](table, {"gain": family})
+    table = pd.DataFrame(rows, columns=["policy", "n_views", "measure", "value", "low", "high", "p"]).assign(
+        p_holm=0.01
+    )
+    figure = VIEWS["front"](table, {"gain": family})
     (axes,) = figure.axes
     texts = [t for t in axes.findobj(Text) if t in axes.texts and t.get_text()]
     assert {t.get_text() for t in texts} >= {"spread", "@0", "gain@0.01", "@0.05"}
@@ -117,13 +119,14 @@ def test_no_name_in_the_figure_covers_another_and_only_robots_have_a_dot():
 def test_a_price_that_is_the_policys_own_is_drawn_once(monkeypatch):
     own = {"random": None, "gain@0.01": 0.01, "gain": 0.01, "gain@0": 0.0}
     monkeypatch.setitem(
-        VIEW_COUNTS["families"].__globals__, "entry_policy", lambda name, _: SimpleNamespace(travel_weight=own[name])
+        VIEWS["families"].__globals__, "entry_policy", lambda name, _: SimpleNamespace(travel_weight=own[name])
     )
-    found = VIEW_COUNTS["families"](list(own), None)
+    found = VIEWS["families"](list(own), None)
     assert found == {"gain": [(0.0, "gain@0"), (0.01, "gain")]}
     measured = {"accuracy": 0.9, "travel": 2.0, "to_random": 0.0}
     rows = [(name, 2, measure, x, x, x, 0.01) for name in own for measure, x in measured.items()]
-    (axes,) = VIEW_COUNTS["front"](
-        pd.DataFrame(rows, columns=["policy", "n_views", "measure", "value", "low", "high", "p"]), found
+    (axes,) = VIEWS["front"](
+        pd.DataFrame(rows, columns=["policy", "n_views", "measure", "value", "low", "high", "p"]).assign(p_holm=0.01),
+        found,
     ).axes
     assert sorted(t.get_text() for t in axes.texts if t.get_text()) == ["@0", "gain@0.01", "random"]

@@ -25,7 +25,7 @@ def make_recogniser(folder: Path, classes: list[str], size: int = 16, seed: int 
     outputs = [helper.make_tensor_value_info("logits", TensorProto.FLOAT, ["batch", len(classes)])]
     outputs += [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["batch", 4])]
     constants = {"weights": weights, "image": np.array([2, 3])}
-    facts: dict = {"kind": "recogniser", "classes": classes, "input_size": size}
+    card: dict = {"kind": "recogniser", "classes": classes, "input": {"kind": "geometry", "size": size}}
     if azimuth_bins:
         nodes += [
             helper.make_node("MatMul", ["features", "side_weights"], ["flat"]),
@@ -36,8 +36,8 @@ def make_recogniser(folder: Path, classes: list[str], size: int = 16, seed: int 
         outputs += [helper.make_tensor_value_info(BINS_OUTPUT, TensorProto.FLOAT, shape)]
         side_weights = np.random.default_rng(seed + 1).normal(size=(4, len(classes) * azimuth_bins)).astype(np.float32)
         constants |= {"side_weights": side_weights / 16, "side_shape": np.array([-1, *shape[1:]])}
-        facts["azimuth_bins"] = azimuth_bins
-    return _save(folder / "tiny.json", nodes, inputs, outputs, constants, facts)
+        card["azimuth_bins"] = azimuth_bins
+    return _save(folder / "tiny.json", nodes, inputs, outputs, constants, card)
 
 
 def make_map_network(folder: Path, name: str = "lem", rings: int = 5, valleys: tuple[str, ...] = ()) -> Path:
@@ -51,15 +51,15 @@ def make_map_network(folder: Path, name: str = "lem", rings: int = 5, valleys: t
     inputs = [helper.make_tensor_value_info("cloud", TensorProto.FLOAT, ["batch", "points", 3])]
     outputs = [helper.make_tensor_value_info("map", TensorProto.FLOAT, ["batch", rings, 3])]
     constants = {"weights": weights, "points": np.array([1]), "shape": np.array([-1, rings, 3])}
-    facts = {"kind": name, "valley_classes": list(valleys)}
-    return _save(folder / f"tiny-{name}.json", nodes, inputs, outputs, constants, facts)
+    card = {"kind": name, "input": {"kind": "cloud"}, "output": "window", "valley_classes": list(valleys)}
+    return _save(folder / f"tiny-{name}.json", nodes, inputs, outputs, constants, card)
 
 
-def _save(card: Path, nodes: list, inputs: list, outputs: list, constants: dict, facts: dict) -> Path:
+def _save(path: Path, nodes: list, inputs: list, outputs: list, constants: dict, card: dict) -> Path:
     initial = [numpy_helper.from_array(np.asarray(values), name) for name, values in constants.items()]
     graph = helper.make_graph(nodes, "tiny", inputs, outputs, initial)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
-    weights = card.with_suffix(".onnx")
+    weights = path.with_suffix(".onnx")
     onnx.save(model, weights)
-    card.write_text(json.dumps({"name": card.stem, "sha256": file_hash(weights), **facts}))
-    return card
+    path.write_text(json.dumps({"schema": 1, "name": path.stem, "sha256": file_hash(weights), **card}))
+    return path

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import ModelError, RiskError, UsageError
+from nextview.json_file import Fields
 
 Float = NDArray[np.float64]
 
@@ -34,6 +34,7 @@ def fuse(logits: NDArray[np.floating], temperature: float = 1.0) -> NDArray[np.f
 
 
 def _softmax(logs: NDArray[np.floating]) -> Float:
+    # As SciPy's; recognising an object imports no SciPy, which keeps its start short.
     values = np.exp(logs - logs.max(-1, keepdims=True))
     return values / values.sum(-1, keepdims=True)
 
@@ -112,11 +113,21 @@ class RiskBounds:
         bounds: error rate that each threshold can promise among those who reach it, by how many views they may take
             (from 1 on), (views, T); 1 where it can promise nothing.
         delta: how often such a promise may fail.
+
+    Raises:
+        ModelError: thresholds that do not ascend, bounds that are no error rates or of another shape.
     """
 
     thresholds: tuple[float, ...]
     bounds: tuple[tuple[float, ...], ...]
     delta: float
+
+    def __post_init__(self) -> None:
+        ascending = all(a < b for a, b in zip(self.thresholds, self.thresholds[1:], strict=False))
+        fits = self.thresholds and self.bounds and all(len(row) == len(self.thresholds) for row in self.bounds)
+        rates = all(0 <= rate <= 1 for row in self.bounds for rate in row) and 0 < self.delta < 1
+        if not (ascending and fits and rates):
+            raise ModelError("error rates that cannot be promised: they do not fit their thresholds")
 
     def threshold(self, risk: float, max_views: int) -> float:
         """The lowest threshold that promises an error rate of at most ``risk``.
@@ -133,6 +144,23 @@ class RiskBounds:
             if bound <= risk:
                 return threshold
         raise RiskError(f"this recogniser cannot promise an error rate of {risk}, only {min(row):.3f} and more")
+
+    @classmethod
+    def from_dict(cls, values: Any) -> RiskBounds:
+        """From what a calibration says under "risk".
+
+        Raises:
+            ModelError: it makes no sense.
+        """
+        fields = Fields(values, "the calibration's risk")
+        thresholds, bounds = fields.numbers("thresholds", 1).tolist(), fields.numbers("bounds", 2).tolist()
+        found = cls(tuple(thresholds), tuple(map(tuple, bounds)), fields.number("delta"))
+        fields.end()
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``from_dict`` reads, for JSON."""
+        return {"delta": self.delta, "thresholds": list(self.thresholds), "bounds": [*map(list, self.bounds)]}
 
 
 @dataclass(frozen=True)
@@ -237,33 +265,31 @@ class Calibration:
         return self.risk.threshold(risk, max_views)
 
     @classmethod
-    def of_facts(cls, facts: Mapping[str, Any] | None) -> Calibration:
-        """From what a model's card says under "calibration"; the plain sum if it says nothing.
+    def from_dict(cls, values: Any) -> Calibration:
+        """From what a recogniser's card says under "calibration".
 
         Raises:
             ModelError: it makes no sense.
         """
-        if not facts:
-            return cls()
-        try:
-            risk = facts.get("risk")
-            bounds = risk and RiskBounds(tuple(risk["thresholds"]), tuple(map(tuple, risk["bounds"])), risk["delta"])
-            return cls(facts["temperature"], facts["correlation"], bounds, facts.get("bin_correlation"))
-        except (KeyError, TypeError, AttributeError) as error:
-            raise ModelError(f"a calibration that cannot be read ({type(error).__name__}: {error})") from None
+        fields = Fields(values, "the calibration")
+        risk = fields.take("risk", None)
+        found = cls(
+            fields.number("temperature"),
+            fields.number("correlation"),
+            None if risk is None else RiskBounds.from_dict(risk),
+            fields.number("bin_correlation", None),
+        )
+        fields.end()
+        return found
 
-    def facts(self) -> dict[str, Any]:
-        """What ``of_facts`` reads, for JSON."""
-        facts: dict[str, Any] = {
-            "temperature": self.temperature,
-            "correlation": self.correlation,
-        }
+    def to_dict(self) -> dict[str, Any]:
+        """What ``from_dict`` reads, for JSON."""
+        values: dict[str, Any] = {"temperature": self.temperature, "correlation": self.correlation}
         if self.bin_correlation is not None:
-            facts["bin_correlation"] = self.bin_correlation
+            values["bin_correlation"] = self.bin_correlation
         if self.risk is not None:
-            r = self.risk
-            facts["risk"] = {"delta": r.delta, "thresholds": list(r.thresholds), "bounds": [*map(list, r.bounds)]}
-        return facts
+            values["risk"] = self.risk.to_dict()
+        return values
 
 
 PLAIN_SUM = Calibration()
@@ -335,3 +361,16 @@ class Stopping:
         first, second = self.threshold_at(np.arange(1, 3))
         last = f", {float(self.threshold_at(self.max_views)):.2g} at view {self.max_views}" * (self.max_views > 2)
         return f"threshold {first:.3g} at the first view, {second:.2g} at the second{last}"
+
+
+@dataclass(frozen=True)
+class FixedLength(Stopping):
+    """Stop after ``max_views`` views and never before, however sure the belief is; the threshold counts for nothing."""
+
+    def threshold_at(self, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
+        """Infinity, which no belief reaches, same shape."""
+        return np.full(np.shape(n_views), np.inf)
+
+    def __str__(self) -> str:
+        """In words."""
+        return f"{self.max_views} views"

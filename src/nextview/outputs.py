@@ -84,7 +84,9 @@ def written_results(folder: Path, kind: str) -> Iterator[Path]:
         with _disk_full_is_said(folder):
             new.mkdir()
             yield new
-            files = {entry.name: _facts(Path(entry.path)) for entry in sorted(os.scandir(new), key=lambda e: e.name)}
+            files = {
+                entry.name: _size_and_hash(Path(entry.path)) for entry in sorted(os.scandir(new), key=lambda e: e.name)
+            }
             _write_manifest(new, kind, files)
         cleanup.pop_all()  # from here on, whatever happens, the new results are kept
         _swap(folder, place, aside, kind)
@@ -143,7 +145,7 @@ def added_file(folder: Path, name: str, kind: str) -> Iterator[Path]:
             yield aside / name
             files = _read_manifest(place, kind)
             if files is not None:
-                _write_manifest(aside, kind, files | {name: _facts(aside / name)})
+                _write_manifest(aside, kind, files | {name: _size_and_hash(aside / name)})
         with _said_of(folder / name):
             if files is not None:
                 os.replace(aside / MANIFEST, place / MANIFEST)
@@ -270,7 +272,7 @@ def _disk_full_is_said(path: Path) -> Iterator[None]:
         raise ResultsError(f"{path}: cannot be written ({os.strerror(error.errno)})") from None
 
 
-def _facts(path: Path) -> dict[str, Any]:
+def _size_and_hash(path: Path) -> dict[str, Any]:
     """What the manifest notes of a file, which is on the disk for good afterwards."""
     with path.open("rb+") as file:
         os.fsync(file.fileno())
@@ -286,9 +288,9 @@ def _is_as_noted(path: Path, noted: dict[str, Any]) -> bool:
 
 
 def _write_manifest(folder: Path, kind: str, files: dict[str, dict[str, Any]]) -> None:
-    facts = {"program": "nextview", "kind": kind, "files": files}
-    (folder / MANIFEST).write_text(json.dumps(facts, indent=1) + "\n")
-    _facts(folder / MANIFEST)
+    manifest = {"program": "nextview", "kind": kind, "files": files}
+    (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
+    _size_and_hash(folder / MANIFEST)
 
 
 def _read_manifest(folder: Path, kind: str) -> dict[str, dict[str, Any]] | None:
@@ -297,12 +299,12 @@ def _read_manifest(folder: Path, kind: str) -> dict[str, dict[str, Any]] | None:
     if path.is_symlink() or not path.is_file():
         return None
     try:
-        facts = json.loads(path.read_bytes())
+        manifest = json.loads(path.read_bytes())
     except (ValueError, RecursionError):
         return None
-    if not isinstance(facts, dict) or (facts.get("program"), facts.get("kind")) != ("nextview", kind):
+    if not isinstance(manifest, dict) or (manifest.get("program"), manifest.get("kind")) != ("nextview", kind):
         return None
-    files = facts.get("files")
+    files = manifest.get("files")
     if not isinstance(files, dict):
         return None
     for name, noted in files.items():

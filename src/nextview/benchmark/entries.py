@@ -14,7 +14,7 @@ from nextview.data.predictions import Predictions
 from nextview.errors import EntryError, OtherUseError
 from nextview.measures.confidence_map import confidence_maps
 from nextview.measures.depth_entropy import normalise_per_object
-from nextview.policies.base import Policy
+from nextview.policies.base import Policy, Scope
 from nextview.policies.fixed import orbit, ranked
 from nextview.policies.maps import MapPeak
 from nextview.policies.oracle import OracleGain, OracleValley
@@ -53,8 +53,8 @@ ORACLES: dict[str, Callable[[EpisodeSpecs], Policy]] = {
     "true-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes, "true-lem"),
     "lcm-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.lcm_valley_classes, "lcm"),
     "true-lcm": lambda t: MapPeak(t.predictions.sphere, "true-lcm"),
-    "oracle-gain": lambda t: _gain(t, anywhere=False),
-    "oracle-gain-all": lambda t: _gain(t, anywhere=True),
+    "oracle-gain": lambda t: _gain(t, "local"),
+    "oracle-gain-all": lambda t: _gain(t, "global"),
 }
 """Policies that are told the truth, or climb the true map."""
 
@@ -69,9 +69,9 @@ FIXED = {
 """Fixed views by name, to be followed by how many: "best-5", "orbit-8". They go on to the end whatever is believed."""
 
 
-def _gain(t: EpisodeSpecs, anywhere: bool) -> Policy:
+def _gain(t: EpisodeSpecs, scope: Scope) -> Policy:
     p = t.predictions
-    return OracleGain(p.sphere, p.log_evidence, len(p.classes), p.labels, t.objects, anywhere, p.calibration)
+    return OracleGain(p.sphere, p.log_evidence, len(p.classes), p.labels, t.objects, scope, p.calibration)
 
 
 def default_entries(specs: EpisodeSpecs) -> list[str]:

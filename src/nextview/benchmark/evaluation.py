@@ -10,14 +10,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from nextview import metrics
 from nextview.belief import Calibration
 from nextview.benchmark import statistics as st
 from nextview.benchmark.entries import true_lcm, true_lem
 from nextview.benchmark.published import published_map, published_recognisers
-from nextview.benchmark.scores import map_errors, map_scores, recogniser_scores
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError
-from nextview.models.model_card import Card
+from nextview.models.model_card import ModelCard
 
 Float = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class Evaluation:
             views fused, calibrated as the recogniser's card says.
         confusion: n_views, label, answer, answers: how many; a view is an answer, or a whole object.
         reliability: n_views, bin, confidence, accuracy, answers: after one view and a few more, in random order.
-        maps: map, by, label, measure, value, low, high, published; the measures are those of ``scores.map_errors``.
+        maps: map, by, label, measure, value, low, high, published; the measures are those of ``metrics.map_errors``.
             ``by`` is the network or a baselines made from the true maps of these very objects, which flatters it:
             their mean, the same for every view; or their mean for the object's true class at the view.
         left_out: for each map that is not judged, or not of all objects, why.
@@ -147,8 +147,8 @@ def _means(
 
         def mean(w: Float, over: str = over, here: NDArray[np.bool_] = here) -> Float:
             if over:
-                return st.class_mean(top, bottom, labels, w)
-            return st.ratio(top[here], bottom[here], w[:, here])
+                return metrics.class_mean(top, bottom, labels, w)
+            return metrics.ratio(top[here], bottom[here], w[:, here])
 
         value = mean(np.ones((1, len(labels))))[0]
         low, high = (np.full_like(value, np.nan),) * 2 if weights is None else st.interval(mean(weights))
@@ -177,17 +177,17 @@ def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.
 def _fusion(p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.float32], weights: Float) -> pd.DataFrame:
     top = right.mean(2).T
     one = np.ones_like(top)
-    low, high = st.interval(st.ratio(top, one, weights))
+    low, high = st.interval(metrics.ratio(top, one, weights))
     return pd.DataFrame(
         {
             "n_views": np.arange(1, len(right) + 1),
             "accuracy": top.mean(0),
             "low": low,
             "high": high,
-            "class_accuracy": st.class_mean(top, one, p.labels, np.ones((1, len(p))))[0],
+            "class_accuracy": metrics.class_mean(top, one, p.labels, np.ones((1, len(p))))[0],
             "confidence": confidence.mean((1, 2), np.float64),
             "calibration_error": [
-                st.calibration_error(sure.ravel(), answer.ravel())
+                metrics.calibration_error(sure.ravel(), answer.ravel())
                 for sure, answer in zip(confidence, right, strict=True)
             ],
         }
@@ -207,7 +207,7 @@ def _reliability(right: NDArray[np.bool_], confidence: NDArray[np.float32]) -> p
     rows, v = [], len(right)
     for n_views in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
         turns = slice(None) if n_views < v else slice(1)  # all views are the same in every order
-        sure, share, count = st.reliability(
+        sure, share, count = metrics.reliability(
             confidence[n_views - 1, :, turns].ravel().astype(np.float64), right[n_views - 1, :, turns].ravel()
         )
         rows += [(n_views, i, sure[i], share[i], count[i]) for i in np.flatnonzero(count)]
@@ -250,7 +250,7 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
         true, labels = TRUTHS[name](p)[kept], p.labels[kept]
         for by, maps in {"network": predicted[kept], **baselines(true, labels)}.items():
             window = true.shape[2:]
-            errors = map_errors(maps.reshape(-1, *window), true.reshape(-1, *window))
+            errors = metrics.map_errors(maps.reshape(-1, *window), true.reshape(-1, *window))
             top = np.stack([values.reshape(len(kept), -1).mean(1) for values in errors.values()], 1)
             drawn = weights[:, kept] if by == "network" else None
             for label, over, value, low, high in _means(top, np.ones_like(top), labels, p.classes, drawn):
@@ -263,7 +263,7 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
     return pd.DataFrame(rows, columns=columns).astype({"published": "float64"}), left_out
 
 
-def scores_for_card(card: Card, p: Predictions) -> dict[str, Any]:
+def scores_for_card(card: ModelCard, p: Predictions) -> dict[str, Any]:
     """The scores of one of the models that made some predictions, as its card notes them.
 
     Raises:
@@ -272,9 +272,9 @@ def scores_for_card(card: Card, p: Predictions) -> dict[str, Any]:
     if p.models.get(card.kind) != (card.name, card.sha256):
         raise ResultsError(f"these predictions were not made by model {card.name}")
     if card.kind == "recogniser":
-        return recogniser_scores(p.logits, p.labels)
+        return metrics.recogniser_scores(p.logits, p.labels)
     kept = judged_objects(p, card.kind)
     if card.kind not in TRUTHS or len(kept) == 0:
         raise ResultsError(f"these predictions hold no object by which model {card.name} can be judged")
     shape = (-1, p.sphere.rings, 3)
-    return map_scores(p.maps[card.kind][kept].reshape(shape), TRUTHS[card.kind](p)[kept].reshape(shape))
+    return metrics.map_scores(p.maps[card.kind][kept].reshape(shape), TRUTHS[card.kind](p)[kept].reshape(shape))

@@ -9,17 +9,18 @@ double precision: no threshold can want more.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.belief import Stopping
+from nextview.belief import FixedLength, Stopping
 from nextview.benchmark.entries import TRUE_MAPS, EpisodeSpecs, entry_policy, fixed_views
 from nextview.data.predictions import Predictions
 from nextview.episode import run_episodes
 from nextview.errors import EntryError, PolicyError, UsageError
-from nextview.policies.base import Evidence, maps_among
+from nextview.policies.base import Evidence, Policy, maps_among
+from nextview.policies.fixed import ViewList
 from nextview.viewsphere import ViewSphere
 
 
@@ -92,14 +93,29 @@ def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int) -> Traject
     Raises:
         EntryError: it failed, or chose a view that cannot be taken.
     """
-    p, objects = specs.predictions, specs.objects
     rng = np.random.default_rng([seed, *name.encode()])
     views = fixed_views(name, specs, rng)
-    if views is not None:
-        return _take_fixed_views(views, specs)
-    policy = entry_policy(name, specs)
-    wanted = maps_among(policy.needs)
-    maps = {name: TRUE_MAPS[name](p) if name in TRUE_MAPS else p.maps[name] for name in wanted}
+    if views is None:
+        return _run(name, entry_policy(name, specs), specs, Stopping(1.0, max_views), rng)
+    # These draw nothing more and may be long: in parts, whose steps do not all have to be held at once.
+    done = []
+    for start in range(0, len(views), PART):
+        part = slice(start, start + PART)
+        here = replace(specs, objects=specs.objects[part], starts=views[part, 0])
+        done.append(_run(name, ViewList(views[part]), here, FixedLength(max_views=views.shape[1]), rng))
+    names = [f.name for f in fields(Trajectories) if f.name != "fixed"]
+    whole = {name: np.concatenate([getattr(part, name) for part in done]) for name in names}
+    return replace(done[0], **whole, fixed=True)
+
+
+PART = 4096
+"""Episodes of fixed views that are run at once."""
+
+
+def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng: np.random.Generator) -> Trajectories:
+    """Follow a policy through all episodes."""
+    p, objects = specs.predictions, specs.objects
+    maps = {name: TRUE_MAPS[name](p) if name in TRUE_MAPS else p.maps[name] for name in maps_among(policy.needs)}
 
     def observe(which: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
         rows = objects[which]
@@ -110,7 +126,7 @@ def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int) -> Traject
         )
 
     try:
-        done = run_episodes(observe, p.sphere, policy, specs.starts, Stopping(1.0, max_views), rng, p.calibration)
+        done = run_episodes(observe, p.sphere, policy, specs.starts, stopping, rng, p.calibration)
     except PolicyError as error:
         where = "" if error.episode is None else f" (object {p.names[objects[error.episode]]})"
         raise EntryError(f"{name}: {error}{where}") from error
@@ -121,18 +137,6 @@ def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int) -> Traject
         confidences[step.episodes, k] = step.belief.max(1)
     views = done.outcome.views
     return Trajectories(views, answers, confidences, *_moved(p.sphere, views), fixed=False)
-
-
-def _take_fixed_views(views: NDArray[np.int64], specs: EpisodeSpecs) -> Trajectories:
-    """Take fixed views one after the other."""
-    p = specs.predictions
-    total = np.zeros((len(views), p.log_evidence.shape[2]))
-    answers, confidences = np.zeros(views.shape, np.int64), np.zeros(views.shape)
-    for k, now in enumerate(views.T):
-        total += p.log_evidence[specs.objects, now]
-        belief = p.calibration.belief(total, k + 1, len(p.classes))
-        answers[:, k], confidences[:, k] = belief.argmax(1), belief.max(1)
-    return Trajectories(views, answers, confidences, *_moved(p.sphere, views), fixed=True)
 
 
 def _moved(sphere: ViewSphere, views: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

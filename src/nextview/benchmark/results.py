@@ -13,8 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from nextview.benchmark.experiment import Grid
 from nextview.benchmark.replay import Outcomes
-from nextview.benchmark.run import Grid
 from nextview.benchmark.summary import Tables
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError

@@ -14,33 +14,6 @@ def resample(n: int, samples: int, rng: np.random.Generator) -> Float:
     return rng.multinomial(n, np.full(n, 1 / n), size=samples).astype(np.float64)
 
 
-def ratio(top: Float, bottom: Float, weights: Float) -> Float:
-    """Ratios of sums over objects, such as a mean over the episodes that moved.
-
-    Args:
-        top: (N, M), one column for each quantity.
-        bottom: (N, M).
-        weights: of the objects, (S, N).
-
-    Returns:
-        (S, M); NaN where the bottom is empty.
-    """
-    with np.errstate(invalid="ignore"):
-        return (weights @ top) / (weights @ bottom)
-
-
-def class_mean(top: Float, bottom: Float, labels: NDArray[np.int64], weights: Float) -> Float:
-    """The same ratio in each class, then the mean over the classes (those in which there is anything), (S, M)."""
-    total, classes = np.zeros((len(weights), top.shape[1])), np.zeros((len(weights), top.shape[1]))
-    for label in np.unique(labels):
-        here = labels == label
-        value = ratio(top[here], bottom[here], weights[:, here])
-        total += np.nan_to_num(value)
-        classes += ~np.isnan(value)
-    with np.errstate(invalid="ignore"):
-        return total / classes
-
-
 def interval(samples: Float, level: float = 0.95) -> tuple[Float, Float]:
     """Percentile interval of bootstrap samples (S, M): its ends, each (M,)."""
     empty = np.isnan(samples).all(0)
@@ -89,23 +62,6 @@ def holm(p: Float) -> Float:
     order = tested[np.argsort(p[tested])]
     adjusted[order] = np.minimum(1, np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1)))
     return adjusted
-
-
-def reliability(confidence: Float, right: NDArray[np.bool_], bins: int = 15) -> tuple[Float, Float, NDArray[np.int64]]:
-    """Mean confidence and share of right answers in bins of equal width, and how many fall in each, (bins,) each.
-
-    Guo et al., On calibration of modern neural networks (2017), section 2. Empty bins are 0.
-    """
-    at = np.clip((confidence * bins).astype(np.int64), 0, bins - 1)
-    count = np.bincount(at, minlength=bins)
-    some = np.maximum(count, 1)
-    return np.bincount(at, confidence, bins) / some, np.bincount(at, right, bins) / some, count
-
-
-def calibration_error(confidence: Float, right: NDArray[np.bool_], bins: int = 15) -> float:
-    """Expected calibration error: the mean gap between confidence and accuracy over the bins of ``reliability``."""
-    sure, accuracy, count = reliability(confidence, right, bins)
-    return float((count * np.abs(sure - accuracy)).sum() / max(1, count.sum()))
 
 
 def area(x: Float, y: Float, low: float, high: float) -> float:

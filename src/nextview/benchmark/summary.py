@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from nextview import metrics
 from nextview.benchmark import statistics as st
+from nextview.benchmark.entries import ORACLES
+from nextview.benchmark.experiment import Grid
 from nextview.benchmark.published import published
 from nextview.benchmark.replay import Outcomes, truncate
-from nextview.benchmark.run import Grid
 
 Float = NDArray[np.float64]
 
@@ -40,6 +43,8 @@ class Tables:
         areas: policy, budget (n_views or travel_all), value: mean accuracy over all budgets, low, high, and the
             difference to the reference with difference_low, difference_high, p and p_holm.
         reliability: policy, threshold, bin, confidence, accuracy, episodes.
+        risks: policy, risk (an error rate that was promised), threshold that promises it, error (measured among the
+            episodes that reached it), low, high, confident (their share): only of policies a robot could follow.
     """
 
     summary: pd.DataFrame
@@ -48,13 +53,16 @@ class Tables:
     sweep: pd.DataFrame
     areas: pd.DataFrame
     reliability: pd.DataFrame
+    risks: pd.DataFrame
 
     def named(self) -> dict[str, pd.DataFrame]:
         """The tables by name."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
-def summarise(grid: Grid, reference: str, samples: int, rng: np.random.Generator) -> Tables:
+def summarise(
+    grid: Grid, reference: str, samples: int, rng: np.random.Generator, promised: Mapping[float, float] | None = None
+) -> Tables:
     """All tables of a grid.
 
     Args:
@@ -62,13 +70,15 @@ def summarise(grid: Grid, reference: str, samples: int, rng: np.random.Generator
         reference: the policy that the others are compared with.
         samples: of the bootstrap.
         rng: draws them; the same ones for all policies, which pairs the differences.
+        promised: the threshold for each error rate that the calibration promises, among those of the grid.
     """
     weights = st.resample(len(grid.specs.predictions), samples, rng)
     cells = list(grid.cells())
     summary, drawn = _summary(grid, cells, weights)
     sweep, areas = _areas(grid, reference, weights[:500])
     tests = _tests(grid, cells, summary, drawn, reference)
-    return Tables(summary, _per_class(grid, cells, weights), tests, sweep, areas, _reliability(grid, cells))
+    per_class, risks = _per_class(grid, cells, weights), _risks(summary, promised or {})
+    return Tables(summary, per_class, tests, sweep, areas, _reliability(grid, cells), risks)
 
 
 def _measures(grid: Grid, ends: Outcomes) -> dict[str, tuple[Float, Float]]:
@@ -110,12 +120,12 @@ def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFram
     labels, classes = grid.specs.predictions.labels, grid.specs.predictions.classes
     duplicate_groups = np.ones((1, weights.shape[1]))
     keys, top, bottom = _columns(grid, cells)
-    value, drawn = st.ratio(top, bottom, duplicate_groups)[0], st.ratio(top, bottom, weights)
+    value, drawn = metrics.ratio(top, bottom, duplicate_groups)[0], metrics.ratio(top, bottom, weights)
     per_class = [i for i, key in enumerate(keys) if key[2] in ("accuracy", "travel_moved", "n_views")]
     keys += [(keys[i][0], keys[i][1], f"class_{keys[i][2]}") for i in per_class]
     top, bottom = top[:, per_class], bottom[:, per_class]
-    value = np.concatenate([value, st.class_mean(top, bottom, labels, duplicate_groups)[0]])
-    drawn = np.concatenate([drawn, st.class_mean(top, bottom, labels, weights)], 1)
+    value = np.concatenate([value, metrics.class_mean(top, bottom, labels, duplicate_groups)[0]])
+    drawn = np.concatenate([drawn, metrics.class_mean(top, bottom, labels, weights)], 1)
     low, high = st.interval(drawn)
     rows = []
     for i, (policy, threshold, measure) in enumerate(keys):
@@ -123,7 +133,7 @@ def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFram
         rows.append((policy, threshold, measure, value[i], low[i], high[i], beside))
     for policy, threshold, ends in cells:
         right = grid.right(ends.answer)
-        error = st.calibration_error(ends.confidence, right.ravel())
+        error = metrics.calibration_error(ends.confidence, right.ravel())
         between = np.std([right[:, labels == label].mean() for label in np.unique(labels)])
         rows.append((policy, threshold, "calibration_error", error, np.nan, np.nan, None))
         rows.append((policy, threshold, "class_accuracy_std", between, np.nan, np.nan, None))
@@ -137,8 +147,8 @@ def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
     rows = []
     for index in np.unique(p.labels):
         here, label = p.labels == index, p.classes[index]
-        value = st.ratio(top[here], bottom[here], np.ones((1, int(here.sum()))))[0]
-        low, high = st.interval(st.ratio(top[here], bottom[here], weights[:, here]))
+        value = metrics.ratio(top[here], bottom[here], np.ones((1, int(here.sum()))))[0]
+        low, high = st.interval(metrics.ratio(top[here], bottom[here], weights[:, here]))
         for i, (policy, threshold, measure) in enumerate(keys):
             beside = published(policy, threshold, measure, p.classes, label)
             rows.append((policy, threshold, label, measure, value[i], low[i], high[i], beside))
@@ -211,9 +221,21 @@ def _holm(table: pd.DataFrame, family: str, column: str) -> pd.Series:
 def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
     rows = []
     for policy, threshold, ends in cells:
-        sure, accuracy, count = st.reliability(ends.confidence, grid.right(ends.answer).ravel())
+        sure, accuracy, count = metrics.reliability(ends.confidence, grid.right(ends.answer).ravel())
         rows += [(policy, threshold, i, sure[i], accuracy[i], count[i]) for i in np.flatnonzero(count)]
     return _frame(rows, ["policy", "threshold", "bin", "confidence", "accuracy", "episodes"])
+
+
+def _risks(summary: pd.DataFrame, promised: Mapping[float, float]) -> pd.DataFrame:
+    rows = []
+    for risk, threshold in promised.items():
+        at = summary[summary["threshold"] == threshold]
+        right, share = (at[at["measure"] == measure] for measure in ("confident_accuracy", "confident"))
+        measured = right[["value", "high", "low"]].to_numpy(float)  # the upper end of accuracy is the lower of error
+        for policy, (mean, high, low), stopped in zip(right["policy"], measured, share["value"], strict=True):
+            if policy not in ORACLES:
+                rows.append((policy, risk, threshold, 1 - mean, 1 - high, 1 - low, stopped))
+    return _frame(rows, ["policy", "risk", "threshold", "error", "low", "high", "confident"])
 
 
 def _frame(rows: list, columns: list[str]) -> pd.DataFrame:

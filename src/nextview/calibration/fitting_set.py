@@ -8,12 +8,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.belief import log_evidence_of
+from nextview.belief import FixedLength, log_evidence_of
 from nextview.data.predictions import Predictions
 from nextview.data.splits import deduplicated, divide
+from nextview.episode import run_episodes
 from nextview.errors import PredictionsError
-from nextview.models.model_card import Card
-from nextview.policies.base import EpisodeState, Evidence, Policy
+from nextview.models.model_card import ModelCard
+from nextview.policies.base import Evidence, Policy
 from nextview.viewsphere import ViewSphere
 
 
@@ -68,10 +69,10 @@ class FittingSet:
         return len(self) / ((count > 0).sum() * count[self.labels])
 
 
-def held_out_by(card: Card, predictions: Predictions) -> NDArray[np.int64]:
+def held_out_by(card: ModelCard, predictions: Predictions) -> NDArray[np.int64]:
     """Objects on which a network was not trained, as its card says, duplicates left out: their indices."""
     once = deduplicated(predictions.labels, predictions.depth_entropy)
-    return once[np.isin(np.array(predictions.names)[once], card.facts.get("unseen", []))]
+    return once[np.isin(np.array(predictions.names)[once], card.held_out)]
 
 
 def fitting_set(predictions: Predictions, validation: float, seed: int) -> FittingSet:
@@ -98,7 +99,7 @@ def fitting_set(predictions: Predictions, validation: float, seed: int) -> Fitti
 def blind_walks(
     sphere: ViewSphere, policy: Policy, starts: NDArray[np.int64], n_views: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Where a policy goes that views at nothing but where it has been.
+    """Where a policy goes that looks at nothing but where it has been.
 
     Args:
         sphere: the viewpoints.
@@ -110,10 +111,8 @@ def blind_walks(
     Returns:
         Views in order, (E, views) int64.
     """
-    rows, nothing = np.arange(len(starts)), np.zeros((len(starts), 1))
-    visited = np.zeros((len(starts), len(sphere)), bool)
-    views = [np.asarray(starts, np.int64)]
-    for k in range(1, n_views):
-        visited[rows, views[-1]] = True
-        views.append(policy.next_views(EpisodeState(views[-1], visited, nothing + 1, Evidence(nothing), k, rows), rng))
-    return np.stack(views, 1)
+
+    def nothing(episodes: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
+        return Evidence(np.zeros((len(episodes), 1)))
+
+    return run_episodes(nothing, sphere, policy, starts, FixedLength(max_views=n_views), rng).outcome.views

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from nextview.belief import Calibration, of_true_class
 from nextview.calibration.fitting_set import FittingSet, blind_walks
+from nextview.policies.base import Scope
 from nextview.policies.learned_tables import FixedRing, cells_from, cells_to
 
 Float = NDArray[np.float64]
@@ -22,13 +23,13 @@ def log_belief(data: FittingSet, calibration: Calibration, total: NDArray[np.flo
 
 
 def fit_sequence(
-    data: FittingSet, anywhere: bool, length: int, calibration: Calibration, travel_weight: float = 0.0
+    data: FittingSet, scope: Scope, length: int, calibration: Calibration, travel_weight: float = 0.0
 ) -> NDArray[np.int64]:
     """The greedily best moves from each ring: each the best for all objects and azimuths together.
 
     Args:
         data: what the recogniser says.
-        anywhere: choose among all views; otherwise in the local window.
+        scope: choose among all views ("global") or in the local window ("local").
         length: moves.
         calibration: of the belief.
         travel_weight: of one cell of travel, in the measure.
@@ -38,14 +39,14 @@ def fit_sequence(
     """
     n = data.sphere.azimuths
     rings = [n * ring + np.arange(n) for ring in range(data.sphere.rings)]
-    paths = [greedy_path(data, starts, anywhere, length, calibration, travel_weight) for starts in rings]
+    paths = [greedy_path(data, starts, scope, length, calibration, travel_weight) for starts in rings]
     return np.array([cells_to(data.sphere)[path[:-1], path[1:]] for path in paths])
 
 
 def greedy_path(
     data: FittingSet,
     starts: NDArray[np.int64],
-    anywhere: bool,
+    scope: Scope,
     length: int,
     calibration: Calibration,
     travel_weight: float = 0.0,
@@ -55,7 +56,7 @@ def greedy_path(
     Args:
         data: what the recogniser says.
         starts: views of one ring.
-        anywhere: choose among all views; otherwise in the local window.
+        scope: choose among all views ("global") or in the local window ("local").
         length: moves.
         calibration: of the belief.
         travel_weight: of one cell of travel, in the measure.
@@ -71,7 +72,7 @@ def greedy_path(
 
     total = log_evidence(path[0])
     for k in range(2, min(length, len(sphere) - 1) + 2):
-        reachable = np.arange(len(sphere)) if anywhere else sphere.window(path[-1]).ravel()
+        reachable = np.arange(len(sphere)) if scope == "global" else sphere.window(path[-1]).ravel()
         free = np.setdiff1d(reachable, path)
         free = free if len(free) else np.setdiff1d(np.arange(len(sphere)), path)
         beliefs = [log_belief(data, calibration, total + log_evidence(v), k).mean(1) for v in free]
@@ -81,12 +82,12 @@ def greedy_path(
     return np.array(path)
 
 
-def fit_ring(data: FittingSet, anywhere: bool, n_views: int, calibration: Calibration) -> tuple[int, int]:
+def fit_ring(data: FittingSet, scope: Scope, n_views: int, calibration: Calibration) -> tuple[int, int]:
     """The best ring to go to, and in which steps to walk it, over all starts, after 2 to ``n_views`` views.
 
     Args:
         data: what the recogniser says.
-        anywhere: any number of azimuth steps; otherwise 1, which stays in the local window.
+        scope: any number of azimuth steps ("global") or 1 ("local"), which stays in the local window.
         n_views: at most.
         calibration: of the belief.
 
@@ -108,7 +109,7 @@ def fit_ring(data: FittingSet, anywhere: bool, n_views: int, calibration: Calibr
                 sum_over_views += float(data.weights @ belief.mean(1))
         return sum_over_views
 
-    steps = range(1, data.sphere.azimuths // 2 + 1) if anywhere else (1,)
+    steps = range(1, data.sphere.azimuths // 2 + 1) if scope == "global" else (1,)
     return max(((ring, step) for ring in range(data.sphere.rings) for step in steps), key=value)
 
 

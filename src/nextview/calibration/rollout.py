@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.belief import PLAIN_SUM, Calibration, of_true_class
+from nextview.belief import PLAIN_SUM, Calibration, FixedLength, of_true_class
 from nextview.calibration.fitting_set import FittingSet
 from nextview.calibration.temperature import fit_temperature
 from nextview.data.predictions import Predictions
+from nextview.episode import run_episodes
 from nextview.errors import PredictionsError
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.baselines import Random
@@ -77,30 +78,29 @@ def rollout(table: ReplayTable, policy: Policy, n_views: int, rng: np.random.Gen
         rng: draws the first views, and what the policy draws.
 
     Yields:
-        The moment after each view.
+        The decision state after each view.
     """
-    data, classes = table.data, len(table.data.classes)
-    rows, sphere = np.arange(len(data)), data.sphere
-    current = rng.integers(len(sphere), size=len(data))
-    visited, total = np.zeros((len(data), len(sphere)), bool), np.zeros((len(data), data.log_evidence.shape[2]))
-    travel = np.zeros(len(data))
-    for k in range(1, n_views + 1):
-        visited[rows, current] = True
-        total = total + data.log_evidence[rows, current]
-        maps = {name: values[rows, current] for name, values in table.maps.items()}
-        belief = table.calibration.belief(total, k, classes)
-        seen = Evidence(
-            data.logits[rows, current],
-            maps,
-            azimuth_bins=None if data.azimuth_bins is None else data.azimuth_bins[rows, current],
+    data, sphere = table.data, table.data.sphere
+    starts = rng.integers(len(sphere), size=len(data))
+
+    def observe(objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
+        return Evidence(
+            data.logits[objects, views],
+            {name: values[objects, views] for name, values in table.maps.items()},
+            azimuth_bins=None if data.azimuth_bins is None else data.azimuth_bins[objects, views],
         )
-        azimuth_bins = table.calibration.azimuth_bins(total, k, classes, sphere.turn[current])
-        state = EpisodeState(current, visited.copy(), belief, seen, k, rows, azimuth_bins)
-        yield DecisionState(state, total, travel)
-        if k < n_views:
-            following = policy.next_views(state, rng)
-            travel = travel + sphere.travel[current, following]
-            current = following
+
+    length = FixedLength(max_views=n_views)
+    steps = run_episodes(observe, sphere, policy, starts, length, rng, table.calibration).steps
+    visited, travel = np.zeros((len(data), len(sphere)), bool), np.zeros(len(data))
+    for k, step in enumerate(steps, 1):
+        visited[step.episodes, step.views] = True
+        turn = sphere.turn[step.views]
+        azimuth_bins = table.calibration.azimuth_bins(step.total, k, len(data.classes), turn)
+        state = EpisodeState(step.views, visited.copy(), step.belief, step.evidence, k, step.episodes, azimuth_bins)
+        yield DecisionState(state, step.total, travel)
+        if k < len(steps):
+            travel = travel + sphere.travel[step.views, step.next_views]
 
 
 def outcome(table: ReplayTable, total: Float, n_views: int, kind: str) -> Float:

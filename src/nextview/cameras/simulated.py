@@ -10,17 +10,27 @@ from nextview.observation import Observation, checked_pose, pinhole
 from nextview.shading import AMBIENT
 from nextview.viewsphere import DISTANCE
 
+EDGE_ON, SLIVER, STRAY = 0.01, 1e-6, 1e-3
+"""Rounding may put a hit anywhere on the ray where the cosine between ray and normal is smaller than the first, or the
+triangle's normal, twice its area, shorter than the second. Such a hit counts if it is no farther than the third, object
+radii, from the triangle's bounding box in the camera's axes."""
+
 
 def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
     """Of rows of three; einsum takes three times as long."""
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
+def _near(points: NDArray[np.float32], corners: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Whether each point, (n, 3), lies in the bounding box of its triangle, (n, 3 corners, 3), or hardly outside."""
+    return ((points > corners.min(1) - STRAY) & (points < corners.max(1) + STRAY)).all(1)
+
+
 class SimulatedCamera:
     """Looks at one mesh from any pose.
 
     The image is lit by a headlight: a pixel's brightness grows with the cosine between the viewing ray and the
-    surface normal.
+    surface normal. A triangle seen exactly from the edge has no width: it shows nothing, or itself.
 
     Args:
         mesh: a normalised mesh.
@@ -37,6 +47,7 @@ class SimulatedCamera:
         from embreex.mesh_construction import TriangleMesh  # only who simulates a camera pays for the import
         from embreex.rtcore_scene import EmbreeScene
 
+        self._faces = mesh.faces
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, vertices, np.ascontiguousarray(mesh.faces, dtype=np.int32))
         centres = (np.arange(size, dtype=np.float32) + 0.5 - size / 2) / self.intrinsics[0, 0].astype(np.float32)
@@ -59,7 +70,12 @@ class SimulatedCamera:
             hits = self._scene.run(origins, rays, output=1)
             hit, normals = hits["primID"] >= 0, hits["Ng"]
             cosine = np.abs(_dot(normals, rays))
-            cosine /= np.sqrt(_dot(normals, normals)) * self._ray_length[bound].ravel() + 1e-30
+            squared = _dot(normals, normals)
+            cosine /= np.sqrt(squared) * self._ray_length[bound].ravel() + 1e-18  # not 0 where that square is
+            doubtful = np.flatnonzero(hit & ((cosine < EDGE_ON) | (squared < SLIVER**2)))
+            where = hits["tfar"][doubtful, None] * self._rays[bound].reshape(-1, 3)[doubtful]
+            corners = self._corners.T[self._faces[hits["primID"][doubtful]]]  # (n, 3, xyz)
+            hit[doubtful] = _near(where, (corners - origin) @ rotation)
             shade = np.where(hit, 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5, 0)
             image[bound] = shade.reshape(height, width)
             depth[bound] = np.where(hit, hits["tfar"], 0).reshape(height, width)

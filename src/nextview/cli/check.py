@@ -23,8 +23,11 @@ def check(
     """
     from nextview.cli.progress import console, track
     from nextview.data.checking import check as check_store
+    from nextview.data.checking import mend
     from nextview.data.store import ViewStore
 
+    if repair:
+        mend(store)
     views = ViewStore.open(store)
     damaged: list[str] = []
 
@@ -34,7 +37,7 @@ def check(
                 damaged.append(f"{name}: {problem}")
             yield n
 
-    done = int(views.done.sum())
+    done = int(views.done.sum()) + len(views.doubtful)
     track(checked(), done, f"checking {store.name}", views=len(views.sphere))
     for line in damaged:
         console.print(line, style="red", highlight=False)

@@ -2,20 +2,10 @@
 
 from __future__ import annotations
 
-from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import tyro
-
-from nextview.errors import UsageError
-
-if TYPE_CHECKING:
-    from rich.table import Table
-    from rich.text import Text
-
-    from nextview.benchmark.evaluation import Evaluation
-    from nextview.report.elements import Number
 
 
 def evaluate(
@@ -44,109 +34,19 @@ def evaluate(
     from nextview.cli.extra import needs_extra
     from nextview.cli.progress import track
     from nextview.cli.terminal import Terminal
-    from nextview.data.predictions import Predictions
-    from nextview.models.model_card import file_hash, find_card, write_card
-    from nextview.outputs import check_folder, written_results
 
     with needs_extra("benchmark"):
-        from nextview.benchmark import evaluation as judge
-        from nextview.report import evaluation_page as evaluation
-    import numpy as np
+        from nextview.report import terminal
+        from nextview.report.evaluation_page import PAGE
+        from nextview.report.evaluation_stage import write_evaluation
 
-    check_folder(out, evaluation.KIND)
-    table = Predictions.load(predictions)
-    if split:
-        table = table.of_split(split)
-    elif len(set(table.splits)) > 1:
-        raise UsageError(f"{predictions}: holds training and test objects; choose with --split which are judged")
-    if deduplicate:
-        table = table.deduplicate()
-    noted = {}
-    for name in cards:
-        card = find_card(name)
-        known = "" if table.of_size is None else ", of known size"
-        things = "shapes" if deduplicate else "objects"
-        of = f"{split or table.splits[0] or 'all'} ({len(table)} {things}{known})"
-        noted[card.path] = card.facts | {
-            "scores": card.facts.get("scores", {}) | {of: judge.scores_for_card(card, table)}
-        }
-    with written_results(out, evaluation.KIND) as part:
-        found = judge.evaluate(table, samples, np.random.default_rng([seed, 0]))
-        settings = {
-            "predictions": predictions.name,
-            "predictions_sha256": file_hash(predictions),
-            "models": table.models,
-            "split": split,
-            "deduplicate": deduplicate,
-            "objects": len(table),
-            "samples": samples,
-            "seed": seed,
-        }
-        figures = evaluation.all_figures(found, table, np.random.default_rng([seed, 1]))
-        track(evaluation.save(part, found, table, settings, figures), len(figures) + 1, "writing figures")
-    for path, facts in noted.items():
-        write_card(path.with_suffix(".json"), facts)
+    found = write_evaluation(
+        predictions, out, split=split, deduplicate=deduplicate, cards=cards, samples=samples, seed=seed, track=track
+    )
     console = Terminal()
-    console.print(_recogniser(found, len(table.sphere)))
+    console.print(terminal.recogniser_table(found))
     for name in found.maps["map"].unique():
-        console.print(_map(found, name))
+        console.print(terminal.map_table(found, name))
     for name, why in found.left_out.items():
         console.print(f"{name}: {why}", highlight=False)
-    console.print(f"numbers, figures and {evaluation.PAGE} in {out}", highlight=False)
-
-
-def _recogniser(found: Evaluation, views: int) -> Table:
-    """Accuracy of each class and of all."""
-    from rich.table import Table
-
-    from nextview.report.elements import numbers
-
-    shown = Table("share of right answers", "objects", "one view", f"all {views} views")
-    right = numbers(found.accuracy, "n_views", "label", "measure")
-    objects = found.accuracy.groupby(["label", "measure"])["objects"].first()
-    labels = [label for label in found.accuracy["label"].unique() if label]
-    lines = [(label.replace("_", " "), label, "accuracy") for label in labels]
-    lines += [("mean of classes", "", "class_accuracy"), ("mean of objects", "", "accuracy")]
-    lines += [("  without duplicates", "", "clean_accuracy")]
-    if "shape_accuracy" in set(found.accuracy["measure"]):
-        lines += [("  size not known", "", "shape_accuracy")]
-    for heading, label, measure in lines:
-        cells = (_cell(right[n_views, label, measure], 3) for n_views in (1, views))
-        shown.add_row(heading, str(objects[label, measure]), *cells, end_section=label == labels[-1])
-    published = right[1, "", "accuracy"].published
-    if isfinite(published):
-        shown.add_row("  published", "", f"{published:.3f}")
-    return shown
-
-
-def _map(found: Evaluation, name: str) -> Table:
-    """Scores of a map over objects and classes, beside the published ones and the baselines."""
-    from rich.table import Table
-
-    from nextview.report.elements import numbers
-
-    measures = {"mse": "MSE", "d0": "d = 0", "d_le_1": "d <= 1", "d_lt_2": "d < 2", "regret": "regret"}
-    scores = numbers(found.maps[(found.maps["map"] == name) & (found.maps["label"] == "")], "by", "measure")
-    baselines = [by for by in found.maps["by"].unique() if by != "network"]
-    printed = any(isfinite(score.published) for score in scores.values())
-    caption = "published: squared error over objects, peaks over classes (table 4)" if printed else None
-    shown = Table(name.upper(), "mean of objects", "of classes", "published", *baselines, caption=caption)
-    shown.columns[1].no_wrap = True
-    for measure, heading in measures.items():
-        digits = 4 if measure == "mse" else 3
-        over_objects, over_classes = scores["network", measure], scores["network", f"class_{measure}"]
-        published = over_objects.published if measure == "mse" else over_classes.published
-        rest = [over_classes.value, published, *(scores[by, measure].value for by in baselines)]
-        cells = (f"{value:.{digits}f}" if isfinite(value) else "-" for value in rest)
-        shown.add_row(heading, _cell(over_objects, digits), *cells)
-    return shown
-
-
-def _cell(number: Number, digits: int) -> Text:
-    """A number and its interval."""
-    from rich.text import Text
-
-    if not isfinite(number.value):
-        return Text("-")
-    interval = f" {number.low:.{digits}f}-{number.high:.{digits}f}" if number.high > number.low else ""
-    return Text.assemble(f"{number.value:.{digits}f}", (interval, "dim"))
+    console.print(f"numbers, figures and {PAGE} in {out}", highlight=False)

@@ -18,7 +18,6 @@ from nextview.cli.ending import orderly_end
 from nextview.cli.evaluate import evaluate
 from nextview.cli.export import export_lcm, export_lem, export_recogniser
 from nextview.cli.fit import fit_calibration, fit_policies, fit_size, fit_valleys
-from nextview.cli.grid import train_grid
 from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
 from nextview.cli.models import models
@@ -27,8 +26,10 @@ from nextview.cli.presets import with_preset
 from nextview.cli.recognise import recognise
 from nextview.cli.render import render
 from nextview.cli.report import report
-from nextview.cli.train import train_lcm, train_lem, train_recogniser
 from nextview.cli.train_gain import train_gain
+from nextview.cli.train_grid import train_grid
+from nextview.cli.train_maps import train_lcm, train_lem
+from nextview.cli.train_recogniser import train_recogniser
 
 COMMANDS: dict[str, Any] = {
     "recognise": recognise,
@@ -70,10 +71,10 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _run(arguments: list[str]) -> None:
     commands = COMMANDS
-    prog, description = "nextview", "Active 3D object recognition: what it is, and where to look next."
     if arguments == ["--version"]:
         print(f"nextview {__version__}")
         return
+    prog, description = "nextview", "Active 3D object recognition: what it is, and where to look next."
     if arguments and isinstance(commands.get(arguments[0]), dict):  # a group, such as nextview train
         prog, description = f"{prog} {arguments[0]}", GROUPS[arguments[0]]
         commands, arguments = commands[arguments[0]], arguments[1:]

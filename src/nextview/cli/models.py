@@ -19,13 +19,13 @@ def models(name: tyro.conf.Positional[str | None] = None, /) -> None:
     from nextview.models.model_card import bundled_cards, file_hash, find_card
 
     if name:
-        print(json.dumps(find_card(name).facts, indent=1))
+        print(json.dumps(find_card(name).to_dict(), indent=1))
         return
     table = Table("model", "kind", "MB", "scores on test", "file")
     table.columns[0].no_wrap = True
     for card in bundled_cards().values():
         tested = []
-        for split, scores in card.facts["scores"].items():
+        for split, scores in card.scores.items():
             if split.startswith("test"):
                 tested.append(split)
             for score, value in scores.items() if split.startswith("test") else ():

@@ -15,8 +15,9 @@ def predict(
     out: tyro.conf.Positional[Path],
     /,
     split: Literal["train", "test"] | None = None,
+    models: str = "modelnet10",
     recogniser: tuple[str, ...] = (),
-    unseen: bool = False,
+    held_out: bool = False,
     maps: tuple[str, ...] = ("lem", "lcm"),
     by_shape: bool = False,
     batch: int = 8,
@@ -29,12 +30,13 @@ def predict(
         store: view store made by nextview render.
         out: predictions to make (.npz), from which nextview benchmark replays policies.
         split: only this split.
-        recogniser: name of a bundled model or path of a card; the bundled one by default. Several with --unseen.
-        unseen: let each object be judged by a recogniser that has not seen it in training (nextview train recogniser
-            --folds makes such), and leave out those that all have seen.
-        maps: maps to predict with the bundled networks, or NAME=CARD for others.
-        by_shape: keep from the recogniser how large the objects are. Else it is told where the store knows it (nextview
-            render --unit), if its card says what sizes mean (nextview fit size).
+        models: bundled models by name, or a folder with models of your own.
+        recogniser: instead, name of a bundled model or path of a card. Several with --held-out.
+        held_out: let each object be judged by a recogniser from whose training it was held out (nextview train
+            recogniser --folds makes such), and leave out those that all were trained on.
+        maps: maps to predict with those models, or NAME=CARD for others.
+        by_shape: recognise by shape alone. By default the size of the objects counts too, where the store knows it
+            (nextview render --unit) and the card of the recogniser says what sizes mean (nextview fit size).
         batch: views a call of the networks.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler, to use its workers instead.
@@ -42,20 +44,20 @@ def predict(
     from nextview.cli.progress import track
     from nextview.data import predicting as job
     from nextview.data.store import ViewStore
-    from nextview.models.inference import MAPS, RECOGNISER
+    from nextview.models.collection import find_models
     from nextview.models.model_card import find_card
 
-    if len(recogniser) > 1 and not unseen:
-        raise UsageError("several recognisers can only share the work with --unseen")
+    if len(recogniser) > 1 and not held_out:
+        raise UsageError("several recognisers can only share the work with --held-out")
     if out.suffix != ".npz":
         raise UsageError(f"{out}: predictions are one .npz file; end the name in .npz")
-    cards = {}
+    found, cards = find_models(models), {}
     for item in maps:
         name, _, card = item.partition("=")
-        if not card and name not in MAPS:
-            raise ModelError(f"no bundled network predicts the map {name!r}; there are {', '.join(MAPS)}")
-        cards[name] = find_card(card or MAPS[name])
-    judges = [find_card(r) for r in recogniser or (RECOGNISER,)]
-    steps = job.predict(store, out, judges, cards, split, unseen, not by_shape, batch, workers, scheduler)
+        if not card and name not in found.maps:
+            raise ModelError(f"no network of {models} predicts the map {name!r}; there are {', '.join(found.maps)}")
+        cards[name] = find_card(card or found.maps[name])
+    judges = [find_card(r) for r in recogniser or (found.recogniser,)]
+    steps = job.predict(store, out, judges, cards, split, held_out, not by_shape, batch, workers, scheduler)
     before, total = next(steps)
     track((done for done, _ in steps), total, f"predicting {store.name}", before, len(ViewStore.open(store).sphere))

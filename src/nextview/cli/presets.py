@@ -1,4 +1,8 @@
-"""Commands that take a recipe offer named ones: --preset sets the defaults of all its options."""
+"""Commands that take a recipe offer named ones: --preset sets the defaults of all its options.
+
+Presets of tyro's own (``tyro.extras.overridable_config_cli``) are subcommands: options of the recipe could then be
+given only after the name of a preset, the default one too.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,8 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
-from nextview.cli.train import train_lcm, train_lem, train_recogniser
+from nextview.cli.train_maps import train_lcm, train_lem
+from nextview.cli.train_recogniser import train_recogniser
 from nextview.training.recipes import THESIS_MAP, THESIS_RECOGNISER, MapRecipe, RecogniserRecipe
 
 PRESETS: dict[Callable, dict[str, Any]] = {

@@ -77,14 +77,12 @@ def show(
     from nextview.cli.episode_table import as_json, print_episode
     from nextview.cli.timing import Stopwatch
     from nextview.errors import ObservationError
-    from nextview.policies.registry import own_modules
 
     watch = Stopwatch()
     watch.lap("importing")
     camera = SimulatedCamera(load())
     watch.lap("building the scene")
-    with own_modules():
-        opened = system.load(models, **options)
+    opened = system.load(models, **options)
     session = opened.session(start, seed)
     watch.lap("loading the models")
     while not session.done:

@@ -8,6 +8,7 @@ from typing import Literal
 import tyro
 
 from nextview.cli.recognise import Unit
+from nextview.errors import DatasetError
 from nextview.mesh_format import MAX_FACES
 
 
@@ -55,10 +56,13 @@ def render(
     from nextview.viewsphere import ViewSphere
 
     views = ViewSphere.named(sphere)
-    if azimuths:
+    if azimuths is not None:
         views = replace(views, azimuths=azimuths)
     total = sum(split in (None, entry.split) for entry in list_dataset(dataset))
-    before = int(ViewStore.open(store).done.sum()) if store.exists() else 0
+    try:
+        before = int(ViewStore.open(store).done.sum())
+    except DatasetError:
+        before = 0  # there is none yet, or rendering mends it or says what is wrong
     new = Deform(stretch, turn)
     jobs = render_dataset(dataset, store, views, size, seed, new, split, unit, workers, scheduler, max_faces)
     track((before + n for n, _ in enumerate(jobs, 1)), total, f"rendering {store.name}", before, len(views))
@@ -74,4 +78,7 @@ def render(
         if len({labels[i] for i in group}) > 1:
             same = " = ".join(f"{made.names[i]} ({labels[i]})" for i in group)
             console.print(f"one mesh, several labels: {same}", style="yellow", highlight=False)
-    console.print(f"{store}: {int(made.done.sum())} of {total} objects, {len(views)} views each")
+    done = int(made.done.sum())
+    console.print(f"{store}: {done} of {total} objects, {len(views)} views each")
+    if not done:
+        raise DatasetError(f"{store}: none of the {total} meshes can be used; see the reasons above")

@@ -18,11 +18,11 @@ def report(
     Args:
         results: folder made by nextview benchmark.
         out: the page; RESULTS/report.html by default, which counts as one of the results.
-        store: the view store of the predictions, for pictures of the objects.
+        store: take the pictures of the objects from this view store; by default from that of the predictions, if it
+            still is where it was.
     """
     from nextview.cli.extra import needs_extra
     from nextview.cli.progress import console
-    from nextview.data.store import ViewStore
 
     with needs_extra("benchmark"):
         from nextview.benchmark.results import load
@@ -31,5 +31,9 @@ def report(
 
     target = out or results / PAGE
     check_page(target, results)
-    write_report(load(results), target, Pictures(ViewStore.open(store) if store else None))
+    loaded = load(results)
+    pictures = Pictures.of(loaded.predictions, store)
+    write_report(loaded, target, pictures)
+    if pictures.why_not:
+        console.print(pictures.why_not, soft_wrap=True)
     console.print(f"{target}: {target.stat().st_size / 1e6:.1f} MB")

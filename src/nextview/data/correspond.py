@@ -28,8 +28,7 @@ def correspond(path: Path, workers: int | None = None, scheduler: str | None = N
     """
     store = ViewStore.open(path)
     store.array("depth"), store.array("points")  # say if they are missing, before anything is begun
-    v = len(store.sphere)
-    yield from keep(path, {ARRAY: (v, v)}, _correspond, workers, scheduler)
+    yield from keep(path, [ARRAY], _correspond, workers, scheduler)
 
 
 def _correspond(store: ViewStore, i: int) -> dict[str, NDArray[np.float32]]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 from nextview.errors import DatasetError
@@ -25,7 +26,8 @@ def list_dataset(root: str | Path) -> list[Entry]:
     """All meshes of a dataset folder, sorted by class, split and name.
 
     Raises:
-        DatasetError: the folder is missing or holds no class folders with meshes, or one whose name cannot be printed.
+        DatasetError: the folder is missing or holds no class folders with meshes, one whose name cannot be printed, or
+            two meshes of one name in one place.
     """
     root = Path(root)
     if not root.is_dir():
@@ -44,7 +46,18 @@ def list_dataset(root: str | Path) -> list[Entry]:
     for entry in entries:
         if not (entry.label + entry.name).isprintable():
             raise DatasetError(f"{entry.path}: its name holds what cannot be printed; rename it")
-    names = [entry.name for entry in entries]
-    if len(set(names)) < len(names):  # plain collections number their meshes within each class
-        entries = [Entry(e.path, f"{e.label}_{e.name}", e.label, e.split) for e in entries]
+    if _repeated(entries):  # plain collections number their meshes within each class
+        entries = [replace(e, name=f"{e.label}_{e.name}") for e in entries]
+    if _repeated(entries):  # or within each split of it
+        entries = [replace(e, name="_".join(filter(None, (e.label, e.split, e.path.stem)))) for e in entries]
+    twice = _repeated(entries)
+    if twice:
+        first, second, *_ = (entry.path for entry in entries if entry.name == twice)
+        raise DatasetError(f"{first} and {second} would both be called {twice}; rename one of them")
     return sorted(entries, key=lambda e: (e.label, e.split != "train", e.name))
+
+
+def _repeated(entries: list[Entry]) -> str | None:
+    """A name that two of them have."""
+    names = sorted(entry.name for entry in entries)
+    return next((name for name, other in pairwise(names) if name == other), None)

@@ -1,4 +1,4 @@
-"""One run at a time on what is being written."""
+"""One run at a time on what is being written, and one sentence if it cannot be."""
 
 from __future__ import annotations
 
@@ -36,3 +36,17 @@ def only_one(path: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn what the disk says against writing into a sentence.
+
+    Raises:
+        DatasetError: ``path`` cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DatasetError(f"{path}: cannot be written ({reason}); what is done is kept, run again to go on") from None

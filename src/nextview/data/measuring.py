@@ -7,11 +7,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 
-from nextview.data.lock import only_one
+from nextview.data.lock import only_one, writing
 from nextview.data.pool import WorkerDied, each
-from nextview.data.rendering import writing
 from nextview.data.store import DEPTH_UNIT, ViewStore
 from nextview.errors import DatasetError
 from nextview.measures.registry import MEASURES
@@ -42,8 +42,7 @@ def measure(
             raise DatasetError(f"no measure is called {name!r}; there are {', '.join(MEASURES)}")
     store = ViewStore.open(path)
     store.array("depth")  # says if it is missing, before anything is begun
-    v = len(store.sphere)
-    yield from keep(path, {f"measures/{n}": (v,) for n in names}, partial(_measure, tuple(names)), workers, scheduler)
+    yield from keep(path, [f"measures/{name}" for name in names], partial(_measure, tuple(names)), workers, scheduler)
 
 
 def _measure(names: tuple[str, ...], store: ViewStore, i: int) -> dict[str, NDArray[np.float32]]:
@@ -53,16 +52,16 @@ def _measure(names: tuple[str, ...], store: ViewStore, i: int) -> dict[str, NDAr
 
 def keep(
     path: Path,
-    shapes: dict[str, tuple[int, ...]],
+    names: Sequence[str],
     function: Callable[[ViewStore, int], dict[str, NDArray[np.float32]]],
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, int]]:
-    """Call ``function(store, i)`` for the objects that lack one of the arrays, and keep what it returns, by array.
+    """Call ``function(store, i)`` for the objects that lack a sound row of the arrays, and keep what it returns.
 
     Args:
         path: the store.
-        shapes: of the arrays for one object; new ones hold NaN where nothing is kept.
+        names: of the arrays; one that is missing or cannot be opened is made.
         function: returns one array of finite numbers for each name.
         workers: processes; one for each core by default; 0 to work in this one.
         scheduler: address of a dask.distributed scheduler, to use instead.
@@ -76,13 +75,15 @@ def keep(
     with only_one(path), writing(path):
         store = ViewStore.open(path.absolute())
         done = np.flatnonzero(store.done)
-        for name, shape in shapes.items():
-            if name not in store.group:
-                store.add(name, shape, "float32", fill=float("nan"))
-        lacking = np.zeros(len(done), bool)
-        for name in shapes:
-            lacking |= np.isnan(store.array(name)[:].reshape(len(store), -1)[done]).any(1)
-        items = [int(i) for i in done[lacking]]
+        for name in names:
+            if not store.sound(name):
+                store.add(name)
+        lacking: set[int] = set()
+        for name in names:
+            values, wrong = store.scan(name, done.tolist())
+            blank = np.isnan(values.reshape(len(store), -1)[done]).any(1)
+            lacking |= {*wrong, *done[blank].tolist()}  # what is damaged is made anew
+        items = sorted(lacking)
         yield len(done) - len(items), len(done)
         finished = len(done) - len(items)
         for i, died in each(partial(_keep_object, store.path, function), items, workers, scheduler):
@@ -94,5 +95,7 @@ def keep(
 
 def _keep_object(path: Path, function: Callable[[ViewStore, int], dict[str, NDArray[np.float32]]], i: int) -> None:
     store = ViewStore.open(path)
-    for name, values in function(store, i).items():
-        store.group[name][i] = values
+    found = function(store, i)
+    with zarr.config.set({"array.write_empty_chunks": True}):  # zeros too: an object without a chunk is a damaged one
+        for name, values in found.items():
+            store.group[name][i] = values

@@ -15,7 +15,7 @@ from multiprocessing import resource_tracker
 from types import FrameType
 from typing import TypeVar
 
-from nextview.errors import DatasetError
+from nextview.errors import DatasetError, UsageError
 
 PATIENCE = "10s"
 """How long a scheduler may take to answer."""
@@ -26,6 +26,19 @@ Result = TypeVar("Result")
 
 class WorkerDied(Exception):
     """The process that worked on an item was killed, or crashed, again when it worked on that item alone."""
+
+
+def count(workers: int | None) -> int:
+    """How many processes are meant: one for each core by default.
+
+    Raises:
+        UsageError: fewer than none.
+    """
+    if workers is None:
+        return os.cpu_count() or 1
+    if workers < 0:
+        raise UsageError(f"there cannot be {workers} workers")
+    return workers
 
 
 def each(
@@ -46,15 +59,16 @@ def each(
         scheduler: address of a dask.distributed scheduler, to use its workers instead of this machine's cores.
 
     Raises:
+        UsageError: fewer than no workers.
         DatasetError: the scheduler cannot be reached, or dask.distributed is not installed.
     """
     if scheduler is not None:
         yield from _on_cluster(function, items, scheduler)
         return
+    workers = count(workers)
     if workers == 0:
         yield from ((item, function(item)) for item in items)
         return
-    workers = workers or os.cpu_count() or 1
     waiting = list(items)
     while waiting:
         finished = set()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -14,16 +15,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.belief import Calibration
-from nextview.data.input_views import input_views
-from nextview.data.lock import only_one
+from nextview.command_line import command_line
+from nextview.data.lock import only_one, writing
 from nextview.data.pool import WorkerDied, each
 from nextview.data.predictions import Predictions
 from nextview.data.splits import duplicate_groups
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, PredictionsError
-from nextview.models.inference import MapNetwork, Recogniser, knows_sphere, size_evidence
-from nextview.models.model_card import Card
+from nextview.models.inference import MAPS, MapNetwork, Recogniser
+from nextview.models.model_card import BUNDLED, ModelCard
+from nextview.models.network_input import from_store
 from nextview.outputs import check_file, written_whole
 from nextview.viewsphere import ViewSphere
 
@@ -42,10 +43,10 @@ def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
 def predict(
     path: Path,
     out: Path,
-    recognisers: Sequence[Card],
-    maps: dict[str, Card],
+    recognisers: Sequence[ModelCard],
+    maps: dict[str, ModelCard],
     split: str | None = None,
-    unseen: bool = False,
+    held_out: bool = False,
     size: bool = True,
     batch: int = 8,
     workers: int | None = None,
@@ -58,11 +59,11 @@ def predict(
     Args:
         path: the view store.
         out: the .npz file to make.
-        recognisers: cards; each object is judged by the first of them, or see ``unseen``.
+        recognisers: cards; each object is judged by the first of them, or see ``held_out``.
         maps: card of the network for each map.
         split: only this split.
-        unseen: let each object be judged by a recogniser that has not seen it in training, and leave out those that
-            all have seen.
+        held_out: let each object be judged by a recogniser from whose training it was held out, and leave out those
+            that all were trained on.
         size: let the recogniser know how large the objects are, where store and card tell.
         batch: views a call of the networks.
         workers: processes; one for each core by default.
@@ -73,10 +74,11 @@ def predict(
 
     Raises:
         DatasetError: the store holds no such objects, or a class that the recogniser does not know, or another run is
-            writing ``out``.
+            writing ``out``, or it cannot be written.
         PredictionsError: ``out`` is there and comes from another store or other models, or an object kills its process.
             Where it comes from the same, only what the cards say beside the networks (valley classes, sizes,
-            calibration) is brought up to date. Or what lies in the folder beside it is not of such a run.
+            calibration) and the place of the store are brought up to date. Or what lies in the folder beside it is not
+            of such a run.
         ResultsError: ``out`` cannot be written.
     """
     check_file(out)
@@ -84,31 +86,44 @@ def predict(
     chosen = np.flatnonzero(store.done & (True if split is None else store.splits == split))
     if len(chosen) == 0:
         raise DatasetError(f"{path}: holds no rendered object" + (f" of the split {split!r}" if split else ""))
-    judge = judges(recognisers, [store.names[i] for i in chosen]) if unseen else np.zeros(len(chosen), np.int64)
+    judge = judges(recognisers, [store.names[i] for i in chosen]) if held_out else np.zeros(len(chosen), np.int64)
     chosen, judge = chosen[judge >= 0], judge[judge >= 0]
     if len(chosen) == 0:
-        raise DatasetError(f"{path}: holds no object that one of these recognisers has not seen in training")
+        raise DatasetError(f"{path}: holds no object that was held out from the training of one of these recognisers")
     recogniser = recognisers[0]
-    classes = tuple(recogniser.facts["classes"])
+    classes = recogniser.classes
     unknown = sorted({store.classes[label] for label in store.labels[chosen]} - set(classes))
     if unknown:
         raise DatasetError(f"{path}: recogniser {recogniser.name} does not know the class {unknown[0]!r}")
     names = tuple(store.names[i] for i in chosen)
     models = {"recogniser": identity(recognisers), **{name: identity([card]) for name, card in maps.items()}}
-    valleys = {name: tuple(card.facts.get("valley_classes", ())) for name, card in maps.items()}
-    calibration = Calibration.of_facts(recogniser.facts.get("calibration"))
+    valleys = {name: card.valley_classes for name, card in maps.items()}
+    calibration = recogniser.calibration
+    own = [card for card in (*recognisers, *maps.values()) if card.path.parent != BUNDLED]
+    commands = tuple(
+        dict.fromkeys(
+            (
+                *store.commands,
+                *(line for card in own for line in card.training.commands),
+                _command(path, out, recognisers, maps, split, held_out, size),
+            )
+        )
+    )
     entropy = store.measure()[chosen]  # differs where the views do
     of_size = sizes_say(store, chosen, recognisers, judge) if size else None
     if out.exists():
         there = Predictions.load(out)
         if (there.names, there.models) != (names, models) or not np.array_equal(there.depth_entropy, entropy):
             raise PredictionsError(f"{out}: was made from other objects or models; give another name or remove it")
-        renewed = (valleys, calibration, None if of_size is None else of_size.tobytes())
-        known = (there.valley_classes, there.calibration, None if there.of_size is None else there.of_size.tobytes())
+        renewed = (valleys, calibration, str(path.resolve()), None if of_size is None else of_size.tobytes())
+        size_there = None if there.of_size is None else there.of_size.tobytes()
+        known = (there.valley_classes, there.calibration, there.store, size_there)
         if renewed != known:
             seen = there.by_shape()
             logits = seen.logits if of_size is None else seen.logits + of_size[:, None]
-            replace(seen, logits=logits, of_size=of_size, valley_classes=valleys, calibration=calibration).save(out)
+            fresh = replace(seen, logits=logits, of_size=of_size, valley_classes=valleys, calibration=calibration)
+            with writing(out):
+                replace(fresh, store=str(path.resolve())).save(out)
         yield len(names), len(names)
         return
 
@@ -116,11 +131,12 @@ def predict(
     with only_one(out):
         n, v = len(chosen), len(store.sphere)
         windows = {name: shape for kind, card in maps.items() for name, shape in map_shapes(kind, card, store.sphere)}
-        azimuth_bins = recogniser.facts.get("azimuth_bins", 0)
+        azimuth_bins = recogniser.azimuth_bins
         optional = {"azimuth_bins": (n, v, len(classes), azimuth_bins)} if azimuth_bins else {}
         maps_of = {f"map_{name}": (n, v, *shape) for name, shape in windows.items()}
         shapes = {"logits": (n, v, len(classes)), **optional, **maps_of}
-        arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
+        with writing(out):
+            arrays = _begin(out.with_name(out.name + ".part"), recipe, shapes)
         # Logits are written last: an object counts as done when none of its logits is the NaN that the file began with.
         todo = np.flatnonzero(np.isnan(arrays["logits"]).any((1, 2)))
         total = n - len(todo)
@@ -141,7 +157,7 @@ def predict(
             yield total, n
 
         seen_logits = np.array(arrays["logits"])
-        Predictions(
+        predictions = Predictions(
             seen_logits if of_size is None else seen_logits + of_size[:, None],
             {name: np.array(arrays[f"map_{name}"]) for name in windows},
             entropy,
@@ -156,51 +172,76 @@ def predict(
             calibration,
             np.array(arrays["azimuth_bins"]) if azimuth_bins else None,
             of_size,
-        ).save(out)
+            str(path.resolve()),
+            commands,
+        )
+        with writing(out):
+            predictions.save(out)
         _end(out.with_name(out.name + ".part"), shapes)
 
 
+def _command(
+    path: Path,
+    out: Path,
+    recognisers: Sequence[ModelCard],
+    maps: dict[str, ModelCard],
+    split: str | None,
+    held_out: bool,
+    size: bool,
+) -> str:
+    """The command that makes these predictions."""
+
+    def place(card: ModelCard) -> str:
+        return card.name if card.path.parent == BUNDLED else str(card.path.with_suffix(".json"))
+
+    named = [name if place(card) == MAPS.get(name) else f"{name}={place(card)}" for name, card in maps.items()]
+    judges = tuple(place(card) for card in recognisers)
+    options = {"split": split, "held_out": held_out, "recogniser": judges, "by_shape": not size}
+    line = command_line("predict", path, out, **options)
+    return " ".join([line, "--maps", *map(shlex.quote, named)])
+
+
 def sizes_say(
-    store: ViewStore, chosen: NDArray[np.int64], recognisers: Sequence[Card], judge: NDArray[np.int64]
+    store: ViewStore, chosen: NDArray[np.int64], recognisers: Sequence[ModelCard], judge: NDArray[np.int64]
 ) -> NDArray[np.float32] | None:
     """What the sizes of the chosen objects say of their class to the recognisers that judge them, (N, C) float32.
 
     None if no recogniser knows of sizes, or the store of none.
     """
     radii = store.radii[chosen]
-    found = [size_evidence(card) for card in recognisers]
+    found = [card.size for card in recognisers]
     if np.isnan(radii).all() or all(evidence is None for evidence in found):
         return None
-    found_evidence = np.zeros((len(chosen), len(recognisers[0].facts["classes"])), np.float32)
+    found_evidence = np.zeros((len(chosen), len(recognisers[0].classes)), np.float32)
     for j, evidence in enumerate(found):
         if evidence is not None:
             found_evidence[judge == j] = evidence.logits(radii[judge == j])
     return found_evidence
 
 
-def map_shapes(name: str, card: Card, sphere: ViewSphere) -> list[tuple[str, tuple[int, int]]]:
+def map_shapes(name: str, card: ModelCard, sphere: ViewSphere) -> list[tuple[str, tuple[int, int]]]:
     """Names and shapes of what a map network says of a view: its window and, if it knows it, its sphere."""
     window = (name, (sphere.rings, 3))
-    return [window, (f"{name}-sphere", (sphere.rings, sphere.azimuths))] if knows_sphere(card) else [window]
+    return [window, (f"{name}-sphere", (sphere.rings, sphere.azimuths))] if card.output == "sphere" else [window]
 
 
-def judges(recognisers: Sequence[Card], names: Sequence[str]) -> NDArray[np.int64]:
-    """Which recogniser judges each object: the first that has not seen it in training; -1 for none.
+def judges(recognisers: Sequence[ModelCard], names: Sequence[str]) -> NDArray[np.int64]:
+    """Which recogniser judges each object: the first from whose training it was held out; -1 for none.
 
     Raises:
-        DatasetError: one of them does not say what it has not seen, or they do not know the same classes.
+        DatasetError: one of them does not name what was held out, or they do not know the same classes.
     """
     for card in recognisers:
-        if "unseen" not in card.facts:
-            raise DatasetError(f"recogniser {card.name} does not say which objects it has not seen in training")
+        if not card.held_out:
+            raise DatasetError(f"recogniser {card.name} does not name the objects that were held out from its training")
         for what in ("classes", "azimuth_bins"):
-            if card.facts.get(what) != recognisers[0].facts.get(what):
+            if getattr(card, what) != getattr(recognisers[0], what):
                 raise DatasetError(f"recognisers {recognisers[0].name} and {card.name} do not know the same {what}")
-    unseen = np.array([np.isin(names, card.facts["unseen"]) for card in recognisers])
-    return np.where(unseen.any(0), unseen.argmax(0), -1)
+    held_out = np.array([np.isin(names, card.held_out) for card in recognisers])
+    return np.where(held_out.any(0), held_out.argmax(0), -1)
 
 
-def identity(cards: Sequence[Card]) -> tuple[str, str]:
+def identity(cards: Sequence[ModelCard]) -> tuple[str, str]:
     """Name and SHA-256 of a model; of several together, their names and the hash of their hashes."""
     if len(cards) == 1:
         return cards[0].name, cards[0].sha256
@@ -218,7 +259,9 @@ def _begin(part: Path, recipe: dict, shapes: dict[str, tuple[int, ...]]) -> dict
         with written_whole(part) as begun:
             begun.mkdir()
             for name, shape in shapes.items():
-                np.lib.format.open_memmap(begun / f"{name}.npy", "w+", np.float32, shape)[:] = np.nan
+                array = np.lib.format.open_memmap(begun / f"{name}.npy", "w+", np.float32, shape)
+                _claim(begun / f"{name}.npy")
+                array[:] = np.nan
             (begun / RECIPE).write_text(json.dumps(recipe))
     try:
         same = not part.is_symlink() and json.loads((part / RECIPE).read_bytes()) == recipe
@@ -242,6 +285,17 @@ def _end(part: Path, names: Iterable[str]) -> None:
         part.rmdir()
 
 
+def _claim(file: Path) -> None:
+    """Have the disk set aside room for a file with holes: one that fills later would kill whoever writes through a map.
+
+    Raises:
+        OSError: there is not that much room.
+    """
+    if hasattr(os, "posix_fallocate"):
+        with file.open("r+b") as whole:
+            os.posix_fallocate(whole.fileno(), 0, file.stat().st_size)
+
+
 @lru_cache(maxsize=1)
 def _open(
     path: Path, recognisers: tuple[Path, ...], maps: tuple[tuple[str, Path], ...]
@@ -258,16 +312,17 @@ def _predict_object(
     i, judge = item
     store, names_it, networks = _open(path, recognisers, maps)
     recogniser = names_it[judge]
-    seen = {what: input_views(store, i, *what) for what in {recogniser.sees} | {n.sees for n in networks.values()}}
+    specs = {recogniser.card.input} | {network.card.input for network in networks.values()}
+    inputs = {spec: from_store(spec, store, i) for spec in specs}
     parts = [slice(start, start + batch) for start in range(0, len(store.sphere), batch)]
     found = {}
     for name, network in networks.items():
-        found_evidence = [network.from_inputs(seen[network.sees][p]) for p in parts]
+        found_evidence = [network.from_inputs(inputs[network.card.input][p]) for p in parts]
         for kind in found_evidence[0]:
             found[f"map_{name}{kind.removeprefix(network.card.kind)}"] = np.concatenate(
                 [part[kind] for part in found_evidence]
             )
-    answers = [recogniser.from_inputs(seen[recogniser.sees][p]) for p in parts]
+    answers = [recogniser.from_inputs(inputs[recogniser.card.input][p]) for p in parts]
     if all(found_evidence.azimuth_bins is not None for found_evidence in answers):
         found["azimuth_bins"] = np.concatenate([found_evidence.azimuth_bins for found_evidence in answers])
     return {**found, "logits": np.concatenate([found_evidence.logits for found_evidence in answers])}

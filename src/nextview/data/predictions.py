@@ -50,6 +50,9 @@ class Predictions:
             ``Evidence``; None if it cannot tell them.
         of_size: what the size of the object has added to the logits of each of its views, (N, C) float32; None if the
             recogniser knows nothing of sizes.
+        store: absolute path of the view store they were made from; empty if it is not known. ``depth_entropy`` tells
+            whether what lies there is still the same.
+        commands: all that made them, in order, from the meshes on; () if that is not known.
 
     Raises:
         PredictionsError: shapes that do not fit, nothing inside, or a number that is not finite.
@@ -69,6 +72,8 @@ class Predictions:
     calibration: Calibration = PLAIN_SUM
     azimuth_bins: NDArray[np.float32] | None = None
     of_size: NDArray[np.float32] | None = None
+    store: str = ""
+    commands: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n, v, c = len(self.names), len(self.sphere), len(self.classes)
@@ -154,7 +159,8 @@ class Predictions:
             "elevations": np.array(self.sphere.elevations),
             "azimuths": self.sphere.azimuths,
             "distance": self.sphere.distance,
-            "calibration": np.array(json.dumps(self.calibration.facts())),
+            "calibration": np.array(json.dumps(self.calibration.to_dict())),
+            "store": np.array(self.store),
             "models": np.array([(kind, *model) for kind, model in self.models.items()]).reshape(-1, 3),
         }
         arrays |= {f"map/{name}": values for name, values in self.maps.items()}
@@ -163,6 +169,8 @@ class Predictions:
             arrays["azimuth_bins"] = self.azimuth_bins
         if self.of_size is not None:
             arrays["of_size"] = self.of_size
+        if self.commands:
+            arrays["commands"] = np.array(self.commands)
         with written_whole(path) as part, part.open("wb") as file:
             np.savez_compressed(file, **arrays)
 
@@ -202,9 +210,11 @@ class Predictions:
                 ViewSphere(tuple(f["elevations"].tolist()), int(f["azimuths"]), float(f["distance"])),
                 {kind: (name, sha) for kind, name, sha in f["models"].tolist()},
                 {name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
-                Calibration.of_facts(json.loads(str(f["calibration"])) if "calibration" in f else None),
+                Calibration.from_dict(json.loads(str(f["calibration"]))) if "calibration" in f else PLAIN_SUM,
                 f.get("azimuth_bins"),
                 f.get("of_size"),
+                str(f.get("store", "")),
+                tuple(f["commands"].tolist()) if "commands" in f else (),
             )
         except KeyError as error:
             raise PredictionsError(f"{path}: {error.args[0]}") from None

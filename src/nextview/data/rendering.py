@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -17,15 +16,20 @@ from numpy.typing import NDArray
 
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.cloud import POINTS
+from nextview.command_line import command_line
+from nextview.data.attributes import restored, validate
 from nextview.data.folders import Entry, list_dataset
-from nextview.data.lock import only_one
-from nextview.data.pool import each
-from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, RENDERED, ViewStore
-from nextview.errors import DatasetError, MeshError
+from nextview.data.lock import only_one, writing
+from nextview.data.pool import count, each
+from nextview.data.store import DEPTH_UNIT, DIGEST, DONE, FAILED, POINT_UNIT, RENDERED, ViewStore, digest
+from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.mesh import Mesh, load_mesh, make_mesh
 from nextview.mesh_format import MAX_FACES
-from nextview.viewsphere import ViewSphere
+from nextview.viewsphere import LAYOUTS, ViewSphere
+
+LARGEST_CHUNK = 2**31 - 2**20
+"""Bytes that may be compressed at once, the compressor's own included."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +39,17 @@ class Deform:
     Attributes:
         stretch: each axis is scaled by a factor drawn log-uniformly from 1/(1 + stretch) to 1 + stretch.
         turn: whether to turn about z.
+
+    Raises:
+        UsageError: a stretch that is negative or not finite.
     """
 
     stretch: float = 0.0
     turn: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.stretch < np.inf:
+            raise UsageError(f"a stretch is a finite number that is not negative, not {self.stretch}")
 
     def draw(self, seed: int, name: str) -> tuple[NDArray[np.float64], float]:
         """The factors of the three axes, (3,), and the angle, radians, of the object of that name."""
@@ -64,7 +75,7 @@ def render_object(mesh: Mesh, sphere: ViewSphere, size: int) -> dict[str, np.nda
     for view, pose in enumerate(sphere.poses):
         observation = camera.observe(pose)
         image[view], points[view] = observation.picture, observation.points
-        depth[view] = np.rint(observation.depth / DEPTH_UNIT)
+        depth[view] = np.rint(observation.depth / DEPTH_UNIT).clip(max=np.iinfo(np.uint16).max)
     return {
         "image": image,
         "depth": depth,
@@ -110,8 +121,17 @@ def render(
     Raises:
         DatasetError: the dataset is unusable, the viewpoints are too far, the store was begun from another dataset or
             with other settings or lacks an array, another run is writing it, or it cannot be written.
+        UsageError: a size, a seed or a number of workers that makes no sense.
     """
     entries = [e for e in list_dataset(dataset.absolute()) if split in (None, e.split)]
+    if not entries:
+        raise DatasetError(f"{dataset}: no meshes in CLASS/{split}/MESH below it")
+    if not (size > 0 and 2 * len(sphere) * size**2 < LARGEST_CHUNK):
+        most = int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere)))
+        raise UsageError(f"the size of {len(sphere)} views is from 1 to {most} pixels, not {size}")
+    count(workers)  # says if that makes no sense
+    if seed < 0:
+        raise UsageError(f"a seed is not negative, unlike {seed}")
     deform = deform or Deform()
     farthest = np.iinfo(np.uint16).max * DEPTH_UNIT
     if sphere.distance + 1 > farthest:
@@ -120,7 +140,10 @@ def render(
             f"{farthest - 1:.2f} at most, not {sphere.distance:g}"
         )
     with only_one(path), writing(path):
-        store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit)
+        store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit, dataset.absolute().name)
+        command = _command(dataset, path, sphere, size, seed, deform, split, unit)
+        if command not in store.commands:
+            store.note(commands=[*store.commands, command])
         todo = [int(i) for i in np.flatnonzero(~store.done)]
         # Largest files first, so that no worker is left with a long one at the end.
         todo.sort(key=lambda i: -entries[i].path.stat().st_size)
@@ -128,48 +151,81 @@ def render(
         for (i, entry), reason in each(task, [(i, entries[i]) for i in todo], workers, scheduler):
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is done.
-                store.group.attrs["failures"] = store.failures | {entry.name: f"{reason}"}
+                store.note(failures=store.failures | {entry.name: f"{reason}"})
                 store.group["status"][i] = FAILED
             elif entry.name in store.failures:
-                store.group.attrs["failures"] = {n: r for n, r in store.failures.items() if n != entry.name}
+                store.note(failures={n: r for n, r in store.failures.items() if n != entry.name})
             yield entry.name, None if reason is None else f"{reason}"
+
+
+def _command(
+    dataset: Path,
+    path: Path,
+    sphere: ViewSphere,
+    size: int,
+    seed: int,
+    deform: Deform,
+    split: str | None,
+    unit: str | None,
+) -> str:
+    """The command that renders so; of a sphere that has no name, the part that the command line can say."""
+    names = [name for name in LAYOUTS if LAYOUTS[name].elevations == sphere.elevations]
+    azimuths = None if names and LAYOUTS[names[0]].azimuths == sphere.azimuths else sphere.azimuths
+    return command_line(
+        "render",
+        dataset,
+        path,
+        sphere=names[0] if names else None,
+        azimuths=azimuths,
+        size=size,
+        split=split,
+        stretch=deform.stretch,
+        turn=deform.turn,
+        unit=unit,
+        seed=seed,
+    )
 
 
 def turns(store: ViewStore) -> NDArray[np.float64]:
     """By how much each object of a store was turned about z when it was rendered, radians, (N,)."""
-    facts = store.group.attrs
-    deform = Deform(float(facts.get("stretch", 0.0)), bool(facts.get("turn", False)))
-    return np.array([deform.draw(int(facts.get("seed", 0)), name)[1] for name in store.names])
-
-
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Say what happens to a store when it cannot be written."""
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise DatasetError(f"{path}: cannot be written ({reason}); what is done is kept, run again to go on") from None
+    recipe = store.group.attrs
+    deform = Deform(float(recipe.get("stretch", 0.0)), bool(recipe.get("turn", False)))
+    return np.array([deform.draw(int(recipe.get("seed", 0)), name)[1] for name in store.names])
 
 
 def _begin(
-    path: Path, entries: list[Entry], sphere: ViewSphere, size: int, seed: int, deform: Deform, unit: str | None
+    path: Path,
+    entries: list[Entry],
+    sphere: ViewSphere,
+    size: int,
+    seed: int,
+    deform: Deform,
+    unit: str | None,
+    dataset: str,
 ) -> ViewStore:
     """The store as an earlier run left it, if that had the same meshes and settings, or a new one."""
     with ThreadPoolExecutor() as pool:
         hashes = list(pool.map(_file_hash, [e.path for e in entries]))
     recipe = {"seed": seed, "stretch": deform.stretch, "turn": deform.turn, "sha256": hashes}
     if not path.exists():
-        return ViewStore.create(path, entries, sphere, size, recipe | {"unit": unit})
-    store = ViewStore.open(path)
+        return ViewStore.create(path, entries, sphere, size, recipe | {"unit": unit, "dataset": dataset})
+    if not (path / "zarr.json").exists():
+        raise DatasetError(f"{path}: is there, and is no view store; give another name")
+    store = ViewStore.open(path, damaged=True)
     wanted = {
         "names": [e.name for e in entries],
+        "labels": [e.label for e in entries],
+        "splits": [e.split for e in entries],
         "size": size,
         "elevations": list(sphere.elevations),
         "azimuths": sphere.azimuths,
         "distance": sphere.distance,
         **recipe,
     }
+    try:
+        validate(store.group.attrs)
+    except DatasetError as damage:
+        _restore(store, wanted, unit, damage)
     for key, value in wanted.items():
         if store.group.attrs.get(key, value) != value:
             raise DatasetError(f"{path}: was begun with other {key}; give another store or the same settings")
@@ -177,12 +233,29 @@ def _begin(
     if unit not in (None, known):
         if known is not None:
             raise DatasetError(f"{path}: its meshes are measured in {known}, not {unit}")
-        store.group.attrs["unit"] = unit
+        store.note(unit=unit)
     for name in RENDERED:
         store.array(name)  # says what is missing
+    if not store.sound(DIGEST):
+        store.add(DIGEST)
     for leftover in path.rglob("*.partial"):  # what was being written when a run was killed
         leftover.unlink()
     return store
+
+
+def _restore(store: ViewStore, wanted: dict, unit: str | None, damage: DatasetError) -> None:
+    """Mend damaged attributes from the meshes and the settings.
+
+    Raises:
+        DatasetError: the store was not made with them, as far as one can tell.
+    """
+    mended = restored(store.group.attrs.asdict(), wanted, unit)
+    if mended is None:
+        raise DatasetError(
+            f"{store.path}: zarr.json is damaged ({damage}), and was not begun with these meshes and settings; give "
+            "those that it was begun with, or another store"
+        )
+    store.group.attrs.put(mended)
 
 
 def _file_hash(path: Path) -> str:
@@ -199,7 +272,7 @@ def _arrays(path: Path, run: str) -> dict[str, zarr.Array]:
     # Finding out whether a chunk is worth writing costs more than writing it.
     with zarr.config.set({"array.write_empty_chunks": True}):
         store = ViewStore.open(path)
-        return {name: store.array(name) for name in RENDERED}
+        return {name: store.array(name) for name in (*RENDERED, DIGEST)}
 
 
 def _render_entry(
@@ -224,8 +297,9 @@ def _render_entry(
         return str(error)
     except MemoryError:
         return f"{entry.path}: too large for this machine's memory"
+    rendered["radius"] = np.array(mesh.radius)
     for name, values in rendered.items():
         arrays[name][i] = values
-    arrays["radius"][i] = mesh.radius
+    arrays[DIGEST][i] = digest(entry.name, rendered)
     arrays["status"][i] = DONE  # last, so that an object counts only when it is whole
     return None

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import logging
+import os
+import re
 import shutil
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
+from uuid import uuid4
 
 import numpy as np
 import zarr
@@ -12,6 +21,7 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from nextview.cloud import POINTS
+from nextview.data.attributes import CHECKSUM, checksum, validate
 from nextview.data.folders import Entry
 from nextview.errors import DatasetError
 from nextview.mesh import UNITS
@@ -26,6 +36,21 @@ POINT_UNIT = 1 / 32767
 PENDING, DONE, FAILED = 0, 1, 2
 RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
 """The arrays that rendering makes; others are added later."""
+DIGEST = "digest"
+"""The array of what ``digest`` gives of each object; stores that were begun before there was one have none."""
+_logger = logging.getLogger(__name__)
+
+
+class ChunkError(Exception):
+    """What is wrong with one object's chunk of an array: it is missing, or cannot be read."""
+
+
+def digest(name: str, rows: Mapping[str, NDArray]) -> NDArray[np.uint8]:
+    """SHA-256 of the name of an object and its rows of image, depth, points and radius, as stored, (32,)."""
+    found = hashlib.sha256(name.encode())
+    for array in ("image", "depth", "points", "radius"):
+        found.update(np.ascontiguousarray(rows[array]).data)
+    return np.frombuffer(found.digest(), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -35,9 +60,10 @@ class ViewStore:
     Arrays of the group, sharded by object (axis 0): ``image`` (N, V, S, S) uint8; ``depth`` (N, V, S, S) uint16 in
     DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object frame; ``measures/depth_entropy``
     (N, V) float32, bits, and other measures alike; ``radius`` (N,) float64, of the object in the unit of its mesh file;
-    ``status`` (N,) uint8. Names, labels, splits, the SHA-256 of the mesh files and their unit, what was rendered how,
-    and why meshes were left out are attributes. Chunks carry a checksum, so that a damaged one is noticed when it is
-    read.
+    ``status`` (N,) uint8; ``digest`` (N, 32) uint8, of an object's name and arrays together, see ``digest``. Names,
+    labels, splits, the SHA-256 of the mesh files and their unit, what was rendered how, and why meshes were left out
+    are attributes. They and all chunks carry a checksum, so that damage is noticed when they are read. A chunk that is
+    gone is noticed too: zarr would read its fill value, so every read looks for the file first.
     """
 
     path: Path
@@ -46,35 +72,46 @@ class ViewStore:
     @classmethod
     def create(cls, path: Path, entries: list[Entry], sphere: ViewSphere, size: int, recipe: dict) -> ViewStore:
         """Make an empty store, whole or not at all; ``recipe`` is kept in the attributes as it is (JSON values)."""
-        part = path.with_name(path.name + ".part")
-        shutil.rmtree(part, ignore_errors=True)
-        store = cls(part, zarr.open_group(part, mode="w-"))
-        v = len(sphere)
-        store.group.attrs.update(
-            {
-                "format": FORMAT,
-                "names": [e.name for e in entries],
-                "labels": [e.label for e in entries],
-                "splits": [e.split for e in entries],
-                "elevations": list(sphere.elevations),
-                "azimuths": sphere.azimuths,
-                "distance": sphere.distance,
-                "size": size,
-                "failures": {},
-                **recipe,
-            }
-        )
-        store.add("image", (v, size, size), "uint8")
-        store.add("depth", (v, size, size), "uint16")
-        store.add("points", (v, POINTS, 3), "int16")
-        store.add("measures/depth_entropy", (v,), "float32")
-        store.add("radius", (), "float64", np.nan)
-        store.add("status", (), "uint8")
-        part.rename(path)
+        part = path.with_name(f"{path.name}.{uuid4().hex}.part")  # nobody else's
+        try:
+            cls._fill(part, entries, sphere, size, recipe)
+            part.rename(path)
+        except BaseException:
+            shutil.rmtree(part, ignore_errors=True)
+            raise
         return cls.open(path)
 
-    def add(self, name: str, shape: tuple[int, ...], dtype: str, fill: float = 0) -> None:
-        """Add an array of one ``shape`` for each object."""
+    @classmethod
+    def _fill(cls, path: Path, entries: list[Entry], sphere: ViewSphere, size: int, recipe: dict) -> None:
+        store = cls(path, zarr.open_group(path, mode="w-"))
+        store.note(
+            format=FORMAT,
+            names=[e.name for e in entries],
+            labels=[e.label for e in entries],
+            splits=[e.split for e in entries],
+            elevations=list(sphere.elevations),
+            azimuths=sphere.azimuths,
+            distance=sphere.distance,
+            size=size,
+            failures={},
+            **recipe,
+        )
+        for name in (*RENDERED, DIGEST):
+            store.add(name)
+
+    def note(self, **facts: Any) -> None:
+        """Change attributes, and with them their checksum."""
+        attributes = self.group.attrs.asdict() | facts
+        self.group.attrs.put(attributes | {CHECKSUM: checksum(attributes)})
+
+    def add(self, name: str) -> None:
+        """Add an array, where there is none or one that cannot be opened. Chunks that are there already are kept."""
+        damaged = [self.path / name / "zarr.json"]
+        if "/" in name and not self._opens(name.rpartition("/")[0]):
+            damaged.append(self.path / name.rpartition("/")[0] / "zarr.json")
+        for file in damaged:
+            file.unlink(missing_ok=True)
+        shape, dtype, fill = self._layout(name)
         self.group.create_array(
             name,
             shape=(len(self), *shape),
@@ -84,31 +121,54 @@ class ViewStore:
             compressors=(BloscCodec(cname="zstd", clevel=2, shuffle="shuffle"), Crc32cCodec()),
         )
 
+    def _layout(self, name: str) -> tuple[tuple[int, ...], str, float]:
+        """Shape for one object, type and fill value of an array."""
+        v, size = len(self.sphere), self.group.attrs["size"]
+        layouts = {
+            "image": ((v, size, size), "uint8", 0),
+            "depth": ((v, size, size), "uint16", 0),
+            "points": ((v, POINTS, 3), "int16", 0),
+            "measures/depth_entropy": ((v,), "float32", 0),
+            "radius": ((), "float64", np.nan),
+            "status": ((), "uint8", PENDING),
+            DIGEST: ((32,), "uint8", 0),
+            "correspondence": ((v, v), "float32", np.nan),
+        }
+        return layouts.get(name, ((v,), "float32", np.nan))  # another measure
+
     @classmethod
-    def open(cls, path: str | Path) -> ViewStore:
+    def open(cls, path: str | Path, damaged: bool = False) -> ViewStore:
         """Open a store for reading.
+
+        Args:
+            path: the store.
+            damaged: also if its attributes are not what they have to be, to restore them.
 
         Raises:
             DatasetError: there is none, it is of another format, or damaged.
         """
         path = Path(path)
-        if not (path / "zarr.json").exists():
+        file = path / "zarr.json"
+        if not file.exists():
             raise DatasetError(f"{path}: there is no view store; make one with nextview render")
+        state = file.stat()
         try:
             group = zarr.open_group(path, mode="r+")
         except Exception as error:  # zarr and JSON raise whatever a damaged file makes them raise
             raise DatasetError(f"{path}: zarr.json cannot be read ({error}); copy or render the store again") from None
         if group.attrs.get("format") != FORMAT:
             raise DatasetError(f"{path}: not a view store of format {FORMAT}; render it again")
+        if not damaged:
+            _validate(path, (state.st_ino, state.st_mtime_ns, state.st_size))
         return cls(path, group)
 
     def array(self, name: str) -> zarr.Array:
         """One of the store's arrays.
 
         Raises:
-            DatasetError: it is missing, damaged, or not as long as the store.
+            DatasetError: it is missing, damaged, or not of the store's objects and views.
         """
-        remedy = "copy or render the store again"
+        remedy = f"nextview check {self.path} --repair makes it, and nextview render fills it"
         if name.startswith("measures/"):
             remedy = f"nextview measure {self.path} {name.removeprefix('measures/')} makes it"
         try:
@@ -116,25 +176,100 @@ class ViewStore:
         except KeyError:
             raise DatasetError(f"{self.path}: the array {name} is missing; {remedy}") from None
         except Exception as error:  # zarr and JSON raise whatever a damaged file makes them raise
-            raise DatasetError(f"{self.path}: the array {name} cannot be opened ({error})") from None
-        if array.shape[0] != len(self):
-            raise DatasetError(f"{self.path}: the array {name} is of {array.shape[0]} objects, not {len(self)}")
+            raise DatasetError(f"{self.path}: the array {name} cannot be opened ({error}); {remedy}") from None
+        shape, dtype, _ = self._layout(name)
+        wanted = ((len(self), *shape), (1, *shape), dtype)
+        if not isinstance(array, zarr.Array) or (array.shape, array.chunks, str(array.dtype)) != wanted:
+            raise DatasetError(f"{self.path}: the array {name} is not one of {wanted[0]} {dtype}; {remedy}")
         return array
+
+    def holds(self, name: str) -> bool:
+        """Whether there is an array of that name, be it damaged."""
+        return (self.path / name / "zarr.json").exists()
+
+    def sound(self, name: str) -> bool:
+        """Whether there is an array of that name, of the store's objects and views, and a group that it is in."""
+        try:
+            self.array(name)
+        except DatasetError:
+            return False
+        return "/" not in name or self._opens(name.rpartition("/")[0])
+
+    def _opens(self, group: str) -> bool:
+        try:
+            return isinstance(self.group[group], zarr.Group)
+        except Exception:  # zarr and JSON raise whatever a damaged file makes them raise
+            return False
+
+    def has(self, name: str, i: int) -> bool:
+        """Whether there is anything of object i in one of the arrays."""
+        return _chunk_exists(self.path, self.array(name), i)
+
+    def chunk(self, name: str, i: int) -> NDArray:
+        """What one of the arrays holds of object i, as it is stored.
+
+        Raises:
+            ChunkError: nothing, or it is damaged there.
+            DatasetError: the array is missing.
+        """
+        return _chunk(self.path, self.array(name), i)
 
     def read(self, name: str, i: int) -> NDArray:
         """What one of the arrays holds of object i, as it is stored.
 
         Raises:
-            DatasetError: the array is missing, or damaged there.
+            DatasetError: the array is missing, or lacks the object, or is damaged there.
+        """
+        try:
+            return self.chunk(name, i)
+        except ChunkError as error:
+            raise DatasetError(self._damage(name, i, error)) from None
+
+    def scan(self, name: str, objects: Iterable[int]) -> tuple[NDArray, dict[int, ChunkError]]:
+        """One of the arrays, as it is stored, and what is wrong with its chunks of some objects.
+
+        Args:
+            name: of the array.
+            objects: indices of those that should be there. The rows of others are not looked at, and may hold anything.
+
+        Returns:
+            (N, ...), with the fill value where nothing can be read; and the errors, by object.
+
+        Raises:
+            DatasetError: the array is missing.
         """
         array = self.array(name)
+        wrong = {i: ChunkError("is missing") for i in objects if not _chunk_exists(self.path, array, i)}
         try:
-            return array[i]
-        except Exception as error:  # a damaged chunk raises whatever its codec makes of it
-            raise DatasetError(
-                f"{self.path}: {name} of {self.names[i]} cannot be read ({error}); "
-                "nextview check --repair takes it out, and nextview render makes it anew"
-            ) from None
+            return array[:], wrong
+        except Exception:  # a damaged chunk raises whatever its codec makes of it; find out which it is
+            values = np.full(array.shape, array.fill_value, array.dtype)
+        for i in objects:
+            try:
+                values[i] = _chunk(self.path, array, i)
+            except ChunkError as error:
+                wrong[i] = error
+        return values, wrong
+
+    def rows(self, name: str) -> NDArray:
+        """One of the arrays, as it is stored, (N, ...). Rows of objects that are not rendered may hold anything.
+
+        Raises:
+            DatasetError: the array is missing, or lacks a rendered object, or is damaged there.
+        """
+        values, wrong = self.scan(name, range(len(self)))
+        if wrong:
+            done = self.done
+            for i, error in sorted(wrong.items()):
+                if done[i]:
+                    raise DatasetError(self._damage(name, i, error))
+        return values
+
+    def _damage(self, name: str, i: int, error: ChunkError) -> str:
+        remedy = f"nextview check {self.path} --repair takes the object out, and nextview render makes it anew"
+        if name.startswith("measures/"):
+            remedy = f"nextview measure {self.path} {name.removeprefix('measures/')} makes it"
+        return f"{self.path}: {name} of {self.names[i]} {error}; {remedy}"
 
     def __len__(self) -> int:
         return len(self.names)
@@ -161,6 +296,20 @@ class ViewStore:
         return np.array(self.group.attrs["splits"])
 
     @property
+    def dataset(self) -> str:
+        """What the objects are called together, in lower case: the name of the folder of their meshes.
+
+        That of the store if it was made before this was noted.
+        """
+        name = self.group.attrs.get("dataset") or self.path.stem
+        return re.sub(r"[^a-z0-9_.]+", "-", name.lower()).strip("-") or "objects"
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """That made it, in order; () if it was made before this was noted."""
+        return tuple(self.group.attrs.get("commands", ()))
+
+    @property
     def sphere(self) -> ViewSphere:
         """The viewpoints."""
         a = self.group.attrs
@@ -173,8 +322,23 @@ class ViewStore:
 
     @property
     def done(self) -> NDArray[np.bool_]:
-        """Objects that are rendered, (N,)."""
-        return self.array("status")[:] == DONE
+        """Objects that are rendered, (N,). One whose status cannot be read counts as not rendered; a warning names it.
+
+        A status that is missing is none: it is that of an object not rendered yet.
+        """
+        status, wrong = self._status()
+        if wrong:
+            _warn_of_status(self.path, tuple(self.names[i] for i in wrong))
+        return status == DONE
+
+    @property
+    def doubtful(self) -> list[int]:
+        """Objects whose status cannot be read."""
+        return list(self._status()[1])
+
+    def _status(self) -> tuple[NDArray[np.uint8], dict[int, ChunkError]]:
+        status, wrong = self.scan("status", range(len(self)))
+        return status, {i: error for i, error in wrong.items() if self.has("status", i)}
 
     @property
     def failures(self) -> dict[str, str]:
@@ -187,7 +351,7 @@ class ViewStore:
         unit = self.group.attrs.get("unit")
         if unit is None:
             return np.full(len(self), np.nan)
-        return self.array("radius")[:] * UNITS[unit]
+        return self.rows("radius") * UNITS[unit]
 
     @property
     def duplicates(self) -> list[list[int]]:
@@ -211,13 +375,53 @@ class ViewStore:
 
     def all_points(self) -> NDArray[np.int16]:
         """Clouds of all views of all objects as stored, (N, V, 1024, 3) int16: 240 kB an object."""
-        return self.array("points")[:]
+        return self.rows("points")
 
     @property
     def measures(self) -> list[str]:
         """Names of the view measures it holds, sorted."""
-        return sorted(self.group["measures"]) if "measures" in self.group else []
+        return sorted(file.parent.name for file in self.path.glob("measures/*/zarr.json"))
 
     def measure(self, name: str = "depth_entropy") -> NDArray[np.float32]:
-        """A view measure of all objects, (N, V) float32, NaN where it is not made yet."""
-        return self.array(f"measures/{name}")[:]
+        """A view measure of all objects, (N, V) float32; anything where an object is not rendered.
+
+        Raises:
+            DatasetError: it is not there, or not of every rendered object.
+        """
+        return self.rows(f"measures/{name}")
+
+
+def _chunk_exists(store: Path, array: zarr.Array, i: int) -> bool:
+    """Whether there is a file of object i; its chunk is the only one in its row."""
+    return os.path.exists(f"{store}/{array.path}/{array.metadata.encode_chunk_key((i,) + (0,) * (array.ndim - 1))}")
+
+
+def _chunk(store: Path, array: zarr.Array, i: int) -> NDArray:
+    if not _chunk_exists(store, array, i):
+        raise ChunkError("is missing")
+    try:
+        return array[i]
+    except Exception as error:  # a damaged chunk raises whatever its codec makes of it
+        raise ChunkError(f"cannot be read ({error})") from None
+
+
+@lru_cache  # a process opens a store often, and thousands of names take longer than what it wants there
+def _validate(path: Path, state: tuple[int, int, int]) -> None:
+    """Validate the attributes of a store, once for each state of their file (inode, time, bytes)."""
+    try:
+        validate(json.loads((path / "zarr.json").read_bytes())["attributes"])
+    except DatasetError as error:
+        raise DatasetError(
+            f"{path}: zarr.json is damaged ({error}); nextview render restores it, with the meshes and the settings "
+            "that the store was made with"
+        ) from None
+
+
+@lru_cache  # once for each process: many things ask which objects are done
+def _warn_of_status(path: Path, names: tuple[str, ...]) -> None:
+    some = ", ".join(names[:3]) + (f" and {len(names) - 3} others" if len(names) > 3 else "")
+    _logger.warning(
+        "nextview: %s: the status of %s cannot be read, so it counts as not rendered; nextview render makes it anew",
+        path,
+        some,
+    )

@@ -11,14 +11,10 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from nextview.belief import Calibration
-from nextview.errors import ModelError, ObservationError
-from nextview.models.cloud_input import cloud_input
-from nextview.models.geometry_input import geometry_input
-from nextview.models.image_input import image_input
-from nextview.models.model_card import Card, find_card
-from nextview.models.onnx_file import open_onnx
-from nextview.models.size_evidence import SizeEvidence
+from nextview.errors import ModelError
+from nextview.models.model_card import ModelCard, find_card
+from nextview.models.network_input import from_observations
+from nextview.models.onnx_file import check_end, open_onnx
 from nextview.observation import Observation
 from nextview.policies.base import Evidence, maps_among
 
@@ -28,72 +24,34 @@ BINS_OUTPUT = "sides"
 MAPS = {"lem": "lem-modelnet10", "lcm": "lcm-modelnet10"}
 
 
-def open_weights(card: Card, threads: int = 0) -> ort.InferenceSession:
-    """Check a model's hash and hand it to ONNX Runtime.
+def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
+    """Check a model's file against its card and hand it to ONNX Runtime.
 
     Args:
         card: the model.
         threads: of ONNX Runtime, 0 for one on each core.
 
     Raises:
-        ModelError: the file is not the one that the card describes, or ONNX Runtime refuses it.
+        ModelError: the file is not the one that the card describes, has other inputs or outputs, or ONNX Runtime
+            refuses it.
     """
-    try:
-        return open_onnx(card.path, card.sha256, threads)
-    except ModelError as error:
-        raise ModelError(str(error)) from None
-
-
-def sight(card: Card) -> tuple[str, int]:
-    """What a network sees, "geometry", "image" or "cloud", and the side of its image in pixels, 0 for clouds.
-
-    Cards that do not say it are of the first recognisers, which see geometry, and of the first maps, which see clouds.
-    """
-    return card.facts.get("sees", "geometry" if card.kind == "recogniser" else "cloud"), card.facts.get("input_size", 0)
-
-
-def knows_sphere(card: Card) -> bool:
-    """Whether a map network predicts all views of the sphere, not those of the local window alone."""
-    return card.facts.get("around") == "sphere"
-
-
-def see(observations: Sequence[Observation], sees: str, size: int) -> NDArray[Any]:
-    """What a network sees of views from one camera.
-
-    Args:
-        observations: B views.
-        sees: "geometry", "image" or "cloud".
-        size: side of the network's image, pixels; clouds have none.
-
-    Returns:
-        Geometry (B, 4, size, size) or image (B, 1, size, size), uint8; or clouds (B, 1024, 3) float32.
-
-    Raises:
-        ObservationError: they are not from one camera, or their image does not suit the network.
-    """
-    first = observations[0]
-    for other in observations[1:]:
-        if other.depth.shape != first.depth.shape or not np.array_equal(other.intrinsics, first.intrinsics):
-            raise ObservationError("views that are handed in together are from one camera: of one size and one pinhole")
-    poses = np.stack([o.pose for o in observations])
-    if sees == "cloud":
-        return cloud_input(np.stack([o.points for o in observations]), poses)
-    if sees == "image":
-        return image_input(np.stack([o.picture for o in observations]), size)
-    return geometry_input(np.stack([o.depth for o in observations]), poses, first.intrinsics, size)
-
-
-def size_evidence(card: Card) -> SizeEvidence | None:
-    """What a recogniser's card says of sizes; None if nothing.
-
-    Raises:
-        ModelError: it makes no sense.
-    """
-    facts = card.facts.get("size")
-    try:
-        return None if facts is None else SizeEvidence.of_facts(facts, len(card.facts["classes"]))
-    except ValueError as error:
-        raise ModelError(f"{card.path.with_suffix('.json')}: {error}") from None
+    session = open_onnx(card.path, card.sha256, threads)
+    kind = "tensor(float)" if card.input.kind == "cloud" else "tensor(uint8)"
+    ends = {end.name: end for end in session.get_outputs()}
+    shapes: dict[str, tuple[int | None, ...]]
+    if card.is_recogniser:
+        shapes = {"logits": (len(card.classes),)}
+        if card.azimuth_bins:
+            shapes[BINS_OUTPUT] = (len(card.classes), card.azimuth_bins)
+    else:
+        shapes = {"map": (None, 3)} | ({"sphere": (None, None)} if card.output == "sphere" else {})
+    for end in session.get_inputs():
+        check_end(card.path, end, kind, card.input.shape)
+    for name, shape in shapes.items():
+        if name not in ends:
+            raise ModelError(f"{card.path}: gives no {name}, which its card promises")
+        check_end(card.path, ends[name], "tensor(float)", shape)
+    return session
 
 
 class Recogniser:
@@ -108,16 +66,11 @@ class Recogniser:
 
     def __init__(self, model: str | Path = RECOGNISER, threads: int = 0) -> None:
         self.card = find_card(model)
-        if self.card.kind != "recogniser":
+        if not self.card.is_recogniser:
             raise ModelError(f"model {self.card.name} is a {self.card.kind}, not a recogniser")
-        self.classes: tuple[str, ...] = tuple(self.card.facts["classes"])
-        self.sees = sight(self.card)
-        self.azimuth_bins: int = self.card.facts.get("azimuth_bins", 0)
-        self._size = size_evidence(self.card)
-        try:
-            self.calibration = Calibration.of_facts(self.card.facts.get("calibration"))
-        except ValueError as error:
-            raise ModelError(f"{self.card.path.with_suffix('.json')}: {error}") from None
+        self.classes = self.card.classes
+        self.azimuth_bins = self.card.azimuth_bins
+        self.calibration = self.card.calibration
         self._session = open_weights(self.card, threads)
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
@@ -125,16 +78,15 @@ class Recogniser:
 
         Views in which nothing is seen are marked and carry none, see ``Evidence.seen``.
         """
-        evidence = replace(
-            self.from_inputs(see(observations, *self.sees)), seen=np.array([o.seen for o in observations])
-        )
-        if self._size is None:
+        inputs = from_observations(self.card.input, observations)
+        evidence = replace(self.from_inputs(inputs), seen=np.array([o.seen for o in observations]))
+        if self.card.size is None:
             return evidence
         radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
-        return replace(evidence, logits=evidence.logits + self._size.logits(radii))
+        return replace(evidence, logits=evidence.logits + self.card.size.logits(radii))
 
     def from_inputs(self, inputs: NDArray[Any]) -> Evidence:
-        """The same by what is seen alone, see ``see``."""
+        """The same by what is seen alone, see ``network_input``."""
         logits, *azimuth_bins = self._session.run(
             ["logits", BINS_OUTPUT] if self.azimuth_bins else ["logits"], {"input": inputs}
         )
@@ -151,10 +103,9 @@ class MapNetwork:
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:
         self.card = find_card(model)
-        if self.card.kind == "recogniser":
+        if self.card.is_recogniser:
             raise ModelError(f"model {self.card.name} is a recogniser, not a map network")
-        self.sees = sight(self.card)
-        self.valley_classes: tuple[str, ...] = tuple(self.card.facts.get("valley_classes", ()))
+        self.valley_classes = self.card.valley_classes
         self._session = open_weights(self.card, threads)
 
     def __call__(self, observations: Sequence[Observation]) -> dict[str, NDArray[np.float32]]:
@@ -163,12 +114,14 @@ class MapNetwork:
         The local one, (B, rings, 3), columns azimuth -1, 0, +1, has the name of the card's kind ("lem"). If the network
         knows it, that of the sphere, (B, rings, azimuths), columns azimuth 0, 1, ... from here, is NAME-sphere.
         """
-        return self.from_inputs(see(observations, *self.sees))
+        return self.from_inputs(from_observations(self.card.input, observations))
 
-    def from_inputs(self, seen: NDArray[Any]) -> dict[str, NDArray[np.float32]]:
-        """The same from what is seen, see ``see``."""
-        names = {"map": self.card.kind} | ({"sphere": f"{self.card.kind}-sphere"} if knows_sphere(self.card) else {})
-        found = self._session.run(list(names), {self._session.get_inputs()[0].name: seen})
+    def from_inputs(self, inputs: NDArray[Any]) -> dict[str, NDArray[np.float32]]:
+        """The same from what the network takes, see ``network_input``."""
+        names = {"map": self.card.kind} | (
+            {"sphere": f"{self.card.kind}-sphere"} if self.card.output == "sphere" else {}
+        )
+        found = self._session.run(list(names), {self._session.get_inputs()[0].name: inputs})
         return dict(zip(names.values(), found, strict=True))
 
 

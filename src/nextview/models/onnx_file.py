@@ -34,3 +34,23 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> ort.InferenceSession
         return ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the runtime has a class of exception for every reason
         raise ModelError(f"{path}: not a usable ONNX model ({str(error).splitlines()[0]})") from None
+
+
+def check_end(path: Path, end: ort.NodeArg, kind: str, shape: tuple[int | None, ...]) -> None:
+    """Refuse a network of which an input or output is not of this type and shape, after a batch dimension that is free.
+
+    Args:
+        path: of the network.
+        end: the input or output.
+        kind: of its numbers, as ONNX Runtime writes it: "tensor(float)".
+        shape: without the batch; None for a size that is free.
+
+    Raises:
+        ModelError: it is another.
+    """
+    found = end.shape[1:]
+    fits = len(end.shape) == len(shape) + 1 and all(w in (None, f) for w, f in zip(shape, found, strict=True))
+    if not fits or end.type != kind or isinstance(end.shape[0], int):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        there = ", ".join(map(str, end.shape))
+        raise ModelError(f"{path}: has {end.name} ({there}) {end.type}, not (batch, {wanted}) {kind} as its card says")

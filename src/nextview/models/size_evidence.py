@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import ModelError
+from nextview.json_file import Fields
 
 Float = NDArray[np.float64]
 
@@ -53,23 +53,20 @@ class SizeEvidence:
         return np.where(np.isfinite(radii)[:, None], self.weight * found, 0).astype(np.float32)
 
     @classmethod
-    def of_facts(cls, facts: Mapping[str, Any], classes: int) -> SizeEvidence:
+    def from_dict(cls, values: Any) -> SizeEvidence:
         """From what a recogniser's card says under "size".
 
         Raises:
             ModelError: it makes no sense.
         """
-        try:
-            radii, density = (np.asarray(facts[key], np.float64) for key in ("radii_m", "log_density"))
-            weight = float(facts["weight"])
-        except (KeyError, TypeError) as error:
-            raise ModelError(f"sizes that cannot be read ({type(error).__name__}: {error})") from None
-        if len(density) != classes:
-            raise ModelError(f"sizes of {len(density)} classes, not {classes}")
-        return cls(radii, density, weight)
+        fields = Fields(values, "the size")
+        radii, density = fields.numbers("radii_m", 1), fields.numbers("log_density", 2)
+        found = cls(radii, density, fields.number("weight"))
+        fields.end()
+        return found
 
-    def facts(self) -> dict[str, Any]:
-        """What ``of_facts`` reads, for JSON."""
+    def to_dict(self) -> dict[str, Any]:
+        """What ``from_dict`` reads, for JSON."""
         return {
             "weight": round(self.weight, 4),
             "radii_m": np.round(self.radii, 5).tolist(),

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nextview.viewsphere import ViewSphere
+
+Scope = Literal["global", "local"]
+"""Where a policy may go: to all views, or to those of the local window."""
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.policies.base import EpisodeState
 from nextview.viewsphere import ViewSphere
 
 
@@ -35,3 +38,19 @@ def ranked(values: NDArray[np.floating], k: int) -> NDArray[np.int64]:
         (E, k) int64.
     """
     return np.argsort(-values, axis=1, kind="stable")[:, :k]
+
+
+@dataclass(frozen=True)
+class ViewList:
+    """Goes where a list says.
+
+    Attributes:
+        views: of each episode in order, (E, k) int64; the first of them are the first views.
+    """
+
+    views: NDArray[np.int64]
+    needs: tuple[str, ...] = ()
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See ``Policy.next_views``."""
+        return self.views[state.episodes, state.step]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
-from nextview.policies.base import EpisodeState, best_in_window
+from nextview.policies.base import EpisodeState, Scope, best_in_window
 from nextview.policies.spread import Spread
 from nextview.viewsphere import ViewSphere
 
@@ -38,12 +38,13 @@ class FixedSequence:
     Attributes:
         sphere: the viewpoints.
         moves: cell of each move, (rings, K) int64.
-        anywhere: whether the moves leave the local window; the views after the last move do as the moves did.
+        scope: whether the moves leave the local window ("global") or not ("local"); the views after the last move do as
+            the moves did.
     """
 
     sphere: ViewSphere
     moves: NDArray[np.int64]
-    anywhere: bool = True
+    scope: Scope = "global"
     needs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -61,7 +62,7 @@ class FixedSequence:
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
-        chosen = Spread(self.sphere, self.anywhere).next_views(state, rng)
+        chosen = Spread(self.sphere, self.scope).next_views(state, rng)
         if state.step >= self.paths.shape[1]:
             return chosen
         # Where the episode began is not told, but what was visited is: the start is the one whose path led here.
@@ -109,12 +110,12 @@ class ClassTable:
     Attributes:
         sphere: the viewpoints.
         values: (classes, rings, V) float64: by believed class, current ring and cell.
-        anywhere: among all views; otherwise among those of the local window.
+        scope: "global", among all views; or "local", among those of the local window.
     """
 
     sphere: ViewSphere
     values: NDArray[np.float64]
-    anywhere: bool = True
+    scope: Scope = "global"
     needs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -127,6 +128,6 @@ class ClassTable:
         rows = np.arange(len(state.current))
         values = self.values[state.belief.argmax(1), self.sphere.ring[state.current]]
         scores = values[rows[:, None], cells_to(self.sphere)[state.current]]
-        if self.anywhere:
+        if self.scope == "global":
             return np.where(state.visited, -np.inf, scores).argmax(1)
         return best_in_window(self.sphere, state, scores[rows[:, None, None], self.sphere.windows[state.current]])

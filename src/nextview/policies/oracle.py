@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.belief import PLAIN_SUM, Calibration, of_true_class
-from nextview.policies.base import EpisodeState, best_in_window
+from nextview.policies.base import EpisodeState, Scope, best_in_window
 from nextview.policies.maps import peaks_first
 from nextview.viewsphere import ViewSphere
 
@@ -52,7 +52,7 @@ class OracleGain:
         classes: how many.
         labels: true class of each object, (N,) int64.
         objects: the object of each episode, (E,) int64.
-        anywhere: choose among all unvisited views instead of the local window.
+        scope: choose in the local window, or among all unvisited views ("global").
         calibration: of the belief in the episodes.
     """
 
@@ -61,7 +61,7 @@ class OracleGain:
     classes: int
     labels: NDArray[np.int64]
     objects: NDArray[np.int64]
-    anywhere: bool = False
+    scope: Scope = "local"
     calibration: Calibration = PLAIN_SUM
     needs: tuple[str, ...] = ()
 
@@ -70,7 +70,7 @@ class OracleGain:
         b = len(state.current)
         parts = np.split(np.arange(b), range(500, b, 500))  # all at once would fill the memory
         gain = np.concatenate([self._gains(state, rows) for rows in parts])
-        if self.anywhere:
+        if self.scope == "global":
             return np.where(state.visited, -np.inf, gain).argmax(1)
         return best_in_window(self.sphere, state, gain.reshape(b, -1, 3))
 
@@ -79,7 +79,7 @@ class OracleGain:
         objects, current = self.objects[state.episodes[rows]], state.current[rows]
         log_evidence = self.log_evidence[objects].astype(np.float64)
         so_far = np.matmul(state.visited[rows, None].astype(np.float64), log_evidence)[:, 0]
-        if not self.anywhere:
+        if self.scope == "local":
             log_evidence = log_evidence[
                 np.arange(len(rows))[:, None], self.sphere.windows[current].reshape(len(rows), -1)
             ]

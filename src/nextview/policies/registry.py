@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,12 +23,15 @@ POLICIES: dict[str, Callable[[ViewSphere, tuple[int, ...]], Policy]] = {
     "furthest": lambda sphere, valleys: Furthest(sphere),
     "unidirectional": lambda sphere, valleys: Unidirectional(sphere),
     "spread": lambda sphere, valleys: Spread(sphere),
-    "spread-local": lambda sphere, valleys: Spread(sphere, anywhere=False),
+    "spread-local": lambda sphere, valleys: Spread(sphere, "local"),
     "lem": lambda sphere, valleys: MapPeak(sphere, "lem", valleys),
     "lem-peak": lambda sphere, valleys: MapPeak(sphere, "lem"),
     "lcm": lambda sphere, valleys: MapPeak(sphere, "lcm", valleys),
     "lcm-peak": lambda sphere, valleys: MapPeak(sphere, "lcm"),
 }
+
+DEFAULT = "gain"
+"""The policy where none is named."""
 
 
 def make_policy(
@@ -60,17 +62,6 @@ def make_policy(
     raise PolicyError(f"no policy is called {name!r}; there are {', '.join([*POLICIES, *learned])}")
 
 
-@contextmanager
-def own_modules() -> Iterator[None]:
-    """Within, a user's own modules in the working folder can be imported, as Python itself lets a script do."""
-    folder = str(Path.cwd())
-    sys.path.insert(0, folder)
-    try:
-        yield
-    finally:
-        sys.path.remove(folder)
-
-
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
     if not isinstance(policy, Gain):
         raise PolicyError(f"{name}: this policy pays no travel weight")
@@ -82,6 +73,9 @@ def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
 
 def _import_policy(path: str, sphere: ViewSphere) -> Policy:
     module, _, attribute = path.partition(":")
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.insert(0, here)  # where a user's own policy lies
     try:
         policy = getattr(importlib.import_module(module), attribute)(sphere)
     except Exception as error:  # whatever a user's module may raise

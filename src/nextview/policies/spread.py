@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.policies.base import EpisodeState, best_in_window
+from nextview.policies.base import EpisodeState, Scope, best_in_window
 from nextview.viewsphere import ViewSphere
 
 
@@ -34,18 +34,18 @@ class Spread:
 
     Attributes:
         sphere: the viewpoints.
-        anywhere: among all views; otherwise among those of the local window.
+        scope: "global", among all views; or "local", among those of the local window.
     """
 
     sphere: ViewSphere
-    anywhere: bool = True
+    scope: Scope = "global"
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
         distance = nearest_visited(self.sphere, state.visited)
         distance += 1e-6 * rng.random(distance.shape)
-        if self.anywhere:
+        if self.scope == "global":
             return np.where(state.visited, -1.0, distance).argmax(1)
         rows = np.arange(len(distance))[:, None, None]
         return best_in_window(self.sphere, state, distance[rows, self.sphere.windows[state.current]])

@@ -7,15 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
 
-from nextview.benchmark.entries import ORACLES
+from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold, is_oracle
 from nextview.benchmark.results import Results
+from nextview.policies.policy_card import bundled_policies
+from nextview.policies.registry import DEFAULT, POLICIES
 from nextview.report.diagrams import confusion_matrix, draw_reliability, reliability_figure
-from nextview.report.style import INK, legend, new_figure
+from nextview.report.style import INK, legend, new_figure, percent_axis
 
 COLOURS = {
     "random": "#8a949e",
+    "gain": "#b5179e",
     "random-all": "#4a5560",
     "furthest": "#d99000",
     "unidirectional": "#38a0d9",
@@ -31,20 +33,12 @@ COLOURS = {
     "oracle-gain": "#111111",
     "oracle-gain-all": "#777777",
 }
-OWN = ("#b5179e", "#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff7043", "#5c6bc0")
-"""For all others: as many as there are at most in a figure of a crowded benchmark."""
+OWN = ("#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff7043", "#5c6bc0")
+"""For all others, in turn."""
+LINES = ("-", "-.", (0, (1, 1)))
+"""Of the others, each time that the colours begin anew."""
 CROWD, BEST = 12, 8
-"""With more curves than the first, only so many of the most accurate are drawn."""
-
-
-def is_oracle(policy: str) -> bool:
-    """Whether a policy takes what a robot cannot know."""
-    return policy in ORACLES
-
-
-def headline_threshold(results: Results) -> float:
-    """The threshold that the report speaks of: 0.97, the library's default, or the one next to it."""
-    return min(results.settings["thresholds"], key=lambda t: abs(t - 0.97))
+"""With more curves than the first, only so many besides the reference are drawn, or more if more are the user's own."""
 
 
 def followed(results: Results) -> list[str]:
@@ -53,20 +47,30 @@ def followed(results: Results) -> list[str]:
     return [n for n in names if not is_oracle(n)] + [n for n in ("oracle-valley", "oracle-gain") if n in names]
 
 
-def compared(results: Results) -> list[str]:
-    """The policies of the curves: those ``followed``.
+def own_policies(results: Results) -> list[str]:
+    """The user's own: a MODULE:CLASS, or a card that is not bundled."""
+    known = {*POLICIES, *bundled_policies()}
+    return [n for n in results.tables.sweep["policy"].unique() if not is_oracle(n) and n.split("@")[0] not in known]
 
-    Of more than ``CROWD``: the reference, the ``BEST`` others that a robot could follow and that are the most accurate
-    at the headline threshold, the published one and the ceiling.
+
+def compared(results: Results) -> list[str]:
+    """The policies of the curves and of the viewer: those ``followed``.
+
+    Of more than ``CROWD``: the reference, the default policy, the user's own, the published one and the ceiling; and,
+    up to ``BEST`` besides the reference, those others that are the most accurate at the headline threshold.
     """
     names = followed(results)
     if len(names) <= CROWD:
         return names
     reference, summary = results.settings["reference"], results.tables.summary
-    at = (summary["measure"] == "accuracy") & (summary["threshold"] == headline_threshold(results))
+    at = (summary["measure"] == "accuracy") & (
+        summary["threshold"] == headline_threshold(results.settings["thresholds"])
+    )
     accuracy = summary[at].set_index("policy")["value"]
-    rivals = sorted((n for n in names if not is_oracle(n) and n != reference), key=lambda n: -accuracy[n])
-    drawn = {reference, *rivals[:BEST]}
+    drawn = {DEFAULT, *own_policies(results)} - {reference}
+    rivals = (n for n in names if not is_oracle(n) and n not in drawn and n != reference)
+    rest = max(0, BEST - len(drawn & set(names)))
+    drawn |= {reference, *sorted(rivals, key=lambda n: -accuracy[n])[:rest]}
     return [n for n in names if n in drawn or is_oracle(n)]
 
 
@@ -74,8 +78,10 @@ def look_of(policy: str, results: Results) -> dict:
     """Colour and line of a policy, the same in all figures; no two of those ``compared`` in a crowd share both."""
     names = dict.fromkeys([*compared(results), *results.tables.sweep["policy"].unique()])
     own = [name for name in names if name not in COLOURS]
-    colour = COLOURS.get(policy) or OWN[own.index(policy) % len(OWN)]
-    style = {"oracle-gain": ":", "oracle-gain-all": ":"}.get(policy, "--" if is_oracle(policy) else "-")
+    again, at = divmod(own.index(policy), len(OWN)) if policy in own else (0, 0)
+    colour = COLOURS.get(policy) or OWN[at]
+    line = LINES[again % len(LINES)]
+    style = {"oracle-gain": ":", "oracle-gain-all": ":"}.get(policy, "--" if is_oracle(policy) else line)
     return {"color": colour, "linestyle": style}
 
 
@@ -93,7 +99,7 @@ def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure
     axes.set_xticks(np.arange(len(ticks)), [f"{t:g}" for t in ticks])
     axes.set_xlabel("confidence threshold")
     axes.set_ylabel("class accuracy" if measure == "class_accuracy" else "accuracy")
-    axes.yaxis.set_major_formatter(PercentFormatter(1))
+    percent_axis(axes.yaxis)
     legend(axes)
     return figure
 
@@ -110,7 +116,7 @@ def budget_curve(results: Results, budget: str) -> Figure:
     labels = {"n_views": "mean views", "travel_all": "mean travel, grid cells", "arc_all": "mean travel, radians"}
     axes.set_xlabel(labels[budget])
     axes.set_ylabel("accuracy")
-    axes.yaxis.set_major_formatter(PercentFormatter(1))
+    percent_axis(axes.yaxis)
     legend(axes, "policy  mean height")
     return figure
 
@@ -120,7 +126,7 @@ def differences(results: Results, threshold: float, measure: str) -> Figure:
     rows = results.tables.tests.query("threshold == @threshold and measure == @measure").iloc[::-1]
     unit = 100 if measure.endswith("accuracy") else 1
     difference, low, high = (unit * rows[column].to_numpy(float) for column in ("difference", "low", "high"))
-    clear = rows["p_holm"].to_numpy(float) < 0.05
+    clear = rows["p_holm"].to_numpy(float) < SIGNIFICANT
     figure, axes = new_figure(4.6, 0.6 + 0.24 * max(3, len(rows)))
     for y, policy in enumerate(rows["policy"]):
         colour = look_of(policy, results)["color"]
@@ -131,7 +137,7 @@ def differences(results: Results, threshold: float, measure: str) -> Figure:
     axes.set_yticks(np.arange(len(rows)), rows["policy"])
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
-    what = {"n_views": "n_views", "travel_all": "travel, grid cells"}.get(measure, "accuracy, percentage points")
+    what = {"n_views": "views", "travel_all": "travel, grid cells"}.get(measure, "accuracy, percentage points")
     axes.set_xlabel(f"{what}: difference to {results.settings['reference']}")
     return figure
 

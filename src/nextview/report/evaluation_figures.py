@@ -11,13 +11,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
 from nextview.benchmark.evaluation import TRUTHS, Evaluation, judged_objects
 from nextview.data.predictions import Predictions
 from nextview.report.diagrams import confusion_matrix, draw_reliability, reliability_figure
-from nextview.report.style import INK, STYLE, PlainFigure, legend, new_figure
+from nextview.report.style import INK, STYLE, PlainFigure, legend, new_figure, percent_axis
 
 ONE, ALL, PUBLISHED, FAINT_INK = "#38a0d9", "#0b5fa5", "#d1495b", "#8a949e"
 BLUES = ("#7cc4ec", "#38a0d9", "#0b5fa5", "#1f2933")
@@ -88,7 +87,7 @@ def _views_axis(axes: Axes, most: int) -> None:
     axes.minorticks_off()
     axes.set_xlim(1 / most**0.02, most * most**0.02)
     axes.set_xlabel("random views fused")
-    axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+    percent_axis(axes.yaxis)
 
 
 def class_accuracies(e: Evaluation) -> Figure:
@@ -100,7 +99,7 @@ def class_accuracies(e: Evaluation) -> Figure:
     }
     figure, axes = _class_figure(series, list(dict.fromkeys(table["label"])))
     axes.set_xlabel("accuracy")
-    axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+    percent_axis(axes.xaxis)
     legend(axes)
     return figure
 
@@ -130,7 +129,7 @@ def map_classes(e: Evaluation, name: str, measure: str) -> Figure:
         axes.plot(rows["published"], y, "D", color=PUBLISHED, markersize=4.5, label="published")
     axes.set_xlabel(MEASURES[measure])
     if measure.startswith("d"):
-        axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+        percent_axis(axes.xaxis)
     legend(axes)
     return figure
 

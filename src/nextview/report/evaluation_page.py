@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +16,18 @@ from nextview.benchmark.published import published_recognisers
 from nextview.data.predictions import Predictions
 from nextview.report import evaluation_figures as drawn
 from nextview.report.elements import (
+    NONE,
+    Card,
+    Cell,
     Number,
-    card,
+    Picture,
+    Table,
     cell,
-    description,
-    document,
+    label,
     numbers,
+    percent,
     picture,
-    side_by_side,
-    table,
+    render,
 )
 from nextview.report.style import to_png
 
@@ -86,47 +88,47 @@ def all_figures(e: Evaluation, p: Predictions, rng: np.random.Generator) -> dict
 
 def page(e: Evaluation, p: Predictions, settings: dict[str, Any], figures: dict[str, Figure]) -> str:
     """The whole page as text."""
-    maps = e.maps["map"].unique()
-    sections = [
-        ("recogniser", "How often it is right", _recogniser(e, p, figures)),
-        ("confusion", "What it takes for what", _confusions(p, figures)),
-        ("calibration", "Is the confidence worth its name?", _calibration(e, figures)),
-        *((name, f"The {escape(name.upper())}", _map(e, name, figures)) for name in maps),
-        ("left-out", "Left out", description(e.left_out) if e.left_out else ""),
-        ("made", "How this was made", description(_facts(p, settings))),
-    ]
+    v, found = len(p.sphere), _accuracies(e)
     name = p.models["recogniser"][0] if "recogniser" in p.models else "the recogniser"
-    return document(f"Evaluation of {name}", _headline(e, p, name), sections)
-
-
-def _headline(e: Evaluation, p: Predictions, name: str) -> str:
-    v = len(p.sphere)
-    found = _accuracies(e)
-    one, fused = found[1, "", "accuracy"], found[v, "", "accuracy"]
-    error = e.fusion.set_index("n_views")["calibration_error"]
-    cards = [
-        _share_card("one view", one, f"classes {100 * found[1, '', 'class_accuracy'].value:.1f}&nbsp;%"),
-        _share_card(f"all {v} views fused", fused, f"classes {100 * found[v, '', 'class_accuracy'].value:.1f}&nbsp;%"),
-        card("calibration error", f"{error[1]:.3f}", f"one view; {error[v]:.3f} with all {v} fused"),
-    ]
-    for kind in e.maps["map"].unique():
-        scores = _scores(e, kind)
-        near, loss = scores["network", "", "d_le_1"], scores["network", "", "mse"]
-        cards.append(_share_card(f"{escape(kind.upper())}: peak within one cell", near, f"MSE {loss.value:.4f}"))
     twice = int(p.conflicting.sum())
-    duplicates = f"; {twice} of them are the very mesh of another object with another label" if twice else ""
-    return (
-        f"<h1>{escape(name)}: {100 * one.value:.1f}&nbsp;% of single views right, {100 * fused.value:.1f}&nbsp;% of "
-        f"objects with all {v} views fused</h1>"
-        f'<p class="lead">{len(p):,} objects of {len(set(p.labels.tolist()))} classes, {v} views each{duplicates}.</p>'
-        "<p>All intervals are 95&nbsp;% bootstrap intervals over objects: views of one object are not independent.</p>"
-        f'<div class="cards">{"".join(cards)}</div>'
+    error = e.fusion.set_index("n_views")["calibration_error"]
+    return render(
+        "evaluate.html",
+        title=f"Evaluation of {name}",
+        headline=f"{name}: {percent(found[1, '', 'accuracy'].value)} of single views right, "
+        f"{percent(found[v, '', 'accuracy'].value)} of objects with all {v} views fused",
+        facts=f"{len(p):,} objects of {len(set(p.labels.tolist()))} classes, {v} views each"
+        + (f"; {twice} of them are the very mesh of another object with another label." if twice else "."),
+        numbers=_cards(e, v),
+        recogniser=_recogniser(p, e, figures),
+        accuracy=_accuracy_table(e, p),
+        published=_published_table(e, p),
+        confusions=_confusions(p, figures),
+        errors=", ".join(f"{error[k]:.3f} after {k}" for k in _compared(e)),
+        calibration=_calibration(e, figures),
+        maps=[_map(e, kind, figures) for kind in e.maps["map"].unique()],
+        left_out=e.left_out,
+        made=_facts(p, settings),
     )
 
 
-def _share_card(title: str, number: Number, small: str) -> str:
-    interval = f"{100 * number.low:.1f} &ndash; {100 * number.high:.1f}&nbsp;%; {small}"
-    return card(title, f"{100 * number.value:.1f}&nbsp;%", interval)
+def _cards(e: Evaluation, v: int) -> list[Card]:
+    found = _accuracies(e)
+    error = e.fusion.set_index("n_views")["calibration_error"]
+    cards = [
+        _share_card(heading, found[n, "", "accuracy"], f"classes {percent(found[n, '', 'class_accuracy'].value)}")
+        for n, heading in ((1, "one view"), (v, f"all {v} views fused"))
+    ]
+    cards.append(Card("calibration error", f"{error[1]:.3f}", f"one view; {error[v]:.3f} with all {v} fused"))
+    for kind in e.maps["map"].unique():
+        scores = _scores(e, kind)
+        near, loss = scores["network", "", "d_le_1"], scores["network", "", "mse"]
+        cards.append(_share_card(f"{kind.upper()}: peak within one cell", near, f"MSE {loss.value:.4f}"))
+    return cards
+
+
+def _share_card(title: str, number: Number, small: str) -> Card:
+    return Card(title, percent(number.value), f"{100 * number.low:.1f} {NONE} {percent(number.high)}; {small}")
 
 
 def _accuracies(e: Evaluation) -> dict[tuple, Number]:
@@ -137,32 +139,45 @@ def _scores(e: Evaluation, name: str) -> dict[tuple, Number]:
     return numbers(e.maps[e.maps["map"] == name], "by", "label", "measure")
 
 
-def _recogniser(e: Evaluation, p: Predictions, figures: dict[str, Figure]) -> str:
+def _compared(e: Evaluation) -> list[int]:
+    """Numbers of views whose confidence is compared with accuracy."""
+    return list(dict.fromkeys(e.reliability["n_views"].tolist()))
+
+
+def _accuracy_table(e: Evaluation, p: Predictions) -> Table:
     found, v = _accuracies(e), len(p.sphere)
     columns = [(n_views, measure) for n_views in (1, v) for measure in ("accuracy", "clean_accuracy")]
-    rows = []
+    rows: list[list[Cell | str]] = []
     counts = np.bincount(p.labels, minlength=len(p.classes))
-    for label in e.accuracy.query("label != ''")["label"].unique():
-        cells = (cell(found[n_views, label, measure]) for n_views, measure in columns)
-        rows.append([escape(label).replace("_", " "), str(counts[p.classes.index(label)]), *cells])
+    for of_class in e.accuracy.query("label != ''")["label"].unique():
+        cells = (cell(found[n_views, of_class, measure]) for n_views, measure in columns)
+        rows.append([label(of_class), str(counts[p.classes.index(of_class)]), *cells])
     for heading, before in (("mean of classes", "class_"), ("mean of objects", "")):
         cells = (cell(found[n_views, "", before + measure]) for n_views, measure in columns)
         rows.append([heading, f"{len(p):,}", *cells])
         if p.of_size is not None:
             one, fused = (cell(found[n_views, "", f"{before}shape_accuracy"]) for n_views in (1, v))
-            rows.append([f"{heading}<small>size of the objects not known</small>", f"{len(p):,}", one, "", fused, ""])
+            rows.append([Cell(heading, ("size of the objects not known",)), f"{len(p):,}", one, "", fused, ""])
     head = ["class", "objects", "one view", "without duplicates", f"all {v} views fused", "without duplicates"]
-    published = published_recognisers(p.classes, v)
-    beside = ""
-    if published:
-        ours = found[1, "", "accuracy"]
-        listed = [[escape(p.models["recogniser"][0]), "", cell(Number(*ours[:3]))]]
-        listed += [[f"{network}, published", str(batch), f"{accuracy:.4f}"] for network, batch, accuracy in published]
-        caption = f"Accuracy from one of {v} views beside the published recognisers (table 6), over objects."
-        beside = table(["network", "batch size", "one view"], listed, caption)
+    return Table(head, rows, "Share of right answers. Small print: 95\u00a0% intervals.")
+
+
+def _published_table(e: Evaluation, p: Predictions) -> Table | None:
+    """Beside the published recognisers; None if there are none for these classes."""
+    published = published_recognisers(p.classes, len(p.sphere))
+    if not published:
+        return None
+    ours = _accuracies(e)[1, "", "accuracy"]
+    listed: list[list[Cell | str]] = [[p.models["recogniser"][0], "", cell(Number(*ours[:3]))]]
+    listed += [[f"{network}, published", str(batch), f"{accuracy:.4f}"] for network, batch, accuracy in published]
+    caption = f"Accuracy from one of {len(p.sphere)} views beside the published recognisers (table 6), over objects."
+    return Table(["network", "batch size", "one view"], listed, caption)
+
+
+def _recogniser(p: Predictions, e: Evaluation, figures: dict[str, Figure]) -> list[Picture]:
     curve = e.fusion.set_index("n_views")["accuracy"]
-    shown = ", ".join(f"{k}: {curve[k]:.3f}" for k in (1, 2, 5, 10, v) if k in curve.index)
-    shown = side_by_side(
+    shown = ", ".join(f"{k}: {curve[k]:.3f}" for k in (1, 2, 5, 10, len(p.sphere)) if k in curve.index)
+    return [
         picture(
             figures["fusion"],
             f"Accuracy against the number of random views fused. {shown}.",
@@ -174,32 +189,21 @@ def _recogniser(e: Evaluation, p: Predictions, figures: dict[str, Figure]) -> st
             "Accuracy of each class from one view and from all; the table has the numbers.",
             "Accuracy by class.",
         ),
-    )
-    caption = "Share of right answers. Small print: 95&nbsp;% intervals."
-    duplicates = (
-        "<p><em>Without duplicates</em> leaves out the objects whose very mesh also stands in the data under another "
-        "label: no recogniser can be right on both.</p>"
-    )
-    return shown + duplicates + table(head, rows, caption) + beside
+    ]
 
 
-def _confusions(p: Predictions, figures: dict[str, Figure]) -> str:
+def _confusions(p: Predictions, figures: dict[str, Figure]) -> list[Picture]:
     caption = "Percent of each true class, as figure 12 of the thesis."
-    return side_by_side(
+    return [
         picture(figures["confusion_one_view"], "Confusion matrix of single views.", caption),
         picture(figures["confusion_all_views"], f"Confusion matrix of all {len(p.sphere)} views fused.", caption),
-    )
+    ]
 
 
-def _calibration(e: Evaluation, figures: dict[str, Figure]) -> str:
+def _calibration(e: Evaluation, figures: dict[str, Figure]) -> list[Picture]:
     curve = e.fusion.set_index("n_views")
-    n_views = list(dict.fromkeys(e.reliability["n_views"].tolist()))
-    shown = ", ".join(f"{curve.calibration_error[k]:.3f} after {k}" for k in n_views)
-    text = (
-        "<p>On the diagonal, an answer of which the belief is 90&nbsp;% sure is right nine times in ten; below it the "
-        f"belief is too sure of itself. Expected calibration error over views: {shown}.</p>"
-    )
-    return text + side_by_side(
+    shown = ", ".join(f"{curve.calibration_error[k]:.3f} after {k}" for k in _compared(e))
+    return [
         picture(
             figures["reliability"],
             f"Share of right answers against confidence. Calibration error: {shown}.",
@@ -208,61 +212,57 @@ def _calibration(e: Evaluation, figures: dict[str, Figure]) -> str:
         picture(
             figures["confidence"],
             "Mean confidence and accuracy against the number of random views fused. "
-            + ", ".join(f"{k}: {curve.confidence[k]:.3f} and {curve.accuracy[k]:.3f}" for k in n_views)
+            + ", ".join(f"{k}: {curve.confidence[k]:.3f} and {curve.accuracy[k]:.3f}" for k in _compared(e))
             + ".",
             "Mean confidence against accuracy. Views of one object make alike mistakes: a sum of logits takes them "
             "for independent and grows too sure.",
         ),
-    )
+    ]
 
 
-def _map(e: Evaluation, name: str, figures: dict[str, Figure]) -> str:
+TRUTH = {
+    "lem": "the depth-entropy of the neighbouring views, scaled to 0 .. 1 over the object's views",
+    "lcm": "the recogniser's confidence in the neighbouring views, 0 where it is wrong",
+}
+"""What the maps tell."""
+
+
+def _map(e: Evaluation, name: str, figures: dict[str, Figure]) -> dict[str, Any]:
     scores = _scores(e, name)
     measures = list(drawn.MEASURES)
-    head = ["", *(escape(words[0].upper() + words[1:]) for words in drawn.MEASURES.values())]
+    head = ["", *(words[0].upper() + words[1:] for words in drawn.MEASURES.values())]
 
-    def row(heading: str, by: str, label: str = "", before: str = "") -> list[str]:
-        cells = (cell(scores.get((by, label, before + measure)), 4 if measure == "mse" else 3) for measure in measures)
+    def row(heading: Cell | str, by: str, of_class: str = "", before: str = "") -> list[Cell | str]:
+        cells = (cell(scores.get((by, of_class, before + m)), 4 if m == "mse" else 3) for m in measures)
         return [heading, *cells]
 
     rows = [row("mean of objects", "network"), row("mean of classes", "network", before="class_")]
     for by in e.maps["by"].unique():
         if by != "network":
-            rows.append(row(f"{escape(by)}<small>mean of objects</small>", by))
-            rows.append(row(f"{escape(by)}<small>mean of classes</small>", by, before="class_"))
-    labels = [label for label in e.maps[e.maps["map"] == name]["label"].unique() if label]
-    by_class = [row(escape(label).replace("_", " "), "network", label) for label in labels]
-    truth = {
-        "lem": "the depth-entropy of the neighbouring views, scaled to 0 .. 1 over the object's views",
-        "lcm": "the recogniser's confidence in the neighbouring views, 0 where it is wrong",
-    }[name]
-    return (
-        f"<p>What is true: {truth}. A peak is right where the highest predicted cell is the highest true one, or near "
-        "it; of equal cells the first counts, so where cells tie the exact peak is a toss-up. The <em>regret</em> is "
-        "what following the prediction loses: the highest true value less the true one at the predicted peak. The "
-        "baselines are made from the true maps of these very objects: one map for all views, and one for each class "
-        "and view, which knows the object's class and which way it faces. The published peaks are means over classes, "
-        "the published loss is over objects.</p>"
-        + table(head, rows, "The predicted maps and the baselines. Small print: 95&nbsp;% intervals.")
-        + side_by_side(
-            *(
-                picture(
-                    figures[f"{name}_{measure}"],
-                    f"{drawn.MEASURES[measure]} by class; the table has the numbers.",
-                    f"{escape(drawn.MEASURES[measure].capitalize())}, by class.",
-                )
-                for measure in ("mse", "d0", "d_le_1", "regret")
+            rows.append(row(Cell(by, ("mean of objects",)), by))
+            rows.append(row(Cell(by, ("mean of classes",)), by, before="class_"))
+    classes = [name for name in e.maps[e.maps["map"] == name]["label"].unique() if name]
+    return {
+        "name": name,
+        "truth": TRUTH[name],
+        "scores": Table(head, rows, "The predicted maps and the baselines. Small print: 95\u00a0% intervals."),
+        "figures": [
+            picture(
+                figures[f"{name}_{measure}"],
+                f"{drawn.MEASURES[measure]} by class; the table has the numbers.",
+                f"{drawn.MEASURES[measure].capitalize()}, by class.",
             )
-        )
-        + table(head, by_class, "By class, as table 7 of the thesis.")
-        + picture(
+            for measure in ("mse", "d0", "d_le_1", "regret")
+        ],
+        "by_class": Table(head, [row(label(c), "network", c) for c in classes], "By class, as table 7 of the thesis."),
+        "examples": picture(
             figures[f"{name}_examples"],
             "True and predicted maps side by side, five objects of each class from the best to the worst.",
             "Examples, as figures 25 to 28: one random view of each object was drawn, and those shown stand at equal "
             "steps of its squared error.",
             broad=True,
-        )
-    )
+        ),
+    }
 
 
 def _calibration_fact(p: Predictions) -> str:

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
 
-from nextview.report.style import legend, new_figure
+from nextview.report.style import legend, new_figure, percent_axis
 
 OURS, PUBLISHED = "#0b5fa5", "#d1495b"
 
@@ -31,7 +30,7 @@ def grid_figure(rows: Sequence[dict[str, Any]]) -> Figure:
     axes.set_yticks(range(len(networks)), [f"ResNet-{depth}, batch {batch}" for depth, batch in networks])
     axes.set_ylim(len(networks) - 0.5, -0.5)
     axes.tick_params(axis="y", length=0)
-    axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=1))
+    percent_axis(axes.xaxis)
     axes.set_xlabel("accuracy from one view, test split")
     axes.margins(x=0.12)
     legend(axes)

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold, is_oracle, nothing_differs, too_few
 from nextview.benchmark.results import KIND, Results
 from nextview.errors import ResultsError
 from nextview.outputs import added_file, check_added, check_file, written_whole
+from nextview.policies.registry import DEFAULT
 from nextview.report import curves
 from nextview.report import html_tables as tables
-from nextview.report.elements import GENERATOR, asset, card, description, document, numbers, picture, side_by_side
+from nextview.report.elements import GENERATOR, NONE, Card, Picture, numbers, percent, picture, render
 from nextview.report.trajectories import Pictures, gains, trajectories, worst_failures
 
 
@@ -22,7 +23,7 @@ def headline_policy(results: Results, threshold: float) -> str:
     """The most accurate policy that a robot could follow, other than the reference; the reference if it is alone."""
     found = numbers(results.tables.summary, "policy", "threshold", "measure")
     reference = results.settings["reference"]
-    names = [n for n in results.tables.sweep["policy"].unique() if not curves.is_oracle(n) and n != reference]
+    names = [n for n in results.tables.sweep["policy"].unique() if not is_oracle(n) and n != reference]
     return max(names, key=lambda n: found[n, threshold, "accuracy"].value, default=reference)
 
 
@@ -75,66 +76,70 @@ def _is_beside(path: Path, results: Path) -> bool:
 
 def page(results: Results, pictures: Pictures) -> str:
     """The whole page as text."""
-    at = curves.headline_threshold(results)
+    at = headline_threshold(results.settings["thresholds"])
     best, reference = headline_policy(results, at), results.settings["reference"]
     failures = worst_failures(results.episodes(best, at))
-    sections = [
-        ("results", "Results", _results(results, at)),
-        ("curves", "Accuracy against its travel weight", _curves(results, at)),
-        ("calibration", "Is the confidence worth its name?", _calibration(results, best, at)),
-        ("classes", "By class", _classes(results, best, at)),
-        ("fixed", "Fixed views", tables.five_views(results)),
-        ("failures", "The worst failures", _failures(results, best, at, failures.values.tolist(), pictures)),
-        ("episodes", "Step through an episode", _viewer(results, best, at, failures.values.tolist(), pictures)),
-        ("made", "How this was made", _made(results, pictures)),
-    ]
-    title = f"Next best view: {best} against {reference}"
-    return document(title, _headline(results, best, at), sections, asset("viewer.js"))
-
-
-def _headline(results: Results, best: str, at: float) -> str:
+    title, difference = _verdict(results, best, at)
     p, settings = results.predictions, results.settings
-    found = numbers(results.tables.summary, "policy", "threshold", "measure")
-    reference = settings["reference"]
-    first = results.tables.sweep.query("policy == @reference or policy == @best").iloc[0]
-
-    def of(policy: str) -> str:
-        n = found[policy, at, "accuracy"]
-        n_views, travel = found[policy, at, "n_views"].value, found[policy, at, "travel_all"].value
-        return card(
-            escape(policy), f"{100 * n.value:.1f} %",
-            f"{100 * n.low:.1f} &ndash; {100 * n.high:.1f} %; {n_views:.2f} views, {travel:.2f} cells",
-        )  # fmt: skip
-
-    cards = [card("one view", f"{100 * first['accuracy']:.1f} %", "no travel")]
-    ran = set(results.tables.sweep["policy"])
-    cards += [of(name) for name in dict.fromkeys((reference, best)) if name in ran]
-    if "oracle-gain" in ran:
-        cards.append(of("oracle-gain"))
-    return (
-        f"{_verdict(results, best, at)}"
-        f"<p>{len(p):,} objects of {len(set(p.labels.tolist()))} classes, {settings['runs']} first views each, "
-        f"threshold {at:g}, at most {settings['max_views']} views. All intervals are 95&nbsp;% bootstrap intervals "
-        f'over objects.</p><div class="cards">{"".join(cards)}</div>'
+    return render(
+        "report.html",
+        title=title,
+        difference=difference,
+        best=best,
+        reference=reference,
+        runs=settings["runs"],
+        warning=too_few(results.tables, at, len(p)),
+        verdict=nothing_differs(results.tables, at, reference),
+        facts=f"{len(p):,} objects of {len(set(p.labels.tolist()))} classes, {settings['runs']} first views each, "
+        f"threshold {at:g}, at most {settings['max_views']} views.",
+        headline=_cards(results, best, at),
+        scenes=_scenes(results, best, at, failures.values.tolist(), pictures),
+        no_pictures=pictures.why_not,
+        left_out=list(settings["failures"].values()),
+        overview=tables.overview(results, at),
+        differences=_differences(results, at),
+        curve_figures=_curves(results, at),
+        reliability=_reliability(results, best, at),
+        calibration=tables.calibration(results, curves.followed(results)),
+        risks=tables.risks(results),
+        class_figures=_classes(results, best, at),
+        class_tables=[tables.per_class(results, measure, at) for measure in ("accuracy", "travel_moved")],
+        fixed_views=tables.five_views(results),
+        failures=_failures(results, best, at, failures.values.tolist(), pictures),
+        made=_made(results, pictures),
     )
 
 
-def _verdict(results: Results, best: str, at: float) -> str:
+def _cards(results: Results, best: str, at: float) -> list[Card]:
+    found = numbers(results.tables.summary, "policy", "threshold", "measure")
+    reference = results.settings["reference"]
+    first = results.tables.sweep.query("policy == @reference or policy == @best").iloc[0]
+    ran = set(results.tables.sweep["policy"])
+    cards = [Card("one view", percent(first["accuracy"]), "no travel")]
+    for policy in dict.fromkeys((reference, best, DEFAULT, *curves.own_policies(results), "oracle-gain")):
+        if policy in ran:
+            n = found[policy, at, "accuracy"]
+            n_views, travel = found[policy, at, "n_views"].value, found[policy, at, "travel_all"].value
+            interval = f"{100 * n.low:.1f} {NONE} {percent(n.high)}"
+            cards.append(Card(policy, percent(n.value), f"{interval}; {n_views:.2f} views, {travel:.2f} cells"))
+    return cards
+
+
+def _verdict(results: Results, best: str, at: float) -> tuple[str, str]:
+    """The title, and the difference of the best policy to the reference in words; none if it was not compared."""
     reference = results.settings["reference"]
     rows = results.tables.tests.query("policy == @best and threshold == @at and measure == 'accuracy'")
     if rows.empty:
-        return f"<h1>{escape(best)} at threshold {at:g}</h1>"
+        return f"{best} at threshold {at:g}", ""
     difference, low, high, p = rows[["difference", "low", "high", "p_holm"]].to_numpy(float)[0]
-    best, reference = escape(best), escape(reference)
     title = (
         f"{best} is {100 * abs(difference):.1f} points {'more' if difference > 0 else 'less'} accurate than {reference}"
     )
-    if p >= 0.05:
+    if p >= SIGNIFICANT:
         title = f"No policy that a robot could follow is clearly more accurate than {reference}"
-    p_text = tables.p_value(p).replace("&lt; ", "under ")
-    return (
-        f'<h1>{title}</h1><p class="lead">{best} against {reference}: {100 * difference:+.1f} points, 95&nbsp;% '
-        f"interval {100 * low:+.1f} to {100 * high:+.1f}, p after Holm's correction {p_text}.</p>"
+    return title, (
+        f"{100 * difference:+.1f} points, 95\u00a0% interval {100 * low:+.1f} to {100 * high:+.1f}, "
+        f"p after Holm's correction {tables.p_value(p).replace('< ', 'under ')}"
     )
 
 
@@ -148,43 +153,27 @@ def _spoken(results: Results, policies: Sequence[str], at: float, measure: str) 
 def _others(results: Results, where: str = "the tables") -> str:
     """What a figure's caption says of the policies that are left out of it in a crowd; nothing if none are."""
     left = len(curves.followed(results)) - len(curves.compared(results))
-    drawn = f"the reference, the {curves.BEST} most accurate others and oracles"
+    drawn = "the reference, the default, your own, the most accurate others and oracles"
     return f" Drawn are {drawn}; {left} more are in {where}." if left else ""
 
 
-def _results(results: Results, at: float) -> str:
-    text = (
-        "<p>Policies marked <em>oracle</em> are told something that no robot knows: the true class, the true map, or "
-        "what every view would say. <code>oracle-valley</code> is the published method, which takes the map's peak or "
-        "its valley by the true class. <em>Without duplicates</em> leaves out the objects whose very mesh also stands "
-        "in the data under another label. Travel is in grid cells: over all episodes, and, as published, over those "
-        "that moved.</p>"
-    )
-    failures = "".join(f"<p>Left out: {escape(sentence)}</p>" for sentence in results.settings["failures"].values())
-    shown = ""
-    if len(results.tables.tests):
-        shown = side_by_side(
-            *(
-                picture(
-                    curves.differences(results, at, measure),
-                    f"Difference of each policy to the reference in {what}, with intervals. "
-                    + _spoken(results, list(results.tables.sweep["policy"].unique()), at, measure),
-                    f"Difference in {what} at threshold {at:g}; filled where Holm's p is under 0.05.",
-                )
-                for measure, what in (("accuracy", "accuracy"), ("n_views", "n_views"), ("travel_all", "travel"))
-            ),
-            small=True,
+def _differences(results: Results, at: float) -> list[Picture]:
+    if results.tables.tests.empty:
+        return []
+    policies = list(results.tables.sweep["policy"].unique())
+    return [
+        picture(
+            curves.differences(results, at, measure),
+            f"Difference of each policy to the reference in {what}, with intervals. "
+            + _spoken(results, policies, at, measure),
+            f"Difference in {what} at threshold {at:g}; filled where Holm's p is under {SIGNIFICANT}.",
         )
-    return text + failures + tables.overview(results, at) + shown
+        for measure, what in (("accuracy", "accuracy"), ("n_views", "views"), ("travel_all", "travel"))
+    ]
 
 
-def _curves(results: Results, at: float) -> str:
+def _curves(results: Results, at: float) -> list[Picture]:
     names = curves.compared(results)
-    text = (
-        "<p>A threshold buys accuracy with views and travel. The curves go through all thresholds from &ldquo;one view "
-        "for all&rdquo; to &ldquo;all views for nearly all&rdquo;; the number beside a name is the curve's mean "
-        "height.</p>"
-    )
     figures = [
         picture(
             curves.threshold_curve(results, measure),
@@ -193,7 +182,7 @@ def _curves(results: Results, at: float) -> str:
         )
         for measure, what in (("class_accuracy", "Mean class accuracy"), ("accuracy", "Accuracy over objects"))
     ]
-    for budget, what in (("n_views", "n_views"), ("travel_all", "travel")):
+    for budget, what in (("n_views", "views"), ("travel_all", "travel")):
         if results.tables.sweep[budget].max() > results.tables.sweep[budget].min():
             figures.append(
                 picture(
@@ -202,72 +191,67 @@ def _curves(results: Results, at: float) -> str:
                     f"Accuracy against mean {what}; oracles broken.{_others(results)}",
                 )
             )
-    return text + side_by_side(*figures)
+    return figures
 
 
-def _calibration(results: Results, best: str, at: float) -> str:
+def _reliability(results: Results, best: str, at: float) -> list[Picture]:
     ran = set(results.tables.sweep["policy"])
     policies = [n for n in dict.fromkeys((results.settings["reference"], best, "oracle-gain")) if n in ran]
-    figure = picture(
-        curves.reliability_diagram(results, policies, at),
-        "Share of right answers against confidence. " + _spoken(results, policies, at, "calibration_error"),
-        f"Reliability at threshold {at:g}: on the diagonal, 90&nbsp;% sure is right nine times in ten.",
-    )
-    return tables.calibration(results, curves.followed(results)) + side_by_side(figure)
-
-
-def _classes(results: Results, best: str, at: float) -> str:
-    figures, ran = [], set(results.tables.sweep["policy"])
-    for name in dict.fromkeys((results.settings["reference"], best)):
-        if name in ran:
-            figure = curves.confusion(results.episodes(name, at), results.predictions.classes, name)
-            figures.append(
-                picture(figure, f"Confusion matrix of {name} at threshold {at:g}.", "Percent of each true class.")
-            )
-    difference = ""
-    if results.settings["reference"] in ran and len(set(curves.compared(results)) - {"oracle-gain"}) > 1:
-        reference = escape(results.settings["reference"])
-        difference = picture(
-            curves.class_differences(results, at),
-            "Accuracy of each class against the reference, in percentage points; the table below has the numbers.",
-            f"Accuracy by class against {reference} at threshold {at:g}, percentage points."
-            + _others(results, "per_class.csv"),
+    return [
+        picture(
+            curves.reliability_diagram(results, policies, at),
+            "Share of right answers against confidence. " + _spoken(results, policies, at, "calibration_error"),
+            f"Reliability at threshold {at:g}: on the diagonal, 90\u00a0% sure is right nine times in ten.",
         )
-    return (
-        side_by_side(*figures, difference)
-        + tables.per_class(results, "accuracy", at)
-        + tables.per_class(results, "travel_moved", at)
-    )
+    ]
 
 
-def _failures(results: Results, best: str, at: float, failures: list, pictures: Pictures) -> str:
+def _classes(results: Results, best: str, at: float) -> list[Picture]:
+    ran, reference = set(results.tables.sweep["policy"]), results.settings["reference"]
+    figures = [
+        picture(
+            curves.confusion(results.episodes(name, at), results.predictions.classes, name),
+            f"Confusion matrix of {name} at threshold {at:g}.",
+            "Percent of each true class.",
+        )
+        for name in dict.fromkeys((reference, best))
+        if name in ran
+    ]
+    if reference in ran and len(set(curves.compared(results)) - {"oracle-gain"}) > 1:
+        figures.append(
+            picture(
+                curves.class_differences(results, at),
+                "Accuracy of each class against the reference, in percentage points; the table below has the numbers.",
+                f"Accuracy by class against {reference} at threshold {at:g}, percentage points."
+                + _others(results, "per_class.csv"),
+            )
+        )
+    return figures
+
+
+def _failures(results: Results, best: str, at: float, failures: list, pictures: Pictures) -> list[dict[str, Any]]:
     p, items = results.predictions, []
     episodes = results.episodes(best, at)
     names = np.asarray(episodes["object"].astype(str))
     for name, wrong, confidence, run in failures:
         episode = episodes[(names == name) & (episodes["run"] == run)].iloc[0]
         views = [int(v) for v in episode["views"]]
-        shown = pictures.views(name, views)
-        strip = "".join(
-            f'<img src="{shown[v]}" alt="{escape(name)} from view {v}" title="view {v}">' for v in views if v in shown
-        )
-        duplicate = (
-            " Its very mesh is also in the data under another label." if p.conflicting[p.names.index(name)] else ""
-        )
         items.append(
-            f"<li><strong>{escape(name)}</strong>, taken for {escape(str(episode['answer'])).replace('_', ' ')}: wrong "
-            f"in {wrong} of {results.settings['runs']} runs, on average {100 * confidence:.1f}&nbsp;% sure.{duplicate} "
-            f'<span class="soft">Views {", ".join(map(str, views))}.</span><div class="strip">{strip}</div></li>'
+            {
+                "name": name,
+                "answer": str(episode["answer"]),
+                "wrong": wrong,
+                "confidence": confidence,
+                "conflicting": bool(p.conflicting[p.names.index(name)]),
+                "views": views,
+                "pictures": pictures.views(name, views),
+            }
         )
-    if not items:
-        return f"<p>{escape(best)} made no mistake.</p>"
-    return (
-        f"<p>What {escape(best)} gets wrong from most first views, and then with the most confidence; the views are "
-        f'those of its most confident mistake.</p><ul class="failures">{"".join(items)}</ul>'
-    )
+    return items
 
 
-def _viewer(results: Results, best: str, at: float, failures: list, pictures: Pictures) -> str:
+def _scenes(results: Results, best: str, at: float, failures: list, pictures: Pictures) -> dict[str, Any] | None:
+    """What the viewer shows; None if there is nothing to see."""
     reference = results.settings["reference"]
     wanted = []
     if reference != best and reference in set(results.tables.sweep["policy"]):
@@ -275,28 +259,16 @@ def _viewer(results: Results, best: str, at: float, failures: list, pictures: Pi
         wanted += [(name, run, f"{best} is right in {n} more runs than {reference}") for name, n, run in better]
     runs = results.settings["runs"]
     wanted += [(name, run, f"{best} is wrong in {n} of {runs} runs") for name, n, _, run in failures[:6]]
-    scenes = trajectories(results, [best, *(n for n in curves.compared(results) if n != best)], wanted, at, pictures)
-    if not scenes["scenes"]:
-        return ""
-    data = json.dumps(scenes, separators=(",", ":")).replace("<", "\\u003c")  # no name opens a comment or a tag
-    return (
-        "<p>The dots are the views, the lighter the higher their depth-entropy; the red ring is the first view. Drag "
-        "to turn, and use the buttons or the arrow keys to step.</p>"
-        '<div id="viewer"><div><div class="controls">'
-        '<select id="scene" aria-label="object"></select><select id="policy" aria-label="policy"></select>'
-        '<button id="back" aria-label="one view back">&#9664;</button>'
-        '<button id="next" aria-label="next view">&#9654;</button></div>'
-        '<div class="stage"><canvas id="sphere" tabindex="0" role="img"></canvas></div></div>'
-        '<div><p id="why" class="soft"></p><p id="verdict" aria-live="polite"></p><ol id="steps"></ol></div></div>'
-        f'<script type="application/json" id="trajectories">{data}</script>'
-    )
+    policies = [best, *(n for n in curves.compared(results) if n != best)]
+    scenes = trajectories(results, policies, wanted, at, pictures)
+    return scenes if scenes["scenes"] else None
 
 
-def _made(results: Results, pictures: Pictures) -> str:
+def _made(results: Results, pictures: Pictures) -> dict[str, str]:
     s, p = results.settings, results.predictions
     splits = zip(*np.unique(p.splits, return_counts=True), strict=True)
     conflicting = [name for name, twice in zip(p.names, p.conflicting, strict=True) if twice]
-    facts = {
+    return {
         "predictions": f"{s['predictions']}, SHA-256 {s['predictions_sha256']}",
         **{f"model: {kind}": f"{name}, SHA-256 {sha}" for kind, (name, sha) in s["models"].items()},
         "splits": ", ".join(f"{n} {name or 'unnamed'}" for name, n in splits),
@@ -307,7 +279,5 @@ def _made(results: Results, pictures: Pictures) -> str:
         "McNemar": "for clustered pairs (Durkalski et al. 2003)",
         "Holm": "over all policies and thresholds of a measure",
         "calibration error": "15 bins of equal width (Guo et al. 2017)",
-    }  # fmt: skip
-    if pictures.store is not None:
-        facts["pictures"] = pictures.store.path.name
-    return description(facts)
+        "pictures": pictures.store.path.name if pictures.store is not None else pictures.why_not,
+    }

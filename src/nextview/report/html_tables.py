@@ -1,16 +1,15 @@
-"""The tables of the report, as HTML."""
+"""The tables of the report."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
 
 import numpy as np
 
+from nextview.benchmark.leaderboard import is_oracle, promised_risks
 from nextview.benchmark.published import COLUMNS, published_threshold
 from nextview.benchmark.results import Results
-from nextview.report.curves import is_oracle
-from nextview.report.elements import NONE, cell, numbers, table
+from nextview.report.elements import NONE, Cell, Table, cell, label, numbers, percent
 
 KNOWING = ("best", "worst", "high", "low")
 """How the names of fixed views begin that are chosen by a truth no robot has."""
@@ -18,16 +17,15 @@ KNOWING = ("best", "worst", "high", "low")
 
 def p_value(p: float) -> str:
     """A p-value as it is written."""
-    return NONE if np.isnan(p) else "&lt; 0.001" if p < 0.001 else f"{p:.3f}"
+    return NONE if np.isnan(p) else "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
-def named(policy: str) -> str:
+def named(policy: str, *small: str) -> Cell:
     """A policy's name, marked if it knows what a robot cannot."""
-    knows = is_oracle(policy) or policy.split("-")[0] in KNOWING
-    return escape(policy) + (' <abbr title="told what a robot cannot know">oracle</abbr>' if knows else "")
+    return Cell(policy, small, oracle=is_oracle(policy) or policy.split("-")[0] in KNOWING)
 
 
-def overview(results: Results, threshold: float) -> str:
+def overview(results: Results, threshold: float) -> Table:
     """All policies under one threshold: table 5 of the thesis, with what it lacked."""
     found = numbers(results.tables.summary, "policy", "threshold", "measure")
     tests = results.tables.tests.query("threshold == @threshold and measure == 'accuracy'")
@@ -42,41 +40,56 @@ def overview(results: Results, threshold: float) -> str:
     measures |= {"n_views": 2, "travel_all": 2, "travel_moved": 2, "arc_all": 2}
     rows = []
     for policy in results.tables.sweep["policy"].unique():
-        row = [named(policy)]
+        row: list[Cell | str] = [named(policy)]
         row += [cell(found[policy, threshold, measure], digits) for measure, digits in measures.items()]
         if policy in tested:
             difference, low, high, p, paired = tested[policy]
-            row.append(f"{100 * difference:+.1f}<small>{100 * low:+.1f} &hellip; {100 * high:+.1f}</small>")
+            row.append(Cell(f"{100 * difference:+.1f}", (f"{100 * low:+.1f} … {100 * high:+.1f}",)))
             row += [p_value(p), p_value(paired)]
         else:
             row += ["reference", NONE, NONE]
         rows.append(row)
     head = [
-        "policy", "accuracy", "without duplicates", "class accuracy", "n_views", "travel, all", "travel, moved",
-        "arc, rad", "points over reference", "p, boot&shy;strap", "p, Mc&shy;Nemar",
+        "policy", "accuracy", "without duplicates", "class accuracy", "views", "travel, all", "travel, moved",
+        "arc, rad", "points over reference", "p, boot\u00adstrap", "p, Mc\u00adNemar",
     ]  # fmt: skip
-    return table(
-        head,
-        rows,
-        f"Every policy at threshold {threshold:g}. Small print: 95&nbsp;% intervals. The p-values are Holm-corrected.",
-    )
+    caption = f"Every policy at threshold {threshold:g}. Small print: 95\u00a0% intervals. p-values are Holm-corrected."
+    return Table(head, rows, caption)
 
 
-def calibration(results: Results, policies: Sequence[str]) -> str:
+def calibration(results: Results, policies: Sequence[str]) -> Table:
     """What a threshold is worth: how many reach it, and how many of these are right."""
     found = numbers(results.tables.summary, "policy", "threshold", "measure")
     thresholds = results.settings["thresholds"]
 
-    def value(policy: str, threshold: float) -> str:
+    def value(policy: str, threshold: float) -> Cell:
         share = found[policy, threshold, "confident"].value
-        return cell(found[policy, threshold, "confident_accuracy"]) + f"<small>of {100 * share:.0f}&nbsp;%</small>"
+        return cell(found[policy, threshold, "confident_accuracy"], below=f"of {percent(share, 0)}")
 
-    rows = [[named(policy), *(value(policy, threshold) for threshold in thresholds)] for policy in policies]
+    rows: list[list[Cell | str]] = [
+        [named(policy), *(value(policy, threshold) for threshold in thresholds)] for policy in policies
+    ]
     caption = "Share of right answers among the episodes that reached the threshold, and how many did."
-    return table(["policy", *(f"{t:g}" for t in thresholds)], rows, caption)
+    return Table(["policy", *(f"{t:g}" for t in thresholds)], rows, caption)
 
 
-def per_class(results: Results, measure: str, fallback: float) -> str:
+def risks(results: Results) -> Table | None:
+    """Promised and measured error rates; None if none were promised."""
+    rows: list[list[Cell | str]] = [
+        [
+            named(row.policy),
+            percent(row.risk),
+            f"{row.threshold:.4g}",
+            Cell(percent(row.error), (f"{100 * row.low:.1f} {NONE} {percent(row.high)}",)),
+            percent(row.confident),
+        ]
+        for row in promised_risks(results.tables)
+    ]
+    caption = "Promised error rates of those who stop early, and measured ones."
+    return Table(["policy", "promised", "threshold", "measured", "stopped early"], rows, caption) if rows else None
+
+
+def per_class(results: Results, measure: str, fallback: float) -> Table:
     """Tables 8 and 9 (40 classes: 10 and 11), each policy at the threshold of its published column."""
     found = numbers(results.tables.per_class, "policy", "threshold", "label", "measure")
     overall = numbers(results.tables.summary, "policy", "threshold", "measure")
@@ -88,37 +101,37 @@ def per_class(results: Results, measure: str, fallback: float) -> str:
         if name in ran:
             at[name] = wanted if wanted in thresholds else fallback
     digits = 3 if measure == "accuracy" else 2
-    rows = []
-    for label in sorted(results.tables.per_class["label"].unique()):
-        cells = (cell(found.get((name, t, label, measure)), digits) for name, t in at.items())
-        rows.append([escape(label).replace("_", " "), *cells])
+    rows: list[list[Cell | str]] = []
+    for of_class in sorted(results.tables.per_class["label"].unique()):
+        cells = (cell(found.get((name, t, of_class, measure)), digits) for name, t in at.items())
+        rows.append([label(of_class), *cells])
     over = "objects" if measure == "accuracy" else "episodes"
     for heading, of in (("mean of classes", f"class_{measure}"), (f"mean of {over}", measure)):
         rows.append([heading, *(cell(overall.get((name, t, of)), digits) for name, t in at.items())])
-    head = ["class", *(f"{named(name)}<small>at {t:g}</small>" for name, t in at.items())]
+    head: list[Cell | str] = ["class", *(named(name, f"at {t:g}") for name, t in at.items())]
     ten = len(results.predictions.classes) <= 10
     number = {"accuracy": 8 if ten else 10, "travel_moved": 9 if ten else 11}[measure]
     what = "Accuracy" if measure == "accuracy" else "Travel in grid cells, over the episodes that moved,"
-    return table(head, rows, f"{what} by class, as table {number} of the thesis, whose numbers stand last in a cell.")
+    return Table(head, rows, f"{what} by class, as table {number} of the thesis, whose numbers stand last in a cell.")
 
 
-def five_views(results: Results) -> str:
-    """Tables 3 and 12: views settled beforehand."""
+def five_views(results: Results) -> Table | None:
+    """Tables 3 and 12: views settled beforehand; None if there are none."""
     found = numbers(results.tables.per_class, "policy", "threshold", "label", "measure")
     overall = numbers(results.tables.summary, "policy", "threshold", "measure")
     policies = [name for name, threshold, measure in overall if threshold is None and measure == "accuracy"]
     if not policies:
-        return ""
-    rows = []
-    for label in sorted(results.tables.per_class["label"].unique()):
-        cells = (cell(found.get((name, None, label, "accuracy"))) for name in policies)
-        rows.append([escape(label).replace("_", " "), *cells])
+        return None
+    rows: list[list[Cell | str]] = []
+    for of_class in sorted(results.tables.per_class["label"].unique()):
+        cells = (cell(found.get((name, None, of_class, "accuracy"))) for name in policies)
+        rows.append([label(of_class), *cells])
     for heading, measure, digits in (
         ("mean of classes", "class_accuracy", 3),
         ("mean of objects", "accuracy", 3),
-        ("n_views", "n_views", 0),
+        ("views", "n_views", 0),
         ("travel, cells", "travel_all", 1),
     ):
         rows.append([heading, *(cell(overall[name, None, measure], digits) for name in policies)])
     caption = "Fixed views, no threshold, as tables 3 and 12. The published numbers are of a network for 40 classes."
-    return table(["class", *map(named, policies)], rows, caption)
+    return Table(["class", *map(named, policies)], rows, caption)

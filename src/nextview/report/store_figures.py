@@ -32,7 +32,7 @@ def object_figure(store: ViewStore, i: int) -> Figure:
     Rows are rings, the horizon lowest; columns are azimuths. A dot marks the view that measures most.
     """
     sphere = store.sphere
-    names = [name for name in store.measures if np.isfinite(store.measure(name)[i]).all()]
+    names = [name for name in store.measures if store.has(f"measures/{name}", i)]
     names.sort(key=lambda name: name != "depth_entropy")  # the thesis's first
     wide = sphere.azimuths / sphere.rings
     rows, columns = (2, 1) if wide > 3 else (1, 2)
@@ -65,7 +65,7 @@ def object_figure(store: ViewStore, i: int) -> Figure:
         spare = panels[len(names)]
         spare.text(0.5, 0.5, hint, ha="center", va="center", color=GREY, transform=spare.transAxes)
     for axes, name in zip(panels, names, strict=False):
-        values = store.measure(name)[i].reshape(sphere.rings, sphere.azimuths)
+        values = store.read(f"measures/{name}", i).reshape(sphere.rings, sphere.azimuths)
         shown = axes.imshow(values, cmap="viridis", origin="lower", aspect="auto")
         elevation, azimuth = sphere.angles(int(values.argmax()))
         axes.set_title(name.replace("_", " "), fontsize=11)
@@ -158,7 +158,7 @@ def summary(store: ViewStore) -> dict[str, str]:
             for name in ("image", "depth", "points")
             if name in sizes
         )
-    missing = [name for name in RENDERED if name not in store.group]
+    missing = [name for name in RENDERED if not store.holds(name)]
     if missing:
         facts["arrays that are missing"] = ", ".join(missing)
     if "sha256" not in store.group.attrs:

@@ -9,8 +9,10 @@ from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 INK, FAINT = "#1f2933", "#d5dbe1"
 STYLE = {
@@ -46,10 +48,18 @@ class PlainFigure(Figure):
 
 
 def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
-    """An empty figure with one pair of axes, inches."""
+    """An empty figure with one pair of axes, inches; few ticks, at round numbers."""
     with matplotlib.rc_context(STYLE):
         figure = PlainFigure((width, height))
-        return figure, figure.add_subplot()
+        axes = figure.add_subplot()
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+        return figure, axes
+
+
+def percent_axis(axis: Axis) -> None:
+    """Write the shares along an axis in percent, with no more digits than they need."""
+    axis.set_major_formatter(FuncFormatter(lambda share, _: f"{round(100 * share, 6):g} %"))
 
 
 def legend(axes: Axes, title: str | None = None) -> None:

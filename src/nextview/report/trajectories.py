@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 from dataclasses import dataclass
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,9 @@ from nextview.benchmark.entries import EpisodeSpecs
 from nextview.benchmark.published import COLUMNS
 from nextview.benchmark.replay import replay, truncate
 from nextview.benchmark.results import Results
+from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, ResultsError
 from nextview.measures.depth_entropy import normalise_per_object
 
 CLOUD = 1500
@@ -29,9 +32,48 @@ THESIS = ("table_0444", 13)
 
 @dataclass(frozen=True)
 class Pictures:
-    """What the objects look like, from the store they were rendered into; without one there are none."""
+    """What the objects look like, from the store they were rendered into.
+
+    Attributes:
+        store: None if there are no pictures.
+        why_not: a sentence that says why there are none; empty if there are.
+    """
 
     store: ViewStore | None
+    why_not: str = ""
+
+    @classmethod
+    def of(cls, predictions: Predictions, store: Path | None = None) -> Pictures:
+        """Pictures of the objects of some predictions.
+
+        Args:
+            predictions: they name the store that they were made from, and hold the depth-entropy of each of its views,
+                by which it is known again.
+            store: take this one instead, as it is.
+
+        Raises:
+            DatasetError: the store that was given cannot be read.
+            ResultsError: it holds none of the objects, or other views of them.
+        """
+        if store is not None:
+            given = ViewStore.open(store)
+            if given.sphere != predictions.sphere or not set(given.names) & set(predictions.names):
+                raise ResultsError(f"{store}: holds no views of these objects from these viewpoints")
+            return cls(given)
+        remedy = "give it with --store"
+        if not predictions.store:
+            return cls(None, f"No pictures: the predictions do not name the view store they were made from; {remedy}.")
+        try:
+            named = ViewStore.open(predictions.store)
+            row = {name: i for i, name in enumerate(named.names)}
+            rows = [row.get(name, -1) for name in predictions.names]
+            same = named.sphere == predictions.sphere and -1 not in rows
+            same = same and np.array_equal(named.measure()[rows], predictions.depth_entropy)
+        except DatasetError:
+            return cls(None, f"No pictures: there is no view store at {predictions.store} any more; {remedy}.")
+        if not same:
+            return cls(None, f"No pictures: the view store {predictions.store} has changed since; {remedy}.")
+        return cls(named)
 
     def row(self, name: str) -> int | None:
         """Where an object is in the store."""

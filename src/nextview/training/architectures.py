@@ -214,7 +214,7 @@ def map_network(recipe: MapRecipe, sphere: ViewSphere) -> nn.Module:
 
 def map_columns(recipe: MapRecipe, sphere: ViewSphere) -> list[int]:
     """Azimuth steps from the view to each column of a map: -1, 0, +1, or 0, 1, ... once round."""
-    return [-1, 0, 1] if recipe.around == "window" else list(range(sphere.azimuths))
+    return [-1, 0, 1] if recipe.output == "window" else list(range(sphere.azimuths))
 
 
 def orthogonality(matrix: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from nextview.errors import ModelError
 from nextview.models.inference import open_weights
-from nextview.models.model_card import find_card
+from nextview.models.model_card import ModelCard, find_card
 from nextview.training.architectures import RESNETS, ResNet
 from nextview.training.lite import LiteNet
 
@@ -111,11 +111,11 @@ def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet |
     Raises:
         ModelError: it is no recogniser of such an input.
     """
-    facts = find_card(card).facts
-    classes, azimuth_bins = len(facts.get("classes", [])), facts.get("azimuth_bins", 0)
+    model = find_card(card)
+    classes, azimuth_bins = len(model.classes), model.azimuth_bins
     depths = {f"ResNet-{depth}": depth for depth in RESNETS}
     networks: list[ResNet | LiteNet] = []
-    for which, name in enumerate(_names(facts)):
+    for which, name in enumerate(_names(model)):
         network: ResNet | LiteNet
         if name == LiteNet.name:
             network = LiteNet(classes, channels, azimuth_bins)
@@ -142,7 +142,8 @@ def load_exported(
 
     The export merges every batch norm into the convolution before it. Here each gets the mean and the variance that its
     input has over ``views``, and a scale and a shift that undo them: the network answers as the exported one, save for
-    the temperature. A last layer that is not there, or has other classes, is left as it is.
+    the temperature by which files of the first version divide. A last layer that is not there, or has other classes,
+    is left as it is.
 
     Args:
         network: is changed in place.
@@ -158,11 +159,10 @@ def load_exported(
     model = find_card(card)
     if model.kind not in kinds:
         raise ModelError(f"{card}: is a {model.kind}, not a {' or '.join(kinds)}")
-    names = _names(model.facts)
+    names = _names(model)
     fitting = [k for k, name in enumerate(names) if name == network.name and which in (None, k)]
     if len(fitting) != 1:
-        named = model.facts.get("network")
-        raise ModelError(f"{card}: is not one network of this depth and input: {named}, not {network.name}")
+        raise ModelError(f"{card}: is not one network of this depth and input: {model.network}, not {network.name}")
     (at,) = fitting
     open_weights(model)  # refuses a file that is not the card's
     graph = onnx.load(model.path).graph
@@ -185,12 +185,13 @@ def load_exported(
             assert isinstance(norm, nn.BatchNorm2d)
             weight = exported(f"{name}.weight", module.weight.shape)
             # A norm forgets the scale of what it is given: bring it to where training begins, as the rate expects.
-            scale = float((2 / (weight.shape[0] * weight[0, 0].numel())) ** 0.5 / weight.std())
+            spread = float(weight.std()) or 1.0  # all zero where a block has hardly been trained
+            scale = (2 / (weight.shape[0] * weight[0, 0].numel())) ** 0.5 / spread
             module.weight.copy_(weight * scale)
             norm.weight.fill_(1 / scale)
             norm.bias.copy_(exported(f"{name}.weight_bias", norm.bias.shape))
             norms.append(norm)
-        for name in ("fc", "azimuth_bin"):
+        for name in ("fc", "side"):
             layer = getattr(network, name)
             if not last or layer is None:
                 continue
@@ -200,9 +201,9 @@ def load_exported(
         _make_norms(network, norms, views)
 
 
-def _names(facts: dict[str, Any]) -> list[str]:
+def _names(card: ModelCard) -> list[str]:
     """Of the networks that a card's recogniser averages."""
-    return NAME.findall(facts.get("network", ""))
+    return NAME.findall(card.network)
 
 
 def refuse_seen(card: Path, kept: list[str]) -> None:
@@ -218,7 +219,7 @@ def refuse_seen(card: Path, kept: list[str]) -> None:
     Raises:
         ModelError: it has seen some of them.
     """
-    seen = sorted(set(kept) - set(find_card(card).facts.get("unseen", [])))
+    seen = sorted(set(kept) - set(find_card(card).held_out))
     if 0 < len(seen) < len(set(kept)):
         raise ModelError(
             f"{card}: was trained on {len(seen)} of the {len(set(kept))} objects that this network must not have seen, "

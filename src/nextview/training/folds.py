@@ -1,4 +1,7 @@
-"""Cross-fitting: every object is kept from one of several networks, which then judges it without having seen it."""
+"""Cross-fitting: every object is held out from one of several networks, which then predicts it out of fold.
+
+Not by scikit-learn's StratifiedGroupKFold: the bundled gain policy was learned in the folds that are made here.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,9 @@ from nextview.errors import DatasetError
 def hold_out(
     labels: NDArray[np.int64], measured: NDArray[np.floating], folds: int, seed: int
 ) -> list[NDArray[np.int64]]:
-    """Divide objects into parts, each to be kept from one network; every class is spread evenly.
+    """Divide objects into parts, each to be held out from one network; every class is spread evenly.
 
-    Objects that look the same are kept together.
+    Duplicate groups, objects that look the same, stay together.
 
     Args:
         labels: class of each object, (N,).
@@ -31,11 +34,11 @@ def hold_out(
     if not 2 <= folds <= len(labels):
         raise DatasetError(f"{len(labels)} objects cannot be divided into {folds} folds")
     rng = np.random.default_rng([seed, folds])
-    duplicate = duplicate_groups(measured)
-    _, first = np.unique(duplicate, return_index=True)  # one object stands for all that look the same
+    group = duplicate_groups(measured)
+    _, first = np.unique(group, return_index=True)  # one object stands for its group
     first = rng.permutation(first)
     first = first[np.argsort(labels[first], kind="stable")]  # dealt out class by class
-    fold_of_twin = np.empty(len(first), np.int64)
-    fold_of_twin[duplicate[first]] = np.arange(len(first)) % folds
-    fold = fold_of_twin[duplicate]
+    fold_of_group = np.empty(len(first), np.int64)
+    fold_of_group[group[first]] = np.arange(len(first)) % folds
+    fold = fold_of_group[group]
     return [np.flatnonzero(fold == k) for k in range(folds)]

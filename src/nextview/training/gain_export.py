@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,9 @@ from nextview.models.model_card import file_hash
 from nextview.models.onnx_file import open_onnx
 from nextview.outputs import written_whole
 from nextview.policies.gain import Gain
-from nextview.policies.gain_weights import FEATURES_INPUT
-from nextview.policies.policy_card import write_policy
-from nextview.training.perceptrons import Perceptrons
+from nextview.policies.gain.gain_file import FEATURES_INPUT
+from nextview.policies.policy_card import PolicyCard, write_policy_card
+from nextview.training.gain.perceptrons import Perceptrons
 
 OPSET = 18
 IR_VERSION = 8
@@ -90,13 +91,13 @@ def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
     return model
 
 
-def write_gain(card: Path, policy: Gain, facts: dict[str, Any], features: NDArray[np.float32]) -> float:
+def write_gain(card: Path, policy: Gain, about: PolicyCard, features: NDArray[np.float32]) -> float:
     """Write a policy that was trained: the ONNX file, then the card, each aside and then renamed.
 
     Args:
         card: NAME.json; the ONNX file is NAME.onnx.
         policy: whose score is of ``Perceptrons``.
-        facts: what the card is to say beside the hash and what the policy itself says.
+        about: the card, to which the hash and what the policy itself says are added.
         features: states on which the file is compared with the networks, (S, D).
 
     Returns:
@@ -117,5 +118,5 @@ def write_gain(card: Path, policy: Gain, facts: dict[str, Any], features: NDArra
             raise ModelError(
                 f"{weights}: ONNX Runtime's answers differ by {difference:.2g} from the networks'; not written"
             )
-    write_policy(card, facts | {"sha256": sha256, "table": policy.facts()})
+    write_policy_card(card, replace(about, sha256=sha256, table=policy.to_dict(), scope=policy.scope))
     return difference

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -11,21 +12,19 @@ from pathlib import Path
 
 import numpy as np
 
-from nextview.data.input_views import input_views
+from nextview.data.lock import only_one
 from nextview.data.store import ViewStore
-from nextview.models.geometry_input import CHANNELS
+from nextview.models.network_input import CHANNELS_OF, InputKind, InputSpec, from_store
+from nextview.tracking import Track, silently
 from nextview.training.packed import PackedViews, load_packed, pack, save_packed
 
-CHANNELS_OF = {"geometry": len(CHANNELS), "image": 1}
-"""Channels of what a recogniser may see."""
 
-
-def inputs_path(store: Path, size: int, kind: str = "geometry") -> Path:
+def inputs_path(store: Path, size: int, kind: InputKind = "geometry") -> Path:
     """The folder where the inputs of a store are kept."""
     return store.with_name(f"{store.name}.{'inputs' if kind == 'geometry' else kind}{size}")
 
 
-def prepare_inputs(path: Path, size: int, kind: str = "geometry", workers: int | None = None) -> Iterator[int]:
+def prepare_inputs(path: Path, size: int, kind: InputKind = "geometry", workers: int | None = None) -> Iterator[int]:
     """Compute the inputs of every object, (N, V, C, size, size) uint8, unless they are there.
 
     Yields:
@@ -40,17 +39,43 @@ def prepare_inputs(path: Path, size: int, kind: str = "geometry", workers: int |
     store = ViewStore.open(path)
     chosen = np.flatnonzero(store.done).tolist()
     for first in chosen[:1]:  # a size that the views do not have is refused before anything is made
-        input_views(store, first, kind, size)
+        from_store(InputSpec(kind, size), store, first)
     with ProcessPoolExecutor(workers or os.cpu_count(), get_context("spawn")) as pool:
         packed = pool.map(partial(_packed, path, size=size, kind=kind), chosen, chunksize=5)
         shape = (len(store), len(store.sphere), CHANNELS_OF[kind], size, size)
         yield from save_packed(target, shape, zip(chosen, packed, strict=True))
 
 
-def load_inputs(path: Path, size: int, kind: str = "geometry") -> PackedViews:
+def ready_inputs(path: Path, size: int, kind: InputKind = "geometry", track: Track = silently) -> PackedViews:
+    """The inputs of a store, (N, V, C, size, size) uint8, computed if they are not there.
+
+    Of the processes of one training, the first computes them and the others wait.
+
+    Args:
+        path: the view store.
+        size: side of the inputs, pixels.
+        kind: geometry or image.
+        track: follows the work.
+
+    Raises:
+        ObservationError: the views cannot be brought to this size.
+        DatasetError: another run computes them.
+    """
+    from nextview.training.loop import is_first  # not above: the processes that prepare inputs need no torch
+
+    target = inputs_path(path, size, kind)
+    if is_first() and not target.exists():
+        with only_one(target):
+            track(prepare_inputs(path, size, kind), int(ViewStore.open(path).done.sum()), f"inputs of {path.name}")
+    while not target.exists():
+        time.sleep(1)
+    return load_inputs(path, size, kind)
+
+
+def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedViews:
     """The inputs of a store, (N, V, C, size, size) uint8, as ``prepare_inputs`` made them."""
     return load_packed(inputs_path(path, size, kind))
 
 
-def _packed(path: Path, i: int, size: int, kind: str) -> list[bytes]:
-    return pack(input_views(ViewStore.open(path), i, kind, size))
+def _packed(path: Path, i: int, size: int, kind: InputKind) -> list[bytes]:
+    return pack(from_store(InputSpec(kind, size), ViewStore.open(path), i))

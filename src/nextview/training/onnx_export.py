@@ -20,20 +20,19 @@ OPSET = 18
 SMALL = 2**17
 
 
-class CalibratedRecogniser(nn.Module):
-    """The recogniser as it ships: raw input bytes in, logits over a temperature out.
+class ShippedRecogniser(nn.Module):
+    """The recogniser as it ships: raw input bytes in, logits out.
 
     Where all networks know the azimuth bins of objects, a second output is what they say of them, see
     ``networks.ResNet``.
 
     Args:
         networks: their logits are averaged, and what they say of the azimuth bins.
-        temperature: what the logits are divided by.
     """
 
-    def __init__(self, networks: Sequence[nn.Module], temperature: float) -> None:
+    def __init__(self, networks: Sequence[nn.Module]) -> None:
         super().__init__()
-        self.networks, self.temperature = nn.ModuleList(networks), temperature
+        self.networks = nn.ModuleList(networks)
         bins = {getattr(network, "azimuths", 0) for network in networks}
         self.azimuth_bins = bins.pop() if len(bins) == 1 else 0
 
@@ -45,7 +44,7 @@ class CalibratedRecogniser(nn.Module):
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         x = x.float() / 255
         outputs = [network(x) for network in self.networks]
-        logits = torch.stack([each[0] for each in outputs]).mean(0) / self.temperature
+        logits = torch.stack([each[0] for each in outputs]).mean(0)
         if not self.azimuth_bins:
             return (logits,)
         return logits, torch.stack([each[1] for each in outputs]).mean(0).log_softmax(2)
@@ -144,25 +143,3 @@ def shrink_weights(model: onnx.ModelProto, bits: int) -> onnx.ModelProto:
     del model.graph.node[:]
     model.graph.node.extend(nodes)
     return model
-
-
-def fit_temperature(logits: NDArray[np.floating], labels: NDArray[np.int64]) -> float:
-    """The temperature that gives single views the best likelihood, every class weighted evenly.
-
-    Args:
-        logits: of single views, (M, classes).
-        labels: their classes, (M,).
-
-    Returns:
-        What to divide the logits by (Guo et al., "On calibration of modern neural networks", ICML 2017).
-    """
-    from scipy.optimize import minimize_scalar
-    from scipy.special import log_softmax
-
-    weight = (1 / np.bincount(labels, minlength=logits.shape[1]).clip(1))[labels]
-
-    def loss(log_temperature: float) -> float:
-        scaled = log_softmax(logits / np.exp(log_temperature), axis=1)
-        return -float((weight * scaled[np.arange(len(labels)), labels]).sum() / weight.sum())
-
-    return float(np.exp(minimize_scalar(loss, bounds=(-3, 3), method="bounded").x))

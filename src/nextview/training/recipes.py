@@ -1,9 +1,30 @@
-"""How the bundled models are trained. No torch here, so that the command line can show them."""
+"""How the bundled models are trained. No torch here, so that the command line can show them.
+
+A recipe that makes no sense is refused when it is made, with a ``UsageError`` that names the option.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
+
+from nextview.errors import UsageError
+
+
+def _at_least(least: int, **options: float) -> None:
+    for name, value in options.items():
+        if not least <= value < float("inf"):
+            raise UsageError(f"{_option(name)} is at least {least}, not {value}")
+
+
+def _share(**options: float) -> None:
+    for name, value in options.items():
+        if not 0 <= value < 1:
+            raise UsageError(f"{_option(name)} is 0 or more and less than 1, not {value}")
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")
 
 
 @dataclass(frozen=True)
@@ -58,6 +79,18 @@ class RecogniserRecipe:
     schedule: Literal["one-cycle", "halving"] = "one-cycle"
     patience: int = 0
 
+    def __post_init__(self) -> None:
+        if self.network != "resnet" and self.depth != RecogniserRecipe.depth:
+            raise UsageError(f"only a ResNet has a --depth: {self.network} is as deep as it is")
+        if self.network == "resnet" and self.dropout:
+            raise UsageError("only EfficientNet-Lite0 drops features and blocks: leave --dropout, or take lite0")
+        _at_least(1, size=self.size, epochs=self.epochs, views=self.views, batch=self.batch)
+        _at_least(0, lr=self.lr, weight_decay=self.weight_decay, azimuth_bins_weight=self.azimuth_bins_weight)
+        _at_least(0, seed=self.seed, ensemble_seed=self.ensemble_seed, patience=self.patience)
+        _share(dropout=self.dropout, smoothing=self.smoothing, validation=self.validation)
+        if not 0 <= self.deformed_share <= 1:
+            raise UsageError(f"--deformed-share is a chance, from 0 to 1, not {self.deformed_share}")
+
 
 THESIS_RECOGNISER = RecogniserRecipe(
     depth=34,
@@ -90,7 +123,7 @@ class MapRecipe:
         depth: of the ResNet.
         size: side of the ResNet's input image, pixels.
         points: drawn from each cloud in training; validation and use take all 1,024.
-        around: what the network predicts: the local window alone, or all views of the sphere, of which the window is a
+        output: what the network predicts: the local window alone, or all views of the sphere, of which the window is a
             part; the others are of use to policies that look farther.
         epochs: passes over the training objects.
         views: views of each object in one epoch, drawn at random.
@@ -114,7 +147,7 @@ class MapRecipe:
     depth: Literal[18, 34, 50, 101, 152] = 18
     size: int = 56
     points: int = 256
-    around: Literal["window", "sphere"] = "sphere"
+    output: Literal["window", "sphere"] = "sphere"
     epochs: int = 8
     views: int = 12
     batch: int = 64
@@ -130,11 +163,21 @@ class MapRecipe:
     seed: int = 0
     patience: int = 0
 
+    def __post_init__(self) -> None:
+        _at_least(1, size=self.size, points=self.points, epochs=self.epochs, views=self.views, batch=self.batch)
+        _at_least(0, lr=self.lr, weight_decay=self.weight_decay, regular=self.regular, peak=self.peak)
+        _at_least(0, reach=self.reach, seed=self.seed, patience=self.patience)
+        _share(validation=self.validation)
+        if self.points > 1024:  # cloud.POINTS, which takes SciPy to import
+            raise UsageError(f"--points is 1024 at most, all that a cloud has, not {self.points}")
+        if not self.sharpness > 0:
+            raise UsageError(f"--sharpness is more than 0, not {self.sharpness}")
+
 
 THESIS_MAP = MapRecipe(
     input="cloud",
     points=1024,
-    around="window",
+    output="window",
     epochs=15,
     views=40,
     batch=16,
@@ -152,11 +195,11 @@ class GainRecipe:
     """How the gain policy is trained.
 
     Attributes:
-        inputs: what the networks are told; see ``policies.gain.INPUTS``.
+        inputs: of the networks; see ``policies.gain.INPUTS``.
         frame: from where azimuths are counted: from the camera's, or from the one at which the object is believed to
             show its azimuth bin 0, which takes a recogniser that was taught the azimuth bins.
-        outcome: of a view: belief in the true class after it, its logarithm, or whether the answer is right.
-        n_views: the outcome of views 2 to this one is learned.
+        outcome: the value of a view: belief in the true class after it, its logarithm, or whether the answer is right.
+        n_views: the values of views 2 to this one are learned.
         hidden: width of the two hidden layers.
         networks: that are averaged, of each fold; each weighs the objects by a bootstrap draw of its own.
         epochs: each over new walks of all objects.
@@ -185,3 +228,10 @@ class GainRecipe:
     lr: float = 3e-3
     weight_decay: float = 0.1
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.inputs:
+            raise UsageError("--inputs names at least one input of the networks")
+        _at_least(2, n_views=self.n_views)
+        _at_least(1, hidden=self.hidden, networks=self.networks, epochs=self.epochs, walks=self.walks, batch=self.batch)
+        _at_least(0, lr=self.lr, weight_decay=self.weight_decay, seed=self.seed)

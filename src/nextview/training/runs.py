@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -13,22 +13,27 @@ import torch
 from torch import nn
 
 from nextview.data.lock import only_one
+from nextview.data.predictions import Predictions
+from nextview.data.store import ViewStore
 from nextview.errors import ModelError
-from nextview.models.model_card import file_hash, find_card
+from nextview.models.model_card import BUNDLED, file_hash, find_card
 from nextview.outputs import written_whole
 from nextview.training.loop import is_first
 
 Recipe = TypeVar("Recipe")
 
+COMMANDS = "commands.json"
+
 
 @contextmanager
-def begin(run: Path, recipe: Any, weights: Path | None = None) -> Iterator[None]:
-    """Open a run's folder to this process alone, or that of its devices; keep its recipe there and what it starts from.
+def begin(run: Path, recipe: Any, weights: Path | None = None, commands: Sequence[str] = ()) -> Iterator[None]:
+    """Open a run's folder to this process alone, or that of its devices; keep there its recipe, start and commands.
 
     Args:
         run: the folder.
         recipe: a dataclass.
         weights: a checkpoint, or the card of an exported network.
+        commands: all that lead to the run, its own last, see ``training_commands``.
 
     Raises:
         ModelError: it holds a run of another recipe, or one that started from other weights; there are none.
@@ -41,10 +46,41 @@ def begin(run: Path, recipe: Any, weights: Path | None = None) -> Iterator[None]
             _compare_start(run / "weights.json", start)
         elif is_first():
             run.mkdir(parents=True, exist_ok=True)
+            (run / COMMANDS).write_text(json.dumps(list(commands), indent=1) + "\n")
             (run / "weights.json").write_text(json.dumps(start) + "\n")
             with written_whole(noted) as part:
                 part.write_text(json.dumps(asdict(recipe), indent=1) + "\n")
         yield
+
+
+def training_commands(command: str, made: Iterable[ViewStore | Predictions], weights: Path | None) -> tuple[str, ...]:
+    """All commands that lead to a training run, in order.
+
+    Args:
+        command: that trains.
+        made: what it is given: stores and predictions, which say what made them.
+        weights: a checkpoint, or the card of an exported network, which says so too.
+    """
+    before = [line for each in made for line in each.commands]
+    if weights is not None and weights.suffix == ".json":
+        card = find_card(weights)
+        before += card.training.commands if card.path.parent != BUNDLED else ()
+    return tuple(dict.fromkeys((*before, command)))
+
+
+def read_commands(run: Path) -> tuple[str, ...]:
+    """The commands that led to a run; () for one that was begun before they were noted.
+
+    Raises:
+        ModelError: they cannot be read.
+    """
+    noted = run / COMMANDS
+    if not noted.exists():
+        return ()
+    try:
+        return tuple(str(line) for line in json.loads(noted.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise ModelError(f"{noted}: cannot be read ({type(error).__name__}); remove it") from None
 
 
 def is_done(run: Path) -> bool:

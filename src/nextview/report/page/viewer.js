@@ -105,8 +105,7 @@
     const s = scene(), e = episode(), truth = s.label;
     const list = e.views.map((v, k) => {
       const picture = s.pictures[v]
-        ? element("img", { src: s.pictures[v], alt: `${s.name} from view ${v}, ${where(v)}` })
-        : element("span", { className: "blank", textContent: String(k + 1) });
+        ? [element("img", { src: s.pictures[v], alt: `${s.name} from view ${v}, ${where(v)}` })] : [];
       const bars = e.beliefs[k].map(([c, p]) => {
         const kind = c === truth ? " true" : p === e.beliefs[k][0][1] ? " wrong" : "";
         const bar = element("i", {});
@@ -115,9 +114,10 @@
           element("span", { textContent: pretty(data.classes[c]) }), element("div", {}, bar),
           element("em", { textContent: `${(100 * p).toFixed(1)} %` }));
       });
-      const title = element("div", { className: "where", textContent: `Look ${k + 1}: view ${v}, ${where(v)}` });
-      const item = element("li", { className: k > state.step ? "ahead" : "", onclick: () => go({ step: k }) },
-        picture, element("div", {}, title, ...bars));
+      const title = element("div", { className: "where", textContent: `${k + 1}: view ${v}, ${where(v)}` });
+      const className = (k > state.step ? "ahead" : "") + (picture.length ? "" : " plain");
+      const item = element("li", { className, onclick: () => go({ step: k }) },
+        ...picture, element("div", {}, title, ...bars));
       if (k === state.step) item.setAttribute("aria-current", "step");
       return item;
     });

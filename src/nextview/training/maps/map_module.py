@@ -122,7 +122,7 @@ class MapModule(L.LightningModule):
         near, goal = predicted[..., self.window], true[..., self.window]
         error = F.mse_loss(near, goal)
         self.log("mse", error, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True)
-        if self.recipe.around == "sphere":
+        if self.recipe.output == "sphere":
             error = (error + F.mse_loss(predicted, true)) / 2
         if self.recipe.peak:
             lost = peak_loss(near / self.recipe.sharpness, goal, self.recipe.reach)
@@ -143,7 +143,7 @@ class MapModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def train(
+def fit_map(
     seen: NDArray[Any] | PackedViews,
     values: NDArray[np.float32],
     sphere: ViewSphere,

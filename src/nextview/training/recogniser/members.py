@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -15,12 +14,12 @@ from nextview.data.splits import split_training
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError
 from nextview.models.model_card import find_card
+from nextview.models.network_input import CHANNELS_OF, InputSpec
 from nextview.training.architectures import ResNet, recogniser_network
 from nextview.training.checkpoints import exported_networks, load_run
-from nextview.training.inputs import CHANNELS_OF
 from nextview.training.lite import LiteNet
 from nextview.training.recipes import RecogniserRecipe
-from nextview.training.runs import read_recipe
+from nextview.training.runs import read_commands, read_recipe
 
 
 @dataclass(frozen=True)
@@ -29,17 +28,15 @@ class Member:
 
     Attributes:
         source: the folder of the run, or the card.
-        size: side of its input, pixels.
-        sees: geometry or image.
+        input: what its networks take.
         validated: names of the training split's objects that it was not trained on and that chose its epoch.
         held: names of those kept from it altogether, as a fold.
         recipes: of its training, the last one last.
-        commands: of its training, as far as its card names them.
+        commands: that led to it, as far as its run or card names them.
     """
 
     source: Path
-    size: int
-    sees: Literal["geometry", "image"]
+    input: InputSpec
     validated: frozenset[str]
     held: frozenset[str]
     recipes: list[RecogniserRecipe]
@@ -59,23 +56,25 @@ def member(source: Path, views: ViewStore) -> Member:
     noted = source / "held_out.json"
     held = json.loads(noted.read_text()) if noted.exists() else []
     validated = frozenset(views.names[i] for i in aside)
-    return Member(source, recipe.size, recipe.input, validated, frozenset(held), [recipe], [])
+    return Member(
+        source, InputSpec(recipe.input, recipe.size), validated, frozenset(held), [recipe], list(read_commands(source))
+    )
 
 
 def _exported(source: Path, views: ViewStore) -> Member:
     model = find_card(source)
     if model.kind != "recogniser":
         raise ModelError(f"{source}: is a {model.kind}, not a recogniser")
-    facts = model.facts
-    kept = frozenset(facts.get("unseen", [])) & frozenset(views.names)
-    if facts.get("classes") != views.classes or not kept:
+    kept = frozenset(model.held_out) & frozenset(views.names)
+    if list(model.classes) != views.classes or not kept:
         raise ModelError(f"{source}: is a recogniser of other objects than {views.path} holds")
     try:
-        size, sees, training = facts["input_size"], facts["sees"], facts["training"]
-        recipes = [RecogniserRecipe(**recipe) for recipe in training["recipes"]]
-    except (KeyError, TypeError) as error:
+        recipes = [RecogniserRecipe(**recipe) for recipe in model.training.recipes]
+    except TypeError as error:
         raise ModelError(f"{source}: says not, or not as this version does, how it was trained ({error})") from None
-    return Member(source, size, sees, kept, frozenset(), recipes, training.get("commands", []))
+    if not recipes:
+        raise ModelError(f"{source}: does not say how it was trained")
+    return Member(source, model.input, kept, frozenset(), recipes, list(model.training.commands))
 
 
 def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) -> list[ResNet | LiteNet]:
@@ -87,7 +86,7 @@ def member_networks(one: Member, views: ViewStore, sample: NDArray[np.uint8]) ->
         sample: some views' inputs, (B, C, S, S); see ``weights.load_exported``.
     """
     if one.source.suffix == ".json":
-        return exported_networks(one.source, CHANNELS_OF[one.sees], torch.from_numpy(sample).float() / 255)
+        return exported_networks(one.source, CHANNELS_OF[one.input.kind], torch.from_numpy(sample).float() / 255)
     return [run_network(one.source, one.recipes[0], views)]
 
 

@@ -16,12 +16,12 @@ from torch.nn import functional as F
 from torch.utils.data import IterableDataset
 
 from nextview.training.architectures import recogniser_network
-from nextview.training.azimuth_bins import side_loss
 from nextview.training.checkpoints import load_checkpoint, load_exported
 from nextview.training.hardware import Hardware
 from nextview.training.loop import fit
 from nextview.training.packed import AHEAD, PackedViews, ask_for
 from nextview.training.recipes import RecogniserRecipe
+from nextview.training.recogniser.azimuth_bins import side_loss
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ class ValidationViews(IterableDataset):
             yield torch.from_numpy(views), torch.full((len(views),), int(self.labels[i]))
 
 
-def train(
+def fit_recogniser(
     sources: list[Source],
     labels: NDArray[np.int64],
     training: NDArray[np.int64],

@@ -21,7 +21,7 @@ from nextview.policies.base import Policy
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.gain import Gain, features, mirrored, mirrored_features, origin
 from nextview.policies.learned_tables import cells_from
-from nextview.training.perceptrons import Layers, Perceptrons
+from nextview.training.gain.perceptrons import Layers, Perceptrons
 from nextview.training.recipes import GainRecipe
 
 Float = NDArray[np.float64]

@@ -1,0 +1,290 @@
+"""What is fitted to predictions, from files to a file: in seconds and without torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from nextview.belief import PLAIN_SUM, Calibration
+from nextview.calibration.fitting_set import FittingSet, fitting_set, held_out_by
+from nextview.calibration.policy_tables import fit_class_table, fit_ring, fit_sequence
+from nextview.calibration.size_density import densities, fit_weight
+from nextview.calibration.temperature import fit_risk, fit_temperature, loss
+from nextview.calibration.valleys import valley_gains
+from nextview.command_line import command_line
+from nextview.data.predictions import Predictions
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, ModelError, PredictionsError, UsageError
+from nextview.models.model_card import file_hash, read_card, write_card
+from nextview.models.size_evidence import SizeEvidence
+from nextview.policies.base import Scope
+from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
+
+
+@dataclass(frozen=True)
+class FittedCalibration:
+    """What ``fit_calibration`` found.
+
+    Attributes:
+        calibration: written into the card.
+        objects: fitted to.
+        before, after: mean negative log-likelihood over 1 to 5 views, by the plain sum and by the calibration.
+    """
+
+    calibration: Calibration
+    objects: int
+    before: float
+    after: float
+
+
+def fit_calibration(
+    predictions: Path,
+    card: Path,
+    validation: float | None = None,
+    split_seed: int = 0,
+    delta: float = 0.1,
+    seed: int = 0,
+) -> FittedCalibration:
+    """Calibrate a recogniser: how far to trust the sum of several views, and which error rates can be promised.
+
+    How large the objects are is left aside.
+
+    Args:
+        predictions: of the training split.
+        card: of the recogniser; is written anew. Those objects are taken that it calls held out.
+        validation: take this part of every class instead, as training kept it out of the whole split; 1 for
+            out-of-fold predictions.
+        split_seed: the recogniser's seed, which decided that part.
+        delta: how often a promised error rate may not hold.
+        seed: of the walks over which is fitted.
+
+    Raises:
+        UsageError, ModelError, PredictionsError: what was given makes no sense, or does not fit together.
+    """
+    if not 0 < delta < 1:
+        raise UsageError(f"delta is a probability between 0 and 1, not {delta}")
+    model, table = read_card(card), Predictions.load(predictions).by_shape()
+    if not model.is_recogniser:
+        raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
+    if validation != 1 and table.models["recogniser"][1] != model.sha256:
+        raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
+    if validation is None:
+        data = FittingSet.of_all(table).of(held_out_by(model, table))
+        if len(data) == 0:
+            raise PredictionsError(f"{predictions}: holds no object that {card} calls held out; see --validation")
+    else:
+        data = fitting_set(table, validation, split_seed)
+    walks = 1 + 8000 // len(data)  # few objects are walked over more often
+    calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=walks)
+    risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
+    calibration = replace(calibration, risk=risk)
+    command = command_line(
+        "fit calibration", predictions, card, validation=validation, split_seed=split_seed, delta=delta, seed=seed
+    )
+    fitted_to = {**model.fitted_to, "calibration": _objects(len(data))}
+    model = replace(model, calibration=calibration, fitted_to=fitted_to)
+    write_card(card, model.made_by(*table.commands, command))
+    before, after = (loss(data, c, np.random.default_rng([seed, 2]), walks=walks) for c in (PLAIN_SUM, calibration))
+    return FittedCalibration(calibration, len(data), before, after)
+
+
+@dataclass(frozen=True)
+class FittedSize:
+    """What ``fit_size`` found.
+
+    Attributes:
+        size: written into the card.
+        objects: whose sizes were learned.
+        weighed_on: so many others.
+        before, after: mean negative log-likelihood of single views, by shape alone and with the size.
+    """
+
+    size: SizeEvidence
+    objects: int
+    weighed_on: int
+    before: float
+    after: float
+
+
+def fit_size(store: Path, predictions: Path, card: Path) -> FittedSize:
+    """Tell a recogniser how large the objects of each class are, for stores and cameras that know it.
+
+    Args:
+        store: view store that knows the unit of its meshes; its training objects teach, except those in the
+            predictions.
+        predictions: of training objects that the recogniser has not seen; they decide how much the size counts.
+        card: of the recogniser; is written anew.
+
+    Raises:
+        DatasetError, ModelError, PredictionsError: what was given does not fit together.
+    """
+    model, views, predicted = read_card(card), ViewStore.open(store), Predictions.load(predictions)
+    if not model.is_recogniser:
+        raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
+    table = predicted.deduplicate().by_shape()
+    radii, labels = views.radii, views.labels
+    if np.isnan(radii[views.done]).any():
+        raise DatasetError(f"{store}: does not know the unit of its meshes; tell it with nextview render --unit")
+    row = {name: i for i, name in enumerate(views.names)}
+    strangers = [name for name in predicted.names if name not in row]
+    if strangers:
+        raise PredictionsError(f"{predictions}: holds {strangers[0]!r}, which {store} does not")
+    if table.models["recogniser"][1] != model.sha256:
+        raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
+    data, judged = FittingSet.of_all(table), [row[name] for name in table.names]
+    of_training = views.done & (views.splits == "train") & np.isin(views.group.attrs["labels"], table.classes)
+    taught = np.setdiff1d(np.flatnonzero(of_training), [row[name] for name in predicted.names])
+    classes = np.array([table.classes.index(name) if name in table.classes else -1 for name in views.classes])
+    log_density = densities(radii[taught], classes[labels[taught]], len(table.classes))
+    size, before, after = fit_weight(data, radii[judged], log_density)
+    about = f"{len(taught)} objects of the training split, weighed on {len(data)} others"
+    model = replace(model, size=size, fitted_to={**model.fitted_to, "size": about})
+    command = command_line("fit size", store, predictions, card)
+    write_card(card, model.made_by(*views.commands, *table.commands, command))
+    return FittedSize(size, len(taught), len(data), before, after)
+
+
+@dataclass(frozen=True)
+class FittedValleys:
+    """What ``fit_valleys`` found.
+
+    Attributes:
+        classes: for which the valley is the better view.
+        gains: by how much, in belief in the true class, by class.
+        objects: fitted to.
+    """
+
+    classes: tuple[str, ...]
+    gains: dict[str, float]
+    objects: int
+
+
+def fit_valleys(predictions: Path, card: Path) -> FittedValleys:
+    """Choose the classes for which the valley of a predicted map is the better view than its peak.
+
+    Args:
+        predictions: of the training split; those of objects are taken that the map network was not trained on. Let
+            neither be the recogniser.
+        card: of the map network; is written anew.
+
+    Raises:
+        ModelError, PredictionsError: what was given does not fit together.
+    """
+    model, table = read_card(card), Predictions.load(predictions)
+    if model.kind not in table.maps or table.models[model.kind] != (model.name, model.sha256):
+        raise PredictionsError(f"{predictions}: holds no maps by {card}")
+    kept = held_out_by(model, table)
+    data = FittingSet.of_all(table).of(kept)
+    if len(kept) == 0:
+        raise PredictionsError(f"{predictions}: holds no object of which {card} says that it was not trained on it")
+    found = valley_gains(data.sphere, data.logits, table.maps[model.kind][kept], data.labels)
+    classes = tuple(table.classes[c] for c, gain in found.items() if gain > 0)
+    gains = {table.classes[c]: round(gain, 4) for c, gain in found.items()}
+    about = f"{len(kept)} objects of the training split, judged by {table.models['recogniser'][0]}"
+    fitted_to = {**model.fitted_to, "valleys": about}
+    model = replace(model, valley_classes=classes, valley_gain=gains, fitted_to=fitted_to)
+    write_card(card, model.made_by(*table.commands, command_line("fit valleys", predictions, card)))
+    return FittedValleys(classes, gains, len(kept))
+
+
+@dataclass(frozen=True)
+class FittedPolicies:
+    """What ``fit_policies`` made.
+
+    Attributes:
+        cards: of the policies.
+        objects: that they were learned from.
+    """
+
+    cards: tuple[Path, ...]
+    objects: int
+
+
+def fit_policies(
+    predictions: Path,
+    out: Path,
+    validation: float = 0.1,
+    split_seed: int = 0,
+    length: int = 7,
+    n_views: int = 5,
+    shrinkage: float = 20.0,
+    travel_weight: float = 0.01,
+    seed: int = 0,
+) -> FittedPolicies:
+    """Learn the policies that follow a table: fixed sequence, fixed ring, class table.
+
+    Each in three variants: over the whole sphere (NAME), in the local window (NAME-local), and over the whole sphere at
+    a travel weight (NAME-near; a ring has none).
+
+    Args:
+        predictions: of the training split.
+        out: folder for NAME.json.
+        validation: part of every class that the recogniser was not trained on; 1 for out-of-fold predictions.
+        split_seed: the recogniser's seed, which decided which.
+        length: moves of the fixed sequence.
+        n_views: over which the ring and the class table are chosen.
+        shrinkage: objects by whose weight the gains of one believed class are drawn towards those of all.
+        travel_weight: of one cell of travel for NAME-near, in units of the logarithm of the belief in the true class.
+        seed: of the walks behind the class table.
+
+    Raises:
+        UsageError, PredictionsError: what was given makes no sense, or nothing can be fitted to it.
+    """
+    if length < 1 or n_views < 2 or shrinkage < 0 or travel_weight < 0:
+        raise UsageError("length has to be at least 1, views at least 2, shrinkage and travel weight not negative")
+    table = Predictions.load(predictions)
+    data = fitting_set(table, validation, split_seed)
+    calibration, sphere = table.calibration, data.sphere
+    if calibration == PLAIN_SUM:  # its recogniser was not calibrated when these were made
+        calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=1 + 8000 // len(data))
+    values = fit_class_table(data, n_views, shrinkage, calibration, np.random.default_rng(seed))
+    travel = sphere.travel[:: sphere.azimuths]  # from each ring to each cell
+    command = command_line(
+        "fit policies",
+        predictions,
+        out,
+        validation=validation,
+        split_seed=split_seed,
+        length=length,
+        n_views=n_views,
+        shrinkage=shrinkage,
+        travel_weight=travel_weight,
+        seed=seed,
+    )
+    settings = {"length": length, "n_views": n_views, "shrinkage": shrinkage, "seed": seed}
+    variants: tuple[tuple[str, Scope, float], ...] = (
+        ("", "global", 0.0),
+        ("-local", "local", 0.0),
+        ("-near", "global", travel_weight),
+    )
+    learned = {}
+    for suffix, scope, paid in variants:
+        about = PolicyCard(
+            "",
+            scope,
+            sphere.elevations,
+            sphere.azimuths,
+            data.classes,
+            {},
+            _objects(len(data)),
+            (LearnedFrom(file_hash(predictions), table.models),),
+            ((calibration.temperature, calibration.correlation),),
+            settings | {"travel_weight": paid},
+            (*table.commands, command),
+        )
+        moves = fit_sequence(data, scope, length, calibration, paid)
+        paying = np.round(values - paid * travel, 5)
+        learned[f"fixed-sequence{suffix}"] = replace(about, kind="fixed-sequence", table={"moves": moves.tolist()})
+        learned[f"class-table{suffix}"] = replace(about, kind="class-table", table={"values": paying.tolist()})
+        if not paid:
+            ring, steps = fit_ring(data, scope, n_views, calibration)
+            learned[f"fixed-ring{suffix}"] = replace(about, kind="fixed-ring", table={"ring": ring, "steps": steps})
+    for name, card in learned.items():
+        write_policy_card(out / f"{name}.json", card)
+    return FittedPolicies(tuple(out / f"{name}.json" for name in learned), len(data))
+
+
+def _objects(n: int) -> str:
+    return f"{n} objects of the training split, classes weighted evenly"

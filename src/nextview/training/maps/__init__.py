@@ -1,0 +1,1 @@
+"""From views to the map networks, LEM and LCM."""

@@ -1,0 +1,307 @@
+"""Write docs/results.md: every measurement on one page, each table beside the command that made it.
+
+    python workflow/results.py docs/results.md --stages evaluation benchmark ...
+
+Runs in the folder of the workflow. A section is written for each of the stages that is given; all numbers are read from
+what the stages wrote.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterable, Iterator
+from math import isfinite
+from pathlib import Path
+
+import pandas as pd
+
+THRESHOLD = 0.97
+"""Of the belief, in the tables that are for one threshold."""
+
+SPLITS = {"validation": "validation", "test": "test", "test-size": "test, size known"}
+"""Folders of the evaluation, and what they are called here."""
+
+SOURCES = ("views.zarr", "validation.npz", "test.npz", "test-size.npz")
+"""Stages from which the others come."""
+
+Cell = tuple[float, float, float, float]
+"""Value, ends of its interval, and the published value."""
+
+
+def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
+    """A table."""
+    head = list(head)
+    yield "| " + " | ".join(head) + " |"
+    yield "|---" * len(head) + "|"
+    for row in rows:
+        yield "| " + " | ".join(row) + " |"
+    yield ""
+
+
+def cells(table: pd.DataFrame, *keys: str) -> dict[tuple, Cell]:
+    """The numbers of a long table by its key columns."""
+    published = table["published"] if "published" in table else [float("nan")] * len(table)
+    numbers = zip(table["value"], table["low"], table["high"], published, strict=True)
+    return dict(zip(table[list(keys)].itertuples(index=False, name=None), numbers, strict=True))
+
+
+def shown(cell: Cell | None, digits: int = 3, interval: bool = True) -> str:
+    """A number, with its interval where it has one."""
+    if cell is None or not isfinite(cell[0]):
+        return ""
+    value, low, high, _ = cell
+    return f"{value:.{digits}f}" + (f" ({low:.{digits}f}-{high:.{digits}f})" if interval and high > low else "")
+
+
+def published(cell: Cell | None, digits: int = 3) -> str:
+    """The published number, if there is one."""
+    return "" if cell is None or not isfinite(cell[3]) else f"{cell[3]:.{digits}f}"
+
+
+def p_value(p: float) -> str:
+    """A p-value, none for the reference itself."""
+    return "" if not isfinite(p) else "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def called(policy: str) -> str:
+    """What a policy is called here: the card of one of ours by its name."""
+    return Path(policy).stem if policy.endswith(".json") else policy
+
+
+def recogniser(stage: Path) -> Iterator[str]:
+    """Accuracy of single views and of all of them."""
+    tables = {split: pd.read_csv(stage / split / "accuracy.csv", keep_default_na=False) for split in SPLITS}
+    for table in tables.values():
+        for column in ("value", "low", "high", "published"):
+            table[column] = pd.to_numeric(table[column])
+    found = {split: cells(table, "n_views", "label", "measure") for split, table in tables.items()}
+    all_views = int(tables["test"]["n_views"].max())
+    objects = {split: int(table.loc[table["label"] == "", "objects"].max()) for split, table in tables.items()}
+    yield "Share of right answers, in brackets 95 % bootstrap intervals over objects. Of all views the logits are"
+    yield "summed. `accuracy.csv`."
+    yield ""
+    measures = {
+        "accuracy": "all objects",
+        "class_accuracy": "mean of classes",
+        "clean_accuracy": "without the meshes that also have another label",
+        "shape_accuracy": "size not used",
+    }
+    rows = []
+    for views in (1, all_views):
+        for measure, what in measures.items():
+            row = [found[split].get((views, "", measure)) for split in SPLITS]
+            name = f"{'one view' if views == 1 else f'all {views} views'}, {what}"
+            rows.append([name, *map(shown, row), published(found["test"].get((views, "", measure)))])
+    head = [f"{what} ({objects[split]} objects)" for split, what in SPLITS.items()]
+    yield from markdown(["", *head, "published, test"], rows)
+    yield "Each class of the test split, one view and all:"
+    yield ""
+    test = found["test"], found["test-size"]
+    labels = [label for label in tables["test"]["label"].unique() if label]
+    rows = [
+        [label.replace("_", " "), *(shown(of.get((v, label, "accuracy"))) for of in test for v in (1, all_views))]
+        for label in labels
+    ]
+    yield from markdown(["class", "one view", "all", "one view, size known", "all, size known"], rows)
+
+
+def calibration(stage: Path) -> Iterator[str]:
+    """What the belief is worth after several views."""
+    yield "Views of the test split in random order, fused as the recogniser's card says. `fusion.csv`."
+    yield ""
+    table = pd.read_csv(stage / "test" / "fusion.csv")
+    rows = [
+        [f"{r.n_views}", f"{r.accuracy:.3f} ({r.low:.3f}-{r.high:.3f})", f"{r.class_accuracy:.3f}",
+         f"{r.confidence:.3f}", f"{r.calibration_error:.3f}"]
+        for r in table.itertuples()
+    ]  # fmt: skip
+    yield from markdown(["views", "accuracy", "mean of classes", "mean confidence", "calibration error"], rows)
+
+
+def maps(stage: Path) -> Iterator[str]:
+    """Scores of the map networks."""
+    measures = {"mse": "squared error", "d0": "peak exact", "d_le_1": "within one cell", "d_lt_2": "d < 2",
+                "regret": "regret"}  # fmt: skip
+    yield "Published: squared error over objects, peaks over classes (table 4). The baselines are made from the true"
+    yield "maps of these very objects, which flatters them. `maps.csv`."
+    yield ""
+    rows = []
+    for split in ("validation", "test"):
+        table = pd.read_csv(stage / split / "maps.csv", keep_default_na=False)
+        for column in ("value", "low", "high", "published"):
+            table[column] = pd.to_numeric(table[column])
+        found = cells(table[table["label"] == ""], "map", "by", "measure")
+        for name in table["map"].unique():
+            for by in table.loc[table["map"] == name, "by"].unique():
+                for over, what in {"": "objects", "class_": "classes"}.items():
+                    row = [found.get((name, by, over + measure)) for measure in measures]
+                    if any(cell is not None for cell in row):
+                        digits = [4 if measure == "mse" else 3 for measure in measures]
+                        values = [shown(c, d, by == "network") for c, d in zip(row, digits, strict=True)]
+                        rows.append([f"{name.upper()}, {by}", split, what, *values])
+            if split == "test":
+                row = [found.get((name, "network", m if m == "mse" else f"class_{m}")) for m in measures]
+                if any(published(cell) for cell in row):
+                    rows.append([f"{name.upper()}, published", split, "see above", *(published(c, 4) for c in row)])
+    yield from markdown(["map", "split", "mean of", *measures.values()], rows)
+
+
+def comparison(stage: Path) -> Iterator[str]:
+    """All policies at one threshold."""
+    settings = json.loads((stage / "benchmark.json").read_text())
+    summary, tests = pd.read_csv(stage / "summary.csv"), pd.read_csv(stage / "tests.csv")
+    decay = settings["threshold_decay"]
+    yield f"{settings['runs']} first views an object, the same for every policy; threshold {THRESHOLD} at the first"
+    yield f"view, which comes down with the views (threshold decay {decay:g}); at most {settings['max_views']} views."
+    yield "Travel is the mean over all episodes, those that never moved included. p: bootstrap test of the accuracy"
+    yield f"against `{settings['reference']}`, corrected by Holm over all policies and thresholds."
+    yield "`summary.csv`, `tests.csv`."
+    yield ""
+    found = cells(summary[summary["threshold"] == THRESHOLD], "policy", "measure")
+    at = tests[(tests["threshold"] == THRESHOLD) & (tests["measure"] == "accuracy")].set_index("policy")
+    rows = []
+    for policy in dict.fromkeys(policy for policy, _ in found):
+        numbers = [("accuracy", 3), ("class_accuracy", 3), ("n_views", 2), ("travel_all", 2), ("arc_all", 2)]
+        row = [shown(found.get((policy, m)), d, m != "class_accuracy") for m, d in numbers]
+        test = at.loc[policy] if policy in at.index else None
+        difference = "" if test is None else f"{round(100 * test['difference'], 1) + 0.0:+.1f}"
+        rows.append([called(policy), *row, difference, "" if test is None else p_value(test["p_holm"])])
+    yield from markdown(
+        ["policy", "accuracy", "mean of classes", "views", "travel, cells", "travel, radians",
+         f"points over {settings['reference']}", "p"], rows)  # fmt: skip
+
+
+def fixed_views(stage: Path) -> Iterator[str]:
+    """Everybody takes so many views: the table that the script wrote."""
+    (page,) = stage.glob("*.md")
+    yield page.read_text()
+
+
+def risk(stage: Path) -> Iterator[str]:
+    """What became of the promised error rates."""
+    settings = json.loads((stage / "benchmark.json").read_text())
+    found = cells(pd.read_csv(stage / "summary.csv"), "policy", "threshold", "measure")
+    yield "With `--risk` an episode stops at the lowest threshold at which, by the calibration on validation objects,"
+    yield "at most that share of those who stop early is wrong. On the test split:"
+    yield ""
+    rows = []
+    for policy in [
+        name for name in settings["policies"] if called(name) in ("random", "random-all", "lem", "lcm", "gain")
+    ]:
+        for promised, threshold in settings["risks"].items():
+            near = next(t for _, t, _ in found if abs(t - threshold) < 1e-9)
+            right, early, views = (found[policy, near, m] for m in ("confident_accuracy", "confident", "n_views"))
+            wrong = f"{1 - right[0]:.3f} ({1 - right[2]:.3f}-{1 - right[1]:.3f})"
+            cell = shown(found[policy, near, "accuracy"])
+            rows.append(
+                [called(policy), promised, f"{threshold:.4f}", f"{early[0]:.3f}", wrong, cell, f"{views[0]:.2f}"]
+            )
+    yield from markdown(
+        ["policy", "promised", "threshold", "stop early", "wrong among those", "accuracy of all", "views"], rows
+    )
+
+
+def thesis(stage: Path) -> Iterator[str]:
+    """Beside the published numbers, by the published sum of logits."""
+    summary, classes = pd.read_csv(stage / "summary.csv"), pd.read_csv(stage / "per_class.csv")
+    yield "Tables 3, 5, 8, 9 and 12 of the thesis, at its thresholds, by its plain sum of logits. What of its"
+    yield "comparison holds up is worked out in [reproduction.md](reproduction.md)."
+    yield ""
+    beside = summary[summary["published"].notna()]
+    rows = [
+        [r.policy, "" if pd.isna(r.threshold) else f"{r.threshold:g}", r.measure.replace("_", " "),
+         shown((r.value, r.low, r.high, 0)), f"{r.published:.3f}"]
+        for r in beside.itertuples()
+    ]  # fmt: skip
+    yield from markdown(["policy", "threshold", "measure", "here", "published"], rows)
+    beside = classes[classes["published"].notna()].fillna({"threshold": 0})  # of fixed views
+    for measure, title in {"accuracy": "Accuracy", "travel_moved": "Travel of those that moved, cells"}.items():
+        of = beside[beside["measure"] == measure]
+        policies = of[["policy", "threshold"]].drop_duplicates().itertuples(index=False, name=None)
+        by = {(r.policy, r.threshold, r.label): r for r in of.itertuples()}
+        policies = list(policies)
+        if not policies:
+            continue
+        yield f"{title}, here / published:"
+        yield ""
+        rows = []
+        for label in of["label"].unique():
+            row = [by.get((*policy, label)) for policy in policies]
+            rows.append(
+                [label.replace("_", " ")] + ["" if r is None else f"{r.value:.3f} / {r.published:.3f}" for r in row]
+            )
+        yield from markdown(["class", *(f"{name} at {t:g}" if t else name for name, t in policies)], rows)
+
+
+def page_as_is(stage: Path) -> Iterator[str]:
+    """Markdown that a script printed."""
+    yield stage.read_text()
+
+
+def text_as_is(stage: Path) -> Iterator[str]:
+    """Text that a script printed."""
+    yield f"```\n{stage.read_text().rstrip()}\n```\n"
+
+
+SECTIONS: list[tuple[str, str, Callable[[Path], Iterator[str]]]] = [
+    ("evaluation", "Recogniser", recogniser),
+    ("evaluation", "Calibration", calibration),
+    ("evaluation", "Map networks", maps),
+    ("benchmark", f"Policies at threshold {THRESHOLD}", comparison),
+    ("views", "Policies after 2, 3 and 5 views", fixed_views),
+    ("views-size", "Policies after 2, 3 and 5 views, size known", fixed_views),
+    ("benchmark-risk", "Promised error rates", risk),
+    ("benchmark-published", "Beside the thesis", thesis),
+    ("agreement.md", "Views that agree on the azimuth bin", page_as_is),
+    ("size.md", "The size of the object", page_as_is),
+    ("unseen.txt", "Classes that no network has seen", text_as_is),
+    ("latency.txt", "Latency", text_as_is),
+]
+"""Stage, heading, and what writes the section."""
+
+
+def commands(stage: Path) -> list[str]:
+    """Those that made a stage, for the reader."""
+    made = json.loads(stage.with_name(f"{stage.name}.done").read_text())["commands"]
+    return [command for command in made if command.startswith(("nextview ", "python "))]
+
+
+def page(stages: Iterable[str]) -> str:
+    """The whole page."""
+    given = set(stages)
+    out = [
+        "# Results",
+        "",
+        "Every measurement, beside the commands that made it. `make reproduce` writes the page; nothing on it is typed",
+        "in. The networks' predictions, from which most of it comes, were made by",
+        "",
+        "```",
+        *[line for name in SOURCES for line in commands(Path(name))],
+        "```",
+        "",
+    ]
+    last = ""
+    for name, heading, section in SECTIONS:
+        if name not in given:
+            continue
+        out += [f"## {heading}", ""]
+        if name != last:
+            out += ["```", *commands(Path(name)), "```", ""]
+        out += section(Path(name))
+        last = name
+    return "\n".join(line.rstrip() for line in out).rstrip() + "\n"
+
+
+def main() -> None:
+    """Read the command line and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--stages", nargs="+", required=True, choices=sorted({name for name, *_ in SECTIONS}))
+    given = parser.parse_args()
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    given.out.write_text(page(given.stages), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
