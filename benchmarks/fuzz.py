@@ -395,8 +395,8 @@ def _work(connection: Connection, kinds: dict[str, Kind], sound: Path, seed: int
     resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY,) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     connection.send(("ready", ""))
-    while True:
-        name, number = connection.recv()
+    while (asked := connection.recv()) is not None:
+        name, number = asked
         before = os.fstat(printed.fileno()).st_size
         with tempfile.TemporaryDirectory() as case:
             signal.setitimer(signal.ITIMER_PROF, patience)  # neither is caught: they end even what is lost in C
@@ -474,7 +474,8 @@ def fuzz(
                 if number and time.monotonic() > began + seconds:
                     break
             number += 1
-        reader.process.kill()
+        reader.connection.send(None)
+        reader.process.join()
     return counts, failures
 
 
