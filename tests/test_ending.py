@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from nextview.cli.ending import Terminated, orderly_end
 from nextview.cli.main import main
 from nextview.data.store import ViewStore
 
@@ -27,6 +28,13 @@ def meshes(tmp_path):
     for i in range(16):
         (tmp_path / f"meshes/ball/ball_{i}.off").write_text(ball)
     return tmp_path / "meshes"
+
+
+@pytest.fixture(autouse=True)
+def complaints(monkeypatch):
+    """What an interrupt silences is heard again afterwards."""
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    monkeypatch.setattr(logging.getLogger("asyncio"), "disabled", False)
 
 
 def signalled(command: list[str], number: signal.Signals, ready) -> tuple[int, str]:
@@ -83,12 +91,29 @@ def test_a_command_that_does_not_resume_says_nothing_of_it(monkeypatch, capsys):
     def interrupted(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # gets back what it is now
-    monkeypatch.setattr(logging.getLogger("asyncio"), "disabled", False)
     monkeypatch.setattr("nextview.models.model_card.bundled_cards", interrupted)
     with pytest.raises(SystemExit, match="130"):
         main(["models"])
     assert capsys.readouterr().err == "nextview: stopped; run the same command again\n"
+
+
+@pytest.mark.parametrize(("interrupt", "status"), [(KeyboardInterrupt, 130), (Terminated, 143)])
+def test_an_interrupt_that_became_an_exit_is_still_one(capsys, interrupt, status):
+    """As Lightning does while it trains."""
+
+    def train():
+        try:
+            raise interrupt
+        except KeyboardInterrupt:
+            sys.exit(1)
+
+    with pytest.raises(SystemExit) as ended, orderly_end("go on"):
+        train()
+    assert ended.value.code == status
+    assert capsys.readouterr().err == "nextview: stopped; go on\n"
+    with pytest.raises(SystemExit) as ended, orderly_end("go on"):
+        sys.exit(1)
+    assert (ended.value.code, capsys.readouterr().err) == (1, "")
 
 
 def test_an_ignored_signal_stays_ignored():

@@ -70,7 +70,12 @@ def orderly_end(advice: str) -> Iterator[None]:
                 raise
             say(f"standard output or a file cannot be written ({error.strerror or 'it is closed'})")
             _forget_output(1)
-        except KeyboardInterrupt as interrupt:
+        except (KeyboardInterrupt, SystemExit) as ended:
+            interrupt = (
+                ended.__context__ if isinstance(ended, SystemExit) else ended
+            )  # Lightning makes one of the other
+            if not isinstance(interrupt, KeyboardInterrupt):
+                raise
             # The reads that zarr has begun would complain, at great length, of being left.
             logging.getLogger("asyncio").disabled = True
             sys.unraisablehook = lambda unraisable: None
