@@ -137,7 +137,7 @@ class PolicyCard:
             policy = FixedRing(sphere, fields.whole("ring"), fields.whole("steps"))
         elif self.kind == "fixed-sequence":
             moves = fields.numbers("moves", 2)
-            if (moves != np.rint(moves)).any():
+            if ((moves != np.rint(moves)) | (np.abs(moves) > 2**31)).any():
                 raise fields.wrong("moves", "a table of whole numbers")
             policy = FixedSequence(sphere, moves.astype(np.int64), self.scope)
         else:
