@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from test_predictions import some_predictions
+from test_report import browse
 
 from nextview.cli.benchmark import benchmark
 from nextview.cli.ending import printable
@@ -83,21 +84,37 @@ class Scripts(HTMLParser):
             self.found[-1] += data
 
 
-def test_a_report_and_an_evaluation_of_strange_names(tmp_path, capsys):
-    classes = (MATH, COMMENT, "</script>", "<b>[red]")
+CLASSES = (MATH, COMMENT, "</script>", "<b>[red]")
+
+
+@pytest.fixture(scope="module")
+def strange(tmp_path_factory):
+    """Predictions of strange names, and a report of them."""
+    folder = tmp_path_factory.mktemp("strange")
     p = some_predictions(24, seed=1)
     logits = np.concatenate([p.logits, p.logits[..., :1] - 9], -1)
     names = (f"{COMMENT}{MATH}", *p.names[1:])
-    p = replace(p, logits=logits, classes=classes, names=names, labels=np.arange(24) % 4, valley_classes={"lem": ()})
-    p.save(tmp_path / "p.npz")
-    benchmark(tmp_path / "p.npz", out=tmp_path / "out", thresholds=(0.8, 0.97), runs=2, samples=50)
-    report(tmp_path / "out")
-    page = (tmp_path / "out/report.html").read_text()
-    data, script = Scripts(page).found
-    assert json.loads(data)["classes"] == list(classes)
+    p = replace(p, logits=logits, classes=CLASSES, names=names, labels=np.arange(24) % 4, valley_classes={"lem": ()})
+    p.save(folder / "p.npz")
+    benchmark(folder / "p.npz", out=folder / "out", thresholds=(0.8, 0.97), runs=2, samples=50)
+    report(folder / "out")
+    return folder
+
+
+def test_no_name_ends_the_script_of_a_report(strange):
+    data, script = Scripts((strange / "out/report.html").read_text()).found
+    assert json.loads(data)["classes"] == list(CLASSES)
     assert "<" not in data  # in HTML, nothing but this can end a script or hide its end
     assert "getElementById" in script
-    main(["evaluate", str(tmp_path / "p.npz"), "--out", str(tmp_path / "e"), "--samples", "20"])
+
+
+def test_the_viewer_of_a_report_of_strange_names_runs_in_a_browser(strange):
+    page = browse(strange / "out/report.html", "#scene=0&step=0")
+    assert re.search(r'id="verdict"[^>]*>[^<]+<', page)
+
+
+def test_an_evaluation_of_strange_names(strange, tmp_path, capsys):
+    main(["evaluate", str(strange / "p.npz"), "--out", str(tmp_path / "e"), "--samples", "20"])
     printed = capsys.readouterr().out
     assert "<b>[red]" in printed
     assert MATH in printed

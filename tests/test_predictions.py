@@ -2,6 +2,7 @@ import os
 import signal
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -120,6 +121,58 @@ def test_a_missing_array_is_named(tmp_path):
         kept = {name: file[name] for name in file.files if name != "labels"}
     np.savez(tmp_path / "p.npz", **kept)
     with pytest.raises(PredictionsError, match="labels"):
+        Predictions.load(tmp_path / "p.npz")
+
+
+def test_what_nobody_asked_for_is_not_read(tmp_path):
+    some_predictions().save(tmp_path / "p.npz")
+    with zipfile.ZipFile(tmp_path / "p.npz", "a", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("unused.npy", b"\x93NUMPY what numpy cannot read")
+    assert Predictions.load(tmp_path / "p.npz").names == some_predictions().names
+
+
+def test_a_flipped_bit_is_harmless_or_refused_in_one_sentence(tmp_path):
+    path, rng = tmp_path / "p.npz", np.random.default_rng(0)
+    some_predictions(2).save(path)
+    sound = path.read_bytes()
+    with zipfile.ZipFile(path) as file:
+        heads = [info.header_offset + k for info in file.infolist() for k in range(30 + len(info.filename))]
+    # Everywhere, in the heads of the members, and in the list of members at the end.
+    places = [*rng.integers(len(sound), size=150), *rng.choice(heads, 150), *range(len(sound) - 150, len(sound))]
+    refused: list[str] = []
+    for place in places:
+        damaged = bytearray(sound)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        try:
+            assert len(Predictions.load(path)) == 2
+        except PredictionsError as refusal:
+            refused.append(str(refusal))
+    assert len(refused) > 100
+    assert all(sentence.startswith(f"{path}: ") and "\n" not in sentence for sentence in refused)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"names": np.arange(6.0)}, "a name in these predictions is no text"),
+        ({"names": np.full((6, 2), "a")}, "a name in these predictions is no text"),
+        ({"labels": np.zeros(6)}, "labels of these predictions is of the wrong type, float64"),
+        ({"logits": np.zeros((6, 40, 3), "c8")}, "logits of these predictions is of the wrong type, complex64"),
+        ({"splits": np.zeros(6)}, "splits of these predictions is of the wrong type"),
+        ({"azimuths": np.arange(3)}, "only"),
+        ({"calibration": np.array("[" * 100_000)}, "recursion"),
+        ({"calibration": np.array('{"correlation": "much"}')}, "a calibration that cannot be read"),
+        ({"models": np.arange(3)}, "unpack"),
+        ({"format": np.arange(3)}, "not a predictions file of format"),
+    ],
+)
+def test_arrays_of_another_kind_are_refused_in_one_sentence(tmp_path, change, sentence):
+    some_predictions().save(tmp_path / "p.npz")
+    with np.load(tmp_path / "p.npz") as file:
+        arrays = {name: file[name] for name in file.files}
+    np.savez(tmp_path / "p.npz", **(arrays | change))
+    with pytest.raises(PredictionsError, match=rf"p\.npz: .*{sentence}"):
         Predictions.load(tmp_path / "p.npz")
 
 

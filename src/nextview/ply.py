@@ -69,7 +69,8 @@ def read_ply(data: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         if element.name == "vertex":
             if not {"x", "y", "z"} <= columns.keys():
                 raise MeshError("its vertices have no x, y and z")
-            vertices = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
+            with np.errstate(invalid="ignore"):  # some kinds of NaN
+                vertices = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
         elif element.name == "face":
             faces = triangles
     if at < len(body):

@@ -36,7 +36,8 @@ def _read_binary(data: bytes) -> NDArray[np.float64]:
         raise MeshError(f"the file is cut short, {announced} faces announced, {int(found)} found")
     if announced < found:
         raise MeshError(f"it is damaged, {announced} faces announced, but it is as long as {found:.10g}")
-    return np.frombuffer(data, FACET, announced, HEADER)["corners"].reshape(-1, 3).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # some kinds of NaN
+        return np.frombuffer(data, FACET, announced, HEADER)["corners"].reshape(-1, 3).astype(np.float64)
 
 
 def _read_text(data: bytes) -> NDArray[np.float64]:

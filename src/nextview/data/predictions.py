@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +18,14 @@ from nextview.outputs import written_whole
 from nextview.viewsphere import ViewSphere
 
 FORMAT = 1
+KEYS = (
+    "format", "logits", "depth_entropy", "names", "labels", "classes", "splits", "conflicting", "elevations",
+    "azimuths", "distance", "calibration", "models", "azimuth_bins", "of_size",
+)  # fmt: skip
+GROUPS = ("map/", "valley/")
+"""The arrays of a file, and how the names of those begin of which there may be several; others are not read."""
+KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}
+"""Of numpy's types; all other arrays are of floats."""
 
 
 @dataclass(frozen=True)
@@ -86,9 +93,13 @@ class Predictions:
         for name, shape in wanted.items():
             if arrays[name].shape != shape:
                 raise PredictionsError(f"{name} of these predictions has the shape {arrays[name].shape}, not {shape}")
+            if arrays[name].dtype.kind not in KINDS.get(name, "f"):
+                raise PredictionsError(f"{name} of these predictions is of the wrong type, {arrays[name].dtype}")
             if arrays[name].dtype.kind == "f" and not np.isfinite(arrays[name]).all():
                 bad = self.names[int(np.flatnonzero(~np.isfinite(arrays[name].reshape(n, -1)).all(1))[0])]
                 raise PredictionsError(f"{name} of object {bad} is not a finite number")
+        if not all(isinstance(name, str) for name in (*self.names, *self.classes, *self.models)):
+            raise PredictionsError("a name in these predictions is no text")
         if len(set(self.names)) < n:
             raise PredictionsError("two objects of these predictions have the same name")
         if ((self.labels < 0) | (self.labels >= c)).any():
@@ -172,12 +183,15 @@ class Predictions:
         """
         try:
             with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-                f = {name: file[name] for name in file.files}
+                f = {name: file[name] for name in file.files if name in KEYS or name.startswith(GROUPS)}
         except FileNotFoundError:
             raise PredictionsError(f"{path}: there is no such file; make one with nextview predict") from None
-        except (OSError, EOFError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-            raise PredictionsError(f"{path}: not a predictions file ({error or 'it is empty'})") from None
-        if "format" not in f or int(f["format"]) != FORMAT:
+        except MemoryError:
+            raise PredictionsError(f"{path}: too large for this machine's memory, or damaged") from None
+        except Exception as error:  # zipfile, zlib and numpy raise whatever a damaged file makes them raise
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise PredictionsError(f"{path}: not a predictions file ({reason})") from None
+        if "format" not in f or f["format"].tolist() != FORMAT:
             raise PredictionsError(f"{path}: not a predictions file of format {FORMAT}; make it again")
 
         def group(prefix: str) -> dict[str, NDArray]:
@@ -206,3 +220,5 @@ class Predictions:
             raise PredictionsError(f"{path}: {error.args[0]}") from None
         except ValueError as error:
             raise PredictionsError(f"{path}: {error}") from None
+        except (TypeError, AttributeError, OverflowError, RecursionError) as error:
+            raise PredictionsError(f"{path}: not a predictions file ({error})") from None
