@@ -106,11 +106,11 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize(("log_evidence", "wrong"), WRONG.items(), ids=list(WRONG))
-def test_mistakes_are_named(message, wrong):
+@pytest.mark.parametrize(("said", "wrong"), WRONG.items(), ids=list(WRONG))
+def test_mistakes_are_named(said, wrong):
     with pytest.raises(ObservationError) as refused:
         Frame(**({"depth": DEPTH, "intrinsics": INTRINSICS} | wrong))
-    assert message in str(refused.value)
+    assert said in str(refused.value)
     assert "\n" not in str(refused.value)
 
 

@@ -194,20 +194,20 @@ def test_a_strip_at_the_same_height_does_not_belong_to_the_table():
 
 
 @pytest.mark.parametrize(
-    ("log_evidence", "mistake"),
+    ("said", "mistake"),
     {
         "OpenGL": lambda r: r @ np.diag([1, -1, -1.0]),
         "ROS": lambda r: r @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]).T,
         "inverse": lambda r: r.T,
     }.items(),
 )
-def test_a_wrong_pose_is_named_by_the_table_that_is_not_level(message, mistake):
+def test_a_wrong_pose_is_named_by_the_table_that_is_not_level(said, mistake):
     pose = pose_at(50, 20, 0.8)
     wrong = pose.copy()
     wrong[:3, :3] = mistake(pose[:3, :3])
     seen = pose[:3, :3].T @ UP  # the table's normal in the camera's frame
     assert mistake_in_pose(Plane(UP, 0.0), pose, UP) is None
-    assert message in mistake_in_pose(Plane(wrong[:3, :3] @ seen, 0.0), wrong, UP)
+    assert said in mistake_in_pose(Plane(wrong[:3, :3] @ seen, 0.0), wrong, UP)
 
 
 # Noise

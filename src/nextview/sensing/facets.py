@@ -174,7 +174,7 @@ def _blocks(images: Float, side: int) -> Float:
 
 
 def _radii(noise: float, inverse: float, pitch: Float, grain: float) -> tuple[int, int]:
-    """Windows that grow with the noise: half azimuth bins of the small one, which leaves slopes as good as they should be,
+    """Windows that grow with the noise: half sides of the small one, which leaves slopes as good as they should be,
     and of one twice as large, pixels.
 
     The slope of a plane fitted to k x k pixels that err for themselves has the standard deviation sigma sqrt(12) / k^2

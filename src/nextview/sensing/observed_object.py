@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from nextview.cloud import visible_points
 from nextview.errors import ObservationError, UsageError
 from nextview.observation import Observation, pinhole
 from nextview.sensing import segmentation
@@ -315,8 +314,7 @@ def _observation(
 ) -> Observation:
     """The only place that makes one."""
     intrinsics = pinhole(SIZE, DISTANCE)
-    grey = np.zeros(depth.shape, np.uint8) if image is None else image
-    return Observation(grey, depth, visible_points(depth, pose, intrinsics), pose, intrinsics, radius)
+    return Observation(depth, pose, intrinsics, radius, image)
 
 
 def _same(new: ObjectFrame, old: ObjectFrame) -> bool:

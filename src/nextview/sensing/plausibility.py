@@ -88,16 +88,13 @@ def _diagnose(points: Float, pose: Float) -> Doubt:
             f"all that is seen lies within {reach:.2g} object radii of the object's centre: lengths in metres? Divide "
             "depth and camera position by the object radius",
         )
-    for name, log_evidence in (
-        ("opengl", "OpenGL's (x right, y up, z backward)"),
-        ("ros", "a ROS body's (x forward, z up)"),
-    ):
+    for name, said in (("opengl", "OpenGL's (x right, y up, z backward)"), ("ros", "a ROS body's (x forward, z up)")):
         turned = pose.copy()
         turned[:3, :3] = pose[:3, :3] @ AXES[name]
         if _plausible(points, turned):
             return Doubt(
                 f"{name} axes",
-                f"the view looks away from the object: the camera's axes are {log_evidence}, OpenCV's (x right, y down, z "
+                f"the view looks away from the object: the camera's axes are {said}, OpenCV's (x right, y down, z "
                 "forward) are expected",
             )
     inverse = np.asarray(np.linalg.inv(pose), np.float64)
@@ -130,7 +127,7 @@ def _diagnose(points: Float, pose: Float) -> Doubt:
 def check_views(first: Observation, second: Observation) -> list[Doubt]:
     """Whether two views of one object contradict each other's geometry; usually not.
 
-    A surface that one view saw has to be seen in the other, or be hidden there. Where the other views through it the
+    A surface that one view saw has to be seen in the other, or be hidden there. Where the other looks through it the
     two contradict: a wrong pose, or the object has moved.
     """
     share = max(_seen_through(first, second), _seen_through(second, first))

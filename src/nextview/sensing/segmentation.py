@@ -138,10 +138,10 @@ def on_ground(points: Float, plane: Float) -> Mask:
         plane: points of the support plane, (M, 2): what stands within their hull stands on it.
     """
     try:
-        azimuth_bins = ConvexHull(plane).equations
+        sides = ConvexHull(plane).equations
     except QhullError:  # a plane of which only a line is seen
         return np.ones(len(points), bool)
-    return np.asarray((points @ azimuth_bins[:, :2].T + azimuth_bins[:, 2] <= 0).all(1))
+    return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(1))
 
 
 def largest(foot: Footprint, labels: NDArray[np.int64], plane: Float) -> int:
