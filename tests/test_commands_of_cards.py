@@ -21,7 +21,7 @@ COMMANDS = """
 render Boxes views.zarr --size 32 --workers 1
 train recogniser views.zarr run --size 32 --epochs 1 --views 2 --batch 8 --validation 0.4
 export recogniser run views.zarr models
-predict views.zarr held_out.npz --unseen --recogniser models/recogniser-boxes.json --maps --workers 1
+predict views.zarr held_out.npz --held-out --recogniser models/recogniser-boxes.json --maps --workers 1
 fit calibration held_out.npz models/recogniser-boxes.json --delta 0.2
 """
 

@@ -171,3 +171,19 @@ def test_the_terminal_is_left_as_it_was(monkeypatch, capsys):
     main(["models"])
     assert (os.environ["COLUMNS"], shutil.get_terminal_size().columns) == ("3", 3)
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments", "extra"),
+    [
+        ("torch", ["train", "recogniser", "views.zarr", "run"], "train"),
+        ("pandas", ["benchmark", "p.npz"], "benchmark"),
+        ("jinja2", ["report", "results"], "benchmark"),
+    ],
+)
+def test_a_missing_extra_is_named_with_what_brings_it(package, arguments, extra):
+    code = f"import sys; sys.modules[{package!r}] = None; from nextview.cli.main import main; main({arguments!r})"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == 2
+    assert f"pip install 'nextview[{extra}]'" in ended.stderr
+    assert ended.stderr.count("\n") == 1

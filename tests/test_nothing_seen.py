@@ -240,7 +240,7 @@ def test_a_mesh_without_area_is_refused():
         make_mesh(line, [[0, 1, 2], [0, 0, 1]], "thing")
     thin = line.copy()
     thin[1, 2] += 1e-5
-    assert len(make_mesh(thin, [[0, 0, 1]] * 5000 + [[0, 1, 2]]).faces) == 5001  # one face with an area is enough
+    assert len(make_mesh(thin, [[0, 0, 1]] * 5000 + [[0, 1, 2]]).faces) == 2  # but for copies; one with area is enough
 
 
 @pytest.mark.parametrize("json_too", [[], ["--json"]])

@@ -298,7 +298,7 @@ def test_damaged_attributes_are_one_sentence(views, capsys, place, content):
     for command in (["check", views], ["measure", views], ["inspect", views, views.parent / "b.png", "--object", "b"]):
         message = refused(capsys, *command)
         assert str(views) in message
-        expected = "not a view store" if content == "{}" else "zarr.json cannot be read"
+        expected = "not a view store" if content == "{}" else "zarr.json is damaged"
         assert (expected if place == "zarr.json" else "depth cannot be opened") in message
 
 
@@ -339,15 +339,17 @@ BAD = {
     "labels": [None, ["box", "box"], ["box", "box", 1], ["box", "box", ""], "box"],
     "splits": [None, ["", ""], ["", "", "validation"], [[], "", ""]],
     "elevations": [None, [], [np.nan], ["45"], [91.0], 45.0, [True]],
-    "azimuths": [None, 0, 2, 12.0, "12", True],
+    "azimuths": [None, 0, 2, 10**400, 12.0, "12", True],
     "distance": [None, 1, 0.5, -3, np.inf, np.nan, "3"],
-    "size": [None, 0, -48, 48.5, "48"],
+    "size": [None, 0, 10**400, -48, 48.5, "48"],
     "failures": [[], {"nobody": "reason"}, {"a": 3}],
     "seed": [-1, 0.5, "0"],
     "stretch": [np.nan, -2, "0"],
     "turn": [0, "no"],
     "sha256": [["0"], [0, 0, 0], "0"],
     "unit": ["parsec", 3, []],
+    "dataset": [3],
+    "commands": ["render", [3]],
     "checksum": [3, "0" * 64],
     "format": [None, 1, "2", [2]],
 }
@@ -388,13 +390,18 @@ def test_one_changed_letter_of_the_attributes_is_found_and_mended(views, capsys)
         (b'"failures": {}', b'"failures": []'),
         (b'"splits"', b'"splitz"'),
         (b'"unit": "cm"', b'"unit": "cn"'),
+        (b'"format": 2', b'"format": 3'),
+        (b'"labels": [', b'"labels": {'),
+        (b'"node_type"', b'"node_typ\xe5"'),
+        (b'"commands"', b'"commandz"'),
+        (b'"dataset": "meshes"', b'"dataset": meshes"'),
         (b'"unit": "cm"', b'"unit": "m"'),
     ):
         assert old in whole
         file.write_bytes(whole.replace(old, new, 1))
-        assert "zarr.json is damaged" in refused(capsys, "check", views)
-        assert "render restores it" in refused(capsys, "inspect", views)
-        with pytest.raises(DatasetError, match="not begun with these meshes and settings"):
+        message = refused(capsys, "check", views)
+        assert "not a view store of format 2" in message if b"format" in new else "zarr.json is damaged" in message
+        with pytest.raises(DatasetError, match="format 2" if b"format" in new else "with these it cannot"):
             list(render(meshes, views, SPHERE, 47, workers=0))
         main(["render", str(meshes), str(views), "--sphere", "12", "--size", "48", "--workers", "1"])
         capsys.readouterr()

@@ -50,13 +50,10 @@ def benchmark(
         samples: of the bootstrap.
         seed: decides first views, random policies and the bootstrap.
     """
-    from nextview.cli.extra import needs_extra
+    from nextview.benchmark.run import run_benchmark
+    from nextview.cli.leaderboard_table import print_leaderboard
     from nextview.cli.progress import console, track
     from nextview.models.collection import find_models
-
-    with needs_extra("benchmark"):
-        from nextview.benchmark.run import run_benchmark
-        from nextview.cli.leaderboard_table import print_leaderboard
 
     own = find_models(models).policies
     results = run_benchmark(

@@ -48,6 +48,7 @@ def orderly_end(advice: str) -> Iterator[None]:
     Args:
         advice: after a signal, what to do to go on.
     """
+    from nextview.cli.extra import missing_extra
     from nextview.errors import NextviewError
 
     _open_what_is_closed()
@@ -59,6 +60,12 @@ def orderly_end(advice: str) -> Iterator[None]:
                 sys.stdout.flush()  # here and not at the interpreter's end, also after --help, which exits by itself
         except NextviewError as error:
             say(str(error))
+            sys.exit(2)
+        except ModuleNotFoundError as error:
+            missing = missing_extra(error)
+            if missing is None:
+                raise
+            say(str(missing))
             sys.exit(2)
         except BrokenPipeError:  # whoever read this has gone, as head does
             _forget_output(1)

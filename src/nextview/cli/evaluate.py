@@ -31,14 +31,11 @@ def evaluate(
         samples: of the bootstrap.
         seed: decides the bootstrap, the orders of views and the examples.
     """
-    from nextview.cli.extra import needs_extra
     from nextview.cli.progress import track
     from nextview.cli.terminal import Terminal
-
-    with needs_extra("benchmark"):
-        from nextview.report import terminal
-        from nextview.report.evaluation_page import PAGE
-        from nextview.report.evaluation_stage import write_evaluation
+    from nextview.report import terminal
+    from nextview.report.evaluation_page import PAGE
+    from nextview.report.evaluation_stage import write_evaluation
 
     found = write_evaluation(
         predictions, out, split=split, deduplicate=deduplicate, cards=cards, samples=samples, seed=seed, track=track

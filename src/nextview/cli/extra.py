@@ -1,17 +1,21 @@
-"""Commands that need an optional part of the installation say so."""
+"""Packages that an optional part of nextview needs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 from nextview.errors import MissingExtraError
 
+EXTRAS = {
+    "benchmark": ("jinja2", "pandas", "pyarrow"),
+    "cluster": ("dask", "distributed"),
+    "train": ("lightning", "numcodecs", "onnx", "onnxscript", "torch", "torchmetrics"),
+}
+"""Packages by the optional part of the installation that brings them."""
 
-@contextmanager
-def needs_extra(extra: str) -> Iterator[None]:
-    """Turn a failed import within into a sentence that says what to install."""
-    try:
-        yield
-    except ImportError as error:
-        raise MissingExtraError(f"this command needs {error.name}: pip install 'nextview[{extra}]'") from None
+
+def missing_extra(error: ModuleNotFoundError) -> MissingExtraError | None:
+    """The sentence that says what to install; None where the module belongs to no optional part."""
+    package = (error.name or "").partition(".")[0]
+    for extra, packages in EXTRAS.items():
+        if package in packages:
+            return MissingExtraError(f"this needs the package {package}: pip install 'nextview[{extra}]'")
+    return None

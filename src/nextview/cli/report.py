@@ -21,13 +21,10 @@ def report(
         store: take the pictures of the objects from this view store; by default from that of the predictions, if it
             still is where it was.
     """
-    from nextview.cli.extra import needs_extra
+    from nextview.benchmark.results import load
     from nextview.cli.progress import console
-
-    with needs_extra("benchmark"):
-        from nextview.benchmark.results import load
-        from nextview.report.html import PAGE, check_page, write_report
-        from nextview.report.trajectories import Pictures
+    from nextview.report.html import PAGE, check_page, write_report
+    from nextview.report.trajectories import Pictures
 
     target = out or results / PAGE
     check_page(target, results)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.cloud import POINTS
 from nextview.command_line import command_line
-from nextview.data.attributes import restored, validate
+from nextview.data.attributes import FORMAT, restored
 from nextview.data.folders import Entry, list_dataset
 from nextview.data.lock import only_one, writing
 from nextview.data.pool import count, each
@@ -130,8 +131,8 @@ def render(
         most = int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere)))
         raise UsageError(f"the size of {len(sphere)} views is from 1 to {most} pixels, not {size}")
     count(workers)  # says if that makes no sense
-    if seed < 0:
-        raise UsageError(f"a seed is not negative, unlike {seed}")
+    if not 0 <= seed < 2**63:
+        raise UsageError(f"a seed is from 0 to {2**63 - 1}, not {seed}")
     deform = deform or Deform()
     farthest = np.iinfo(np.uint16).max * DEPTH_UNIT
     if sphere.distance + 1 > farthest:
@@ -211,8 +212,8 @@ def _begin(
         return ViewStore.create(path, entries, sphere, size, recipe | {"unit": unit, "dataset": dataset})
     if not (path / "zarr.json").exists():
         raise DatasetError(f"{path}: is there, and is no view store; give another name")
-    store = ViewStore.open(path, damaged=True)
     wanted = {
+        "format": FORMAT,
         "names": [e.name for e in entries],
         "labels": [e.label for e in entries],
         "splits": [e.split for e in entries],
@@ -223,9 +224,10 @@ def _begin(
         **recipe,
     }
     try:
-        validate(store.group.attrs)
+        store = ViewStore.open(path)
     except DatasetError as damage:
-        _restore(store, wanted, unit, damage)
+        _restore(path, wanted, unit, dataset, damage)
+        store = ViewStore.open(path)
     for key, value in wanted.items():
         if store.group.attrs.get(key, value) != value:
             raise DatasetError(f"{path}: was begun with other {key}; give another store or the same settings")
@@ -243,19 +245,19 @@ def _begin(
     return store
 
 
-def _restore(store: ViewStore, wanted: dict, unit: str | None, damage: DatasetError) -> None:
-    """Mend damaged attributes from the meshes and the settings.
+def _restore(path: Path, wanted: dict, unit: str | None, dataset: str, damage: DatasetError) -> None:
+    """Mend the damaged attributes of a store from the meshes and the settings.
 
     Raises:
-        DatasetError: the store was not made with them, as far as one can tell.
+        DatasetError: they are not those that the store was begun with, or too little of it is left to tell.
     """
-    mended = restored(store.group.attrs.asdict(), wanted, unit)
+    mended = restored(path / "zarr.json", wanted, unit, dataset)
     if mended is None:
-        raise DatasetError(
-            f"{store.path}: zarr.json is damaged ({damage}), and was not begun with these meshes and settings; give "
-            "those that it was begun with, or another store"
-        )
-    store.group.attrs.put(mended)
+        sentence = f"{damage}; with these it cannot: give the right ones, copy zarr.json back, or make another store"
+        raise DatasetError(sentence) from None
+    part = path / f"zarr.{uuid4().hex}.partial"
+    part.write_text(json.dumps({"attributes": mended, "zarr_format": 3, "node_type": "group"}, indent=2))
+    part.replace(path / "zarr.json")
 
 
 def _file_hash(path: Path) -> str:

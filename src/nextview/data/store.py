@@ -21,14 +21,13 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from nextview.cloud import POINTS
-from nextview.data.attributes import CHECKSUM, checksum, validate
+from nextview.data.attributes import CHECKSUM, FORMAT, checksum, validate
 from nextview.data.folders import Entry
 from nextview.errors import DatasetError
 from nextview.mesh import UNITS
 from nextview.observation import pinhole
 from nextview.viewsphere import ViewSphere
 
-FORMAT = 2
 DEPTH_UNIT = 1e-4
 """Depth is stored as uint16 in steps of this many object radii."""
 POINT_UNIT = 1 / 32767
@@ -38,6 +37,7 @@ RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "sta
 """The arrays that rendering makes; others are added later."""
 DIGEST = "digest"
 """The array of what ``digest`` gives of each object; stores that were begun before there was one have none."""
+RESTORE = "nextview render restores it, with the meshes and the settings that the store was made with"
 _logger = logging.getLogger(__name__)
 
 
@@ -137,12 +137,8 @@ class ViewStore:
         return layouts.get(name, ((v,), "float32", np.nan))  # another measure
 
     @classmethod
-    def open(cls, path: str | Path, damaged: bool = False) -> ViewStore:
+    def open(cls, path: str | Path) -> ViewStore:
         """Open a store for reading.
-
-        Args:
-            path: the store.
-            damaged: also if its attributes are not what they have to be, to restore them.
 
         Raises:
             DatasetError: there is none, it is of another format, or damaged.
@@ -155,11 +151,10 @@ class ViewStore:
         try:
             group = zarr.open_group(path, mode="r+")
         except Exception as error:  # zarr and JSON raise whatever a damaged file makes them raise
-            raise DatasetError(f"{path}: zarr.json cannot be read ({error}); copy or render the store again") from None
+            raise DatasetError(f"{path}: zarr.json is damaged ({error}); {RESTORE}") from None
         if group.attrs.get("format") != FORMAT:
             raise DatasetError(f"{path}: not a view store of format {FORMAT}; render it again")
-        if not damaged:
-            _validate(path, (state.st_ino, state.st_mtime_ns, state.st_size))
+        _validate(path, (state.st_ino, state.st_mtime_ns, state.st_size))
         return cls(path, group)
 
     def array(self, name: str) -> zarr.Array:
@@ -411,10 +406,7 @@ def _validate(path: Path, state: tuple[int, int, int]) -> None:
     try:
         validate(json.loads((path / "zarr.json").read_bytes())["attributes"])
     except DatasetError as error:
-        raise DatasetError(
-            f"{path}: zarr.json is damaged ({error}); nextview render restores it, with the meshes and the settings "
-            "that the store was made with"
-        ) from None
+        raise DatasetError(f"{path}: zarr.json is damaged ({error}); {RESTORE}") from None
 
 
 @lru_cache  # once for each process: many things ask which objects are done

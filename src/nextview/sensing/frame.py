@@ -1,0 +1,207 @@
+"""One frame of a depth camera, in the units and axes of nextview, or refused in words."""
+
+from __future__ import annotations
+
+from dataclasses import InitVar, dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nextview.errors import ObservationError
+
+FARTHEST = 65.0
+"""Metres beyond which a float depth is taken for "nothing"; 65.535 m is also what uint16 millimetres can say."""
+AXES = {
+    "opencv": np.eye(3),
+    "opengl": np.diag([1.0, -1.0, -1.0]),
+    "ros": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+}
+"""The axes of a camera pose: OpenCV's optical axes (x right, y down, z forward), OpenGL's (x right, y up, z backward)
+and those of a robot's body (x forward, y left, z up; ROS REP 103). Columns: OpenCV's axes in the named ones."""
+
+LUMA = np.array([0.299, 0.587, 0.114])
+"""Weights of red, green and blue in a grey image (ITU-R BT.601)."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a depth camera gave at one moment. Only depth and intrinsics are needed.
+
+    The arguments may be in the habits of the sensor; the attributes are in those of nextview.
+
+    Args:
+        depth: along the optical axis, (H, W), any size. Float: metres, where NaN, infinity, zero and negative numbers
+            mean nothing. uint16: millimetres, where 0 and 65535 mean nothing (ROS REP 118).
+        intrinsics: pinhole matrix, (3, 3), pixels.
+        pose: camera-to-world, (4, 4), metres, any world frame. None: the camera itself is the world; good for a single
+            frame only.
+        mask: where the object is, (H, W) bool; None if that is to be found.
+        image: grey (H, W) or colour (H, W, 3) uint8, registered to the depth.
+        axes: of the pose: "opencv", "opengl" or "ros", see AXES.
+        pixel_centre: coordinate of the first pixel's centre in the convention of the intrinsics: 0 for OpenCV and ROS,
+            0.5 for OpenGL and for nextview's own ``Observation``.
+
+    Attributes:
+        depth: (H, W) float32, metres, 0 = nothing.
+        intrinsics: (3, 3) float64; pixel (row, column) has its centre at (column + 0.5, row + 0.5).
+        pose: (4, 4) float64, OpenCV axes; or None.
+        mask: as given.
+        image: grey, (H, W) uint8; or None.
+
+    Raises:
+        ObservationError: what is wrong, and the likely mistake.
+    """
+
+    depth: NDArray[np.float32]
+    intrinsics: NDArray[np.float64]
+    pose: NDArray[np.float64] | None = None
+    mask: NDArray[np.bool_] | None = None
+    image: NDArray[np.uint8] | None = None
+    axes: InitVar[str] = "opencv"
+    pixel_centre: InitVar[float] = 0.0
+
+    def __post_init__(self, axes: str, pixel_centre: float) -> None:
+        depth = _metres(self.depth)
+        intrinsics = _check_intrinsics(self.intrinsics, depth.shape)
+        intrinsics[:2, 2] += 0.5 - pixel_centre
+        object.__setattr__(self, "depth", depth)
+        object.__setattr__(self, "intrinsics", intrinsics)
+        if axes not in AXES:
+            raise ObservationError(f"the axes of a pose are {', '.join(AXES)}, not {axes!r}")
+        if self.pose is not None:
+            pose = check_pose(self.pose)
+            pose[:3, :3] = pose[:3, :3] @ AXES[axes]
+            object.__setattr__(self, "pose", pose)
+        if self.mask is not None:
+            mask = np.asarray(self.mask)
+            if mask.shape != depth.shape or mask.dtype != bool:
+                raise ObservationError(
+                    f"a mask is (H, W) bool as the depth is, {depth.shape}, not {mask.shape} {mask.dtype}"
+                )
+            if not (mask & (depth > 0)).any():
+                raise ObservationError("no pixel of the mask has a depth: a mask of another image, or empty")
+            object.__setattr__(self, "mask", mask)
+        if self.image is not None:
+            object.__setattr__(self, "image", _grey(self.image, depth.shape))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width, pixels."""
+        return self.depth.shape[0], self.depth.shape[1]
+
+    @property
+    def camera_to_world(self) -> NDArray[np.float64]:
+        """The pose, or the identity if there is none."""
+        return np.eye(4) if self.pose is None else self.pose
+
+    @property
+    def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """x and y of the rays (x, y, 1) through the columns (W,) and the rows (H,), float32."""
+        k, (height, width) = self.intrinsics, self.shape
+        x = (np.arange(width) + 0.5 - k[0, 2]) / k[0, 0]
+        y = (np.arange(height) + 0.5 - k[1, 2]) / k[1, 1]
+        return x.astype(np.float32), y.astype(np.float32)
+
+    def positions(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """What some pixels show, (N, 3) float64, world, metres."""
+        (x, y), z, pose = self.rays, self.depth[rows, columns].astype(np.float64), self.camera_to_world
+        return (np.stack([x[columns], y[rows], np.ones(len(z))], 1) * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
+
+    def along(self, direction: NDArray[np.float64], offset: float = 0.0) -> NDArray[np.float32]:
+        """``direction @ position + offset`` of what every pixel shows, world, (H, W) float32; void at depth 0."""
+        (x, y), pose = self.rays, self.camera_to_world
+        a, b, c = (pose[:3, :3].T @ direction).astype(np.float32)
+        return self.depth * ((a * x)[None, :] + (b * y + c)[:, None]) + np.float32(direction @ pose[:3, 3] + offset)
+
+
+def _metres(depth: ArrayLike) -> NDArray[np.float32]:
+    depth = np.asarray(depth)
+    if depth.ndim != 2 or min(depth.shape) < 2:
+        raise ObservationError(f"a depth image is (H, W), not {depth.shape}")
+    if depth.dtype == np.uint16:
+        metres = np.where(depth == np.iinfo(np.uint16).max, 0, depth) * np.float32(0.001)
+    elif np.issubdtype(depth.dtype, np.floating):
+        metres = depth.astype(np.float32)
+        metres = np.where((metres > 0) & (metres < np.inf), metres, np.float32(0))  # no NaN passes a comparison
+    else:
+        raise ObservationError(f"depth is float metres or uint16 millimetres, not {depth.dtype}")
+    seen = metres[::4, ::4]
+    middle = float(np.median(seen[seen > 0])) if (seen > 0).any() else 0.0
+    if middle > FARTHEST:
+        raise ObservationError(
+            f"the depth has a median of {middle:.0f} where metres are expected: millimetres? Divide them by 1000, or "
+            "hand them in as uint16"
+        )
+    if 0 < middle < 0.01:
+        raise ObservationError(
+            f"the depth has a median of {middle:.2g} m: scaled to 0 .. 1, divided twice, or uint16 of another unit?"
+        )
+    metres = np.where(metres < FARTHEST, metres, np.float32(0))
+    if not metres.any():
+        raise ObservationError("nothing is seen: no pixel has a depth")
+    return metres
+
+
+def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    k = np.array(intrinsics, np.float64)
+    if k.shape != (3, 3) or not np.isfinite(k).all():
+        raise ObservationError(f"intrinsics are a (3, 3) matrix of finite numbers, not {k.shape}")
+    if not np.array_equal(k[2], [0, 0, 1]) or k[1, 0] != 0 or abs(k[0, 1]) > 1e-3 * abs(k[0, 0]):
+        raise ObservationError("intrinsics are [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: transposed, or with a skew?")
+    k[0, 1] = 0
+    height, width = shape
+    if not (k[0, 0] > 0 and k[1, 1] > 0):
+        raise ObservationError("the focal lengths have to be positive: an image that is flipped?")
+    if max(k[0, 0], k[1, 1]) < 0.1 * max(shape):
+        raise ObservationError(
+            f"a focal length of {k[0, 0]:.3g} is too short for an image of {width} x {height}: it is expected in "
+            "pixels, not in millimetres or parts of the image"
+        )
+    if not (-width < k[0, 2] < 2 * width and -height < k[1, 2] < 2 * height):
+        raise ObservationError(
+            f"the principal point ({k[0, 2]:.0f}, {k[1, 2]:.0f}) is far off an image of {width} x {height}: intrinsics "
+            "of another resolution?"
+        )
+    return k
+
+
+def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
+    """A copy of a rigid pose.
+
+    Args:
+        pose: (4, 4).
+
+    Raises:
+        ObservationError: it is not rigid; names the likely mistake.
+    """
+    pose = np.array(pose, np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ObservationError(f"a pose is a (4, 4) matrix of finite numbers, not {pose.shape}")
+    if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
+        transposed = np.allclose(pose[:, 3], [0, 0, 0, 1], atol=1e-6)
+        raise ObservationError(
+            f"the last row of a pose is 0, 0, 0, 1, not {np.round(pose[3], 3).tolist()}"
+            + (": transposed?" if transposed else "")
+        )
+    rotation = pose[:3, :3]
+    gram = rotation.T @ rotation
+    scale = np.sqrt(np.trace(gram) / 3)
+    if not np.allclose(gram, np.eye(3), atol=1e-3):
+        scaled = scale > 0 and np.allclose(gram / scale**2, np.eye(3), atol=1e-3)
+        raise ObservationError(
+            "the pose is not rigid: " + (f"its rotation is scaled by {scale:.3g}" if scaled else "no rotation matrix")
+        )
+    if np.linalg.det(rotation) < 0:
+        raise ObservationError("the pose is mirrored (left-handed axes): one axis has the wrong sign")
+    u, _, vt = np.linalg.svd(rotation)
+    pose[:3, :3] = u @ vt  # poses from text files are rounded
+    return pose
+
+
+def _grey(image: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    given = np.asarray(image)
+    if given.dtype != np.uint8 or given.shape not in (shape, (*shape, 3)):
+        raise ObservationError(
+            f"an image is (H, W) or (H, W, 3) uint8 registered to the depth, {shape}, not {given.shape} {given.dtype}"
+        )
+    return given if given.ndim == 2 else np.rint(given @ LUMA).astype(np.uint8)

@@ -1,0 +1,464 @@
+"""From frames to observations in whole scenes: what is found, where, and that it looks as a render would."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scenes import INTRINSICS, SHAPE, TABLE, box, cast, pose_at
+from scipy.spatial.transform import Rotation
+
+from nextview import Observation, SimulatedCamera
+from nextview.errors import ObservationError, UsageError
+from nextview.mesh import make_mesh
+from nextview.models.inference import load_models
+from nextview.sensing import Box, Frame, ObjectFrame, ObservedObject, check_observation, check_views
+from nextview.sensing.facets import fit_facets
+from nextview.sensing.noise import estimate_noise
+from nextview.sensing.virtual_view import look_again, virtual_pose
+from nextview.viewsphere import look_at_origin
+
+WEDGE = trimesh.util.concatenate([box((0.2, 0.16, 0.1), (0, 0, 0.05)), box((0.06, 0.16, 0.08), (-0.07, 0, 0.14))])
+"""A little sofa, 0.18 m high."""
+WALL = box((0.02, 1.4, 1.0), (-0.9, 0, 0.3))
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def frame(meshes, pose, seed=None, sigma=0.001, holes=0.05, **more) -> Frame:
+    depth, _ = cast(meshes, pose)
+    if seed is not None:
+        rng = np.random.default_rng(seed)
+        depth = np.where(depth > 0, depth + sigma * rng.normal(size=SHAPE), 0)
+        depth[rng.random(SHAPE) < holes] = np.nan
+    return Frame(depth, INTRINSICS, pose, pixel_centre=0.5, **more)
+
+
+def true_frame(mesh, axes=np.eye(3)) -> ObjectFrame:
+    normal = make_mesh(mesh.vertices, mesh.faces)
+    return ObjectFrame(normal.centre, normal.radius, axes)
+
+
+def overlap(depth, other) -> float:
+    return ((depth > 0) & (other > 0)).sum() / ((depth > 0) | (other > 0)).sum()
+
+
+def rendered(mesh, frame_: ObjectFrame, pose) -> Observation:
+    """What a camera sees of the mesh alone, level, from three true radii."""
+    return SimulatedCamera(make_mesh(mesh.vertices, mesh.faces)).observe(virtual_pose(frame_.pose_in_object(pose)))
+
+
+# The virtual view
+
+
+@pytest.mark.parametrize(("elevation", "azimuth"), [(0, 0), (20, 100), (72, 300), (-15, 40)])
+def test_the_virtual_pose_is_that_of_the_view_sphere(elevation, azimuth):
+    pose = pose_at(elevation, azimuth, 5.0, turn=(4, -5, 30))
+    expected = look_at_origin(np.radians(elevation), np.radians(azimuth))
+    np.testing.assert_allclose(virtual_pose(pose), expected, atol=1e-12)
+
+
+def test_from_straight_above_the_camera_keeps_its_right():
+    pose = np.eye(4)
+    pose[:3, :3] = np.diag([1, -1, -1])
+    pose[2, 3] = 4
+    expected = pose.copy()
+    expected[2, 3] = 3
+    np.testing.assert_allclose(virtual_pose(pose), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("distance", [0.4, 0.6, 1.2])
+def test_a_frame_is_seen_again_as_a_render_from_three_radii(distance):
+    """The camera is at another distance, rolled and aimed beside the object: against a camera that is not."""
+    known = true_frame(WEDGE)
+    pose = pose_at(35, 25, distance, known.centre, (3, -4, 17))
+    depth, _ = cast([WEDGE], pose)
+    facets = fit_facets(depth, depth > 0, INTRINSICS, denoise=False)
+    again, facet = look_again(facets, known.pose_in_object(pose), known.radius, 224)
+    expected = rendered(WEDGE, known, pose).depth
+    assert overlap(again, expected) > 0.94
+    both = (again > 0) & (expected > 0)
+    assert np.median(np.abs(again - expected)[both]) < 1e-3
+    assert np.quantile(np.abs(again - expected)[both], 0.9) < 0.01
+    np.testing.assert_array_equal(facet >= 0, again > 0)
+
+
+# What is found
+
+
+def test_a_frame_becomes_an_observation_of_the_object_alone():
+    pose = pose_at(40, 25, 0.7, (0.02, -0.03, 0.06), (2, 3, -8))
+    thing = ObservedObject()
+    observation = thing.add(frame([TABLE, WEDGE, WALL], pose, seed=0))
+    true = true_frame(WEDGE)
+    assert np.linalg.norm(thing.object_frame.centre - true.centre) < 0.05 * true.radius
+    assert thing.object_frame.radius == pytest.approx(true.radius, rel=0.04)
+    assert observation.radius == thing.object_frame.radius
+    assert observation.depth.shape == (224, 224)
+    expected = rendered(WEDGE, true, pose)
+    assert overlap(observation.depth, expected.depth) > 0.9
+    both = (observation.depth > 0) & (expected.depth > 0)
+    assert np.median(np.abs(observation.depth - expected.depth)[both]) < 0.03
+    assert thing.doubts == []
+
+
+def test_millimetres_of_a_sensor_give_the_same():
+    pose = pose_at(40, 25, 0.7)
+    metres = frame([TABLE, WEDGE], pose, seed=0)
+    millimetres = Frame(np.rint(metres.depth * 1000).astype(np.uint16), INTRINSICS, pose, pixel_centre=0.5)
+    a, b = ObservedObject(), ObservedObject()
+    assert overlap(a.add(metres).depth, b.add(millimetres).depth) > 0.97
+    np.testing.assert_allclose(a.object_frame.centre, b.object_frame.centre, atol=0.003)
+
+
+def test_of_several_objects_the_one_asked_for_is_taken():
+    small, large = box((0.08, 0.08, 0.1), (0.2, 0.2, 0.05)), box((0.2, 0.2, 0.15), (-0.15, -0.1, 0.075))
+    seen = frame([TABLE, small, large], pose_at(45, 20, 0.9), seed=1)
+    for options, mesh in (
+        ({}, large),
+        ({"point": (0.18, 0.22, 0.1)}, small),
+        ({"point": (-0.2, -0.1, 0.0)}, large),
+        ({"box": Box([0.16, 0.16, 0], [0.24, 0.24, 0.1])}, small),
+        ({"known": true_frame(small)}, small),
+    ):
+        thing = ObservedObject(**options)
+        thing.add(seen)
+        true = true_frame(mesh)
+        assert np.linalg.norm(thing.object_frame.centre - true.centre) < 0.1 * true.radius, options
+        assert thing.object_frame.radius == pytest.approx(true.radius, rel=0.08), options
+
+
+def test_a_wall_behind_the_table_is_not_the_object():
+    seen = frame([TABLE, box((0.1, 0.1, 0.1), (0, 0, 0.05)), WALL], pose_at(20, 0, 0.9), seed=2)
+    thing = ObservedObject()
+    thing.add(seen)
+    np.testing.assert_allclose(thing.object_frame.centre, [0, 0, 0.05], atol=0.015)
+
+
+def test_a_mask_needs_no_table():
+    """A ball in a gripper: seen from above, even its near half spans its whole width."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.05).apply_translation((0.1, 0, 0.4))
+    pose = pose_at(10, 60, 0.5, (0.1, 0, 0.4))
+    depth, seen = cast([ball, WALL], pose)
+    thing = ObservedObject(support=False)
+    thing.add(Frame(depth, INTRINSICS, pose, seen == 0, pixel_centre=0.5))
+    np.testing.assert_allclose(thing.object_frame.centre, [0.1, 0, 0.4], atol=0.004)
+    assert thing.object_frame.radius == pytest.approx(0.05, rel=0.04)
+
+
+def test_a_mask_on_a_table_reaches_down_to_it():
+    lid = box((0.2, 0.2, 0.01), (0, 0, 0.095))
+    pose = pose_at(60, 10, 0.7)
+    depth, seen = cast([lid, TABLE], pose)
+    masked = Frame(depth, INTRINSICS, pose, seen == 0, pixel_centre=0.5)
+    on_table, floating = ObservedObject(), ObservedObject(support=False)
+    on_table.add(masked)
+    floating.add(masked)
+    assert on_table.object_frame.centre[2] == pytest.approx(0.05, abs=0.004)
+    assert floating.object_frame.centre[2] > 0.09
+
+
+def test_an_object_cut_off_by_the_picture_is_still_seen():
+    pose = pose_at(35, 10, 0.6, (0, 0, 0.08), (0, 30, 0))
+    seen = frame([TABLE, WEDGE], pose, seed=3)
+    true = true_frame(WEDGE)
+    observation = ObservedObject(known=true).add(seen)
+    expected = rendered(WEDGE, true, pose)
+    shown = observation.depth > 0
+    assert 0.2 < shown.sum() / (expected.depth > 0).sum() < 0.9
+    assert (shown & (expected.depth > 0)).sum() / shown.sum() > 0.93
+
+
+def test_a_frame_alone_needs_no_pose():
+    """Up is then the normal of the largest plane."""
+    pose = pose_at(40, 25, 0.7)
+    seen = frame([TABLE, WEDGE], pose)
+    thing = ObservedObject()
+    observation = thing.add(Frame(seen.depth, INTRINSICS, pixel_centre=0.5))
+    np.testing.assert_allclose(thing.object_frame.axes[2], pose[:3, :3].T @ [0, 0, 1], atol=0.01)
+    assert thing.object_frame.radius == pytest.approx(true_frame(WEDGE).radius, rel=0.04)
+    assert overlap(observation.depth, ObservedObject().add(seen).depth) > 0.95
+    with pytest.raises(ObservationError, match="a second frame needs a pose"):
+        thing.add(seen)
+
+
+def test_colour_comes_along():
+    pose = pose_at(40, 25, 0.7)
+    _, seen = cast([TABLE, WEDGE], pose)
+    colour = np.zeros((*SHAPE, 3), np.uint8)
+    colour[seen == 1] = 200
+    observation = ObservedObject().add(frame([TABLE, WEDGE], pose, image=colour))
+    assert (observation.image[observation.depth > 0] == 200).mean() > 0.97
+    assert (observation.image[observation.depth == 0] == 0).all()
+
+
+def test_toys_tell_no_size():
+    assert ObservedObject(life_size=False).add(frame([TABLE, WEDGE], pose_at(40, 25, 0.7))).radius is None
+
+
+# The world does not matter
+
+
+def test_moving_the_world_and_the_camera_changes_nothing():
+    pose = pose_at(40, 25, 0.7, turn=(2, 3, -8))
+    there = np.eye(4)
+    there[:3, :3] = Rotation.from_euler("xyz", [70, -20, 130], degrees=True).as_matrix()
+    there[:3, 3] = 1.5, -2, 0.7
+    here = ObservedObject()
+    seen = here.add(frame([TABLE, WEDGE], pose, seed=4))
+    other = ObservedObject(up=there[:3, 2])
+    again = other.add(replace(frame([TABLE, WEDGE], pose, seed=4), pose=there @ pose, axes="opencv", pixel_centre=0.5))
+    assert other.object_frame.radius == pytest.approx(here.object_frame.radius, rel=0.02)
+    np.testing.assert_allclose(
+        other.object_frame.centre, there[:3, :3] @ here.object_frame.centre + there[:3, 3], atol=0.003
+    )
+    assert overlap(seen.depth, again.depth) > 0.96
+    assert np.linalg.norm(again.pose[:3, 3]) == pytest.approx(3)
+    assert again.pose[2, 3] == pytest.approx(seen.pose[2, 3], abs=0.02)
+
+
+def test_scaling_the_world_changes_nothing_but_the_size():
+    pose = pose_at(40, 25, 0.7, turn=(2, 3, -8))
+    small = frame([TABLE, WEDGE], pose, seed=5)
+    far = pose.copy()
+    far[:3, 3] *= 4
+    large = Frame(4 * small.depth, INTRINSICS, far, pixel_centre=0.5)
+    a, b = ObservedObject(), ObservedObject()
+    one, four = a.add(small), b.add(large)
+    assert four.radius == pytest.approx(4 * one.radius, rel=1e-4)
+    assert overlap(one.depth, four.depth) > 0.995
+    np.testing.assert_allclose(one.pose, four.pose, atol=1e-3)
+
+
+def test_the_same_frames_give_the_same_observations():
+    frames = [frame([TABLE, WEDGE], pose_at(e, a, 0.7), seed=i) for i, (e, a) in enumerate([(40, 25), (20, 100)])]
+    one, two = ObservedObject(), ObservedObject()
+    for seen in frames:
+        np.testing.assert_array_equal(one.add(seen).depth, two.add(seen).depth)
+
+
+# More frames
+
+
+def test_the_object_frame_gets_better_and_earlier_views_with_it():
+    """From the front at the height of the table the depth of a long box is not seen; from the side it is."""
+    long = box((0.4, 0.12, 0.12), (0, 0, 0.06))
+    thing = ObservedObject(life_size=False)
+    first = thing.add(frame([TABLE, long], pose_at(4, 0, 0.8, (0, 0, 0.06)), seed=6))
+    early = thing.object_frame
+    assert thing.revision == 0
+    second = thing.add(frame([TABLE, long], pose_at(45, 90, 0.8, (0, 0, 0.06)), seed=7))
+    true = true_frame(long)
+    assert early.radius < 0.7 * true.radius
+    assert thing.object_frame.radius == pytest.approx(true.radius, rel=0.04)
+    assert np.linalg.norm(thing.object_frame.centre - true.centre) < 0.05 * true.radius
+    assert thing.revision == 1
+    anew, latest = thing.observations
+    assert latest is second
+    assert not np.array_equal(anew.depth, first.depth)
+    expected = rendered(long, true, pose_at(4, 0, 0.8, (0, 0, 0.06)))
+    assert overlap(anew.depth, expected.depth) > 0.85 > overlap(first.depth, expected.depth)
+
+
+def test_where_nothing_gets_better_earlier_views_stay():
+    thing = ObservedObject()
+    first = thing.add(frame([TABLE, WEDGE], pose_at(60, 25, 0.7), seed=1))
+    thing.add(frame([TABLE, WEDGE], pose_at(60, 25, 0.7), seed=1))
+    assert thing.revision == 0
+    assert thing.observations[0] is first
+    np.testing.assert_array_equal(thing.observations[1].depth, first.depth)
+
+
+def test_two_parts_seen_apart_become_one_object_once_the_bridge_is_seen():
+    """An arch whose beam the first frame misses: its legs lie 16 cm apart."""
+    legs = [box((0.06, 0.06, 0.2), (0, y, 0.1)) for y in (-0.11, 0.11)]
+    arch = [*legs, box((0.06, 0.28, 0.04), (0, 0, 0.22))]
+    thing = ObservedObject(point=(0, 0.11, 0.1), life_size=False)
+    thing.add(frame([TABLE, *legs], pose_at(30, 0, 0.8, (0, 0, 0.1)), seed=1))
+    assert thing.object_frame.centre[1] == pytest.approx(0.11, abs=0.02)
+    thing.add(frame([TABLE, *arch], pose_at(30, 40, 0.8, (0, 0, 0.1)), seed=2))
+    assert thing.object_frame.centre[1] == pytest.approx(0, abs=0.02)
+    _, columns = np.nonzero(thing.observations[0].depth)
+    assert np.ptp(columns) > 120  # both legs are the object's now, in the first frame as well
+    assert thing.revision == 1
+
+
+def test_a_frame_without_the_object_is_not_taken_in():
+    thing = ObservedObject()
+    thing.add(frame([TABLE, WEDGE], pose_at(40, 25, 0.7)))
+    known, observations = thing.object_frame, thing.observations
+    with pytest.raises(ObservationError, match="nothing of the object known so far"):
+        thing.add(frame([TABLE], pose_at(40, 120, 0.7)))
+    assert thing.object_frame is known
+    assert len(thing.observations) == len(observations) == len(thing.sightings) == 1
+    thing.add(frame([TABLE, WEDGE], pose_at(40, 120, 0.7)))
+    assert len(thing.observations) == 2
+
+
+def test_a_pose_that_contradicts_the_frames_before_is_doubted():
+    thing = ObservedObject()
+    thing.add(frame([TABLE, WEDGE], pose_at(40, 25, 0.7)))
+    wrong = pose_at(40, 120, 0.7)
+    wrong[:3, 3] += 0.08, 0, 0
+    thing.add(replace(frame([TABLE, WEDGE], pose_at(40, 120, 0.7)), pose=wrong, axes="opencv", pixel_centre=0.5))
+    assert [doubt.name for doubt in thing.doubts] == ["contradiction"]
+
+
+# What is refused
+
+
+def turned(pose, axes):
+    changed = pose.copy()
+    changed[:3, :3] = pose[:3, :3] @ axes
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("said", "wrong"),
+    {
+        "OpenGL": lambda pose: pose @ FLIP,
+        "ROS": lambda pose: turned(pose, np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]])),
+        "inverse": np.linalg.inv,
+    }.items(),
+)
+def test_a_wrong_first_pose_is_named(said, wrong):
+    pose = pose_at(40, 20, 0.7)
+    seen = frame([TABLE, WEDGE], pose)
+    with pytest.raises(ObservationError, match=said):
+        ObservedObject().add(replace(seen, pose=wrong(pose), axes="opencv", pixel_centre=0.5))
+
+
+def test_what_cannot_be_found_is_said():
+    pose = pose_at(40, 20, 0.7)
+    with pytest.raises(ObservationError, match="nothing on the support plane"):
+        ObservedObject().add(frame([TABLE], pose))
+    with pytest.raises(ObservationError, match="no support plane is seen"):
+        ObservedObject().add(frame([WALL], pose_at(5, 0, 0.7)))
+    with pytest.raises(ObservationError, match="no telling where up is"):
+        ObservedObject(up=None, support=False).add(frame([TABLE, WEDGE], pose))
+    with pytest.raises(ObservationError, match="where the object should be"):
+        ObservedObject(box=Box([0.3, 0.3, 0], [0.4, 0.4, 0.1])).add(frame([TABLE, WEDGE], pose))
+    with pytest.raises(ObservationError, match="no frame was added yet"):
+        _ = ObservedObject().object_frame
+
+
+def test_an_object_is_asked_for_in_one_way():
+    with pytest.raises(UsageError, match="by one of them"):
+        ObservedObject(point=(0, 0, 0), known=ObjectFrame(np.zeros(3), 1.0, np.eye(3)))
+    with pytest.raises(UsageError, match="three numbers"):
+        ObservedObject(point=(0, 0))
+
+
+# Doubts about observations
+
+
+BENCH = make_mesh(WEDGE.vertices, WEDGE.faces)
+
+
+def view(elevation=30.0, azimuth=50.0, distance=3.0) -> Observation:
+    return SimulatedCamera(BENCH).observe(pose_at(elevation, azimuth, distance))
+
+
+def with_depth(observation, factor):
+    return replace(observation, depth=(observation.depth * factor).astype(np.float32))
+
+
+def in_metres(observation, radius):
+    pose = observation.pose.copy()
+    pose[:3, 3] *= radius
+    return replace(with_depth(observation, radius), pose=pose)
+
+
+@pytest.mark.parametrize("elevation", [-10, 0, 30, 72])
+@pytest.mark.parametrize("distance", [2.0, 3.0, 6.0])
+def test_correct_views_are_not_doubted(elevation, distance):
+    views = [view(elevation, azimuth, distance) for azimuth in (0, 50, 200)]
+    assert [check_observation(v) for v in views] == [[], [], []]
+    assert check_views(views[0], views[1]) == check_views(views[1], views[2]) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("nothing seen", lambda o: with_depth(o, 0)),
+        ("opengl axes", lambda o: replace(o, pose=o.pose @ FLIP)),
+        ("ros axes", lambda o: replace(o, pose=turned(o.pose, np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]])))),
+        ("inverse pose", lambda o: replace(o, pose=np.linalg.inv(o.pose))),
+        ("scale", lambda o: with_depth(o, 0.12)),
+        ("scale", lambda o: with_depth(o, 2.5)),
+        ("scale", lambda o: in_metres(o, 0.12)),
+        ("outside", lambda o: replace(o, pose=turned(o.pose, Rotation.from_euler("y", 1.0).as_matrix()))),
+    ],
+)
+def test_mistakes_in_observations_are_named(name, wrong):
+    doubts = check_observation(wrong(view()))
+    assert [doubt.name for doubt in doubts] == [name]
+    assert "\n" not in doubts[0].message
+
+
+def test_views_that_look_through_each_other_are_doubted():
+    first, second = view(20, 10), view(40, 100)
+    assert check_views(first, replace(second, pose=first.pose))[0].name == "contradiction"
+    shifted = second.pose.copy()
+    shifted[2, 3] += 0.5
+    assert check_views(first, replace(second, pose=shifted))[0].name == "contradiction"
+
+
+# Real frames
+
+
+KINECT = Path(os.environ.get("NEXTVIEW_DATA", ".")) / "real_kinect"
+real = pytest.mark.skipif(not (KINECT / "camera-intrinsics.txt").exists(), reason="NEXTVIEW_DATA has no real_kinect")
+UPRIGHT = np.array(
+    [[0.99997497, 0.00632106, 0.00317997], [0, -0.44941069, 0.89332528], [0.00707587, -0.89330292, -0.44939944]]
+)
+CHAIR = Box([-1.38, 1.40, -1.497], [-0.90, 2.05, -0.587], UPRIGHT)
+
+
+def kinect(number: int) -> Frame:
+    from imageio.v3 import imread  # comes with scikit-image
+
+    name = f"frame-{number:06d}"
+    depth, pose = imread(KINECT / f"{name}.depth.png"), np.loadtxt(KINECT / f"{name}.pose.txt")
+    return Frame(depth, np.loadtxt(KINECT / "camera-intrinsics.txt"), pose)
+
+
+@real
+def test_the_noise_of_a_kinect_is_constant_in_inverse_depth():
+    """It measures disparity; its pixels err together, and an eighth of a pixel is its step (Nguyen et al. 2012)."""
+    found = [estimate_noise(f.depth, f.depth > 0) for f in (kinect(n) for n in (0, 280, 540, 840))]
+    sigmas = np.concatenate([noise.sigmas for noise in found])
+    assert sigmas.std() / sigmas.mean() < 0.1
+    assert 0.001 < sigmas.mean() < 0.003
+    assert all(noise.grain > 1 for noise in found)
+
+
+@real
+def test_a_real_chair_is_a_chair():
+    """Single frames in which at least half of the chair's box is in the picture."""
+    recogniser = load_models(()).recogniser
+    grid = np.stack(np.meshgrid(*(np.linspace(*ends, 8) for ends in zip(CHAIR.low, CHAIR.high, strict=True))), -1)
+    answers = []
+    for number in range(0, 1000, 20):
+        seen = kinect(number)
+        points = (grid.reshape(-1, 3) @ CHAIR.axes - seen.pose[:3, 3]) @ seen.pose[:3, :3]
+        pixels = points @ seen.intrinsics.T
+        column, row = (pixels[:, :2] / pixels[:, 2:]).T
+        inside = (points[:, 2] > 0.1) & (column > 0) & (column < 640) & (row > 0) & (row < 480)
+        if inside.mean() > 0.5:
+            observation = ObservedObject(box=CHAIR).add(seen)
+            answers.append(recogniser.classes[int(recogniser([observation]).logits.argmax())])
+    assert len(answers) > 8
+    assert np.mean([answer == "chair" for answer in answers]) >= 0.9
+
+
+@real
+@pytest.mark.parametrize("number", [360, 400])
+def test_a_lunch_box_is_found_on_a_real_table(number):
+    """It is the largest thing on the table, some 30 x 20 cm, behind it a wall with shelves."""
+    thing = ObservedObject(up=UPRIGHT[2])
+    thing.add(kinect(number))
+    assert 0.15 < thing.object_frame.radius < 0.25
+    top = -0.807
+    assert 0 < thing.object_frame.centre @ UPRIGHT[2] - top < 0.1
