@@ -163,7 +163,7 @@ def test_a_flipped_bit_is_harmless_or_refused_in_one_sentence(tmp_path):
         ({"splits": np.zeros(6)}, "splits of these predictions is of the wrong type"),
         ({"azimuths": np.arange(3)}, "only"),
         ({"calibration": np.array("[" * 100_000)}, "recursion"),
-        ({"calibration": np.array('{"correlation": "much"}')}, "a calibration that cannot be read"),
+        ({"calibration": np.array('{"correlation": "much"}')}, "the calibration lacks 'temperature'"),
         ({"models": np.arange(3)}, "unpack"),
         ({"format": np.arange(3)}, "not a predictions file of format"),
     ],
