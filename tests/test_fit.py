@@ -47,6 +47,9 @@ class SmallNet(torch.nn.Module):
 
 def train(out, recipe=RECIPE, hardware=Hardware(), stop=None):
     """Train on the small set; ``stop`` is (epoch, batch, "raise" or "kill")."""
+    torch.set_num_threads(
+        1
+    )  # sums of several threads depend on how many there are, and a test before may have set that
     sources, labels = data()
     recogniser.recogniser_network, usual = SmallNet, recogniser.recogniser_network
     if stop:

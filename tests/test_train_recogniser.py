@@ -263,7 +263,8 @@ def test_published_recipe_on_images_by_the_command(store, tmp_path, capsys):
     noted = json.loads((run / "recipe.json").read_text())
     assert noted == asdict(replace(THESIS_RECOGNISER, depth=18, epochs=1, size=32, views=2, batch=4, validation=0.25))
     assert {path.name for path in run.iterdir()} == {
-        "recipe.json", "weights.json", "held_out.json", "network.pt", "best.ckpt", "last.ckpt", "log", "curves.png",
+        "recipe.json", "weights.json", "commands.json", "held_out.json", "network.pt", "best.ckpt", "last.ckpt", "log",
+        "curves.png",
     }  # fmt: skip
     assert torch.load(run / "network.pt", weights_only=True)["conv1.weight"].shape == (64, 1, 7, 7)
     images = load_inputs(store, 32, "image")

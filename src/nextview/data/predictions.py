@@ -20,7 +20,7 @@ from nextview.viewsphere import ViewSphere
 FORMAT = 1
 KEYS = (
     "format", "logits", "depth_entropy", "names", "labels", "classes", "splits", "conflicting", "elevations",
-    "azimuths", "distance", "calibration", "models", "azimuth_bins", "of_size",
+    "azimuths", "distance", "calibration", "models", "azimuth_bins", "of_size", "store", "commands",
 )  # fmt: skip
 GROUPS = ("map/", "valley/")
 """The arrays of a file, and how the names of those begin of which there may be several; others are not read."""
