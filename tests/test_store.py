@@ -434,18 +434,16 @@ def test_objects_that_changed_places_are_found(views):
     assert found["a"] == found["b"] == "image, depth, points, radius and name are not together what was rendered"
 
 
-@pytest.mark.parametrize("place", [*(f"{name}/zarr.json" for name in RENDERED), "measures/zarr.json"])
+@pytest.mark.parametrize("place", [*(f"{name}/zarr.json" for name in (*RENDERED, "digest")), "measures/zarr.json"])
 @pytest.mark.parametrize("damage", ["{", '{"zarr_format": 3}', None])
 def test_arrays_that_cannot_be_opened_are_mended_and_keep_what_they_hold(views, capsys, place, damage):
     before = {name: ViewStore.open(views).rows(name) for name in RENDERED}
     file = views / place
     file.unlink() if damage is None else file.write_text(damage)
-    message = refused(capsys, "check", views)
-    assert (
-        "nextview measure" in message
-        if place.startswith("measures/d")
-        else f"nextview check {views} --repair" in message
-    )
+    if (place, damage) != ("digest/zarr.json", None):  # stores that were begun earlier have none
+        message = refused(capsys, "check", views)
+        remedy = "nextview measure" if place.startswith("measures/d") else f"nextview check {views} --repair"
+        assert remedy in message
     main(["check", str(views), "--repair", "--workers", "1"])
     assert "3 objects are sound, 0 damaged, 0 not rendered yet" in " ".join(capsys.readouterr().err.split())
     for name, values in before.items():

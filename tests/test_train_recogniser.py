@@ -28,7 +28,7 @@ from nextview.models.image_input import image_input  # noqa: E402
 from nextview.models.inference import RECOGNISER  # noqa: E402
 from nextview.models.model_card import bundled_cards, find_card  # noqa: E402
 from nextview.training.architectures import ResNet  # noqa: E402
-from nextview.training.inputs import load_inputs  # noqa: E402
+from nextview.training.inputs import load_inputs, prepare_inputs  # noqa: E402
 from nextview.training.packed import load_packed, pack, save_packed  # noqa: E402
 from nextview.training.recipes import THESIS_RECOGNISER, MapRecipe, RecogniserRecipe  # noqa: E402
 from nextview.training.recogniser.grid_training import published_cells  # noqa: E402
@@ -54,6 +54,19 @@ def store(tmp_path_factory):
     views.group["measures/depth_entropy"][:] = rng.random((10, V))
     views.group["status"][:] = DONE
     return root / "views.zarr"
+
+
+def test_inputs_made_before_an_object_was_rendered_are_refused(tmp_path):
+    """Its views would be blank."""
+    entries = [Entry(tmp_path / f"{i}.off", f"object_{i}", "ab"[i % 2], "train") for i in range(3)]
+    views = ViewStore.create(tmp_path / "views.zarr", entries, ViewSphere((0.0,), V, 3.0), SIZE, {})
+    views.group["image"][:] = 7
+    views.group["status"][:2] = DONE
+    list(prepare_inputs(views.path, 32, "image", workers=1))
+    assert load_inputs(views.path, 32, "image")[1].any()
+    views.group["status"][2] = DONE
+    with pytest.raises(DatasetError, match=r"image32: lacks objects that .*views.zarr holds by now; delete it"):
+        load_inputs(views.path, 32, "image")
 
 
 def views_of(recipe, objects=6, views=V):

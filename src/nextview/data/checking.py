@@ -69,8 +69,8 @@ def mend(path: Path) -> None:
     """
     store = ViewStore.open(path)
     with only_one(path), writing(path):
-        for name in RENDERED:
-            if not store.sound(name):
+        for name in (*RENDERED, DIGEST):
+            if not store.sound(name) and (name in RENDERED or store.holds(name)):
                 store.add(name)
 
 

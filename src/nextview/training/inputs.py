@@ -14,6 +14,7 @@ import numpy as np
 
 from nextview.data.lock import only_one
 from nextview.data.store import ViewStore
+from nextview.errors import DatasetError
 from nextview.models.network_input import CHANNELS_OF, InputKind, InputSpec, from_store
 from nextview.tracking import Track, silently
 from nextview.training.packed import PackedViews, load_packed, pack, save_packed
@@ -73,8 +74,17 @@ def ready_inputs(path: Path, size: int, kind: InputKind = "geometry", track: Tra
 
 
 def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedViews:
-    """The inputs of a store, (N, V, C, size, size) uint8, as ``prepare_inputs`` made them."""
-    return load_packed(inputs_path(path, size, kind))
+    """The inputs of a store, (N, V, C, size, size) uint8, as ``prepare_inputs`` made them.
+
+    Raises:
+        DatasetError: they are damaged, or the store has been rendered further since.
+    """
+    target, store = inputs_path(path, size, kind), ViewStore.open(path)
+    views = load_packed(target)
+    there = views.places[..., 1].all(1)
+    if there.shape != (len(store),) or (store.done & ~there).any():
+        raise DatasetError(f"{target}: lacks objects that {path} holds by now; delete it, and it is made again")
+    return views
 
 
 def _packed(path: Path, i: int, size: int, kind: InputKind) -> list[bytes]:
