@@ -137,7 +137,7 @@ def test_every_read_of_a_damaged_chunk_names_it(views, name, damage):
     for other in (0, 2):
         assert store.read(name, other) is not None
     # The damage of an object that is not rendered hurts nobody.
-    store.group["status"][1] = PENDING
+    store.mark(1, PENDING)
     sound = [0, 2]
     assert np.isfinite(store.rows(name)[sound]).all()
     assert (store.rows(name)[sound] != 0).any()
@@ -187,22 +187,26 @@ def test_measure_makes_damaged_measures_anew(views):
 
 
 @pytest.mark.parametrize("healer", ["check", "render"])
-def test_a_damaged_status_costs_one_object_and_is_healed(views, capsys, caplog, healer):
-    flip_a_byte(chunk(views, "status", 1))
+@pytest.mark.parametrize("damage", ["flipped", "lost"])
+def test_a_damaged_status_costs_one_object_and_is_healed(views, capsys, caplog, damage, healer):
+    flip_a_byte(chunk(views, "status", 1)) if damage == "flipped" else chunk(views, "status", 1).unlink()
+    problem = "status is missing" if damage == "lost" else "status cannot be read"
     assert ViewStore.open(views).done.tolist() == [True, False, True]
     assert ViewStore.open(views).done.tolist() == [True, False, True]
-    assert ["status of b cannot be read" in line for line in caplog.messages] == [True]
-    assert dict(check(views, workers=0)) == {"a": None, "b": "status cannot be read", "c": None}
+    assert ["status of b is lost" in line for line in caplog.messages] == [True]
+    found = dict(check(views, workers=0))
+    assert found["b"].startswith(problem)
+    assert (found["a"], found["c"]) == (None, None)
     main(["measure", str(views), "--workers", "1"])
     with pytest.raises(SystemExit) as end:
         main(["check", str(views), "--workers", "1"])
     assert end.value.code == 2
     message = " ".join(capsys.readouterr().err.split())
-    assert "b: status cannot be read" in message
+    assert f"b: {problem}" in message
     assert "2 objects are sound, 1 damaged, 0 not rendered yet" in message
     if healer == "check":
         list(check(views, repair=True, workers=0))
-        assert ViewStore.open(views).doubtful == []
+        assert ViewStore.open(views).lost == {}
         assert ViewStore.open(views).done.tolist() == [True, False, True]
     assert list(render(views.parent / "meshes", views, SPHERE, 48, workers=0)) == [("b", None)]
     assert dict(check(views, workers=0)) == {"a": None, "b": None, "c": None}
@@ -321,7 +325,7 @@ def test_a_store_from_before_checksums_and_digests_is_read_and_completed(views):
     before = {name: store.rows(name) for name in RENDERED}
     later = ("sha256", "failures", "checksum", "unit", "stretch", "turn", "seed")
     store.group.attrs.put({k: v for k, v in store.group.attrs.items() if k not in later})
-    store.group["status"][1] = PENDING
+    store.mark(1, PENDING)
     shutil.rmtree(views / "digest")
     old = ViewStore.open(views)
     assert (old.failures, old.duplicates) == ({}, [])

@@ -37,7 +37,7 @@ def check(
                 damaged.append(f"{name}: {problem}")
             yield n
 
-    done = int(views.done.sum()) + len(views.doubtful)
+    done = int(views.done.sum()) + len(views.lost)
     track(checked(), done, f"checking {store.name}", views=len(views.sphere))
     for line in damaged:
         console.print(line, style="red", highlight=False)

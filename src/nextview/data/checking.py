@@ -26,7 +26,7 @@ def check(
     Image and depth must show the same silhouette, points must lie where the depth says, measures and correspondence,
     where they are made, must be those of depth and points. Every chunk must be there and have its checksum, and the
     object's arrays and name must have the digest that they were rendered with, where the store keeps one. An object
-    whose status cannot be read is damaged too.
+    whose status is lost is damaged too.
 
     Args:
         path: the store.
@@ -51,13 +51,13 @@ def check(
             raise DatasetError(f"{path}: the group of {name} cannot be opened; nextview check {path} --repair makes it")
     with only_one(path) if repair else nullcontext(), writing(path) if repair else nullcontext():
         items = [int(i) for i in np.flatnonzero(store.done)]
-        for i in store.doubtful:
+        for i, how in store.lost.items():
             if repair:
-                store.group["status"][i] = PENDING
-            yield store.names[i], "status cannot be read"
+                store.mark(i, PENDING)
+            yield store.names[i], how
         for i, problem in each(partial(_check_object, path.absolute()), items, workers, scheduler):
             if problem is not None and repair:
-                store.group["status"][i] = PENDING
+                store.mark(i, PENDING)
             yield store.names[i], None if problem is None else f"{problem}"
 
 

@@ -153,7 +153,7 @@ def render(
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is done.
                 store.note(failures=store.failures | {entry.name: f"{reason}"})
-                store.group["status"][i] = FAILED
+                store.mark(i, FAILED)
             elif entry.name in store.failures:
                 store.note(failures={n: r for n, r in store.failures.items() if n != entry.name})
             yield entry.name, None if reason is None else f"{reason}"

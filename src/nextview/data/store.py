@@ -317,23 +317,29 @@ class ViewStore:
 
     @property
     def done(self) -> NDArray[np.bool_]:
-        """Objects that are rendered, (N,). One whose status cannot be read counts as not rendered; a warning names it.
-
-        A status that is missing is none: it is that of an object not rendered yet.
-        """
-        status, wrong = self._status()
-        if wrong:
-            _warn_of_status(self.path, tuple(self.names[i] for i in wrong))
+        """Objects that are rendered, (N,). One whose status is lost counts as not rendered; a warning names it."""
+        status, lost = self._status()
+        if lost:
+            _warn_of_status(self.path, tuple(self.names[i] for i in lost))
         return status == DONE
 
     @property
-    def doubtful(self) -> list[int]:
-        """Objects whose status cannot be read."""
-        return list(self._status()[1])
+    def lost(self) -> dict[int, str]:
+        """Objects whose status is lost, and how."""
+        return {i: f"status {error}" for i, error in self._status()[1].items()}
+
+    def mark(self, i: int, status: int) -> None:
+        """Set the status of object i. PENDING is written too: where there is none, an object that was begun lost it."""
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            self.group["status"][i] = status
 
     def _status(self) -> tuple[NDArray[np.uint8], dict[int, ChunkError]]:
+        """Of all objects; those for which nothing was ever written are PENDING."""
         status, wrong = self.scan("status", range(len(self)))
-        return status, {i: error for i, error in wrong.items() if self.has("status", i)}
+        arrays = [self.array(name) for name in ("status", "radius") if self.sound(name)]
+        return status, {
+            i: error for i, error in wrong.items() if any(_chunk_exists(self.path, array, i) for array in arrays)
+        }
 
     @property
     def failures(self) -> dict[str, str]:
@@ -413,7 +419,7 @@ def _validate(path: Path, state: tuple[int, int, int]) -> None:
 def _warn_of_status(path: Path, names: tuple[str, ...]) -> None:
     some = ", ".join(names[:3]) + (f" and {len(names) - 3} others" if len(names) > 3 else "")
     _logger.warning(
-        "nextview: %s: the status of %s cannot be read, so it counts as not rendered; nextview render makes it anew",
+        "nextview: %s: the status of %s is lost, so it counts as not rendered; nextview render makes it anew",
         path,
         some,
     )
