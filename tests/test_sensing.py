@@ -267,7 +267,7 @@ def test_where_nothing_gets_better_earlier_views_stay():
     thing.add(frame([TABLE, WEDGE], pose_at(60, 25, 0.7), seed=1))
     assert thing.revision == 0
     assert thing.observations[0] is first
-    np.testing.assert_array_equal(thing.observations[1].depth, first.depth)
+    assert overlap(thing.observations[1].depth, first.depth) > 0.98
 
 
 def test_two_parts_seen_apart_become_one_object_once_the_bridge_is_seen():
@@ -462,3 +462,29 @@ def test_a_lunch_box_is_found_on_a_real_table(number):
     assert 0.15 < thing.object_frame.radius < 0.25
     top = -0.807
     assert 0 < thing.object_frame.centre @ UPRIGHT[2] - top < 0.1
+
+
+# The guide
+
+
+def test_the_code_of_the_guide_runs():
+    """With a little sofa on a table and an arm that misses its target by a centimetre."""
+    import re
+
+    guide = (Path(__file__).parent.parent / "docs" / "your_camera.md").read_text()
+    turned_off = pose_at(18, 135, 0.6, (0, 0, 0.06))
+
+    def go_and_look(target):
+        reached = target.copy()
+        reached[:3, 3] += 0.01, -0.005, 0.01
+        return cast([TABLE, WEDGE], reached, k)[0], reached
+
+    k = INTRINSICS.copy()
+    names = {"depth": cast([TABLE, WEDGE], turned_off, k)[0], "pose": turned_off, "go_and_look": go_and_look}
+    names["intrinsics"] = k - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    blocks = re.findall(r"```python\n(.*?)```", guide, re.S)
+    assert len(blocks) == 2
+    for block in blocks:
+        exec(block, names)
+    assert names["session"].done
+    assert np.linalg.norm(names["thing"].object_frame.centre - true_frame(WEDGE).centre) < 0.01

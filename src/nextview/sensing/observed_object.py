@@ -42,6 +42,7 @@ class Sighting:
 
     Attributes:
         frame: as it came.
+        noise: of the whole frame.
         facets: the object's surface, camera frame.
         hull: corners of the convex hull of that surface, world, (K, 3) float64.
         plane: the support plane as this frame sees it; None if it sees none.
@@ -50,6 +51,7 @@ class Sighting:
     """
 
     frame: Frame
+    noise: Noise
     facets: Facets
     hull: Float
     plane: Plane | None
@@ -138,7 +140,7 @@ class ObservedObject:
         """
         if self.sightings and (frame.pose is None or self.sightings[0].frame.pose is None):
             raise ObservationError("a second frame needs a pose, and the first one too: how else do they fit together?")
-        noise = estimate_noise(frame.depth[8::16], frame.depth[8::16] > 0)
+        noise = estimate_noise(frame.depth[8::24], frame.depth[8::24] > 0)
         seen = frame.depth > 0 if frame.mask is None else (frame.depth > 0) & ~frame.mask
         samples = sample(frame, seen, noise)
         up = self._known_up(frame)
@@ -230,7 +232,7 @@ class ObservedObject:
         labels = segmentation.clusters([*(s.footprint for s in self.sightings if s.footprint is not None), foot])
         target = self._target(labels, foot, ground, axes)
         chosen = labels[-1] == target
-        mask = (foot.cell_of >= 0) & np.append(chosen, False)[foot.cell_of]
+        mask = foot.pixels_over(chosen)
         if target == 0 or mask.sum() < FEWEST:
             where = "of the object known so far" if self.sightings else "on the support plane"
             raise ObservationError(f"this frame shows nothing {where}: check its pose, or aim the camera at the object")
@@ -241,8 +243,8 @@ class ObservedObject:
                 now = next(old_labels) == target
                 changed = s.footprint.pixels[now != s.chosen].sum()
                 if s.frame.mask is None and changed > MENDED * s.footprint.pixels[s.chosen].sum() and now.any():
-                    seen = (s.footprint.cell_of >= 0) & np.append(now, False)[s.footprint.cell_of]
-                    s = replace(self._sighting(s.frame, seen, s.plane, noise), footprint=s.footprint, chosen=now)
+                    mended = self._sighting(s.frame, s.footprint.pixels_over(now), s.plane, s.noise)
+                    s = replace(mended, footprint=s.footprint, chosen=now)
             sightings.append(s)
         new = self._sighting(frame, mask, plane, noise)
         return [*sightings, replace(new, footprint=foot, chosen=chosen)]
@@ -280,10 +282,10 @@ class ObservedObject:
         if len(facets.planes) * coarse**2 < FEWEST:
             raise ObservationError("too little is seen of the object")
         pose = frame.camera_to_world
-        points = facets.points[:: max(1, len(facets.planes) // 5000)] @ pose[:3, :3].T + pose[:3, 3]
+        points = facets.points[:: max(1, len(facets.planes) // 3000)] @ pose[:3, :3].T + pose[:3, 3]
         with suppress(QhullError):  # all in one plane: they do as they are
             points = points[ConvexHull(points).vertices]
-        return Sighting(frame, facets, points, plane, None, None)
+        return Sighting(frame, noise, facets, points, plane, None, None)
 
     # Where the object is, and how it looks from there
 
