@@ -1,6 +1,7 @@
 """From frames to observations in whole scenes: what is found, where, and that it looks as a render would."""
 
 import os
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -341,6 +342,30 @@ def test_what_cannot_be_found_is_said():
         ObservedObject(box=Box([0.3, 0.3, 0], [0.4, 0.4, 0.1])).add(frame([TABLE, WEDGE], pose))
     with pytest.raises(ObservationError, match="no frame was added yet"):
         _ = ObservedObject().object_frame
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (3, 40), (40, 3), (60, 80)])
+@pytest.mark.parametrize("kind", ["noise", "flat", "a row", "a diagonal", "specks"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_odd_frames_give_an_observation_or_one_sentence(shape, kind, masked):
+    rng = np.random.default_rng(0)
+    depth = {
+        "noise": rng.uniform(0.1, 5, shape),
+        "flat": np.full(shape, 1.3),
+        "a row": np.where(np.arange(shape[0])[:, None] == shape[0] // 2, 1.0, np.zeros(shape)),
+        "a diagonal": np.eye(max(shape))[: shape[0], : shape[1]],
+        "specks": np.where(rng.random(shape) < 0.2, rng.uniform(0.3, 3, shape), 0),
+    }[kind]
+    k = np.array([[1.1 * max(shape), 0, shape[1] / 2], [0, 1.1 * max(shape), shape[0] / 2], [0, 0, 1]])
+    mask = np.ones(shape, bool) if masked else None
+    thing = ObservedObject(support=not masked)
+    with suppress(ObservationError):
+        thing.add(Frame(depth, k, pose_at(40, 20, 0.7), mask))
+    assert len(thing.observations) == len(thing.sightings) <= 1
+    for observation in thing.observations:
+        assert np.isfinite(observation.depth).all()
+        assert observation.depth.min() >= 0
+        assert (observation.depth > 0).any()
 
 
 def test_an_object_is_asked_for_in_one_way():

@@ -15,7 +15,7 @@ from nextview.observation import Observation, pinhole
 from nextview.sensing import segmentation
 from nextview.sensing.facets import Facets, fit_facets
 from nextview.sensing.frame import Frame
-from nextview.sensing.noise import Noise, estimate_noise
+from nextview.sensing.noise import ROWS, Noise, estimate_noise
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, upright_axes
 from nextview.sensing.plausibility import Doubt, check_observation, check_views
 from nextview.sensing.segmentation import Footprint
@@ -140,7 +140,8 @@ class ObservedObject:
         """
         if self.sightings and (frame.pose is None or self.sightings[0].frame.pose is None):
             raise ObservationError("a second frame needs a pose, and the first one too: how else do they fit together?")
-        noise = estimate_noise(frame.depth[8::24], frame.depth[8::24] > 0)
+        few = slice(None, None, max(1, frame.shape[0] // ROWS))
+        noise = estimate_noise(frame.depth[few], frame.depth[few] > 0)
         seen = frame.depth > 0 if frame.mask is None else (frame.depth > 0) & ~frame.mask
         samples = sample(frame, seen, noise)
         up = self._known_up(frame)
