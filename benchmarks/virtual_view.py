@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from nextview import SimulatedCamera, ViewSphere, load_mesh, load_models
+import nextview
+from nextview import SimulatedCamera, load_mesh
 from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
 from nextview.sensing import Frame, ObjectFrame, ObservedObject
@@ -46,7 +47,8 @@ class Settings:
 def main(settings: Settings) -> None:
     entries = [e for e in list_dataset(settings.dataset) if e.split == "test"]
     entries = entries[:: len(entries) // settings.objects][: settings.objects]
-    recogniser, sphere = load_models((), threads=1).recogniser, ViewSphere.named("40")
+    system = nextview.load(threads=1)
+    recogniser, sphere = system.models.recogniser, system.sphere
     right = defaultdict(list)
 
     def each():

@@ -183,11 +183,11 @@ class ObservedObject:
         if earlier:
             return refine_plane(earlier[0], samples, loose=2)
         plane = find_plane(samples, self._rng, up, self._above())
-        if up is not None and frame.mask is None:
+        share = 0.0 if plane is None else float(plane.holds(samples).mean())
+        if up is not None and frame.mask is None and share < 1 / 3:  # else no other is twice as large
             largest = find_plane(samples, self._rng)
             mistake = None if largest is None else mistake_in_pose(largest, frame.camera_to_world, up)
-            rival = 0.0 if plane is None else float(plane.holds(samples).mean())
-            if largest is not None and mistake and largest.holds(samples).mean() > 2 * rival:
+            if largest is not None and mistake and largest.holds(samples).mean() > 2 * share:
                 raise ObservationError(f"the largest plane in view is not level: {mistake} Or up is another direction")
         return plane
 
