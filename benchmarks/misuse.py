@@ -3,8 +3,8 @@
     python benchmarks/misuse.py DATASET/ModelNet10 [--objects 150] [--views 8]
 
 Views of test objects in random directions are handed in as they should be, and with each mistake. Prints the share
-that ``check_observation`` doubts and the share where it names the mistake; for pairs of views what ``check_views``
-doubts; and the time that they take.
+that is doubted by ``check_observation``, or refused before, and the share where the mistake is named; for pairs of
+views what ``check_views`` doubts; and the time that they take.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ import tyro
 from nextview import Observation, SimulatedCamera, load_mesh
 from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
+from nextview.depth import FARTHEST
+from nextview.errors import ObservationError
 from nextview.sensing import check_observation, check_views
 from nextview.viewsphere import look_at_origin
 
@@ -51,23 +53,30 @@ def position_scaled(pose: np.ndarray, scale: float) -> np.ndarray:
     return pose
 
 
-def mistakes(o: Observation) -> dict[str, tuple[Observation, str]]:
-    """Observations with one mistake each, and the name under which it should be doubted."""
-    made = {
-        "correct": (o, ""),
-        "empty": (replace(o, depth=np.zeros_like(o.depth)), "nothing seen"),
-        "OpenGL axes": (replace(o, pose=o.pose @ FLIP), "opengl axes"),
-        "inverse pose": (replace(o, pose=np.linalg.inv(o.pose)), "inverse pose"),
-        "pose not rigid": (replace(o, pose=o.pose @ np.diag([1.1, 1, 1, 1.0])), "not rigid"),
+def mistakes(o: Observation) -> dict[str, tuple[str, dict]]:
+    """Mistakes: what the doubt is called, or a word of the refusal; and what changes in the observation."""
+    made: dict[str, tuple[str, dict]] = {
+        "correct": ("", {}),
+        "empty": ("nothing seen", {"depth": np.zeros_like(o.depth)}),
+        "OpenGL axes": ("opengl axes", {"pose": o.pose @ FLIP}),
+        "inverse pose": ("inverse pose", {"pose": np.linalg.inv(o.pose)}),
+        "pose not rigid": ("not rigid", {"pose": o.pose @ np.diag([1.1, 1, 1, 1.0])}),
     }
     for r in RADII:
-        made[f"depth in metres, radius {r} m"] = (replace(o, depth=(o.depth * r).astype(np.float32)), "scale")
-        made[f"all in metres, radius {r} m"] = (
-            replace(o, depth=(o.depth * r).astype(np.float32), pose=position_scaled(o.pose, r)), "scale",
-        )  # fmt: skip
-        name = "nothing seen" if 4 * 1000 * r > 50 else "scale"
-        made[f"depth in millimetres, radius {r} m"] = (replace(o, depth=(o.depth * 1000 * r).astype(np.float32)), name)
+        made[f"depth in metres, radius {r} m"] = "scale", {"depth": o.depth * r}
+        made[f"all in metres, radius {r} m"] = "scale", {"depth": o.depth * r, "pose": position_scaled(o.pose, r)}
+        name = "millimetres" if 2 * 1000 * r > FARTHEST else "scale"
+        made[f"depth in millimetres, radius {r} m"] = name, {"depth": o.depth * 1000 * r}
     return made
+
+
+def judge(observation: Observation, change: dict) -> str:
+    """The name of the doubt, or the sentence of the refusal; empty if there is neither."""
+    try:
+        doubts = check_observation(replace(observation, **change))
+    except ObservationError as refused:
+        return str(refused)
+    return doubts[0].name if doubts else ""
 
 
 def main(settings: Settings) -> None:
@@ -85,12 +94,12 @@ def main(settings: Settings) -> None:
                 elevation, azimuth = np.arcsin(rng.uniform(-0.2, 1)), rng.uniform(0, 2 * np.pi)
                 distance = rng.uniform(2.5, 4)
                 observation = camera.observe(look_at_origin(elevation, azimuth, distance))
-                for mistake, (wrong, name) in mistakes(observation).items():
+                for mistake, (name, change) in mistakes(observation).items():
                     begun = time.perf_counter()
-                    doubts = check_observation(wrong)
+                    said = judge(observation, change)
                     took["correct" if mistake == "correct" else "a mistake"].append(time.perf_counter() - begun)
-                    noticed[mistake].append(bool(doubts))
-                    named[mistake].append([d.name for d in doubts] == [name] * bool(name))
+                    noticed[mistake].append(bool(said))
+                    named[mistake].append(name in said if name else not said)
                 if before is not None:
                     begun = time.perf_counter()
                     contradicted["correct"].append(bool(check_views(before, observation)))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from nextview.sensing.noise import Noise, estimate_noise
+from nextview.sensing.noise import ROWS, Noise, estimate_noise
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -25,8 +25,6 @@ STEEPEST_ERROR = 0.1
 """Error of the slope (tangent) that noise may leave: six degrees of the normal."""
 FINEST = 2e-4
 """Relative noise of depth that even the best frame is taken to have."""
-ROWS = 25
-"""Rows of pixels in which the noise is measured."""
 STEEPEST = np.tan(np.radians(85.0))
 """Slope towards the ray beyond which neighbouring pixels are taken for two surfaces."""
 
@@ -105,14 +103,18 @@ def fit_facets(
     usable = mask & (depth > 0)
     noise, grain, wanted = 0.0, 1, usable
     if denoise:
-        noise, grain = _noise(depth, usable, frame_noise)
+        if usable.any():
+            noise, grain = _noise(depth, usable, frame_noise)
         usable = drop_flying(depth, usable, noise, 1 / focal.mean())
         wanted = _without_holes(usable, mask, depth > 0)
+    if not usable.any():
+        none = np.zeros(0, np.int64)
+        return Facets(np.zeros((0, 3)), np.zeros((0, 3)), none, none, coarse / focal)
     x = (corner[1] + np.arange(w) + 0.5 - intrinsics[0, 2]) / focal[0]
     y = (corner[0] + np.arange(h) + 0.5 - intrinsics[1, 2]) / focal[1]
     inverse = np.where(usable, 1 / np.where(usable, depth, 1), 0).astype(np.float64)
     weight = usable.astype(np.float64)
-    middle = np.array([x.mean(), y.mean(), inverse.sum() / max(weight.sum(), 1)])
+    middle = np.array([x.mean(), y.mean(), inverse.sum() / weight.sum()])
     sums = _moments(weight, x - middle[0], y - middle[1], np.where(usable, inverse - middle[2], 0))
     pitch = coarse / focal
     if coarse > 1:
@@ -145,7 +147,7 @@ def _noise(depth: NDArray[np.float32], usable: Mask, frame_noise: Noise | None) 
     """Standard deviation of inverse depth and grain of an object's pixels: no more than those of the whole frame."""
     few = slice(None, None, max(1, len(depth) // ROWS))
     own = estimate_noise(depth[few], usable[few])
-    middle = float(np.median(depth[usable])) if usable.any() else 1.0
+    middle = float(np.median(depth[usable]))
     if frame_noise is None or own.at(middle) < frame_noise.at(middle):
         return float(own.at(middle)), own.grain
     return float(frame_noise.at(middle)), frame_noise.grain

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 BINS = 4
 """Ranges of depth in which the noise is measured, with equally many pixels."""
+ROWS = 20
+"""About so many rows of a picture are enough to measure it."""
 LAGS = (1, 2, 4, 6)
 """Distances of the pixels that are compared. Neighbours err together in many sensors: a structured-light camera has
 patches of four pixels with the same error."""
@@ -47,24 +49,23 @@ def estimate_noise(depth: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noi
         The noise; none at all where too few pixels lie in a row.
     """
     q = np.where(usable, 1 / np.where(usable, depth, 1), np.nan)
-    typical = np.zeros(len(LAGS))
-    known = np.zeros(0, bool)
-    for i, lag in enumerate(LAGS):
-        if q.shape[1] <= 2 * lag:
-            break
-        second = np.abs(q[:, : -2 * lag] - 2 * q[:, lag:-lag] + q[:, 2 * lag :])
+    found = []
+    for lag in LAGS:
+        second = np.abs(q[:, : -2 * lag] - 2 * q[:, lag:-lag] + q[:, 2 * lag :]) if q.shape[1] > 2 * lag else q[:, :0]
         known = np.isfinite(second)
-        typical[i] = _sigma(second[known])
-    if not known.any():
-        return Noise(np.ones(1), np.full(1, typical.max()))
-    at, second = depth[:, lag:-lag][known], second[known]
+        if not known.any():
+            break
+        found.append((lag, second[known], depth[:, lag:-lag][known]))
+    if not found:
+        return Noise(np.ones(1), np.zeros(1))
+    typical = np.array([_sigma(second) for _, second, _ in found])
+    grain = found[int((typical >= 0.7 * typical.max()).argmax())][0]
+    _, second, at = found[-1]
     parts = np.array_split(np.argsort(at), min(BINS, len(at)))
     depths = np.array([np.median(at[part]) for part in parts], np.float64)
-    return Noise(
-        depths, np.array([_sigma(second[part]) for part in parts]), LAGS[int((typical > 0.7 * typical[-1]).argmax())]
-    )
+    return Noise(depths, np.array([_sigma(second[part]) for part in parts]), grain)
 
 
 def _sigma(second: NDArray[np.floating]) -> float:
-    """Standard deviation of the noise from the sizes of second differences, 0 if there are none."""
-    return float(np.median(second)) / (0.6745 * np.sqrt(6)) if len(second) else 0.0
+    """Standard deviation of the noise from the sizes of second differences."""
+    return float(np.median(second)) / (0.6745 * np.sqrt(6))

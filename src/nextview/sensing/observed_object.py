@@ -15,7 +15,7 @@ from nextview.observation import Observation, pinhole
 from nextview.sensing import segmentation
 from nextview.sensing.facets import Facets, fit_facets
 from nextview.sensing.frame import Frame
-from nextview.sensing.noise import Noise, estimate_noise
+from nextview.sensing.noise import ROWS, Noise, estimate_noise
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, upright_axes
 from nextview.sensing.plausibility import Doubt, check_observation, check_views
 from nextview.sensing.segmentation import Footprint
@@ -42,6 +42,7 @@ class Sighting:
 
     Attributes:
         frame: as it came.
+        noise: of the whole frame.
         facets: the object's surface, camera frame.
         hull: corners of the convex hull of that surface, world, (K, 3) float64.
         plane: the support plane as this frame sees it; None if it sees none.
@@ -50,6 +51,7 @@ class Sighting:
     """
 
     frame: Frame
+    noise: Noise
     facets: Facets
     hull: Float
     plane: Plane | None
@@ -138,7 +140,8 @@ class ObservedObject:
         """
         if self.sightings and (frame.pose is None or self.sightings[0].frame.pose is None):
             raise ObservationError("a second frame needs a pose, and the first one too: how else do they fit together?")
-        noise = estimate_noise(frame.depth[8::16], frame.depth[8::16] > 0)
+        few = slice(None, None, max(1, frame.shape[0] // ROWS))
+        noise = estimate_noise(frame.depth[few], frame.depth[few] > 0)
         seen = frame.depth > 0 if frame.mask is None else (frame.depth > 0) & ~frame.mask
         samples = sample(frame, seen, noise)
         up = self._known_up(frame)
@@ -180,11 +183,11 @@ class ObservedObject:
         if earlier:
             return refine_plane(earlier[0], samples, loose=2)
         plane = find_plane(samples, self._rng, up, self._above())
-        if up is not None and frame.mask is None:
+        share = 0.0 if plane is None else float(plane.holds(samples).mean())
+        if up is not None and frame.mask is None and share < 1 / 3:  # else no other is twice as large
             largest = find_plane(samples, self._rng)
             mistake = None if largest is None else mistake_in_pose(largest, frame.camera_to_world, up)
-            rival = 0.0 if plane is None else float(plane.holds(samples).mean())
-            if largest is not None and mistake and largest.holds(samples).mean() > 2 * rival:
+            if largest is not None and mistake and largest.holds(samples).mean() > 2 * share:
                 raise ObservationError(f"the largest plane in view is not level: {mistake} Or up is another direction")
         return plane
 
@@ -230,7 +233,7 @@ class ObservedObject:
         labels = segmentation.clusters([*(s.footprint for s in self.sightings if s.footprint is not None), foot])
         target = self._target(labels, foot, ground, axes)
         chosen = labels[-1] == target
-        mask = (foot.cell_of >= 0) & np.append(chosen, False)[foot.cell_of]
+        mask = foot.pixels_over(chosen)
         if target == 0 or mask.sum() < FEWEST:
             where = "of the object known so far" if self.sightings else "on the support plane"
             raise ObservationError(f"this frame shows nothing {where}: check its pose, or aim the camera at the object")
@@ -241,8 +244,8 @@ class ObservedObject:
                 now = next(old_labels) == target
                 changed = s.footprint.pixels[now != s.chosen].sum()
                 if s.frame.mask is None and changed > MENDED * s.footprint.pixels[s.chosen].sum() and now.any():
-                    seen = (s.footprint.cell_of >= 0) & np.append(now, False)[s.footprint.cell_of]
-                    s = replace(self._sighting(s.frame, seen, s.plane, noise), footprint=s.footprint, chosen=now)
+                    mended = self._sighting(s.frame, s.footprint.pixels_over(now), s.plane, s.noise)
+                    s = replace(mended, footprint=s.footprint, chosen=now)
             sightings.append(s)
         new = self._sighting(frame, mask, plane, noise)
         return [*sightings, replace(new, footprint=foot, chosen=chosen)]
@@ -280,10 +283,10 @@ class ObservedObject:
         if len(facets.planes) * coarse**2 < FEWEST:
             raise ObservationError("too little is seen of the object")
         pose = frame.camera_to_world
-        points = facets.points[:: max(1, len(facets.planes) // 5000)] @ pose[:3, :3].T + pose[:3, 3]
+        points = facets.points[:: max(1, len(facets.planes) // 3000)] @ pose[:3, :3].T + pose[:3, 3]
         with suppress(QhullError):  # all in one plane: they do as they are
             points = points[ConvexHull(points).vertices]
-        return Sighting(frame, facets, points, plane, None, None)
+        return Sighting(frame, noise, facets, points, plane, None, None)
 
     # Where the object is, and how it looks from there
 

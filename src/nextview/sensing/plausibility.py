@@ -29,8 +29,8 @@ class Doubt:
     """Something that is likely to be wrong.
 
     Attributes:
-        name: of the mistake: "nothing seen", "opengl axes", "ros axes", "inverse pose", "not rigid", "scale", "outside"
-            or "contradiction".
+        name: of the mistake: "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside" or
+            "contradiction".
         message: one sentence for the user.
     """
 
@@ -41,21 +41,18 @@ class Doubt:
 def check_observation(observation: Observation) -> list[Doubt]:
     """What is likely to be wrong with an observation; usually nothing. Takes less than a millisecond.
 
+    What no camera can give, such as a pose that is not rigid, was refused when the observation was made.
+
     The object fills most of the unit sphere about the origin and nothing of it is outside. Where that is not so, the
     usual mistakes are undone one after the other: the one without which it would be so is named.
     """
     depth, pose = observation.depth, np.asarray(observation.pose, np.float64)
-    rotation = pose[:3, :3]
-    rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) and np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6)
-    if not rigid or np.linalg.det(rotation) < 0:
-        return [Doubt("not rigid", "the pose is not rigid: a rotation (right-handed axes) and a shift are expected")]
     seen = np.flatnonzero(depth)
     if len(seen) < FEWEST:
         return [
             Doubt(
                 "nothing seen",
-                f"only {len(seen)} pixels have a depth: is the object in the picture, and the depth in object radii? "
-                "(Depth in millimetres is taken for nothing)",
+                f"only {len(seen)} pixels have a depth: is the object in the picture, and the depth in object radii?",
             )
         ]
     rows, columns = np.divmod(seen[:: max(1, len(seen) // SAMPLE)], depth.shape[1])

@@ -81,6 +81,10 @@ class Footprint:
     pixels: NDArray[np.int64]
     cell_of: NDArray[np.int32]
 
+    def pixels_over(self, chosen: Mask) -> Mask:
+        """Pixels that show something over the chosen cells, (H, W) bool."""
+        return np.append(chosen, False)[self.cell_of]  # the last is that of -1
+
 
 def footprint(frame: Frame, above: Mask, axes: Float, cell: float) -> Footprint:
     """The footprint of the pixels ``above``.

@@ -22,7 +22,7 @@ LEAST = 0.04
 LEAST_ALONE = 0.15
 
 
-SAMPLES = 2000
+SAMPLES = 1500
 """Pixels in which planes are searched."""
 
 
