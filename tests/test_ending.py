@@ -21,6 +21,13 @@ from nextview.data.store import ViewStore
 COMMAND = [sys.executable, "-m", "nextview.cli.main"]
 
 
+def popen(command, **options):
+    """A process that Ctrl-C reaches, also where these tests run in the background of a shell, which ignores it."""
+    return subprocess.Popen(
+        command, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler), **options
+    )
+
+
 @pytest.fixture
 def meshes(tmp_path):
     (tmp_path / "meshes/ball").mkdir(parents=True)
@@ -39,9 +46,7 @@ def complaints(monkeypatch):
 
 def signalled(command: list[str], number: signal.Signals, ready) -> tuple[int, str]:
     """Send a signal to a command, to all its processes as a terminal does with Ctrl-C, once it is ready."""
-    running = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    running = popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
     while not ready() and running.poll() is None:
         time.sleep(0.01)
     (os.killpg if number == signal.SIGINT else os.kill)(running.pid, number)
