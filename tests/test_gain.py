@@ -508,7 +508,7 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
     for wrong in ("-1", "much", "nan", ""):
         with pytest.raises(ValueError, match="a travel weight is a number of at least 0"):
             make_policy(f"{card}@{wrong}", SPHERE)
-    with pytest.raises(ValueError, match="pays no travel weight"):
+    with pytest.raises(ValueError, match="does not weigh travel"):
         make_policy("class-table@1", SPHERE)
     with pytest.raises(ValueError, match="other classes"):
         make_policy(str(card), SPHERE, classes=("ball", "box"))

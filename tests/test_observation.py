@@ -165,7 +165,7 @@ def test_what_no_camera_gives_is_refused_in_one_sentence(other, words):
 
 
 def test_a_pose_written_with_four_digits_is_rigid_enough():
-    observe(pose=np.round(POSE, 4))
+    np.testing.assert_array_equal(observe(pose=np.round(POSE, 4)).pose, np.round(POSE, 4))
 
 
 def test_millimetres_with_a_few_pixels_of_noise_are_refused_still():

@@ -126,8 +126,9 @@ def test_the_version(how):
 
 
 def test_importing_and_a_robot_need_no_ray_caster():
-    code = "import sys; sys.modules['embreex'] = None; import nextview; nextview.load().session().pose"
-    subprocess.run([sys.executable, "-c", code], check=True)
+    code = "import sys; sys.modules['embreex'] = None; import nextview; print(nextview.load().session().pose.shape)"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert printed.strip() == "(4, 4)"
 
 
 @pytest.mark.skipif(not os.environ.get("NEXTVIEW_DATA"), reason="NEXTVIEW_DATA names no folder with ModelNet10")

@@ -47,7 +47,7 @@ def _pointing(total: NDArray[np.floating], classes: int) -> NDArray[np.floating]
 def reorient(azimuth_bins: NDArray[np.floating], azimuth: NDArray[np.floating]) -> NDArray[np.floating]:
     """Log-evidence of the bins seen from an azimuth as log-evidence of the azimuths to which bin 0 points; or back.
 
-    From azimuth a side s is seen if azimuth bin 0 points to a - s: the same sum turns either into the other.
+    From azimuth a, bin s is seen if bin 0 points to a - s: the same sum turns either into the other.
 
     Args:
         azimuth_bins: (..., classes, azimuth bins), in even steps of azimuth.

@@ -161,14 +161,14 @@ def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.
     best = published_recognisers(p.classes, len(p.sphere))
     rows = []
     for n_views, logits in judged.items():
-        log_evidence = {"accuracy": logits, "clean_accuracy": logits}
+        scored = {"accuracy": logits, "clean_accuracy": logits}
         if by_shape:
-            log_evidence["shape_accuracy"] = by_shape[n_views]
-        right = np.stack([(x.argmax(2) == p.labels[:, None]).mean(1) for x in log_evidence.values()], 1)
-        bottom = np.stack([clean if measure == "clean_accuracy" else one for measure in log_evidence], 1)
+            scored["shape_accuracy"] = by_shape[n_views]
+        right = np.stack([(x.argmax(2) == p.labels[:, None]).mean(1) for x in scored.values()], 1)
+        bottom = np.stack([clean if measure == "clean_accuracy" else one for measure in scored], 1)
         for label, over, value, low, high in _means(right * bottom, bottom, p.labels, p.classes, weights):
             here = p.labels == p.classes.index(label) if label else slice(None)
-            for i, (measure, objects) in enumerate(zip(log_evidence, bottom[here].sum(0), strict=True)):
+            for i, (measure, objects) in enumerate(zip(scored, bottom[here].sum(0), strict=True)):
                 beside = best[0][2] if best and (n_views, label, over, i) == (1, "", "", 0) else np.nan
                 rows.append((n_views, label, over + measure, int(objects), value[i], low[i], high[i], beside))
     return pd.DataFrame(rows, columns=["n_views", "label", "measure", "objects", "value", "low", "high", "published"])

@@ -12,7 +12,7 @@ from nextview.errors import DatasetError
 def inspect(
     store: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path | None] = None, /, object: str | None = None
 ) -> None:
-    """Draw what a view store holds: classes, counts, failures, size on disk; or one object from all azimuth bins.
+    """Draw what a view store holds: classes, counts, failures, size on disk; or one object from all sides.
 
     Args:
         store: view store made by nextview render.

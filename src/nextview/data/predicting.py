@@ -34,10 +34,10 @@ RECIPE = "recipe.json"
 
 def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
     """Objects that look exactly like one with another label, in any split of the store, (N,) bool."""
-    duplicate = duplicate_groups(store.measure())
-    several = np.zeros((duplicate.max() + 1, len(store.classes)), bool)
-    several[duplicate, store.labels] = True
-    return (several.sum(1) > 1)[duplicate] & store.done
+    group = duplicate_groups(store.measure())
+    several = np.zeros((group.max() + 1, len(store.classes)), bool)
+    several[group, store.labels] = True
+    return (several.sum(1) > 1)[group] & store.done
 
 
 def predict(

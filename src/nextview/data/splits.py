@@ -51,13 +51,13 @@ def divide(
     Returns:
         Indices of either, sorted.
     """
-    duplicate = duplicate_groups(measured)
+    group = duplicate_groups(measured)
     rng = np.random.default_rng(seed)
     validates = np.zeros(len(labels), bool)
     for label in np.unique(labels):
         members = rng.permutation(np.flatnonzero(labels == label))
         validates[members[: round(share * len(members))]] = True
-    validates = np.isin(duplicate, duplicate[validates])
+    validates = np.isin(group, group[validates])
     return np.flatnonzero(~validates), np.flatnonzero(validates)
 
 

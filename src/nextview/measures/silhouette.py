@@ -21,7 +21,7 @@ def silhouette_area(depth: NDArray[np.floating]) -> float:
 
 
 def silhouette_length(depth: NDArray[np.floating]) -> float:
-    """Length of the object's outline, holes included, in azimuth bins of the image.
+    """Length of the object's outline, holes included, in sides of the image.
 
     By Cauchy and Crofton: the length of a curve is half the mean number of times that lines cross it, over all lines.
     Counted over the lines through the pixels' centres in four directions, which is right within a few per cent where

@@ -57,7 +57,7 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
 class Recogniser:
     """Names the object in each view, by what is seen and, where the camera knows it, by how large the object is.
 
-    ``azimuth bins`` is how many azimuth bins of the object it tells apart, 0 if it was not taught to.
+    ``azimuth_bins`` is how many azimuth bins of the object it tells apart, 0 if it was not taught to.
 
     Args:
         model: name of a bundled model, or path of a card.
@@ -153,7 +153,7 @@ class Models:
 def load_models(maps: Sequence[str] = ("lem",), recogniser: str | Path = RECOGNISER, threads: int = 0) -> Models:
     """The bundled recogniser, or the one whose card is given, and the bundled map networks of the given names.
 
-    The names may be a policy's needs: "azimuth bins" takes no network beside the recogniser.
+    The names may be a policy's needs: "azimuth_bins" takes no network beside the recogniser.
 
     Raises:
         ModelError: a model is missing, damaged or of the wrong kind.

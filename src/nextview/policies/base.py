@@ -49,7 +49,7 @@ class EpisodeState:
         episodes: which episodes these are, (B,) int64: where an oracle looks up its truth. Live there is one, 0.
         azimuth_bins: belief, over all views, in the azimuth bin that is seen from the current view, if the object is
             of each class, (B, classes, azimuth bins) float64, sums to 1 over the azimuth bins. None if the recogniser
-            cannot tell, or "azimuth bins" is not among the policy's needs.
+            cannot tell, or "azimuth_bins" is not among the policy's needs.
     """
 
     current: NDArray[np.int64]
@@ -66,7 +66,7 @@ class Policy(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the maps it wants in the evidence; "azimuth bins" for what the recogniser says of them."""
+        """Names of the maps it wants in the evidence; "azimuth_bins" for what the recogniser says of them."""
         ...
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:

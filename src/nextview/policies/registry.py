@@ -64,7 +64,7 @@ def make_policy(
 
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
     if not isinstance(policy, Gain):
-        raise PolicyError(f"{name}: this policy pays no travel weight")
+        raise PolicyError(f"{name}: this policy does not weigh travel")
     try:
         return replace(policy, travel_weight=float(travel_weight))
     except ValueError:

@@ -1,4 +1,4 @@
-"""Pictures of a view store: one object from all azimuth bins, the whole data set, and point correspondence."""
+"""Pictures of a view store: one object from all sides, the whole data set, and point correspondence."""
 
 from __future__ import annotations
 

@@ -36,9 +36,9 @@ def training_curves(log: dict[str, list[float]]) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = PlainFigure((4.6, 0.4 + 1.5 * len(panels)), layout="constrained")
         for axes, name in zip(figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0], panels, strict=True):
-            duplicate = f"validation_{name}"
-            lines = {name: TRAINING} if duplicate in log else {name: INK if name == "rate" else VALIDATION}
-            lines |= {duplicate: VALIDATION} if duplicate in log else {}
+            judged = f"validation_{name}"
+            lines = {name: TRAINING} if judged in log else {name: INK if name == "rate" else VALIDATION}
+            lines |= {judged: VALIDATION} if judged in log else {}
             for line, colour in lines.items():
                 part = "validation" if colour == VALIDATION else "training"
                 axes.plot(epochs, log[line], color=colour, marker="o", markersize=2.5, label=part)

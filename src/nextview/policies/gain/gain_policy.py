@@ -1,4 +1,4 @@
-"""The policy that has learned what a view from each viewpoint brings, and pays a travel weight."""
+"""The policy that has learned what a view from each viewpoint brings, and weighs it against the travel there."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from nextview.training.recogniser.azimuth_bins import side_loss
 
 @dataclass(frozen=True)
 class Source:
-    """Where views of the training objects come from: their own store or one of deformed duplicates.
+    """Where views of the training objects come from: their own store or one of deformed copies.
 
     Attributes:
         inputs: (rows, V, C, S, S) uint8.
@@ -46,7 +46,7 @@ class Views(IterableDataset):
     Balanced, objects are drawn with weight 1/sqrt(objects of their class), so that rare classes are seen more often,
     and views at random. Otherwise every view comes at most once an epoch, and once exactly if ``recipe.views`` takes
     all of them. The views of an object come from its own store or, with chance ``recipe.deformed_share``, from one of
-    its deformed duplicates, which may have other views.
+    its deformed copies, which may have other views.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ def fit_recogniser(
     """Train and return the network of the best epoch; checkpoints in ``out``, from which a second call resumes.
 
     Args:
-        sources: the store's own, whose rows are the objects, and maybe those of deformed duplicates.
+        sources: the store's own, whose rows are the objects, and maybe those of deformed copies.
         labels: class of each object, (N,).
         training: objects that train.
         validation: objects that validate.
