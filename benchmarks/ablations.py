@@ -9,10 +9,14 @@ means, and 95 % bootstrap intervals over objects.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+
+from nextview.cli.extra import require
+
+require("train")
+require("benchmark")
 
 import numpy as np
 import tyro
@@ -23,10 +27,11 @@ from nextview.benchmark.evaluation import fused_views
 from nextview.benchmark.statistics import interval, resample
 from nextview.calibration.fitting_set import FittingSet
 from nextview.calibration.temperature import fit_temperature
+from nextview.cli.ending import orderly_end
 from nextview.data.predictions import Predictions
 from nextview.data.splits import split_training
 from nextview.data.store import ViewStore
-from nextview.errors import NextviewError, PredictionsError
+from nextview.errors import PredictionsError
 from nextview.metrics import mean_over_classes, ratio
 
 Float = NDArray[np.float64]
@@ -119,7 +124,5 @@ def size(predictions: tyro.conf.Positional[Path]) -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with orderly_end("run it again"):
         tyro.extras.subcommand_cli_from_dict({"agreement": agreement, "size": size}, description=__doc__)
-    except NextviewError as error:
-        sys.exit(f"ablations.py: {error}")

@@ -12,6 +12,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from nextview.cli.extra import require
+
+require("train")
+
 import numpy as np
 import onnx
 import onnxruntime as ort
@@ -19,6 +23,7 @@ import tyro
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, shape_inference
 
+from nextview.cli.ending import orderly_end
 from nextview.models.inference import open_weights
 from nextview.models.model_card import ModelCard, bundled_cards, find_card
 
@@ -103,4 +108,5 @@ def main(models: tuple[str, ...] = (), threads: int = 2, rounds: int = 200, seed
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("run it again"):
+        tyro.cli(main)

@@ -18,6 +18,7 @@ import numpy as np
 import tyro
 
 from nextview import Observation, SimulatedCamera, load_mesh
+from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
 from nextview.depth import FARTHEST
@@ -126,4 +127,5 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    with orderly_end("run it again"):
+        main(tyro.cli(Settings))

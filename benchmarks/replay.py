@@ -13,6 +13,10 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
+from nextview.cli.extra import require
+
+require("benchmark")
+
 import numpy as np
 import tyro
 
@@ -21,6 +25,7 @@ from nextview.benchmark.entries import default_entries
 from nextview.benchmark.experiment import THRESHOLDS, Grid, run_grid
 from nextview.benchmark.replay import make_specs
 from nextview.benchmark.summary import summarise
+from nextview.cli.ending import orderly_end
 from nextview.data.predictions import Predictions
 from nextview.viewsphere import ViewSphere
 
@@ -118,4 +123,5 @@ def main(predictions: Path | None = None, meshes: list[Path] | None = None) -> N
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("run it again"):
+        tyro.cli(main)

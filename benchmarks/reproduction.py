@@ -11,6 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from nextview.cli.extra import require
+
+require("benchmark")
+
 import numpy as np
 import tyro
 
@@ -21,6 +25,7 @@ from nextview.benchmark.leaderboard import SIGNIFICANT, nothing_differs
 from nextview.benchmark.published import published, published_threshold
 from nextview.benchmark.replay import make_specs
 from nextview.benchmark.summary import Tables, summarise
+from nextview.cli.ending import orderly_end
 from nextview.data.predictions import Predictions
 from nextview.models.model_card import file_hash
 
@@ -236,4 +241,5 @@ def main(predictions: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("run it again"):
+        tyro.cli(main)

@@ -11,11 +11,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from nextview.cli.extra import require
+
+require("benchmark")
+
 import numpy as np
 import tyro
 
 from nextview.benchmark.evaluation import baselines
 from nextview.benchmark.statistics import interval, resample
+from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.store import ViewStore
 from nextview.measures.depth_entropy import normalise_per_object
@@ -66,4 +71,5 @@ def main(store: tyro.conf.Positional[Path], card: str = "lem-modelnet10", sample
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("run it again"):
+        tyro.cli(main)

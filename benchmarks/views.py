@@ -23,6 +23,10 @@ from itertools import pairwise, product
 from pathlib import Path
 from typing import Literal
 
+from nextview.cli.extra import require
+
+require("benchmark")
+
 import matplotlib
 import numpy as np
 import pandas as pd
@@ -37,8 +41,10 @@ from nextview.benchmark.entries import EpisodeSpecs, entry_policy
 from nextview.benchmark.experiment import Grid, run_grid
 from nextview.benchmark.replay import Outcomes, Trajectories, make_specs, truncate
 from nextview.benchmark.statistics import holm, interval, mcnemar, resample
+from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.predictions import Predictions
+from nextview.errors import UsageError
 from nextview.metrics import ratio
 from nextview.report.curves import COLOURS, OWN, is_oracle
 from nextview.report.html_tables import KNOWING
@@ -303,9 +309,9 @@ def main(
     if split:
         table = table.of_split(split)
     elif len(set(table.splits)) > 1:
-        raise ValueError(f"{predictions}: holds training and test objects; choose with --split which are compared")
+        raise UsageError(f"{predictions}: holds training and test objects; choose with --split which are compared")
     if not n_views or not 1 <= min(n_views) <= max(n_views) <= len(table.sphere):
-        raise ValueError(f"policies are compared after 1 to {len(table.sphere)} views, not {n_views}")
+        raise UsageError(f"policies are compared after 1 to {len(table.sphere)} views, not {n_views}")
     specs = make_specs(table, runs, seed)
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
     names = list(dict.fromkeys([*REFERENCES, *against, *(policies or POLICIES), CEILING]))
@@ -324,12 +330,9 @@ def main(
     to_png(front(found, families(choosing, specs)), out / "front.png")
     print(text, end="")
     if (policies or against != REFERENCES) and grid.failures:
-        raise ValueError("not all that was asked for could be run")
+        raise UsageError("not all that was asked for could be run")
 
 
 if __name__ == "__main__":
-    try:
+    with orderly_end("run it again"):
         tyro.cli(main)
-    except ValueError as error:
-        print(f"views.py: {error}", file=sys.stderr)
-        sys.exit(2)

@@ -18,6 +18,7 @@ import tyro
 
 import nextview
 from nextview import SimulatedCamera, load_mesh
+from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
 from nextview.sensing import Frame, ObjectFrame, ObservedObject
@@ -73,4 +74,5 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    with orderly_end("run it again"):
+        main(tyro.cli(Settings))

@@ -192,3 +192,26 @@ def test_a_missing_extra_is_named_with_what_brings_it(package, arguments, extra)
     assert ended.returncode == 2
     assert f"pip install 'nextview[{extra}]'" in ended.stderr
     assert ended.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("package", "script", "extra"),
+    [
+        ("pandas", "benchmarks/views.py", "benchmark"),
+        ("pandas", "benchmarks/replay.py", "benchmark"),
+        ("pandas", "benchmarks/reproduction.py", "benchmark"),
+        ("pandas", "benchmarks/unseen_classes.py", "benchmark"),
+        ("pandas", "benchmarks/ablations.py", "benchmark"),
+        ("torch", "benchmarks/ablations.py", "train"),
+        ("onnx", "benchmarks/latency.py", "train"),
+        ("jinja2", "workflow/results.py", "benchmark"),
+    ],
+)
+def test_a_script_names_the_missing_extra_too(package, script, extra):
+    path = str(Path(__file__).parents[1] / script)
+    without = f"import sys, runpy; sys.modules[{package!r}] = None; sys.argv = [{path!r}, '--help']"
+    code = f"{without}; runpy.run_path({path!r}, run_name='__main__')"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == 2
+    assert f"pip install 'nextview[{extra}]'" in ended.stderr
+    assert ended.stderr.count("\n") == 1

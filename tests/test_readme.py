@@ -4,9 +4,13 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from nextview.cameras.simulated import SimulatedCamera
 from nextview.cli.main import COMMANDS, main
+from nextview.data.samples import SAMPLES, boxes_mesh
+from nextview.mesh import load_mesh
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
 
@@ -59,3 +63,47 @@ def test_its_options_are_there(line, capsys):
 @pytest.mark.parametrize("command", sorted(set(re.findall(r"^nextview (\w+)", README, re.M))))
 def test_commands_exist(command):
     assert command in COMMANDS
+
+
+def test_its_session_runs(tmp_path, capsys):
+    (example,) = re.findall(r"```\n(session = .*?)```", README, re.S)
+    camera = SimulatedCamera(load_mesh(Path(__file__).parent.parent / "samples/chair.off"))
+    exec(f"import nextview\n{example}", {"my_camera": camera})
+    assert "chair (belief" in capsys.readouterr().out
+
+
+SMALL = {
+    "render": "--workers 1",
+    "train recogniser": "--size 32 --epochs 1 --views 2 --batch 8 --validation 0.4",
+    "predict": "--workers 1",
+    "fit calibration": "--delta 0.2",
+    "train gain": "--folds 2 --epochs 1 --walks 1 --networks 1",
+    "benchmark": "--runs 2 --samples 100",
+}
+"""What makes a command of the page quick."""
+
+
+def test_making_it_ones_own_works_from_the_first_line_to_the_last(tmp_path, monkeypatch, capsys):
+    for package in ("torch", "onnx", "pandas", "jinja2"):
+        pytest.importorskip(package)
+    rng = np.random.default_rng(0)
+    for label in ("chair", "monitor", "table"):
+        for split, count in (("train", 5), ("test", 2)):
+            (folder := tmp_path / "data/ModelNet10" / label / split).mkdir(parents=True)
+            for k in range(count):
+                scale = rng.uniform(0.8, 1.25, 3)
+                boxes = [tuple(tuple(np.multiply(corner, scale)) for corner in box) for box in SAMPLES[label]()]
+                write_off(folder / f"{label}_{k}.off", boxes_mesh(boxes, label))
+    shutil.copytree(Path(__file__).parent.parent / "samples", tmp_path / "samples")
+    monkeypatch.chdir(tmp_path)
+    (part,) = re.findall(r"## Make it yours\n+```sh\n(.*?)```", README, re.S)
+    lines = [line.partition("#")[0].strip() for line in part.splitlines()]
+    assert lines[0] == "nextview download modelnet10 data"  # into the folder that is there already
+    for line in lines[1:]:
+        small = next((options for command, options in SMALL.items() if line.startswith(f"nextview {command} ")), "")
+        capsys.readouterr()
+        main([*line.split()[1:], *small.split()])
+        if line.startswith("nextview recognise "):
+            assert "It is a" in capsys.readouterr().out
+    assert (tmp_path / "benchmark/leaderboard.md").exists() or (tmp_path / "benchmark/summary.csv").exists()
+    assert list(tmp_path.rglob("*.html"))

@@ -38,7 +38,8 @@ from nextview.training.inputs import load_inputs  # noqa: E402
 from nextview.training.lite import LiteNet  # noqa: E402
 from nextview.training.maps.map_module import MapModule, Windows  # noqa: E402
 from nextview.training.onnx_export import export_onnx  # noqa: E402
-from nextview.training.recipes import MapRecipe  # noqa: E402
+from nextview.training.recipes import MapRecipe, RecogniserRecipe  # noqa: E402
+from nextview.training.recogniser.recogniser_module import Source, Views  # noqa: E402
 
 
 def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
@@ -217,6 +218,16 @@ def test_map_batches_hold_each_view_with_its_own_map():
     assert len(set(drawn)) == 16  # no view comes twice before all have come
     assert {o for o, _ in drawn} == {1, 2, 5}
     assert 0 < sum(flips) < 16
+
+
+def test_fewer_views_than_a_batch_are_one_batch():
+    sphere, seen = ViewSphere.named("40"), np.zeros((2, 40, 4, 2, 2), np.uint8)
+    recipe = MapRecipe(views=3, batch=64)
+    for training in (True, False):
+        windows = Windows(seen, np.zeros((2, 40), np.float32), sphere, np.arange(2), recipe, training)
+        assert [len(images) for images, _ in windows] == [6]
+    views = Views([Source(seen, np.arange(2))], np.arange(2), np.arange(2), RecogniserRecipe(views=3, batch=64))
+    assert [len(images) for images, _ in views] == [6]
 
 
 @pytest.mark.parametrize("kind", ["geometry", "cloud"])

@@ -14,6 +14,10 @@ from collections.abc import Callable, Iterable, Iterator
 from math import isfinite
 from pathlib import Path
 
+from nextview.cli.extra import require
+
+require("benchmark")
+
 import pandas as pd
 
 THRESHOLD = 0.97

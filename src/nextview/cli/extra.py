@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from importlib.util import find_spec
+
 from nextview.errors import MissingExtraError
 
 EXTRAS = {
@@ -19,3 +22,13 @@ def missing_extra(error: ModuleNotFoundError) -> MissingExtraError | None:
         if package in packages:
             return MissingExtraError(f"this needs the package {package}: pip install 'nextview[{extra}]'")
     return None
+
+
+def require(extra: str) -> None:
+    """End a script, with the sentence that says what to install, before its imports fail for a package of an extra."""
+    for package in EXTRAS[extra]:
+        if find_spec(package) is None:
+            from nextview.cli.ending import say
+
+            say(f"{sys.argv[0]} needs the package {package}: pip install 'nextview[{extra}]'")
+            sys.exit(2)

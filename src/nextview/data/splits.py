@@ -81,6 +81,23 @@ def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple
     return usable[training], usable[validation]
 
 
+def check_any(store: ViewStore, training: NDArray[np.int64], validation: NDArray[np.int64], lacking: str = "") -> None:
+    """Refuse to train on nothing, or to judge by nothing.
+
+    Args:
+        store: the views.
+        training: objects that train.
+        validation: objects that validate.
+        lacking: why objects of the training split may be missing among them.
+
+    Raises:
+        DatasetError: there are none of one or the other.
+    """
+    for objects, what in ((training, "to train on"), (validation, "to validate with (see --validation)")):
+        if len(objects) == 0:
+            raise DatasetError(f"{store.path}: no object is left {what}{lacking}")
+
+
 def deduplicate(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.int64]:
     """One object of each shape and label among some of a store, see ``deduplicated``."""
     return objects[deduplicated(store.labels[objects], store.measure()[objects])]

@@ -47,13 +47,14 @@ class Windows(IterableDataset):
         self.around = np.arange(sphere.rings)[None, :, None] * n + azimuths[:, None, :]  # (V, rings, columns)
         self.mirror = [list(steps % n).index(-step % n) for step in steps]
         self.recipe, self.training, self.epoch, self.share = recipe, training, 0, slice(None)
+        self.batch = min(recipe.batch, len(objects) * recipe.views)
 
     def __len__(self) -> int:
-        return len(self.objects) * self.recipe.views // self.recipe.batch
+        return len(self.objects) * self.recipe.views // self.batch
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
         rng = np.random.default_rng([self.recipe.seed, self.epoch])
-        n, v, batch = len(self) * self.recipe.batch, len(self.poses), self.recipe.batch
+        n, v, batch = len(self) * self.batch, len(self.poses), self.batch
         if self.training:  # every object as often as any other, and each of its views before one comes again
             turns = np.argsort(rng.random((v, len(self.objects))), axis=0)
             views = np.resize(turns, (self.recipe.views, len(self.objects))).flatten()

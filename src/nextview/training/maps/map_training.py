@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nextview.command_line import command_line
 from nextview.data.predictions import Predictions
-from nextview.data.splits import deduplicate, split_training
+from nextview.data.splits import check_any, deduplicate, split_training
 from nextview.data.store import ViewStore
 from nextview.tracking import Track, silently
 from nextview.training.checkpoints import refuse_seen
@@ -98,11 +98,12 @@ def train_map(
         ``out``.
 
     Raises:
-        DatasetError: the store cannot be used, or another process trains in the same folder.
+        DatasetError: the store cannot be used or has nothing to train on, or another process trains in the same folder.
         ModelError: the weights cannot be used, or have seen what validates; or ``out`` holds another run.
     """
     views = ViewStore.open(store)
     training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
+    check_any(views, training, validation, "" if target.there.all() else ": of the others no map is known")
     if weights:
         refuse_seen(weights, [views.names[i] for i in validation])
     with begin(out, recipe, weights, commands):

@@ -60,14 +60,16 @@ class Views(IterableDataset):
         count = np.bincount(labels[objects])[labels[objects]]
         self.weights = count**-0.5 / (count**-0.5).sum()
         self.epoch, self.share = 0, slice(None)
+        views = recipe.views if recipe.balanced else min(recipe.views, sources[0].inputs.shape[1])
+        self.drawn = len(objects) * views
+        self.batch = min(recipe.batch, self.drawn)
 
     def __len__(self) -> int:
-        views = self.recipe.views if self.recipe.balanced else min(self.recipe.views, self.sources[0].inputs.shape[1])
-        return len(self.objects) * views // self.recipe.batch
+        return self.drawn // self.batch
 
     def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
         rng = np.random.default_rng([self.recipe.seed, self.epoch, self.recipe.ensemble_seed])
-        n, v = len(self) * self.recipe.batch, self.sources[0].inputs.shape[1]
+        n, v = len(self) * self.batch, self.sources[0].inputs.shape[1]
         if self.recipe.balanced:
             objects = rng.choice(self.objects, n, p=self.weights)
             turn = rng.random(n)  # of the view, as a part of all views
@@ -78,7 +80,7 @@ class Views(IterableDataset):
         source = np.where(deformed, rng.integers(1, max(2, len(self.sources)), n), 0)
         row = np.stack([own.row for own in self.sources])[source, objects]
         view = (turn * np.array([own.inputs.shape[1] for own in self.sources])[source]).astype(int)
-        batches = np.arange(n).reshape(-1, self.recipe.batch)[:, self.share]
+        batches = np.arange(n).reshape(-1, self.batch)[:, self.share]
         for step, batch in enumerate(batches):
             coming = batches[step + AHEAD if step else 0 : step + AHEAD + 1]
             for s, own in enumerate(self.sources):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.command_line import command_line
-from nextview.data.splits import deduplicate, split_training
+from nextview.data.splits import check_any, deduplicate, split_training
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError
 from nextview.tracking import Track, silently
@@ -62,6 +62,7 @@ def train_recogniser(
         raise UsageError(f"there is no fold {fold} of {folds}: they are counted from 0")
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation, recipe.seed)
+    check_any(views, training, validation)
     held_out = {out: training[:0]}
     if folds:
         parts = hold_out(views.labels[training], views.measure()[training], folds, recipe.seed)
