@@ -190,8 +190,8 @@ def comparison(stage: Path) -> Iterator[str]:
     robot = tests["policy"].map(lambda policy: not is_oracle(called(policy)))
     if not (tests["p_holm"][robot & (tests["measure"] == "accuracy")] < SIGNIFICANT).any():
         yield f"**No policy that a robot could follow differs significantly from {settings['reference']} in accuracy**"
-        yield f"at any threshold: every p after the correction is {SIGNIFICANT} or more. Those called oracle or true know"
-        yield "what a robot cannot."
+        yield f"at any threshold: every p after the correction is {SIGNIFICANT} or more. Those called oracle or true"
+        yield "know what a robot cannot."
         yield ""
 
 
