@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from nextview.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
 from nextview.errors import PolicyError, SessionError, UsageError
 from nextview.policies.base import EpisodeState, Evidence, Policy
+from nextview.policies.off_grid import OffGrid
 from nextview.viewsphere import SNAP, Viewpoints, angle_between, turn_of
 
 VISITED = np.radians(6.0)
@@ -253,7 +254,7 @@ class Episodes:
 
     def _choose(self, state: EpisodeState) -> NDArray[np.int64]:
         """What the policy chooses, checked. One that goes where it cannot is asked again as if it had been there."""
-        name, free, rows = type(self.policy).__name__, state.free, np.arange(len(state.current))
+        name, free, rows = self._name, state.free, np.arange(len(state.current))
         chosen = self._ask(state)
         barred = ~free[rows, chosen] & ~state.visited[rows, chosen]
         if barred.any():
@@ -269,7 +270,7 @@ class Episodes:
 
     def _ask(self, state: EpisodeState) -> NDArray[np.int64]:
         """What the policy answers: views of the sphere, whichever."""
-        name = type(self.policy).__name__
+        name = self._name
         try:
             chosen = np.asarray(self.policy.next_views(state, self.rng))
         except Exception as error:  # whatever a user's policy may raise
@@ -282,6 +283,11 @@ class Episodes:
             where = int(state.episodes[off][0])
             raise PolicyError(f"policy {name} chose view {chosen[off][0]}, which is not on the sphere", where)
         return chosen
+
+    @property
+    def _name(self) -> str:
+        policy = self.policy.policy if isinstance(self.policy, OffGrid) else self.policy
+        return type(policy).__name__
 
     def _first_to_fail(self, state: EpisodeState) -> int | None:
         """The first episode for which the policy raises even if asked for it alone."""

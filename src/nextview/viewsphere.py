@@ -239,6 +239,10 @@ class ViewSphere(Viewpoints):
         """How many rings."""
         return len(self.elevations)
 
+    def same_grid(self, other: ViewSphere) -> bool:
+        """Whether another one has the same views, from whatever distance."""
+        return (self.elevations, self.azimuths) == (other.elevations, other.azimuths)
+
     @cached_property
     def ring(self) -> Index:
         """Ring of each view, shape (V,), int64."""

@@ -17,6 +17,15 @@ from nextview.viewsphere import Viewpoints, ViewSphere, angle_between, elevation
 Float = NDArray[np.float64]
 
 
+def anywhere(policy: Policy, sphere: Viewpoints) -> Policy:
+    """A policy for some viewpoints and for cameras that stand beside them: itself, if it knows its way already."""
+    grid = getattr(policy, "sphere", None)
+    if not isinstance(grid, ViewSphere):
+        return policy
+    same = isinstance(sphere, ViewSphere) and sphere.same_grid(grid)
+    return policy if same and not isinstance(policy, ScoresViews) else OffGrid(policy, grid, sphere)
+
+
 @dataclass(frozen=True)
 class OffGrid:
     """A policy on its grid, for any views.
@@ -71,7 +80,7 @@ class OffGrid:
         return values - self.policy.travel_weight * travel_from(self.sphere, state)
 
     def _on_grid(self, state: EpisodeState) -> bool:
-        if self.sphere != self.grid:
+        if not isinstance(self.sphere, ViewSphere) or not self.sphere.same_grid(self.grid):
             return False
         return state.places is None or np.array_equal(state.places[:, -1], self.sphere.directions[state.current])
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -128,6 +128,18 @@ class ObservedObject:
     def observations(self) -> list[Observation]:
         """One for each frame, in order, all in the latest object frame."""
         return list(self._made)
+
+    @contextmanager
+    def undone_by_errors(self) -> Iterator[None]:
+        """What is added within the block is as if it had never been, to the last random number, if the block raises."""
+        before, drawn = dict(vars(self)), self._rng.bit_generator.state
+        try:
+            yield
+        except BaseException:
+            vars(self).clear()
+            vars(self).update(before)
+            self._rng.bit_generator.state = drawn
+            raise
 
     def add(self, frame: Frame) -> Observation:
         """Take in a frame.
