@@ -4,7 +4,8 @@
 
 Test objects are scaled to a radius of 12 cm and put on a table, turned at random. The camera (640 x 480) stands 0.6 m
 from the object. The pipeline is told which way is up and nothing else: it finds the table, the object, its centre and
-its size. Prints how many are right, how many wrong but confident, views, and the milliseconds of a frame.
+its size; where the arm cannot go it is not sent. Prints how many are right, how many wrong but confident, views, and
+the milliseconds of an update.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from embreex.rtcore_scene import EmbreeScene
 from scipy.spatial.transform import Rotation
 
 import nextview
-from nextview import Mesh, System, load_mesh
+from nextview import Mesh, Session, System, load_mesh
 from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
 from nextview.sensing import Frame, ObservedObject
@@ -109,22 +110,19 @@ class Wrist:
         return Frame(depth, INTRINSICS, pose, mask if self.settings.masked else None)
 
 
-def run_object(camera: Wrist, system: System, settings: Settings, start: int) -> tuple:
-    """How it ended, what is known of the object, the milliseconds of each frame on its way, and what was doubted."""
+def run_object(camera: Wrist, system: System, settings: Settings, start: int) -> tuple[Session, list[float]]:
+    """The session at its end, and the milliseconds of each update. What is timed is what a user writes."""
     thing = ObservedObject(denoise=settings.denoise, life_size=False)
-    session = system.session(start)
-    pose = camera.pose(*np.radians(system.sphere.angles(start)))
-    took, doubts = [], []
+    session = system.session(object=thing, distance=settings.distance)
+    session.reachable = lambda pose: pose[2, 3] >= CLEARANCE
+    pose, took = camera.pose(*np.radians(system.sphere.angles(start))), []
     while not session.done:
         frame = camera.frame(pose)
         begun = time.perf_counter()
-        observation = thing.add(frame)
+        session.update(frame)
         took.append(1e3 * (time.perf_counter() - begun))
-        doubts.extend(doubt.name for doubt in thing.doubts)
-        session.update(observation)
-        pose = thing.object_frame.pose_in_world(session.pose, settings.distance)
-        pose[2, 3] = max(pose[2, 3], CLEARANCE)
-    return session.result, thing, took, doubts
+        pose = session.target
+    return session, took
 
 
 def main(settings: Settings) -> None:
@@ -137,13 +135,14 @@ def main(settings: Settings) -> None:
         for i, entry in enumerate(entries):
             rng = np.random.default_rng([settings.seed, i])
             camera = Wrist(load_mesh(entry.path), settings, rng)
-            result, thing, took, doubts = run_object(camera, system, settings, int(rng.integers(len(system.sphere))))
-            right, found = result.answer == entry.label, thing.object_frame
+            session, took = run_object(camera, system, settings, int(rng.integers(len(system.sphere))))
+            result = session.result
+            right, found = result.answer == entry.label, session.object.object_frame
             off = np.linalg.norm(found.centre - camera.centre) / settings.radius
             views = len(result.views)
             rows.append((right, result.confident, result.confidence, views, off, found.radius / settings.radius))
             milliseconds.extend(took[1:] if i == 0 else took)
-            doubted.extend(doubts)
+            doubted.extend(doubt.name for view in result.views for doubt in view.doubts)
             if not right:
                 wrong.append(f"{entry.path.stem}: {result} from {[view.index for view in result.views]}")
             yield i + 1
@@ -153,7 +152,7 @@ def main(settings: Settings) -> None:
     print(
         f"{int(right.sum())} of {len(rows)} right, {int((confident * (1 - right)).sum())} wrong but stopped by the "
         f"threshold (it decays), {int(((belief >= settings.threshold) * (1 - right)).sum())} wrong at a belief of "
-        f"{settings.threshold}, {views.mean():.2f} views; a frame takes {np.median(milliseconds):.1f} ms (99 %: "
+        f"{settings.threshold}, {views.mean():.2f} views; an update takes {np.median(milliseconds):.1f} ms (99 %: "
         f"{np.percentile(milliseconds, 99):.1f} ms); centre off by {np.median(off):.3f} radii (90 %: "
         f"{np.percentile(off, 90):.3f}), radius {np.median(size):.3f} of the true (10 to 90 %: "
         f"{np.percentile(size, 10):.3f} to {np.percentile(size, 90):.3f})"

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.special import softmax
 
 from nextview.belief import PLAIN_SUM, Calibration, FixedLength, Stopping
-from nextview.episode import Episodes, run_episodes, select
+from nextview.episode import Episodes, run_episodes
 from nextview.errors import PolicyError
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.baselines import Random, RandomAll, Unidirectional
@@ -184,11 +184,11 @@ def test_select_keeps_rows_of_everything():
     evidence = Table.random(6).observe(np.arange(6), np.arange(6))
     evidence = replace(evidence, azimuth_bins=np.random.default_rng(1).normal(size=(6, CLASSES, 8)))
     keep = np.array([True, False, True, True, False, False])
-    kept = select(evidence, keep)
+    kept = evidence.of(keep)
     np.testing.assert_array_equal(kept.logits, evidence.logits[[0, 2, 3]])
     np.testing.assert_array_equal(kept.maps["lem"], evidence.maps["lem"][[0, 2, 3]])
     np.testing.assert_array_equal(kept.azimuth_bins, evidence.azimuth_bins[[0, 2, 3]])
-    assert select(Evidence(evidence.logits), keep).azimuth_bins is None
+    assert Evidence(evidence.logits).of(keep).azimuth_bins is None
 
 
 # Refusing
@@ -308,7 +308,7 @@ def test_an_episode_of_fixed_length_goes_on_however_sure_it_is():
     views = np.array([[3, 1, 2], [0, 7, 4], [5, 6, 1], [2, 0, 3]])
     sphere = ViewSphere.named("40")
     done = run_episodes(
-        lambda episodes, _: select(sure, np.isin(np.arange(4), episodes)),
+        lambda episodes, _: sure.of(np.isin(np.arange(4), episodes)),
         sphere, ViewList(views), views[:, 0], FixedLength(max_views=3), np.random.default_rng(0),
     )  # fmt: skip
     np.testing.assert_array_equal(done.outcome.views, views)

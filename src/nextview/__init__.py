@@ -32,13 +32,14 @@ from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.registry import make_policy
 from nextview.session import Recognition, Session, View
 from nextview.system import System, load, recognise
-from nextview.viewsphere import ViewSphere
+from nextview.viewsphere import Directions, ViewSphere
 
 __version__ = "0.2.0"
 
 __all__ = [
     "Camera",
     "DatasetError",
+    "Directions",
     "EntryError",
     "EpisodeState",
     "Evidence",

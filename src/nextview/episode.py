@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 from nextview.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
 from nextview.errors import PolicyError, SessionError, UsageError
 from nextview.policies.base import EpisodeState, Evidence, Policy
-from nextview.viewsphere import ViewSphere
+from nextview.policies.off_grid import OffGrid
+from nextview.viewsphere import SNAP, Viewpoints, angle_between, turn_of
+
+VISITED = np.radians(6.0)
+"""Views within this angle of where a camera stood count as visited, beside the nearest one: it saw what they show."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +24,7 @@ class Step:
 
     Attributes:
         episodes: which ones, (A,) int64.
-        views: the view taken, (A,) int64.
+        views: the view taken, or the one nearest to where the camera stood, (A,) int64.
         evidence: what the models said of it.
         belief: fused after it, (A, classes).
         stopped: whether the episode ended here, (A,) bool.
@@ -49,9 +53,9 @@ class Outcome:
         answer: most believed class, (B,) int64.
         confidence: its belief, (B,) float64.
         n_views: views taken, (B,) int64.
-        confident: whether the threshold was reached (else the views ran out), (B,) bool; never where nothing was seen.
-        travel: sum over the moves in grid cells, (B,) float64.
-        arc: sum over the moves in radians, (B,) float64.
+        confident: whether the threshold was reached (else no view was left), (B,) bool; never where nothing was seen.
+        travel: sum over the moves between these views in grid cells, (B,) float64.
+        arc: the same in radians, (B,) float64.
         views: the views in order, (B, max views) int64, -1 after the end.
     """
 
@@ -64,6 +68,17 @@ class Outcome:
     views: NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class _Sums:
+    """What A episodes have taken in: see ``Step`` and ``EpisodeState``."""
+
+    total: NDArray[np.float64]
+    seen: NDArray[np.int64]
+    visited: NDArray[np.bool_]
+    azimuth: NDArray[np.float64]
+    places: NDArray[np.float64] | None
+
+
 class Episodes:
     """B episodes side by side. Give ``update`` what was seen from ``current``, until ``running`` is empty.
 
@@ -74,19 +89,22 @@ class Episodes:
         stopping: when an episode ends; a sphere with fewer views than ``max_views`` ends it too.
         rng: for policies that draw.
         calibration: how far to trust the sum of the logits; fully by default.
+        constrain: before the policy is asked, says where the robot can go and what that costs it: the state with
+            ``reachable`` and ``travel``. An episode without a free view ends.
     """
 
     def __init__(
         self,
-        sphere: ViewSphere,
+        sphere: Viewpoints,
         policy: Policy,
         starts: NDArray[np.int64],
         stopping: Stopping,
         rng: np.random.Generator,
         calibration: Calibration = PLAIN_SUM,
+        constrain: Callable[[EpisodeState], EpisodeState] | None = None,
     ) -> None:
         self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
-        self.calibration = calibration
+        self.calibration, self.constrain = calibration, constrain
         self.running = np.arange(len(starts))
         self.current = np.array(starts, np.int64)
         if ((self.current < 0) | (self.current >= len(sphere))).any():
@@ -95,60 +113,164 @@ class Episodes:
         self._visited = np.zeros((len(starts), len(sphere)), bool)
         self._total: NDArray[np.float64] = np.zeros((len(starts), 0))
         self._seen = np.zeros(len(starts), np.int64)
+        self._places: NDArray[np.float64] | None = None
 
-    def update(self, evidence: Evidence) -> Step:
+    def update(self, evidence: Evidence, directions: NDArray[np.float64] | None = None) -> Step:
         """Take in the evidence of one view in every running episode; stop or choose its next view.
 
         A view in which nothing was seen is taken, but changes no belief and ends no episode as a confident one. Where
         this raises, nothing is taken in: the same view can be told again.
 
+        Args:
+            evidence: of the A running episodes.
+            directions: unit vectors towards where the cameras really stood, (A, 3); in all updates or in none. The
+                nearest views then count as taken, those within VISITED as visited too, and azimuths and travel are
+                measured from the places themselves. By default the cameras stood at ``current``.
+
         Raises:
             UsageError: the evidence is of another number of episodes, or a logit is not finite.
             PolicyError: the policy failed or chose something that is not a next view.
         """
-        now, views = self.running, self.current[self.running]
-        if len(evidence.logits) != len(now):
-            raise UsageError(f"evidence of {len(evidence.logits)} views for {len(now)} running episodes")
-        evidence, seen = _without_unseen(evidence)
-        before = self._total[now] if self.steps else 0.0
-        azimuth = self.sphere.turn[views]
-        total = before + np.asarray(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64)
-        n_views, classes = len(self.steps) + 1, evidence.logits.shape[1]
-        counted = self._seen[now] + seen
-        weighed = np.maximum(counted, 1)  # before anything is seen the total is zero, whatever it is divided by
-        belief = self.calibration.belief(total, weighed, classes)
-        visited = self._visited[now]
-        visited[np.arange(len(now)), views] = True
-        stopped = (belief.max(1) >= self.stopping.threshold_at(weighed)) & seen
+        step, sums = self._taken(evidence, directions)
+        n_views, weighed = len(self.steps) + 1, np.maximum(sums.seen, 1)
+        stopped = (step.belief.max(1) >= self.stopping.threshold_at(weighed)) & (step.seen > self._seen[self.running])
         if n_views >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
         going = ~stopped
-        next_views, state = np.full(len(now), -1), None
         if going.any():
-            left, azimuth_bins = now[going], None
+            azimuth_bins, places = None, None if sums.places is None else sums.places[going]
             if "azimuth_bins" in self.policy.needs:
-                azimuth_bins = self.calibration.azimuth_bins(total[going], weighed[going], classes, azimuth[going])
-            state = EpisodeState(
-                views[going],
-                visited[going],
-                belief[going],
-                select(evidence, going),
-                n_views,
-                left,
-                azimuth_bins,
+                classes, azimuth = evidence.logits.shape[1], sums.azimuth[going]
+                azimuth_bins = self.calibration.azimuth_bins(sums.total[going], weighed[going], classes, azimuth)
+            state, next_views = self._move(
+                EpisodeState(
+                    step.views[going],
+                    sums.visited[going],
+                    step.belief[going],
+                    step.evidence.of(going),
+                    n_views,
+                    step.episodes[going],
+                    azimuth_bins,
+                    places=places,
+                )
             )
-            next_views[going] = self._choose(state)
-        step = Step(now, views, evidence, belief, stopped, next_views, total, counted, state)
+            step.next_views[going] = next_views
+            step = replace(step, state=state)
+        self._keep(replace(step, stopped=step.next_views < 0), sums)
+        return self.steps[-1]
+
+    def take(self, evidence: Evidence, directions: NDArray[np.float64] | None = None) -> None:
+        """Take in a view after which it is known that the episodes went on: neither stop nor choose.
+
+        Arguments and errors as for ``update``.
+        """
+        self._keep(*self._taken(evidence, directions))
+
+    def choose_again(self) -> Step:
+        """Ask the policy once more where to go from here, for what ``constrain`` says has changed.
+
+        Returns:
+            The last step, with other ``next_views``. Where no view is free any more the episode has ended.
+
+        Raises:
+            SessionError: no view was taken yet, or all have ended.
+            PolicyError: as for ``update``.
+        """
+        if not self.steps or self.steps[-1].state is None or len(self.running) == 0:
+            raise SessionError("there is nothing to choose: no view was taken yet, or the episodes have ended")
+        step, here = self.steps[-1], np.isin(self.steps[-1].state.episodes, self.running)
+        state, chosen = self._move(self.steps[-1].state.of(here))
+        next_views = np.full(len(step.episodes), -1)
+        next_views[np.isin(step.episodes, self.running)] = chosen
+        self.steps[-1] = replace(step, next_views=next_views, stopped=next_views < 0, state=state)
+        self._go(self.steps[-1])
+        return self.steps[-1]
+
+    def _taken(self, evidence: Evidence, directions: NDArray[np.float64] | None) -> tuple[Step, _Sums]:
+        """The next step, as if no episode ended and none moved on, and what it adds up to. Nothing is changed yet."""
+        now = self.running
+        if len(evidence.logits) != len(now):
+            raise UsageError(f"evidence of {len(evidence.logits)} views for {len(now)} running episodes")
+        if self.steps and (directions is None) != (self._places is None):
+            raise UsageError("where the cameras stood is told of all views or of none")
+        evidence, seen = _without_unseen(evidence)
+        visited = self._visited[now]
+        views, azimuth, places = self.current[now], self.sphere.turn[self.current[now]], None
+        if directions is not None:
+            arc = angle_between(directions[:, None], self.sphere.directions[None])
+            views, there = arc.argmin(1), arc.min(1) < SNAP
+            azimuth = np.where(there, self.sphere.turn[views], turn_of(directions))
+            place = np.where(there[:, None], self.sphere.directions[views], directions)[:, None]
+            places = place if self._places is None else np.concatenate([self._places[now], place], 1)
+            visited |= arc <= VISITED
+        visited[np.arange(len(now)), views] = True
+        before = self._total[now] if self.steps else 0.0
+        total = before + np.asarray(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64)
+        counted = self._seen[now] + seen
+        # Before anything is seen the total is zero, whatever it is divided by.
+        belief = self.calibration.belief(total, np.maximum(counted, 1), evidence.logits.shape[1])
+        going, nowhere = np.zeros(len(now), bool), np.full(len(now), -1)
+        step = Step(now, views, evidence, belief, going, nowhere, total, counted)
+        return step, _Sums(total, counted, visited, azimuth, places)
+
+    def _keep(self, step: Step, sums: _Sums) -> None:
         if not self.steps:
-            self._total = np.zeros((len(self.current), total.shape[1]))
-        self._total[now], self._visited[now], self._seen[now] = total, visited, counted
-        self.current[now[going]] = next_views[going]
+            self._total = np.zeros((len(self.current), sums.total.shape[1]))
+        self._total[step.episodes], self._visited[step.episodes] = sums.total, sums.visited
+        self._seen[step.episodes] = sums.seen
+        if sums.places is not None:
+            self._places = np.zeros((len(self.current), *sums.places.shape[1:]))
+            self._places[step.episodes] = sums.places
         self.steps.append(step)
-        self.running = now[going]
-        return step
+        self._go(step)
+
+    def _go(self, step: Step) -> None:
+        moved = step.next_views >= 0
+        self.current[step.episodes[moved]] = step.next_views[moved]
+        self.running = step.episodes[~step.stopped]
+
+    def _move(self, state: EpisodeState) -> tuple[EpisodeState, NDArray[np.int64]]:
+        """What the policy is shown, and where it goes, -1 where no view is free."""
+        state = replace(state, reachable=None, travel=self._travel(state))
+        if self.constrain is not None:
+            state = self.constrain(state)
+        chosen, free = np.full(len(state.current), -1), state.free.any(1)
+        if free.all():
+            chosen = self._choose(state)
+        elif free.any():
+            chosen[free] = self._choose(state.of(free))
+        return state, chosen
+
+    def _travel(self, state: EpisodeState) -> NDArray[np.float64] | None:
+        """Cells to each view from the places, (B, V); None where these are views."""
+        if state.places is None:
+            return None
+        here = state.places[:, -1]
+        there = (here == self.sphere.directions[state.current]).all(1)
+        if there.all():
+            return None
+        cells = self.sphere.travel_between(here[:, None], self.sphere.directions[None])
+        return np.where(there[:, None], self.sphere.travel[state.current], cells)
 
     def _choose(self, state: EpisodeState) -> NDArray[np.int64]:
-        name = type(self.policy).__name__
+        """What the policy chooses, checked. One that goes where it cannot is asked again as if it had been there."""
+        name, free, rows = self._name, state.free, np.arange(len(state.current))
+        chosen = self._ask(state)
+        barred = ~free[rows, chosen] & ~state.visited[rows, chosen]
+        if barred.any():
+            some = state.of(barred)
+            chosen = chosen.copy()
+            chosen[barred] = self._ask(replace(some, visited=~some.free))
+        wrong = ~free[rows, chosen]
+        if wrong.any():
+            view, where = int(chosen[wrong][0]), int(state.episodes[wrong][0])
+            why = "was visited before" if state.visited[wrong][0, view] else "cannot be reached"
+            raise PolicyError(f"policy {name} chose view {view}, which {why}", where)
+        return chosen
+
+    def _ask(self, state: EpisodeState) -> NDArray[np.int64]:
+        """What the policy answers: views of the sphere, whichever."""
+        name = self._name
         try:
             chosen = np.asarray(self.policy.next_views(state, self.rng))
         except Exception as error:  # whatever a user's policy may raise
@@ -160,27 +282,18 @@ class Episodes:
         if off.any():
             where = int(state.episodes[off][0])
             raise PolicyError(f"policy {name} chose view {chosen[off][0]}, which is not on the sphere", where)
-        again = state.visited[np.arange(len(chosen)), chosen]
-        if again.any():
-            where = int(state.episodes[again][0])
-            raise PolicyError(f"policy {name} chose view {chosen[again][0]}, which was visited before", where)
         return chosen
+
+    @property
+    def _name(self) -> str:
+        policy = self.policy.policy if isinstance(self.policy, OffGrid) else self.policy
+        return type(policy).__name__
 
     def _first_to_fail(self, state: EpisodeState) -> int | None:
         """The first episode for which the policy raises even if asked for it alone."""
         for episode in state.episodes:
-            here = state.episodes == episode
-            alone = EpisodeState(
-                state.current[here],
-                state.visited[here],
-                state.belief[here],
-                select(state.evidence, here),
-                state.step,
-                state.episodes[here],
-                None if state.azimuth_bins is None else state.azimuth_bins[here],
-            )
             try:
-                self.policy.next_views(alone, self.rng)
+                self.policy.next_views(state.of(state.episodes == episode), self.rng)
             except Exception:
                 return int(episode)
         return None
@@ -215,13 +328,6 @@ class Episodes:
         )
 
 
-def select(evidence: Evidence, keep: NDArray[np.bool_]) -> Evidence:
-    """The evidence of some of the episodes."""
-    azimuth_bins = None if evidence.azimuth_bins is None else evidence.azimuth_bins[keep]
-    seen = None if evidence.seen is None else evidence.seen[keep]
-    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, azimuth_bins, seen)
-
-
 def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
     """The evidence with zeros where nothing was seen, and where anything was, (B,) bool."""
     seen = evidence.seen
@@ -238,7 +344,7 @@ def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
 
 def run_episodes(
     observe: Callable[[NDArray[np.int64], NDArray[np.int64]], Evidence],
-    sphere: ViewSphere,
+    sphere: Viewpoints,
     policy: Policy,
     starts: NDArray[np.int64],
     stopping: Stopping,

@@ -8,23 +8,28 @@ chair (belief 0.998, 2 views, 1.41 cells of travel, confident)
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nextview.belief import Stopping
-from nextview.errors import ModelError, OtherUseError
+from nextview.errors import ModelError, OtherUseError, PolicyError
 from nextview.mesh import Mesh, load_mesh
 from nextview.models.collection import find_models
 from nextview.models.inference import MapNetwork, Models, Recogniser
 from nextview.observation import Camera
 from nextview.policies.base import Policy, maps_among
-from nextview.policies.registry import make_policy
+from nextview.policies.maps import MapPeak
+from nextview.policies.registry import make_policy_anywhere
 from nextview.session import Recognition, Session
-from nextview.viewsphere import ViewSphere
+from nextview.viewsphere import LAYOUTS, Viewpoints, ViewSphere, viewpoints_of
+
+if TYPE_CHECKING:
+    from nextview.sensing.observed_object import ObservedObject
 
 DEFAULT = "modelnet10"
 """The models that ship with the package."""
@@ -48,7 +53,7 @@ class System:
     models: Models
     policy: Policy
     policy_name: str
-    sphere: ViewSphere
+    sphere: Viewpoints
     stopping: Stopping
     loaded: dict[str, Any] = field(repr=False)
 
@@ -57,19 +62,30 @@ class System:
         """Names of the classes that it knows."""
         return self.models.classes
 
-    def session(self, start: int | None = None, seed: int = 0) -> Session:
-        """One object under way, for whoever moves the camera.
+    def session(
+        self,
+        start: int | None = None,
+        seed: int = 0,
+        object: ObservedObject | None = None,
+        distance: float | None = None,
+    ) -> Session:
+        """One object under way, for whoever moves the camera. Those for a robot need no more than a distance.
 
         Args:
-            start: the first view, an index of ``sphere``; drawn by the seed if not given.
+            start: where to look first, an index of ``sphere``; drawn by the seed if not given. Wherever the first view
+                is taken from, its own pose counts.
             seed: decides the first view and whatever the policy draws.
+            object: which object to find in the frames of a depth camera; the largest on the support plane by default.
+            distance: how far from the object the camera shall stand, metres; 3 object radii by default. With an object
+                or a distance the session takes frames, else what it is given first.
 
         Raises:
-            UsageError: there is no such view.
+            UsageError: there is no such view or distance.
         """
         rng = np.random.default_rng(seed)
         drawn = int(rng.integers(len(self.sphere)))
-        return Session(self.models, self.policy, self.sphere, drawn if start is None else start, self.stopping, rng)
+        first = drawn if start is None else start
+        return Session(self.models, self.policy, self.sphere, first, self.stopping, rng, object, distance)
 
     def recognise(
         self,
@@ -113,7 +129,7 @@ def load(
     threshold: float = 0.97,
     risk: float | None = None,
     max_views: int = 5,
-    viewpoints: str = "40",
+    viewpoints: str | Viewpoints | ArrayLike = "40",
     threads: int = 0,
 ) -> System:
     """Open models, and what belongs to them.
@@ -127,7 +143,9 @@ def load(
         threshold: stop when the belief in one class reaches this after one view, and less after several.
         risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
         max_views: stop after so many views.
-        viewpoints: name of the layout of candidate viewpoints.
+        viewpoints: the candidates: "40", "12", "rings:0,30,60x12", "fibonacci:60", or directions or poses of your own,
+            see ``viewsphere.viewpoints_of``. Policies that know one grid of views are asked as ``policies.off_grid``
+            says.
         threads: of ONNX Runtime, 0 for one on each core.
 
     Raises:
@@ -139,32 +157,45 @@ def load(
     given = {k: v for k, v in locals().items() if k != "models"} | {"models": str(models)}
     Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
     found = find_models(models)
-    sphere = ViewSphere.named(viewpoints)
+    sphere = viewpoints_of(viewpoints)
     recogniser = Recogniser(found.recogniser, threads)
     if policy is None:
         policy, made = _default_policy(found.policies, sphere, recogniser)
     else:
-        made = make_policy(str(found.policies.get(policy, policy)), sphere, (), recogniser.classes)
+        made = make_policy_anywhere(str(found.policies.get(policy, policy)), sphere, (), recogniser.classes)
     names = dict.fromkeys(name.removesuffix("-sphere") for name in maps_among(made.needs))
     missing = [name for name in names if name not in found.maps]
     if missing:
         raise ModelError(f"policy {policy} needs the map {missing[0]!r}; there are {', '.join(found.maps)}")
     opened = Models(recogniser, {name: MapNetwork(found.maps[name], threads) for name in names})
     if policy in names:  # "lem" and "lcm" go to the valley for some classes, which the map's card names
-        made = make_policy(policy, sphere, opened.valley_classes(policy), recogniser.classes)
+        made = make_policy_anywhere(policy, sphere, opened.valley_classes(policy), recogniser.classes)
+    if isinstance(made, MapPeak):
+        made = replace(made, sphere=_grid_of(opened.maps[made.map_name], made.sphere))
     stopping = Stopping.of(recogniser.calibration, threshold, risk, max_views)
     return System(opened, made, policy, sphere, stopping, given)
 
 
-def _default_policy(own: dict[str, Path], sphere: ViewSphere, recogniser: Recogniser) -> tuple[str, Policy]:
+def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
+    """The grid whose local maps a network predicts: that of the views if it has as many rings, else the 40 views."""
+    for grid in (sphere, *LAYOUTS.values()):
+        if network.rings in (None, grid.rings):
+            return grid
+    raise PolicyError(
+        f"the map {network.card.name} has {network.rings} rings, and the {len(sphere)} viewpoints {sphere.rings}"
+    )
+
+
+def _default_policy(own: dict[str, Path], sphere: Viewpoints, recogniser: Recogniser) -> tuple[str, Policy]:
     """ "gain", where one fits, else "spread", which asks for nothing."""
     try:
-        gain = make_policy(str(own.get("gain", "gain")), sphere, (), recogniser.classes)
-        if "azimuth_bins" not in gain.needs or recogniser.azimuth_bins == sphere.azimuths:
+        gain = make_policy_anywhere(str(own.get("gain", "gain")), sphere, (), recogniser.classes)
+        grid = getattr(gain, "sphere", None)
+        if "azimuth_bins" not in gain.needs or recogniser.azimuth_bins == getattr(grid, "azimuths", None):
             return "gain", gain
     except OtherUseError:
         pass
-    return "spread", make_policy("spread", sphere)
+    return "spread", make_policy_anywhere("spread", sphere)
 
 
 def _load(given: dict[str, Any]) -> System:

@@ -1,13 +1,16 @@
 """Candidate viewpoints around an object: where they are, which are neighbours, what it costs to move.
 
 The world is z up, the object sits at the origin inside the unit sphere, and every viewpoint looks at the origin.
-Viewpoints lie on rings of equal elevation, evenly spaced in azimuth; ``view = ring * azimuths + azimuth_index``.
+On a ``ViewSphere`` they lie on rings of equal elevation, evenly spaced in azimuth; ``view = ring * azimuths +
+azimuth_index``. ``Directions`` lie anywhere.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +22,10 @@ Index = NDArray[np.int64]
 
 DISTANCE = 3.0
 """Distance of the camera from the object's centre, in object radii."""
+CELL = np.radians((18.0, 45.0))
+"""Elevation and azimuth of a cell of the 40 views: travel between directions that are on no grid is counted in it."""
+SNAP = 1e-6
+"""Radians within which a camera stands at a candidate. What is more is a place of its own."""
 
 
 def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = DISTANCE) -> Float:
@@ -50,8 +57,148 @@ def _fixed(array: NDArray) -> NDArray:
     return array
 
 
+def angle_between(a: Float, b: Float) -> Float:
+    """Great-circle angle between unit vectors, (..., 3) each, radians, (...)."""
+    # arctan2 keeps its precision for equal and for opposite directions, where arccos loses half the digits.
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1))
+
+
+def elevation_of(directions: Float) -> Float:
+    """Elevation of unit vectors, (..., 3), radians, (...)."""
+    return np.arctan2(directions[..., 2], np.hypot(directions[..., 0], directions[..., 1]))
+
+
+def turn_of(directions: Float) -> Float:
+    """Azimuth of unit vectors, (..., 3), as a part of a full turn, 0 to 1, (...)."""
+    return np.arctan2(directions[..., 1], directions[..., 0]) / (2 * np.pi) % 1.0
+
+
+def direction_of(pose: Float) -> Float:
+    """Unit vector from the origin towards a camera, (3,); pose camera-to-world, (4, 4), object frame.
+
+    Straight above the origin the azimuth is that from which a level camera would see the same picture: towards the
+    bottom of the image. A camera at the origin itself is taken to stand behind what it looks at.
+    """
+    position = pose[:3, 3]
+    outward = position / np.linalg.norm(position) if position.any() else -pose[:3, 2]
+    if np.hypot(outward[0], outward[1]) < SNAP:
+        outward = outward + 2e-6 * np.array([pose[0, 1], pose[1, 1], 0.0]) * np.sign(outward[2])
+        outward /= np.linalg.norm(outward)
+    return outward
+
+
+class Viewpoints:
+    """Candidate viewpoints in some directions from the object; ``len(viewpoints)`` of them, V.
+
+    What a ``ViewSphere`` and ``Directions`` have in common. Arrays are read-only.
+
+    Attributes:
+        distance: of every viewpoint from the origin, object radii.
+        directions: unit vector from the origin towards each, (V, 3) float64.
+    """
+
+    distance: float
+    directions: Float
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    @cached_property
+    def turn(self) -> Float:
+        """Azimuth of each view as a part of a full turn, shape (V,), float64."""
+        return _fixed(turn_of(self.directions))
+
+    @cached_property
+    def elevation(self) -> Float:
+        """Elevation of each view, radians, shape (V,), float64."""
+        return _fixed(elevation_of(self.directions))
+
+    def angles(self, view: int) -> tuple[float, float]:
+        """(elevation, azimuth) of a view, degrees."""
+        return float(np.degrees(self.elevation[view])), 360.0 * float(self.turn[view])
+
+    @cached_property
+    def poses(self) -> Float:
+        """Camera-to-world pose of each view, shape (V, 4, 4), float64, OpenCV camera axes."""
+        return _fixed(look_at_origin(self.elevation, 2 * np.pi * self.turn, self.distance))
+
+    @cached_property
+    def arc(self) -> Float:
+        """Great-circle angle between views, radians, shape (V, V), float64."""
+        return _fixed(angle_between(self.directions[:, None], self.directions[None, :]))
+
+    @cached_property
+    def travel(self) -> Float:
+        """Distance between views in grid cells, shape (V, V), float64."""
+        return _fixed(self.travel_between(self.directions[:, None], self.directions[None, :]))
+
+    def cells(self, directions: Float) -> tuple[Float, Float]:
+        """Where directions, (..., 3), lie on the grid whose cells travel is counted in: row and column, (...) each."""
+        return elevation_of(directions) / CELL[0], 2 * np.pi * turn_of(directions) / CELL[1]
+
+    def travel_between(self, a: Float, b: Float) -> Float:
+        """Distance between any directions, (..., 3) each, in grid cells: Euclidean over row and column, (...)."""
+        (row_a, column_a), (row_b, column_b) = self.cells(a), self.cells(b)
+        steps = np.abs(column_a - column_b)
+        return np.hypot(row_a - row_b, np.minimum(steps, self.columns - steps))
+
+    @property
+    def columns(self) -> float:
+        """Cells of travel once round."""
+        return float(2 * np.pi / CELL[1])
+
+    def nearest(self, direction: Float) -> tuple[int, bool]:
+        """The view nearest to a direction, (3,), and whether it is that direction."""
+        arc = angle_between(self.directions, direction)
+        view = int(arc.argmin())
+        return view, bool(arc[view] < SNAP)
+
+
+@dataclass(frozen=True, eq=False)
+class Directions(Viewpoints):
+    """Candidate viewpoints in any directions.
+
+    Attributes:
+        directions: from the object towards the views, (V, 3); any length but 0.
+        distance: of every viewpoint from the origin, object radii.
+
+    Raises:
+        UsageError: they are no directions.
+
+    >>> len(Directions.fibonacci(60))
+    60
+    """
+
+    directions: Float
+    distance: float = DISTANCE
+
+    def __post_init__(self) -> None:
+        given = np.asarray(self.directions)
+        if given.ndim != 2 or given.shape[1] != 3 or len(given) == 0 or given.dtype.kind not in "fiu":
+            raise UsageError(f"directions are an array of numbers of the shape (V, 3), not {given.dtype} {given.shape}")
+        length = np.linalg.norm(given, axis=1, keepdims=True)
+        if not ((length > 0) & (length < np.inf)).all():
+            raise UsageError("a direction is zero, or holds NaN or infinity")
+        _check_distance(self.distance)
+        object.__setattr__(self, "directions", _fixed(given / length))
+
+    @classmethod
+    def fibonacci(cls, n: int) -> Directions:
+        """n views spread evenly over the upper half (Fibonacci lattice; Swinbank and Purser, QJRMS 132, 2006)."""
+        if n < 1:
+            raise UsageError(f"at least one viewpoint is needed, not {n}")
+        height, azimuth = (np.arange(n) + 0.5) / n, np.arange(n) * np.pi * (3 - np.sqrt(5))
+        flat = np.sqrt(1 - height**2)
+        return cls(np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], 1))
+
+
+def _check_distance(distance: float) -> None:
+    if not 0 < distance < np.inf:
+        raise UsageError(f"the distance must be a positive number of object radii, not {distance}")
+
+
 @dataclass(frozen=True)
-class ViewSphere:
+class ViewSphere(Viewpoints):
     """Viewpoints on rings around an object; ``len(sphere)`` of them.
 
     Its arrays are read-only: the named layouts are shared, and a change in place would move everybody's viewpoints.
@@ -75,8 +222,7 @@ class ViewSphere:
             raise UsageError("a view sphere needs at least one ring of at least three viewpoints")
         if not all(-90 <= e <= 90 for e in self.elevations):
             raise UsageError(f"elevations must lie between -90 and 90 degrees, not {self.elevations}")
-        if not 0 < self.distance < np.inf:
-            raise UsageError(f"the distance must be a positive number of object radii, not {self.distance}")
+        _check_distance(self.distance)
 
     @classmethod
     def named(cls, name: str) -> ViewSphere:
@@ -92,6 +238,10 @@ class ViewSphere:
     def rings(self) -> int:
         """How many rings."""
         return len(self.elevations)
+
+    def same_grid(self, other: ViewSphere) -> bool:
+        """Whether another one has the same views, from whatever distance."""
+        return (self.elevations, self.azimuths) == (other.elevations, other.azimuths)
 
     @cached_property
     def ring(self) -> Index:
@@ -119,7 +269,7 @@ class ViewSphere:
         return _fixed(look_at_origin(elevation, azimuth, self.distance))
 
     @cached_property
-    def directions(self) -> Float:
+    def directions(self) -> Float:  # type: ignore[override]
         """Unit vector from the origin towards each view, shape (V, 3), float64."""
         return _fixed(self.poses[:, :3, 3] / self.distance)
 
@@ -140,15 +290,50 @@ class ViewSphere:
         steps = np.abs(self.azimuth_index[:, None] - self.azimuth_index[None, :])
         return _fixed(np.hypot(rings, np.minimum(steps, self.azimuths - steps)))
 
-    @cached_property
-    def arc(self) -> Float:
-        """Great-circle angle between views, radians, shape (V, V), float64."""
-        # arctan2 keeps its precision for equal and for opposite directions, where arccos loses half the digits.
-        a, b = self.directions[:, None], self.directions[None, :]
-        return _fixed(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
+    def cells(self, directions: Float) -> tuple[Float, Float]:
+        """Ring and azimuth step at which directions lie, between those of the views; beyond the last ring, at it."""
+        order = np.argsort(self.elevations, kind="stable")
+        rings = np.interp(elevation_of(directions), np.radians(self.elevations)[order], order)
+        return rings, turn_of(directions) * self.azimuths
+
+    @property
+    def columns(self) -> float:
+        """Cells of travel once round."""
+        return self.azimuths
 
 
 LAYOUTS = {
     "40": ViewSphere(elevations=(0.0, 18.0, 36.0, 54.0, 72.0), azimuths=8),
     "12": ViewSphere(elevations=(45.0,), azimuths=12),
 }
+
+
+def viewpoints_of(what: str | Viewpoints | Any) -> Viewpoints:
+    """A layout of candidate viewpoints.
+
+    Args:
+        what: "40" or "12", the thesis's; "rings:0,30,60x12", elevations in degrees by views on each ring;
+            "fibonacci:60", so many spread evenly over the upper half; directions from the object, (V, 3), or poses of
+            cameras in the object frame, (V, 4, 4), of which only the directions count; or such a layout itself.
+
+    Raises:
+        UsageError: it is none of these.
+    """
+    if isinstance(what, Viewpoints):
+        return what
+    if not isinstance(what, str):
+        try:
+            given = np.asarray(what, np.float64)
+        except (TypeError, ValueError):
+            raise UsageError("viewpoints are a name, directions (V, 3) or poses (V, 4, 4)") from None
+        return Directions(given[:, :3, 3] if given.ndim == 3 and given.shape[1:] == (4, 4) else given)
+    if fibonacci := re.fullmatch(r"fibonacci:(\d{1,5})", what):
+        return Directions.fibonacci(int(fibonacci[1]))
+    if rings := re.fullmatch(r"rings:(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?)*)x(\d{1,4})", what):
+        return ViewSphere(tuple(map(float, rings[1].split(","))), int(rings[2]))
+    if what not in LAYOUTS:
+        raise UsageError(
+            f"no viewpoints are called {what!r}; there are {', '.join(LAYOUTS)}, rings:ELEVATIONSxAZIMUTHS such as "
+            "rings:0,30,60x12, and fibonacci:N"
+        )
+    return LAYOUTS[what]

@@ -12,11 +12,10 @@ from rich.text import Text
 from nextview.cli.ending import printable
 from nextview.cli.terminal import Terminal
 from nextview.session import Recognition
-from nextview.viewsphere import ViewSphere
 
 
-def _angles(sphere: ViewSphere, view: int) -> str:
-    elevation, azimuth = sphere.angles(view)
+def _angles(view: int, angles: tuple[float, float]) -> str:
+    elevation, azimuth = angles
     return f"{view}\n{elevation:.0f}°, {azimuth:.0f}°"
 
 
@@ -38,16 +37,20 @@ def print_episode(result: Recognition, name: str, policy: str) -> None:
         own = int(view.alone.argmax())
         table.add_row(
             str(step),
-            _angles(sphere, view.index),
+            _angles(view.index, view.angles),
             f"{result.classes[own]}\n{view.alone[own]:.3f}" if view.observation.seen else "nothing\nis seen",
             "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top),
             f"{float(result.stopping.threshold_at(step)):.2f}",
-            "stop" if view.next_view is None else _angles(sphere, view.next_view),
+            "stop" if view.next_view is None else _angles(view.next_view, sphere.angles(view.next_view)),
             f"{view.travel:.2f}",
         )
     console = Terminal()
     console.print(table)
-    reason = "threshold reached" if result.confident else "no views left"
+    for step, view in enumerate(result.views, 1):
+        for doubt in view.doubts:
+            console.print(f"Step {step} is doubtful ({doubt.name}): {doubt.message}.", markup=False, highlight=False)
+    left = "no other view in reach" if result.stranded else "no views left"
+    reason = "threshold reached" if result.confident else left
     rest = (
         f", belief {result.confidence:.3f}, after {len(result.views)} view{'s' * (len(result.views) > 1)} "
         f"and {result.travel:.2f} cells of travel ({reason})."
@@ -57,8 +60,6 @@ def print_episode(result: Recognition, name: str, policy: str) -> None:
 
 def as_json(result: Recognition) -> str:
     """Everything the table shows, and the whole beliefs and maps, as one JSON object."""
-
-    sphere = result.sphere
 
     def rounded(values: np.ndarray) -> list:
         """As JSON has them: what is no number becomes null."""
@@ -73,8 +74,8 @@ def as_json(result: Recognition) -> str:
         views.append(
             {
                 "view": view.index,
-                "elevation": sphere.angles(view.index)[0],
-                "azimuth": sphere.angles(view.index)[1],
+                "elevation": round(view.angles[0], 6),
+                "azimuth": round(view.angles[1], 6),
                 "seen": view.observation.seen,
                 "alone": dict(zip(result.classes, rounded(view.alone), strict=True)),
                 "belief": dict(zip(result.classes, rounded(view.belief), strict=True)),
@@ -87,6 +88,7 @@ def as_json(result: Recognition) -> str:
                 "next_view": view.next_view,
                 "travel_cells": round(view.travel, 6),
                 "travel_radians": round(view.arc, 6),
+                "doubts": [doubt.message for doubt in view.doubts],
             }
         )
     return json.dumps(

@@ -25,6 +25,7 @@ def recognise(
     threshold: float = 0.97,
     risk: float | None = None,
     max_views: int = 5,
+    viewpoints: str = "40",
     start: int | None = None,
     up: Literal["y", "z"] | None = None,
     unit: Unit | None = None,
@@ -45,7 +46,9 @@ def recognise(
         threshold: stop when the belief in one class reaches this after one view, less after several.
         risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
         max_views: stop after so many views.
-        start: first view, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
+        viewpoints: where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in degrees by views on
+            each ring), or fibonacci:60 (spread evenly over the upper half).
+        start: first view; of the 40, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
         up: the file's up axis; z if not given, but y for GLB.
         unit: the file's unit of length, if it is known: how large an object is says something of its class.
         max_faces: refuse a mesh of more triangles, or a file of more than 60 bytes for each of these.
@@ -56,7 +59,7 @@ def recognise(
     """
     from nextview.mesh import load_mesh
 
-    options = {"policy": policy, "threshold": threshold, "risk": risk, "max_views": max_views}
+    options = {"policy": policy, "threshold": threshold, "risk": risk, "max_views": max_views, "viewpoints": viewpoints}
     show(lambda: load_mesh(mesh, up, unit, max_faces), mesh.name, models, options, start, seed, figure, json, timing)
 
 

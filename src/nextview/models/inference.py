@@ -96,6 +96,8 @@ class Recogniser:
 class MapNetwork:
     """Predicts the local map around each view from the geometry seen, or from its partial cloud, as its card says.
 
+    ``rings`` is how many rings of views the map has, None if its file leaves that open.
+
     Args:
         model: name of a bundled model, or path of a card.
         threads: of ONNX Runtime, 0 for one on each core.
@@ -107,6 +109,8 @@ class MapNetwork:
             raise ModelError(f"model {self.card.name} is a recogniser, not a map network")
         self.valley_classes = self.card.valley_classes
         self._session = open_weights(self.card, threads)
+        rings = next(end.shape[1] for end in self._session.get_outputs() if end.name == "map")
+        self.rings: int | None = rings if isinstance(rings, int) else None
 
     def __call__(self, observations: Sequence[Observation]) -> dict[str, NDArray[np.float32]]:
         """Maps of views from one camera, by name.

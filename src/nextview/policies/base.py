@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.viewsphere import ViewSphere
+from nextview.viewsphere import Viewpoints, ViewSphere
 
 Scope = Literal["global", "local"]
 """Where a policy may go: to all views, or to those of the local window."""
@@ -35,6 +35,12 @@ class Evidence:
     azimuth_bins: NDArray[np.floating] | None = None
     seen: NDArray[np.bool_] | None = None
 
+    def of(self, rows: Any) -> Evidence:
+        """That of some of the episodes, by index or mask."""
+        azimuth_bins = None if self.azimuth_bins is None else self.azimuth_bins[rows]
+        seen = None if self.seen is None else self.seen[rows]
+        return Evidence(self.logits[rows], {k: m[rows] for k, m in self.maps.items()}, azimuth_bins, seen)
+
 
 @dataclass(frozen=True)
 class EpisodeState:
@@ -50,6 +56,11 @@ class EpisodeState:
         azimuth_bins: belief, over all views, in the azimuth bin that is seen from the current view, if the object is
             of each class, (B, classes, azimuth bins) float64, sums to 1 over the azimuth bins. None if the recogniser
             cannot tell, or "azimuth_bins" is not among the policy's needs.
+        reachable: which views the camera can be brought to, (B, V) bool; None for all.
+        travel: what it costs to go from here to each view, grid cells, (B, V) float64; None for the travel of the
+            viewpoints, see ``travel_from``.
+        places: unit vectors towards the places where the camera really stood, the last one here, (B, step, 3) float64;
+            None where these are the views themselves. Then ``visited`` are the views nearest to them.
     """
 
     current: NDArray[np.int64]
@@ -59,6 +70,33 @@ class EpisodeState:
     step: int
     episodes: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
     azimuth_bins: NDArray[np.float64] | None = None
+    reachable: NDArray[np.bool_] | None = None
+    travel: NDArray[np.float64] | None = None
+    places: NDArray[np.float64] | None = None
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """The views that may be chosen: reachable and not visited, (B, V) bool."""
+        return ~self.visited if self.reachable is None else ~self.visited & self.reachable
+
+    def of(self, rows: Any) -> EpisodeState:
+        """Some of the episodes, by index or mask."""
+
+        def part(values: NDArray[Any] | None) -> Any:
+            return None if values is None else values[rows]
+
+        return EpisodeState(
+            self.current[rows],
+            self.visited[rows],
+            self.belief[rows],
+            self.evidence.of(rows),
+            self.step,
+            self.episodes[rows],
+            part(self.azimuth_bins),
+            part(self.reachable),
+            part(self.travel),
+            part(self.places),
+        )
 
 
 class Policy(Protocol):
@@ -70,7 +108,7 @@ class Policy(Protocol):
         ...
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """The next view of each episode, (B,) int64: one not visited yet, as long as there is any."""
+        """The next view of each episode, (B,) int64: one of ``state.free``, of which each episode has at least one."""
         ...
 
 
@@ -83,15 +121,47 @@ class ValuesViews(Protocol):
         ...
 
 
+@runtime_checkable
+class ScoresViews(Protocol):
+    """A policy on a grid that goes to the free view with the highest score less its weighted travel.
+
+    It can be asked from any place about any views, see ``policies.off_grid``.
+
+    Attributes:
+        travel_weight: of a grid cell of travel.
+    """
+
+    @property
+    def travel_weight(self) -> float:
+        """Of a grid cell of travel."""
+        ...
+
+    def scores(self, state: EpisodeState) -> NDArray[np.float64]:
+        """The score of each view before travel counts, (B, V) float64; NaN for those that are not considered."""
+        ...
+
+
 def maps_among(needs: Sequence[str]) -> list[str]:
     """Those of a policy's needs that are maps."""
     return [name for name in needs if name != "azimuth_bins"]
 
 
-def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]) -> NDArray[np.int64]:
-    """The unvisited view of the local window with the highest score.
+def travel_from(sphere: Viewpoints, state: EpisodeState) -> NDArray[np.float64]:
+    """What it costs to go from where the camera is to each view, grid cells, (B, V)."""
+    return sphere.travel[state.current] if state.travel is None else state.travel
 
-    Where the whole window is visited, the unvisited view with the shortest travel; where all are, the window's best.
+
+def in_window(sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Values of the local window's cells, (B, rings, 3), where they lie on the sphere, (B, V); NaN elsewhere."""
+    found = np.full(state.visited.shape, np.nan)
+    np.put_along_axis(found, sphere.windows[state.current].reshape(len(found), -1), values.reshape(len(found), -1), 1)
+    return found
+
+
+def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]) -> NDArray[np.int64]:
+    """The free view of the local window with the highest score.
+
+    Where none of the window is free, the free view with the shortest travel; where none is, the window's best.
 
     Args:
         sphere: the viewpoints.
@@ -105,11 +175,11 @@ def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.f
     rows = np.arange(b)
     window = sphere.windows[state.current].reshape(b, -1)
     flat = np.asarray(scores, np.float64).reshape(b, -1)
-    free = ~state.visited[rows[:, None], window]
+    free = state.free[rows[:, None], window]
     chosen = window[rows, np.where(free, flat, -np.inf).argmax(1)]
     stuck = ~free.any(1)
     if stuck.any():
-        near = np.where(state.visited[stuck], np.inf, sphere.travel[state.current[stuck]])
+        near = np.where(state.free[stuck], travel_from(sphere, state)[stuck], np.inf)
         left = np.isfinite(near).any(1)
         chosen[stuck] = np.where(left, near.argmin(1), window[stuck, flat[stuck].argmax(1)])
     return chosen

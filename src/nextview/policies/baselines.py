@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.policies.base import EpisodeState, best_in_window
-from nextview.viewsphere import ViewSphere
+from nextview.viewsphere import Viewpoints, ViewSphere
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class Random:
 class RandomAll:
     """Any unvisited view of the whole sphere, with equal chance: the far views that a local window rules out."""
 
-    sphere: ViewSphere
+    sphere: Viewpoints
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
-        return np.where(state.visited, -1.0, rng.random(state.visited.shape)).argmax(1)
+        return np.where(state.free, rng.random(state.visited.shape), -1.0).argmax(1)
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Unidirectional:
         n = self.sphere.azimuths
         ring, azimuth = np.divmod(state.current, n)
         ahead = ring[:, None] * n + (azimuth[:, None] + np.arange(1, n)) % n
-        free = ~state.visited[np.arange(len(ring))[:, None], ahead]
+        free = state.free[np.arange(len(ring))[:, None], ahead]
         chosen = ahead[np.arange(len(ring)), free.argmax(1)]
         round_trip = ~free.any(1)
         if round_trip.any():

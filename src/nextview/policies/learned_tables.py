@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
-from nextview.policies.base import EpisodeState, Scope, best_in_window
+from nextview.policies.base import EpisodeState, Scope, best_in_window, in_window
 from nextview.policies.spread import Spread
 from nextview.viewsphere import ViewSphere
 
@@ -70,7 +70,7 @@ class FixedSequence:
         deduplicated = (np.diff(np.sort(so_far, axis=1)) > 0).all(1)
         led_here = deduplicated & state.visited[:, so_far].all(2) & (so_far[:, -1] == state.current[:, None])
         following = self.paths[led_here.argmax(1), state.step]
-        free = ~state.visited[np.arange(len(chosen)), following]
+        free = state.free[np.arange(len(chosen)), following]
         return np.where(led_here.any(1) & (state.visited.sum(1) == state.step) & free, following, chosen)
 
 
@@ -98,7 +98,7 @@ class FixedRing:
         n, rows = self.sphere.azimuths, np.arange(len(state.current))
         order = np.concatenate([[0], np.arange(1, n) * self.steps, np.arange(1, n)])
         ahead = self.ring * n + (self.sphere.azimuth_index[state.current][:, None] + order) % n
-        free = ~state.visited[rows[:, None], ahead]
+        free = state.free[rows[:, None], ahead]
         chosen = ahead[rows, free.argmax(1)]
         return np.where(free.any(1), chosen, Spread(self.sphere).next_views(state, rng))
 
@@ -125,9 +125,21 @@ class ClassTable:
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
-        rows = np.arange(len(state.current))
-        values = self.values[state.belief.argmax(1), self.sphere.ring[state.current]]
-        scores = values[rows[:, None], cells_to(self.sphere)[state.current]]
+        scores = self._looked_up(state)
         if self.scope == "global":
-            return np.where(state.visited, -np.inf, scores).argmax(1)
-        return best_in_window(self.sphere, state, scores[rows[:, None, None], self.sphere.windows[state.current]])
+            return np.where(state.free, scores, -np.inf).argmax(1)
+        return best_in_window(self.sphere, state, self._window(state, scores))
+
+    travel_weight = 0.0
+
+    def scores(self, state: EpisodeState) -> NDArray[np.float64]:
+        """The table where it may go; see ``ScoresViews``."""
+        scores = self._looked_up(state)
+        return scores if self.scope == "global" else in_window(self.sphere, state, self._window(state, scores))
+
+    def _looked_up(self, state: EpisodeState) -> NDArray[np.float64]:
+        values = self.values[state.belief.argmax(1), self.sphere.ring[state.current]]
+        return values[np.arange(len(values))[:, None], cells_to(self.sphere)[state.current]]
+
+    def _window(self, state: EpisodeState, scores: NDArray[np.float64]) -> NDArray[np.float64]:
+        return scores[np.arange(len(scores))[:, None, None], self.sphere.windows[state.current]]

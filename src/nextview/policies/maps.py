@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
-from nextview.policies.base import EpisodeState, best_in_window
+from nextview.policies.base import EpisodeState, best_in_window, in_window
 from nextview.viewsphere import ViewSphere
 
 
@@ -56,17 +56,24 @@ class MapPeak:
 
     def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
         """The predicted map where it lies on the sphere, (B, V); NaN outside the window."""
-        found = np.full(state.visited.shape, np.nan)
-        window = self.sphere.windows[state.current].reshape(len(found), -1)
-        np.put_along_axis(found, window, np.asarray(state.evidence.maps[self.map_name]).reshape(len(found), -1), 1)
-        return found
+        return in_window(self.sphere, state, np.asarray(state.evidence.maps[self.map_name]))
+
+    travel_weight = 0.0
+
+    def scores(self, state: EpisodeState) -> NDArray[np.float64]:
+        """Peaks, or valleys, before all else; see ``ScoresViews``."""
+        return in_window(self.sphere, state, self._climbed(state))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
+        return best_in_window(self.sphere, state, self._climbed(state))
+
+    def _climbed(self, state: EpisodeState) -> NDArray[np.float64]:
+        """What makes each cell of the window a better view, (B, rings, 3)."""
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
         if maps.shape[1:] != (self.sphere.rings, 3):
             raise PolicyError(
                 f"the map {self.map_name!r} is {maps.shape[1:]}, but the sphere has {self.sphere.rings} rings"
             )
         valley = np.isin(state.belief.argmax(1), self.valley_classes)
-        return best_in_window(self.sphere, state, peaks_first(np.where(valley[:, None, None], -maps, maps)))
+        return peaks_first(np.where(valley[:, None, None], -maps, maps))

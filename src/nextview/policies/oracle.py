@@ -71,7 +71,7 @@ class OracleGain:
         parts = np.split(np.arange(b), range(500, b, 500))  # all at once would fill the memory
         gain = np.concatenate([self._gains(state, rows) for rows in parts])
         if self.scope == "global":
-            return np.where(state.visited, -np.inf, gain).argmax(1)
+            return np.where(state.free, gain, -np.inf).argmax(1)
         return best_in_window(self.sphere, state, gain.reshape(b, -1, 3))
 
     def _gains(self, state: EpisodeState, rows: NDArray[np.int64]) -> NDArray[np.float64]:

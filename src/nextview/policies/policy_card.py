@@ -16,7 +16,7 @@ from nextview.outputs import written_whole
 from nextview.policies.base import Policy, Scope
 from nextview.policies.gain.gain_file import read_gain
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence
-from nextview.viewsphere import ViewSphere
+from nextview.viewsphere import Viewpoints, ViewSphere
 
 BUNDLED = Path(__file__).parent / "bundled"
 SCHEMA = 1
@@ -191,7 +191,7 @@ def read_policy_card(path: Path) -> PolicyCard:
         raise PolicyError(f"{path}: not a policy card ({error})") from None
 
 
-def read_policy(path: Path, sphere: ViewSphere, classes: Sequence[str] | None = None) -> Policy:
+def read_policy(path: Path, sphere: Viewpoints, classes: Sequence[str] | None = None) -> Policy:
     """Make the policy that a card describes.
 
     Args:
@@ -204,7 +204,7 @@ def read_policy(path: Path, sphere: ViewSphere, classes: Sequence[str] | None = 
         PolicyError: there is no such card, or it or its weights are damaged.
     """
     card, weights = read_policy_card(path), path.with_suffix(".onnx")
-    if (card.elevations, card.azimuths) != (sphere.elevations, sphere.azimuths):
+    if not isinstance(sphere, ViewSphere) or (card.elevations, card.azimuths) != (sphere.elevations, sphere.azimuths):
         rings = len(card.elevations)
         raise OtherUseError(f"{path}: was learned for {rings} rings of {card.azimuths} views, not for this sphere")
     if classes is not None and card.classes != tuple(classes):

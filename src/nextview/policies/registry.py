@@ -7,17 +7,18 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from nextview.errors import PolicyError
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
 from nextview.policies.gain import Gain
 from nextview.policies.maps import MapPeak
-from nextview.policies.policy_card import bundled_policies, read_policy
+from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card
 from nextview.policies.spread import Spread
-from nextview.viewsphere import ViewSphere
+from nextview.viewsphere import Viewpoints, ViewSphere
 
-POLICIES: dict[str, Callable[[ViewSphere, tuple[int, ...]], Policy]] = {
+POLICIES: dict[str, Callable[[Any, tuple[int, ...]], Policy]] = {
     "random": lambda sphere, valleys: Random(sphere),
     "random-all": lambda sphere, valleys: RandomAll(sphere),
     "furthest": lambda sphere, valleys: Furthest(sphere),
@@ -30,12 +31,15 @@ POLICIES: dict[str, Callable[[ViewSphere, tuple[int, ...]], Policy]] = {
     "lcm-peak": lambda sphere, valleys: MapPeak(sphere, "lcm"),
 }
 
+ANYWHERE = ("random-all", "spread")
+"""Those that ask for no grid."""
+
 DEFAULT = "gain"
 """The policy where none is named."""
 
 
 def make_policy(
-    name: str, sphere: ViewSphere, valley_classes: Sequence[int] = (), classes: Sequence[str] | None = None
+    name: str, sphere: Viewpoints, valley_classes: Sequence[int] = (), classes: Sequence[str] | None = None
 ) -> Policy:
     """A policy by name.
 
@@ -43,7 +47,7 @@ def make_policy(
         name: one of POLICIES, a learned one that is bundled, the path of a learned one's card (.json), or
             "module:Class" for one of your own, which is called with the sphere alone. A learned one that weighs
             travel takes another travel weight as NAME@WEIGHT.
-        sphere: the viewpoints.
+        sphere: the viewpoints; a ``ViewSphere`` but for those of ANYWHERE and your own.
         valley_classes: classes (indices) whose believers go to the map's valley; only "lem" and "lcm" use it.
         classes: names of the recogniser's classes; a learned policy for others is refused.
 
@@ -51,6 +55,8 @@ def make_policy(
         PolicyError: there is no such policy, or it cannot be made.
     """
     if name in POLICIES:
+        if name not in ANYWHERE and not isinstance(sphere, ViewSphere):
+            raise PolicyError(f"policy {name} needs viewpoints on rings")
         return POLICIES[name](sphere, tuple(valley_classes))
     learned = bundled_policies()
     card, weighted, travel_weight = name.partition("@")
@@ -62,6 +68,24 @@ def make_policy(
     raise PolicyError(f"no policy is called {name!r}; there are {', '.join([*POLICIES, *learned])}")
 
 
+def make_policy_anywhere(
+    name: str, viewpoints: Viewpoints, valley_classes: Sequence[int] = (), classes: Sequence[str] | None = None
+) -> Policy:
+    """A policy by name for live use, whatever the viewpoints: see ``policies.off_grid``.
+
+    One that was learned on a grid is made for that, the baselines that know neighbours for the 40 views where the
+    viewpoints are on no grid, and all others for the viewpoints. Arguments and errors as for ``make_policy``.
+    """
+    card = name.partition("@")[0]
+    path = bundled_policies().get(card, Path(card) if card.endswith(".json") else None)
+    if path is not None:
+        about = read_policy_card(path)
+        return make_policy(name, ViewSphere(about.elevations, about.azimuths), valley_classes, classes)
+    if name in POLICIES and name not in ANYWHERE and not isinstance(viewpoints, ViewSphere):
+        return make_policy(name, ViewSphere.named("40"), valley_classes, classes)
+    return make_policy(name, viewpoints, valley_classes, classes)
+
+
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
     if not isinstance(policy, Gain):
         raise PolicyError(f"{name}: this policy does not weigh travel")
@@ -71,7 +95,7 @@ def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
         raise PolicyError(f"{name}: a travel weight is a number of at least 0") from None
 
 
-def _import_policy(path: str, sphere: ViewSphere) -> Policy:
+def _import_policy(path: str, sphere: Viewpoints) -> Policy:
     module, _, attribute = path.partition(":")
     here = str(Path.cwd())
     if here not in sys.path:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.policies.base import EpisodeState, Scope, best_in_window
-from nextview.viewsphere import ViewSphere
+from nextview.viewsphere import Viewpoints, ViewSphere
 
 
-def nearest_visited(sphere: ViewSphere, visited: NDArray[np.bool_]) -> NDArray[np.float64]:
+def nearest_visited(sphere: Viewpoints, visited: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Great-circle angle from every view to the closest one visited.
 
     Args:
@@ -33,11 +33,11 @@ class Spread:
     """The unvisited view farthest on the sphere from all visited ones; equal ones with equal chance.
 
     Attributes:
-        sphere: the viewpoints.
+        sphere: the viewpoints; a ``ViewSphere`` where the scope is local.
         scope: "global", among all views; or "local", among those of the local window.
     """
 
-    sphere: ViewSphere
+    sphere: Viewpoints
     scope: Scope = "global"
     needs: tuple[str, ...] = ()
 
@@ -46,6 +46,7 @@ class Spread:
         distance = nearest_visited(self.sphere, state.visited)
         distance += 1e-6 * rng.random(distance.shape)
         if self.scope == "global":
-            return np.where(state.visited, -1.0, distance).argmax(1)
+            return np.where(state.free, distance, -1.0).argmax(1)
+        assert isinstance(self.sphere, ViewSphere)
         rows = np.arange(len(distance))[:, None, None]
         return best_in_window(self.sphere, state, distance[rows, self.sphere.windows[state.current]])

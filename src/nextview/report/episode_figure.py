@@ -14,7 +14,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from nextview.errors import UsageError
 from nextview.report.style import PlainFigure
 from nextview.session import Recognition, View
-from nextview.viewsphere import ViewSphere
+from nextview.viewsphere import Viewpoints, ViewSphere
 
 INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
 
@@ -41,7 +41,7 @@ def draw_episode(result: Recognition, title: str = "") -> Figure:
     axes = left.subplots(len(heights), len(views), squeeze=False, gridspec_kw={"height_ratios": heights})
     shown = np.argsort(-np.max([view.belief for view in views], axis=0))[:5]
     for k, view in enumerate(views):
-        _draw_image(axes[0, k], view, sphere, k + 1)
+        _draw_image(axes[0, k], view, k + 1)
         if valued:
             _draw_values(axes[1, k], view, sphere, [v.index for v in views[:k]], first=k == 0)
         _draw_belief(axes[-1, k], view, result, k + 1, shown)
@@ -50,18 +50,25 @@ def draw_episode(result: Recognition, title: str = "") -> Figure:
     return figure
 
 
-def _draw_image(axis: Axes, view: View, sphere: ViewSphere, step: int) -> None:
-    elevation, azimuth = sphere.angles(view.index)
+def _draw_image(axis: Axes, view: View, step: int) -> None:
+    elevation, azimuth = view.angles
     axis.imshow(view.observation.picture, cmap="gray", vmin=0, vmax=255)
     axis.set_title(f"step {step}: view {view.index}\n{elevation:.0f}° up, {azimuth:.0f}° round", color=INK, fontsize=10)
     axis.axis("off")
 
 
-def _draw_values(axis: Axes, view: View, sphere: ViewSphere, visited: list[int], first: bool) -> None:
-    """What the policy valued each candidate view at, ring over azimuth, with here, next and the visited marked."""
+def _draw_values(axis: Axes, view: View, sphere: Viewpoints, visited: list[int], first: bool) -> None:
+    """What the policy valued each candidate view at, elevation over azimuth, with here, next and the visited marked."""
     if view.values is None:
         axis.axis("off")
         axis.text(0.5, 0.5, "no other view needed", ha="center", va="center", fontsize=9, color=INK)
+        return
+    axis.set_title("value of each view", fontsize=9)
+    if first:
+        axis.set_ylabel("elevation")
+    axis.set_xlabel("azimuth", fontsize=8)
+    if not isinstance(sphere, ViewSphere):
+        _scatter_values(axis, view, view.values, sphere, visited)
         return
     values = view.values.reshape(sphere.rings, sphere.azimuths)
     axis.imshow(np.ma.masked_invalid(values), cmap="viridis", origin="lower", aspect="auto")
@@ -79,10 +86,24 @@ def _draw_values(axis: Axes, view: View, sphere: ViewSphere, visited: list[int],
     ticks = range(0, sphere.azimuths, 2)
     axis.set_xticks(ticks, [f"{step * k:.0f}°" for k in ticks], fontsize=8)
     axis.set_yticks(range(sphere.rings), [f"{e:.0f}°" for e in sphere.elevations] if first else [], fontsize=8)
-    axis.set_title("value of each view", fontsize=9)
-    if first:
-        axis.set_ylabel("elevation")
-    axis.set_xlabel("azimuth", fontsize=8)
+
+
+def _scatter_values(axis: Axes, view: View, values: np.ndarray, sphere: Viewpoints, visited: list[int]) -> None:
+    """The same for views that lie on no grid."""
+    azimuth, elevation = 360 * sphere.turn, np.degrees(sphere.elevation)
+    valued = np.isfinite(values)
+    axis.scatter(azimuth[~valued], elevation[~valued], s=22, color=FAINT)
+    axis.scatter(azimuth[valued], elevation[valued], s=34, c=values[valued], cmap="viridis")
+    marks = [(index, INK, "x") for index in visited] + [(view.index, INK, "here")]
+    if view.next_view is not None:
+        marks.append((view.next_view, ACCENT, "next"))
+    for index, colour, label in marks:
+        if label != "x":
+            axis.scatter(azimuth[index], elevation[index], s=110, facecolor="none", edgecolor=colour, linewidth=2)
+        axis.text(azimuth[index], elevation[index] + 3, label, ha="center", fontsize=6, color=colour, weight="bold")
+    axis.set_xticks([0, 90, 180, 270, 360], [f"{a}°" for a in (0, 90, 180, 270, 360)], fontsize=8)
+    axis.tick_params(axis="y", labelsize=8)
+    axis.yaxis.set_major_formatter("{x:.0f}°")
 
 
 def _draw_belief(axis: Axes, view: View, result: Recognition, step: int, shown: np.ndarray) -> None:
@@ -102,25 +123,25 @@ def _draw_belief(axis: Axes, view: View, result: Recognition, step: int, shown: 
         axis.legend(fontsize=7, loc="lower right", frameon=False)
 
 
-def _draw_path(axis: Axes3D, views: tuple[View, ...], sphere: ViewSphere) -> None:
+def _draw_path(axis: Axes3D, views: tuple[View, ...], sphere: Viewpoints) -> None:
     d = sphere.directions
     axis.scatter(*d.T, s=14, color=FAINT, depthshade=False)
-    for elevation in np.radians(sphere.elevations):
+    for elevation in np.radians(sphere.elevations) if isinstance(sphere, ViewSphere) else ():
         around = np.linspace(0, 2 * np.pi, 91)
         ring = np.cos(elevation) * np.cos(around), np.cos(elevation) * np.sin(around), 0 * around + np.sin(elevation)
         axis.plot(*ring, color=FAINT, linewidth=0.6)
     seen = [view.observation.points[::3] for view in views if view.observation.seen]
     cloud = np.concatenate([np.zeros((0, 3)), *seen])
     axis.scatter(*cloud.T, s=1, color=INK, alpha=0.35, depthshade=False)
-    path = [view.index for view in views]
-    for a, b in itertools.pairwise(d[path]):
+    path = np.array([view.direction for view in views])
+    for a, b in itertools.pairwise(path):
         arc = _great_circle(a, b)
         axis.plot(*arc.T, color=ACCENT, linewidth=2)
-    axis.scatter(*d[path].T, s=46, color=ACCENT, depthshade=False)
-    for step, index in enumerate(path, 1):
-        axis.text(*(d[index] * 1.16), str(step), color=ACCENT, fontsize=12, weight="bold", ha="center")
+    axis.scatter(*path.T, s=46, color=ACCENT, depthshade=False)
+    for step, place in enumerate(path, 1):
+        axis.text(*(place * 1.16), str(step), color=ACCENT, fontsize=12, weight="bold", ha="center")
     # Look from the side where the path is, a little from above.
-    middle = d[path].sum(0)
+    middle = path.sum(0)
     axis.view_init(elev=24, azim=float(np.degrees(np.arctan2(middle[1], middle[0]))) - 25)
     axis.set_box_aspect((1, 1, 0.75), zoom=1.2)  # room for the numbers at its rim
     axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-0.5, 1))

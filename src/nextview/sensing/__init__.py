@@ -1,8 +1,21 @@
 """From a sensor frame to an observation: units and frames, support plane, segmentation, object frame, denoising."""
 
+from typing import TYPE_CHECKING, Any
+
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box, ObjectFrame
-from nextview.sensing.observed_object import ObservedObject
 from nextview.sensing.plausibility import Doubt, check_observation, check_views
 
+if TYPE_CHECKING:
+    from nextview.sensing.observed_object import ObservedObject
+
 __all__ = ["Box", "Doubt", "Frame", "ObjectFrame", "ObservedObject", "check_observation", "check_views"]
+
+
+def __getattr__(name: str) -> Any:
+    """The observed object, imported when it is used: it takes SciPy, which recognition does without."""
+    if name == "ObservedObject":
+        from nextview.sensing.observed_object import ObservedObject
+
+        return ObservedObject
+    raise AttributeError(f"module 'nextview.sensing' has no attribute {name!r}")

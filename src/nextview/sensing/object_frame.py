@@ -100,11 +100,12 @@ class Box:
         return ObjectFrame(middle @ self.axes, diagonal / 2, self.axes)
 
 
-def upright_axes(up: ArrayLike) -> Float:
-    """Axes with z along ``up`` and x as near to the world's x as can be; near its y where x is up.
+def upright_axes(up: ArrayLike, front: ArrayLike | None = None) -> Float:
+    """Axes with z along ``up`` and x as near to the front as can be.
 
     Args:
         up: direction in the world, (3,), any length.
+        front: direction in the world, (3,), not along ``up``. The world's x by default; its y where x is up.
 
     Returns:
         Rows x, y, z, (3, 3) float64.
@@ -117,7 +118,7 @@ def upright_axes(up: ArrayLike) -> Float:
     if not 0 < length < np.inf:
         raise UsageError(f"up is a direction, three numbers, not {up!r}")
     z = z / length
-    x = np.eye(3)[0 if abs(z[0]) < 0.9 else 1]
+    x = np.eye(3)[0 if abs(z[0]) < 0.9 else 1] if front is None else np.asarray(front, np.float64)
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z])

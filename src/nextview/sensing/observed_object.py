@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -65,7 +65,8 @@ class ObservedObject:
     The object is found in each frame: by the frame's mask; else as what lies in a ``box``; else as the cluster on the
     support plane that is nearest to a ``point``, or the largest in the first frame. Its centre and radius are those of
     the box, or estimated from all frames so far. When they get better the earlier frames are expressed anew:
-    ``observations`` are always all in the same, latest object frame, and ``revision`` counts how often it changed.
+    ``observations`` are always all in the same, latest object frame, and ``revision`` counts how often it changed. Its
+    x axis points to the side from which the first frame was taken, unless a box or a known frame says otherwise.
 
     >>> thing = ObservedObject()                                                # doctest: +SKIP
     >>> observation = thing.add(Frame(depth, intrinsics, pose))                 # doctest: +SKIP
@@ -129,6 +130,18 @@ class ObservedObject:
         """One for each frame, in order, all in the latest object frame."""
         return list(self._made)
 
+    @contextmanager
+    def undone_by_errors(self) -> Iterator[None]:
+        """What is added within the block is as if it had never been, to the last random number, if the block raises."""
+        before, drawn = dict(vars(self)), self._rng.bit_generator.state
+        try:
+            yield
+        except BaseException:
+            vars(self).clear()
+            vars(self).update(before)
+            self._rng.bit_generator.state = drawn
+            raise
+
     def add(self, frame: Frame) -> Observation:
         """Take in a frame.
 
@@ -152,8 +165,8 @@ class ObservedObject:
                     "no support plane is seen, so there is no telling where up is: give it, and the camera's pose"
                 )
             up = plane.normal
-        axes = self._frame.axes if self._frame is not None else upright_axes(up)
-        sightings = self._find(frame, axes, plane, samples, noise)
+        axes = self._frame.axes if self._frame is not None else upright_axes(up, _towards(frame, up))
+        sightings = self._find(frame, upright_axes(up), plane, samples, noise)
         found = self._estimate(sightings, axes)
         same = self._frame is not None and _same(found, self._frame)
         if same and self._frame is not None:
@@ -310,6 +323,12 @@ class ObservedObject:
             facets = sighting.facets
             image = np.where(facet >= 0, sighting.frame.image[facets.rows[facet], facets.columns[facet]], 0)
         return _observation(depth, virtual_pose(pose), found.radius if self.life_size else None, image)
+
+
+def _towards(frame: Frame, up: Float) -> Float:
+    """Direction from what a camera looks at towards the camera; from above that of the bottom of its image."""
+    pose = frame.camera_to_world
+    return -pose[:3, 2] if abs(pose[:3, 2] @ up) < 0.99 else pose[:3, 1]
 
 
 def _observation(

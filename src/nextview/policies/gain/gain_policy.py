@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
-from nextview.policies.base import EpisodeState, Scope, best_in_window
+from nextview.policies.base import EpisodeState, Scope, best_in_window, in_window, travel_from
 from nextview.policies.gain.decision_features import INPUTS, MAPS, Frame, features, origin
 from nextview.policies.learned_tables import cells_to
 from nextview.viewsphere import ViewSphere
@@ -86,12 +86,20 @@ class Gain:
 
     def view_values(self, state: EpisodeState) -> Float:
         """Predicted gain of each view less the weighted travel there, (B, V); differences between views count."""
-        return self.gains(state) - self.travel_weight * self.sphere.travel[state.current]
+        return self.gains(state) - self.travel_weight * travel_from(self.sphere, state)
+
+    def scores(self, state: EpisodeState) -> Float:
+        """The gains of the views where it may go; see ``ScoresViews``."""
+        gains = self.gains(state)
+        if self.scope == "global":
+            return gains
+        rows = np.arange(len(gains))[:, None, None]
+        return in_window(self.sphere, state, gains[rows, self.sphere.windows[state.current]])
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
         scores = self.view_values(state)
         if self.scope == "global":
-            return np.where(state.visited, -np.inf, scores).argmax(1)
+            return np.where(state.free, scores, -np.inf).argmax(1)
         rows = np.arange(len(scores))[:, None, None]
         return best_in_window(self.sphere, state, scores[rows, self.sphere.windows[state.current]])

@@ -1,0 +1,133 @@
+"""A policy that knows one grid of views, asked about views that lie anywhere from a camera that stands anywhere.
+
+All that a policy on a grid is told counts azimuth from the camera. So the grid is turned until a column of it passes
+through the camera; the policy values the turned grid, and between its views the values are interpolated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.policies.base import EpisodeState, Policy, ScoresViews, ValuesViews, travel_from
+from nextview.viewsphere import Viewpoints, ViewSphere, angle_between, elevation_of, turn_of
+
+Float = NDArray[np.float64]
+
+
+def anywhere(policy: Policy, sphere: Viewpoints) -> Policy:
+    """A policy for some viewpoints and for cameras that stand beside them: itself, if it knows its way already."""
+    grid = getattr(policy, "sphere", None)
+    if not isinstance(grid, ViewSphere):
+        return policy
+    same = isinstance(sphere, ViewSphere) and sphere.same_grid(grid)
+    return policy if same and not isinstance(policy, ScoresViews) else OffGrid(policy, grid, sphere)
+
+
+@dataclass(frozen=True)
+class OffGrid:
+    """A policy on its grid, for any views.
+
+    One that scores views goes to the free view with the highest score, less its weighted travel; the scores are
+    interpolated between the four views of the turned grid around each view, and a view counts only where all of them
+    do. Where none counts it goes to the free view with the shortest travel. Any other policy chooses among the cells of
+    the turned grid that have a free view, and goes to the one nearest to the cell.
+
+    Camera and views on the grid itself make no difference: then the policy decides alone.
+
+    Attributes:
+        policy: on the grid.
+        grid: which it knows.
+        sphere: the views.
+    """
+
+    policy: Policy
+    grid: ViewSphere
+    sphere: Viewpoints
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Those of the policy."""
+        return self.policy.needs
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See ``Policy.next_views``."""
+        if self._on_grid(state):
+            return self.policy.next_views(state, rng)
+        turned, ahead = self._turned(state)
+        if not isinstance(self.policy, ScoresViews):
+            return self._nearest_to(self.policy.next_views(turned, rng), state, ahead)
+        scores = self._between(self.policy.scores(turned), ahead)
+        scores -= self.policy.travel_weight * travel_from(self.sphere, state)
+        free = state.free
+        considered = free & np.isfinite(scores)
+        near = np.where(free, travel_from(self.sphere, state), np.inf)
+        return np.where(considered.any(1), np.where(considered, scores, -np.inf).argmax(1), near.argmin(1))
+
+    def view_values(self, state: EpisodeState) -> Float:
+        """What the policy values each view at, interpolated, (B, V); all NaN where it values nothing."""
+        if not isinstance(self.policy, ValuesViews):
+            return np.full(state.visited.shape, np.nan)
+        if self._on_grid(state):
+            return self.policy.view_values(state)
+        turned, ahead = self._turned(state)
+        if not isinstance(self.policy, ScoresViews):
+            return self._between(self.policy.view_values(turned), ahead)
+        # Travel to the views counts, not that to the grid.
+        values = self._between(self.policy.view_values(replace(turned, travel=np.zeros(turned.visited.shape))), ahead)
+        return values - self.policy.travel_weight * travel_from(self.sphere, state)
+
+    def _on_grid(self, state: EpisodeState) -> bool:
+        if not isinstance(self.sphere, ViewSphere) or not self.sphere.same_grid(self.grid):
+            return False
+        return state.places is None or np.array_equal(state.places[:, -1], self.sphere.directions[state.current])
+
+    def _turned(self, state: EpisodeState) -> tuple[EpisodeState, Float]:
+        """The state on the turned grid, and how many steps of azimuth each view lies ahead of the camera, (B, V)."""
+        n, rows = self.grid.azimuths, np.arange(len(state.current))[:, None]
+        here = self.sphere.directions[state.current] if state.places is None else state.places[:, -1]
+        ahead = (self.sphere.turn[None] - turn_of(here)[:, None]) * n % n
+        ring = np.abs(np.radians(self.grid.elevations) - elevation_of(here)[:, None]).argmin(1)
+        ring_of = np.abs(np.radians(self.grid.elevations) - self.sphere.elevation[:, None]).argmin(1)
+        cell = ring_of * n + np.floor(ahead + 0.5).astype(np.int64) % n
+        visited = np.zeros((len(rows), len(self.grid)), bool)
+        reachable = visited.copy()
+        views, cells = np.nonzero(state.visited), np.nonzero(state.free)
+        visited[views[0], cell[views]] = True
+        reachable[cells[0], cell[cells]] = True
+        visited &= ~reachable  # a cell with several views may have one that is free
+        current = ring * n
+        visited[rows[:, 0], current] = True
+        lost = ~(reachable & ~visited).any(1)  # the only free view lies in the camera's own cell
+        reachable[lost] = True
+        turned = replace(state, current=current, visited=visited, reachable=reachable, travel=None, places=None)
+        return turned, ahead
+
+    def _between(self, values: Float, ahead: Float) -> Float:
+        """Values of the turned grid's views, (B, grid), between which the views lie, (B, V); NaN beside a NaN."""
+        n, order = self.grid.azimuths, np.argsort(self.grid.elevations, kind="stable")
+        heights = np.radians(self.grid.elevations)[order]
+        row = np.interp(self.sphere.elevation, heights, np.arange(len(heights)))
+        low = np.minimum(np.floor(row + 1e-9).astype(np.int64), len(heights) - 1)
+        up = np.maximum(row - low, 0.0)
+        left = np.floor(ahead + 1e-9).astype(np.int64)
+        right = np.maximum(ahead - left, 0.0)
+        rows, found = np.arange(len(values))[:, None], np.zeros(ahead.shape)
+        for ring, of_ring in ((low, 1 - up), (np.minimum(low + 1, len(heights) - 1), up)):
+            for step, of_step in ((left, 1 - right), (left + 1, right)):
+                share = of_ring * of_step
+                corner = values[rows, order[ring] * n + step % n]
+                found += np.where(share > 1e-6, share * corner, 0.0)
+        return found
+
+    def _nearest_to(self, cells: NDArray[np.int64], state: EpisodeState, ahead: Float) -> NDArray[np.int64]:
+        """The free view nearest to a cell of the turned grid, (B,)."""
+        here = self.sphere.directions[state.current] if state.places is None else state.places[:, -1]
+        azimuth = 2 * np.pi * (turn_of(here) + self.grid.azimuth_index[cells] / self.grid.azimuths)
+        elevation = np.radians(self.grid.elevations)[self.grid.ring[cells]]
+        flat = np.cos(elevation)
+        towards = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], 1)
+        arc = angle_between(towards[:, None], self.sphere.directions[None])
+        return np.where(state.free, arc, np.inf).argmin(1)

@@ -1,0 +1,226 @@
+"""Candidate views anywhere, and policies of the 40 views on them, against brute force."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nextview.belief import Calibration, FixedLength, Stopping
+from nextview.episode import VISITED, Episodes
+from nextview.errors import PolicyError, UsageError
+from nextview.policies.base import EpisodeState, Evidence
+from nextview.policies.maps import MapPeak
+from nextview.policies.off_grid import OffGrid, anywhere
+from nextview.policies.registry import POLICIES, make_policy, make_policy_anywhere
+from nextview.viewsphere import Directions, ViewSphere, look_at_origin, viewpoints_of
+
+SPHERE = ViewSphere.named("40")
+CLASSES = 10
+LAYOUTS = ("40", "12", "rings:0,30,60x12", "fibonacci:60", "fibonacci:7")
+NAMES = (*POLICIES, "gain", "fixed-sequence", "fixed-ring", "class-table", "class-table-local")
+
+
+def evidence(rng, b=1) -> Evidence:
+    maps = {name: rng.random((b, 5, 3)) for name in ("lem", "lcm")} | {"lem-sphere": rng.random((b, 5, 8))}
+    bins = np.log(rng.dirichlet(np.ones(8), (b, CLASSES)))
+    return Evidence(rng.normal(size=(b, CLASSES)), maps, bins)
+
+
+def direction(elevation, azimuth):
+    pose = look_at_origin(np.radians(elevation), np.radians(azimuth), 1.0)
+    return pose[..., :3, 3]
+
+
+# Layouts
+
+
+def test_rings_of_other_counts_are_view_spheres():
+    layout = viewpoints_of("rings:0,30.5,-60x12")
+    assert isinstance(layout, ViewSphere)
+    assert (layout.elevations, layout.azimuths) == ((0.0, 30.5, -60.0), 12)
+
+
+def test_a_fibonacci_hemisphere_is_even():
+    directions = viewpoints_of("fibonacci:200").directions
+    assert directions.shape == (200, 3)
+    assert (directions[:, 2] > 0).all()
+    angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1)))
+    np.fill_diagonal(angles, 180)
+    even = np.degrees(np.sqrt(2 * np.pi / 200))  # side of a square of each one's share of the half sphere
+    assert angles.min(1).min() > 0.75 * even
+    assert angles.min(1).max() < 1.1 * even
+    heights = np.sort(directions[:, 2])  # equal areas: heights are uniform (Archimedes)
+    np.testing.assert_allclose(heights, (np.arange(200) + 0.5) / 200)
+
+
+@given(st.lists(st.tuples(st.floats(-90, 90), st.floats(0, 360)), min_size=1, max_size=12), st.floats(0.5, 9))
+def test_a_list_of_directions_or_poses_gives_its_views(angles, distance):
+    elevation, azimuth = np.radians(np.array(angles)).T
+    poses = look_at_origin(elevation, azimuth, distance)
+    for layout in (viewpoints_of(poses), viewpoints_of(poses[:, :3, 3]), Directions(poses[:, :3, 3])):
+        assert len(layout) == len(angles)
+        np.testing.assert_allclose(layout.poses[:, :3, 3], 3 * poses[:, :3, 3] / distance, atol=1e-9)
+        np.testing.assert_allclose(layout.poses[:, :3, 2], poses[:, :3, 2], atol=1e-9)
+        cosines = np.einsum("id,jd->ij", layout.directions, layout.directions)
+        np.testing.assert_allclose(np.cos(layout.arc), cosines, atol=1e-9)
+
+
+def test_travel_of_directions_is_counted_in_the_cells_of_the_40_views():
+    np.testing.assert_allclose(Directions(SPHERE.directions).travel, SPHERE.travel, atol=1e-9)
+    between = SPHERE.travel_between(direction(27, 350), direction(36, 10))
+    assert between == pytest.approx(np.hypot(0.5, 20 / 45))
+    assert viewpoints_of("12").travel_between(direction(45, 5), direction(45, 350)) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        ("41", "no viewpoints are called '41'.*40, 12.*fibonacci"),
+        ("rings:0,30", "no viewpoints"),
+        ("rings:0,99x8", "between -90 and 90"),
+        ("rings:0x2", "at least three"),
+        ("fibonacci:0", "at least one"),
+        ([[0, 0, 0]], "zero"),
+        ([[0, 0, np.nan]], "NaN"),
+        ([[1, 2]], "shape"),
+        ([["a", "b", "c"]], "viewpoints are"),
+        ([], "shape"),
+    ],
+)
+def test_impossible_layouts(what, reason):
+    with pytest.raises(UsageError, match=reason):
+        viewpoints_of(what)
+
+
+def test_local_policies_need_rings():
+    with pytest.raises(PolicyError, match="rings"):
+        make_policy("random", Directions.fibonacci(9))
+
+
+# Policies off their grid
+
+
+def state_at(sphere, place, rng, visited=(), reachable=None) -> EpisodeState:
+    view, _ = sphere.nearest(place)
+    seen = np.zeros((1, len(sphere)), bool)
+    seen[0, [view, *visited]] = True
+    e, bins = evidence(rng), rng.dirichlet(np.ones(8), (1, CLASSES))
+    belief = rng.dirichlet(np.ones(CLASSES))[None]
+    return EpisodeState(
+        np.array([view]), seen, belief, e, 1, np.zeros(1, int), bins, reachable, None, place[None, None]
+    )
+
+
+@pytest.mark.parametrize("name", ["gain", "lem-peak", "class-table", "class-table-local"])
+def test_on_views_that_happen_to_be_the_grid_the_interpolation_is_the_policy(name):
+    """The 40 views as a mere list of directions: the same decisions and values as on the grid itself."""
+    policy, rng = make_policy(name, SPHERE), np.random.default_rng(0)
+    off = OffGrid(policy, SPHERE, Directions(SPHERE.directions))
+    for k in range(40):
+        state = state_at(SPHERE, SPHERE.directions[k], rng, rng.integers(0, 40, 6), rng.random((1, 40)) < 0.7)
+        assert off.next_views(state, rng) == policy.next_views(state, rng)
+        if name in ("gain", "lem-peak"):
+            np.testing.assert_allclose(off.view_values(state), policy.view_values(state), atol=1e-9)
+        assert anywhere(policy, SPHERE).next_views(state, rng) == policy.next_views(state, rng)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.floats(-20, 89), st.floats(0, 360), st.sampled_from(LAYOUTS), st.integers(0, 99))
+def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout, seed):
+    """Bilinear in elevation and in azimuth from the camera, written out for each view."""
+
+    class Fixed:
+        sphere, needs, travel_weight = SPHERE, (), 0.5
+        cells = np.random.default_rng(seed).random((1, 40))
+
+        def scores(self, state):
+            assert SPHERE.azimuth_index[state.current[0]] == 0
+            return self.cells
+
+        def next_views(self, state, rng):
+            raise AssertionError
+
+    sphere, rng = Directions(viewpoints_of(layout).directions), np.random.default_rng(seed)
+    state = state_at(sphere, direction(elevation, azimuth), rng, reachable=rng.random((1, len(sphere))) < 0.5)
+    travel = rng.random((1, len(sphere)))
+    state = replace(state, travel=travel)
+    if not state.free.any():
+        return
+    grid = np.column_stack([Fixed.cells.reshape(5, 8), Fixed.cells.reshape(5, 8)[:, 0]])
+    expected = []
+    for view in range(len(sphere)):
+        up, round_ = sphere.angles(view)
+        row = np.clip(up, 0, 72) / 18
+        column = (round_ - azimuth) % 360 / 45
+        r, c = min(int(row), 3), min(int(column), 7)
+        a, b = row - r, column - c
+        corners = grid[r, c] * (1 - b) + grid[r, c + 1] * b, grid[r + 1, c] * (1 - b) + grid[r + 1, c + 1] * b
+        expected.append(corners[0] * (1 - a) + corners[1] * a - 0.5 * travel[0, view])
+    expected = np.where(state.free[0], expected, -np.inf)
+    chosen = OffGrid(Fixed(), SPHERE, sphere).next_views(state, rng)[0]
+    assert state.free[0, chosen]
+    assert expected[chosen] == pytest.approx(expected.max(), abs=1e-6)
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.data(), st.sampled_from(LAYOUTS), st.sampled_from(NAMES), st.integers(0, 10**6))
+def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(data, layout, name, seed):
+    sphere = viewpoints_of(layout)
+    policy = make_policy_anywhere(name, sphere)
+    policy = anywhere(replace(policy, sphere=SPHERE) if isinstance(policy, MapPeak) else policy, sphere)
+    share = data.draw(st.sampled_from([0.1, 0.5, 1.0]))
+    jitter = data.draw(st.sampled_from([0.0, 0.02, 0.3]))
+    paths = []
+    for _ in range(2):
+        rng = np.random.default_rng(seed)
+        reachable = rng.random(len(sphere)) < share
+        episodes = Episodes(
+            sphere, policy, np.array([0]), FixedLength(max_views=8), np.random.default_rng(seed), Calibration(0.8, 0.5),
+            lambda state, mask=reachable: replace(state, reachable=mask[None]),
+        )  # fmt: skip
+        places, path = [], []
+        while len(episodes.running):
+            place = sphere.directions[episodes.current] + jitter * rng.normal(size=(1, 3))
+            place /= np.linalg.norm(place)
+            places.append(place[0])
+            step = episodes.update(evidence(rng), place)
+            assert step.belief.sum() == pytest.approx(1)
+            to = int(step.next_views[0])
+            path.append(to)
+            angles = np.arccos(np.clip(np.array(places) @ sphere.directions.T, -1, 1))
+            visited = {*angles.argmin(1), *np.flatnonzero((angles < VISITED - 1e-6).any(0))}
+            free = set(np.flatnonzero(reachable)) - visited
+            if to >= 0:
+                assert to in free
+            else:
+                assert len(path) == min(8, len(sphere)) or free <= set(
+                    np.flatnonzero((angles <= VISITED + 1e-6).any(0))
+                )
+        assert not episodes.outcome.confident[0]
+        paths.append(path)
+    assert paths[0] == paths[1]
+
+
+def test_a_policy_that_knows_nothing_of_reach_is_kept_from_what_is_out_of_it():
+    class First:
+        needs = ()
+
+        def next_views(self, state, rng):
+            return (~state.visited).argmax(1)
+
+    reach = np.zeros(40, bool)
+    reach[[5, 17]] = True
+    episodes = Episodes(
+        SPHERE, First(), np.array([3, 5]), Stopping(1.0, 9), np.random.default_rng(0),
+        constrain=lambda state: replace(state, reachable=np.tile(reach, (len(state.current), 1))),
+    )  # fmt: skip
+    rng = np.random.default_rng(0)
+    assert episodes.update(evidence(rng, 2)).next_views.tolist() == [5, 17]
+    step = episodes.update(evidence(rng, 2))
+    assert step.next_views.tolist() == [17, -1]
+    assert step.stopped.tolist() == [False, True]
+    assert episodes.update(evidence(rng)).stopped.tolist() == [True]
+    assert episodes.outcome.n_views.tolist() == [3, 2]
+    assert not episodes.outcome.confident.any()

@@ -1,0 +1,427 @@
+"""A session for a robot: frames of a depth camera from wherever it stands, and a robot that cannot go everywhere."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scenes import TABLE, box, cast, pose_at
+from scipy.spatial.transform import Rotation
+from tests.tiny_models import make_map_network, make_recogniser
+
+import nextview
+from nextview import Observation, SessionError, SimulatedCamera, Stopping, UsageError, ViewSphere
+from nextview.belief import Calibration, log_evidence_of
+from nextview.data.samples import sample_mesh
+from nextview.errors import ObservationError, PolicyError
+from nextview.models.inference import MapNetwork, Models, Recogniser
+from nextview.policies.maps import MapPeak
+from nextview.policies.registry import make_policy
+from nextview.sensing import Frame, ObjectFrame, ObservedObject
+from nextview.session import Session
+from nextview.viewsphere import viewpoints_of
+
+SPHERE = ViewSphere.named("40")
+SHAPE = 120, 160
+INTRINSICS = np.array([[260.0, 0, 80], [0, 260.0, 60], [0, 0, 1]])
+SOFA = trimesh.util.concatenate([box((0.2, 0.16, 0.1), (0, 0, 0.05)), box((0.06, 0.16, 0.08), (-0.07, 0, 0.14))])
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory) -> Models:
+    folder = tmp_path_factory.mktemp("tiny")
+    recogniser = Recogniser(make_recogniser(folder, ["box", "ball", "pillar"], azimuth_bins=8))
+    recogniser.calibration = Calibration(0.8, 1.0, bin_correlation=1.5)
+    return Models(recogniser, {"lem": MapNetwork(make_map_network(folder))})
+
+
+def frame(pose, move=np.eye(4), scale=1.0, meshes=(TABLE, SOFA), masked=False, **more) -> Frame:
+    """What a camera at a pose sees of the sofa on the table; then the world is moved and scaled."""
+    depth, which = cast(meshes, pose, INTRINSICS, SHAPE)
+    moved = move @ pose
+    moved[:3, 3] *= scale
+    mask = which == len(meshes) - 1 if masked else None
+    return Frame(scale * depth, INTRINSICS, moved, mask, pixel_centre=0.5, **more)
+
+
+def begin(models, policy=None, max_views=4, threshold=1.0, seed=0, sphere=SPHERE, **more) -> Session:
+    policy = policy or MapPeak(SPHERE)
+    stopping = Stopping(threshold, max_views)
+    return Session(models, policy, sphere, 0, stopping, np.random.default_rng(seed), **({"distance": 0.7} | more))
+
+
+def run(session, first, look=frame) -> Session:
+    pose = first
+    while not session.done:
+        session.update(look(pose))
+        pose = session.target
+    return session
+
+
+def snapshot(session):
+    """All that a session says, for comparison."""
+    views = [(v.index, v.next_view, v.travel, v.arc, *v.belief, *v.direction, v.doubts) for v in session.views]
+    where = None if session.object is None else (len(session.object.sightings), session.object.revision)
+    return views, session.view, session.done, where, str(session._rng.bit_generator.state)
+
+
+def same_decisions(a, b, atol):
+    assert [v.index for v in a.views] == [v.index for v in b.views]
+    assert [v.next_view for v in a.views] == [v.next_view for v in b.views]
+    for one, other in zip(a.views, b.views, strict=True):
+        np.testing.assert_allclose(one.belief, other.belief, atol=atol)
+        np.testing.assert_allclose(one.direction, other.direction, atol=atol)
+
+
+# Frames
+
+
+def test_the_whole_way_from_frames_to_a_name():
+    """The bundled networks name a sample chair on a table that stands anywhere, in its true size."""
+    mesh = sample_mesh("chair")
+    chair = trimesh.Trimesh(0.12 * mesh.vertices, mesh.faces)
+    chair.apply_translation([0.3, -0.2, -chair.vertices[:, 2].min()])
+    middle = chair.bounds.mean(0)
+    session = nextview.load().session(object=ObservedObject(life_size=False), distance=0.6)
+    run(session, pose_at(40, 77, 0.6, middle), lambda pose: frame(pose, meshes=(TABLE, chair)))
+    assert session.result.answer == "chair"
+    assert session.result.confident
+    assert not any(view.doubts for view in session.views)
+    target = session.poses[3]
+    np.testing.assert_allclose(target[:3, 3] + 0.6 * target[:3, 2], session.object.object_frame.centre, atol=1e-9)
+    assert np.linalg.norm(session.object.object_frame.centre - middle) < 0.02
+
+
+def test_a_better_object_frame_changes_what_the_earlier_views_say(tiny):
+    """Beliefs are those of all observations in the last object frame, each as if it had been seen so at once."""
+    session = begin(tiny)
+    pose, firsts = pose_at(20, 30, 0.7, (0, 0, 0.08)), []
+    while not session.done:
+        session.update(frame(pose))
+        firsts.append(session.views[0].observation)
+        pose = session.target
+    assert session.object.revision > 0
+    assert firsts[0] is not firsts[-1]
+    total, k = 0.0, len(session.views)
+    for view, observation in zip(session.views, session.object.observations, strict=True):
+        assert view.observation is observation
+        e = tiny.evidence([observation])
+        x, y, _ = observation.pose[:3, 3]
+        azimuth = np.array([np.arctan2(y, x) / (2 * np.pi) % 1])
+        total = total + log_evidence_of(e.logits, e.azimuth_bins, azimuth).astype(np.float64)
+    expected = tiny.recogniser.calibration.belief(total, k, 3)[0]
+    np.testing.assert_allclose(session.views[-1].belief, expected, atol=1e-6)
+
+
+def test_only_what_changed_goes_through_the_networks_again(tiny):
+    counted = []
+
+    class Counting:
+        recogniser, maps, classes = tiny.recogniser, tiny.maps, tiny.classes
+
+        def evidence(self, observations):
+            counted.append(len(observations))
+            return tiny.evidence(observations)
+
+    known = ObjectFrame([0, 0, 0.09], 0.14, np.eye(3))
+    run(begin(Counting(), object=ObservedObject(known=known)), pose_at(40, 10, 0.7, (0, 0, 0.08)))
+    assert counted == [1, 1, 1, 1]
+    counted.clear()
+    session = run(begin(Counting()), pose_at(10, 10, 0.7, (0, 0, 0.08)))
+    assert counted[0] == 1
+    assert sum(counted) > len(session.views)
+
+
+@settings(deadline=None, max_examples=5)
+@given(st.integers(5, 70), st.integers(0, 359), st.floats(-3.1, 3.1), st.tuples(*[st.floats(-2, 2)] * 3))
+def test_moving_the_world_and_the_poses_together_changes_nothing(tiny, elevation, azimuth, turn, shift):
+    move = np.eye(4)
+    move[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
+    move[:3, 3] = shift
+    pose = pose_at(elevation, azimuth, 0.7, (0, 0, 0.08), turn=(2, -1, 4))
+    here, there = begin(tiny), begin(tiny)
+    while not here.done:
+        here.update(frame(pose, masked=True))
+        there.update(frame(pose, move, masked=True))
+        assert there.view == here.view
+        np.testing.assert_allclose(there.target, move @ here.target, atol=2e-3)
+        pose = here.target
+    same_decisions(here, there, 5e-3)
+
+
+@settings(deadline=None, max_examples=5)
+@given(st.integers(5, 70), st.integers(0, 359), st.sampled_from([0.25, 2.0, 4.0]))
+def test_scaling_the_world_changes_nothing_but_size(tiny, elevation, azimuth, scale):
+    pose = pose_at(elevation, azimuth, 0.7, (0, 0, 0.08))
+    here, there = begin(tiny), begin(tiny, distance=0.7 * scale)
+    while not here.done:
+        here.update(frame(pose))
+        there.update(frame(pose, scale=scale))
+        pose = here.target
+    same_decisions(here, there, 1e-6)
+    assert there.object.object_frame.radius == pytest.approx(scale * here.object.object_frame.radius, rel=1e-5)
+    np.testing.assert_allclose(there.poses[:, :3, 3], scale * here.poses[:, :3, 3], atol=1e-5)
+
+
+def test_the_same_frames_give_the_same_decisions(tiny):
+    for name in ("random-all", "random", "lem", "spread"):
+        a, b = (run(begin(tiny, make_policy(name, SPHERE), seed=5), pose_at(30, 50, 0.7, (0, 0, 0.1))) for _ in "ab")
+        assert snapshot(a) == snapshot(b)
+
+
+def test_doubts_of_a_frame_reach_the_user(tiny):
+    session = begin(tiny, max_views=2)
+    session.update(frame(pose_at(35, 0, 0.7, (0, 0, 0.08)), masked=True))
+    wrong = replace(frame(pose_at(35, 0, 0.7, (0, 0, 0.08)), masked=True), pose=pose_at(35, 90, 0.7, (0, 0, 0.08)))
+    view = session.update(wrong)
+    assert [doubt.name for doubt in view.doubts] == ["contradiction"]
+    assert "doubtful: contradiction" in repr(session.result)
+
+
+# Mistakes
+
+
+def mistakes():
+    good = frame(pose_at(35, 0, 0.7, (0, 0, 0.08)))
+    away = frame(pose_at(35, 0, 0.7, (0, 0, 0.08)), meshes=(TABLE,))
+    flipped = good.pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+    yield "the empty table", lambda: away, ObservationError
+    yield "OpenGL axes", lambda: replace(good, pose=flipped), ObservationError
+    yield "an inverse pose", lambda: replace(good, pose=np.linalg.inv(good.pose)), ObservationError
+    yield "no pose", lambda: replace(good, pose=None), ObservationError
+    yield "millimetres", lambda: replace(good, depth=1000 * good.depth), ObservationError
+    yield (
+        "an observation",
+        lambda: Observation(np.full((16, 16), 3.0), SPHERE.poses[0], np.diag([16, 16, 1.0])),
+        SessionError,
+    )
+
+
+@pytest.mark.parametrize("after", [0, 1, 2])
+@pytest.mark.parametrize(("what", "make", "error"), list(mistakes()), ids=lambda x: x if isinstance(x, str) else "")
+def test_a_session_is_as_it_was_after_each_mistake(tiny, what, make, error, after):
+    if what == "no pose" and after == 0:
+        pytest.skip("a first frame may be the only one")
+    poses = [pose_at(35, 0, 0.7, (0, 0, 0.08)), *(pose_at(35, a, 0.7, (0, 0, 0.08)) for a in (130, 250, 20))]
+    ends = []
+    for wrong in (False, True):
+        session = begin(tiny, make_policy("random-all", SPHERE))
+        for k, pose in enumerate(poses):
+            if wrong and k == after:
+                before = snapshot(session)
+                with pytest.raises(error):
+                    session.update(make())
+                assert snapshot(session) == before
+            session.update(frame(pose))
+        ends.append(snapshot(session))
+    assert ends[0] == ends[1]
+
+
+def test_a_policy_that_fails_takes_the_frame_back(tiny):
+    class Fails:
+        needs = ()
+        broken = True
+
+        def next_views(self, state, rng):
+            rng.random(7)
+            if self.broken:
+                raise RuntimeError("a bug of one's own")
+            return (~state.visited).argmax(1)
+
+    policy = Fails()
+    session = begin(tiny, policy)
+    before = snapshot(session)
+    for meshes in ((TABLE, SOFA), (TABLE, SOFA)):
+        with pytest.raises(PolicyError, match="a bug of one's own"):
+            session.update(frame(pose_at(35, 0, 0.7, (0, 0, 0.08)), meshes=meshes))
+        assert snapshot(session) == before
+    policy.broken = False
+    assert session.update(frame(pose_at(35, 0, 0.7, (0, 0, 0.08)))).doubts == ()
+
+
+def test_frames_and_observations_do_not_mix(tiny):
+    camera = SimulatedCamera(sample_mesh("chair"), 16)
+    session = begin(tiny, distance=None)
+    session.update(camera.observe(session.pose))
+    with pytest.raises(SessionError, match="has taken observations"):
+        session.update(frame(pose_at(35, 0, 0.7)))
+    session = begin(tiny)
+    with pytest.raises(SessionError, match="before the first frame"):
+        _ = session.target
+    session.update(frame(pose_at(35, 0, 0.7)))
+    session.object.add(frame(pose_at(35, 90, 0.7)))
+    with pytest.raises(SessionError, match="outside of the session"):
+        session.update(frame(pose_at(35, 180, 0.7)))
+
+
+# Where the camera really stands
+
+
+def test_the_pose_that_was_reached_counts(tiny):
+    camera = SimulatedCamera(sample_mesh("chair"), 16)
+    session = begin(tiny, distance=None)
+    place = (27.0, 100.0)
+    pose = nextview.viewsphere.look_at_origin(*np.radians(place), 3.0)
+    view = session.update(camera.observe(pose))
+    assert view.index == (SPHERE.directions @ (pose[:3, 3] / 3)).argmax()
+    assert view.angles == pytest.approx(place)
+    second = session.update(camera.observe(session.pose))
+    (up, round_), (to_up, to_round) = place, SPHERE.angles(second.index)
+    steps = abs(to_round - round_) / 45 % 8
+    assert second.travel == pytest.approx(np.hypot((to_up - up) / 18, min(steps, 8 - steps)))
+    a, b = pose[:3, 3] / 3, SPHERE.directions[second.index]
+    assert second.arc == pytest.approx(np.arccos(a @ b))
+
+
+def test_views_near_the_place_count_as_visited(tiny):
+    camera, layout = SimulatedCamera(sample_mesh("chair"), 16), viewpoints_of("fibonacci:1000")
+    session = begin(tiny, make_policy("spread", layout), sphere=layout, distance=None)
+    session.update(camera.observe(session.pose))
+    angles = np.degrees(np.arccos(np.clip(layout.directions @ layout.directions[0], -1, 1)))
+    np.testing.assert_array_equal(session._episodes.steps[0].state.visited[0], angles <= 6)
+    assert (angles <= 6).sum() > 1
+
+
+# What the robot can do
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.data(), st.sampled_from(["40", "fibonacci:30"]), st.sampled_from(["random-all", "spread", "lem"]))
+def test_failed_and_unreachable_views_never_come(tiny, data, layout, name):
+    sphere = viewpoints_of(layout)
+    policy = MapPeak(SPHERE) if name == "lem" else make_policy(name, sphere)
+    camera = SimulatedCamera(sample_mesh("chair"), 16)
+    session = begin(tiny, policy, sphere=sphere, max_views=6, distance=None, seed=data.draw(st.integers(0, 99)))
+    mask = np.random.default_rng(data.draw(st.integers(0, 999))).random(len(sphere)) < data.draw(st.floats(0.05, 1))
+    assume(mask.any())
+    session.reachable = (
+        mask if data.draw(st.booleans()) else (lambda pose: mask[np.abs(sphere.poses - pose).sum((1, 2)).argmin()])
+    )
+    failed, visited = set(), set()
+    while not session.done:
+        if session.views or not callable(session.reachable):
+            assert mask[session.view]
+        assert session.view not in failed | visited
+        if data.draw(st.booleans()) and session.views:
+            failed.add(session.view)
+            session.failed()
+            continue
+        visited.add(session.view)
+        view = session.update(camera.observe(session.pose))
+        assert view.belief.sum() == pytest.approx(1)
+        assert view.next_view == (None if session.done else session.view)
+    result = session.result
+    left = set(np.flatnonzero(mask)) - failed - visited
+    assert result.stranded == (len(result.views) < 6)
+    assert not (result.stranded and left)
+    assert not result.confident
+
+
+def test_a_view_that_becomes_unreachable_is_replaced_at_once(tiny):
+    camera = SimulatedCamera(sample_mesh("chair"), 16)
+    session = begin(tiny, distance=None)
+    session.update(camera.observe(session.pose))
+    first = session.view
+    session.reachable = np.arange(40) != first
+    assert session.view != first
+    assert session.views[-1].next_view == session.view
+    session.reachable = np.zeros(40, bool)
+    assert session.done
+    assert session.result.stranded
+    assert "no other view in reach" in repr(session.result)
+    with pytest.raises(SessionError, match="has ended"):
+        session.failed()
+
+
+def test_before_the_first_view_the_nearest_one_in_reach_is_asked_for(tiny):
+    session = begin(tiny, distance=None)
+    session.failed()
+    assert session.view in np.flatnonzero(SPHERE.arc[0] == np.sort(SPHERE.arc[0])[1])
+    with pytest.raises(SessionError, match="none"):
+        session.reachable = np.zeros(40, bool)
+    assert session.reachable is None
+    for wrong in ([1, 0], np.zeros(39, bool), "all", np.ones(40)):
+        with pytest.raises(UsageError, match="mask"):
+            session.reachable = wrong
+
+
+def test_travel_in_seconds_is_weighed_as_travel_in_cells(tiny):
+    """A cost that is proportional to travel changes nothing; another one is what decides where gains are alike."""
+
+    class Flat:
+        """Values all views alike."""
+
+        sphere, needs, travel_weight = SPHERE, (), 0.1
+
+        def scores(self, state):
+            return np.zeros(state.visited.shape)
+
+        def next_views(self, state, rng):
+            travel = SPHERE.travel[state.current] if state.travel is None else state.travel
+            return np.where(state.free, -self.travel_weight * travel, -np.inf).argmax(1)
+
+    camera, rng = SimulatedCamera(sample_mesh("chair"), 16), np.random.default_rng(0)
+    costs = {
+        "cells": None,
+        "seconds": 3.5 * SPHERE.travel,
+        "matrix": rng.random((40, 40)),
+    }
+    costs["callable"] = lambda a, b: costs["matrix"][
+        tuple(int(np.abs(SPHERE.poses - pose).sum((1, 2)).argmin()) for pose in (a, b))
+    ]
+    paths = {}
+    for name, cost in costs.items():
+        session = begin(tiny, Flat(), distance=None)
+        session.travel_cost = cost
+        while not session.done:
+            session.update(camera.observe(session.pose))
+        paths[name] = [view.index for view in session.views]
+    assert paths["cells"] == paths["seconds"]
+    assert paths["matrix"] == paths["callable"]
+    for k, (a, b) in enumerate(itertools.pairwise(paths["matrix"]), 1):
+        row = costs["matrix"][a].copy()
+        row[paths["matrix"][:k]] = np.inf
+        assert b == row.argmin()
+
+
+def test_an_infinite_cost_is_out_of_reach_and_nonsense_is_refused(tiny):
+    camera = SimulatedCamera(sample_mesh("chair"), 16)
+    session = begin(tiny, distance=None)
+    cost = np.full((40, 40), np.inf)
+    cost[:, 23] = 2.0
+    session.travel_cost = cost
+    assert session.update(camera.observe(session.pose)).next_view == 23
+    session.update(camera.observe(session.pose))
+    assert session.result.stranded
+    for wrong in (np.zeros((40, 39)), np.full((40, 40), np.nan), -np.ones((40, 40))):
+        with pytest.raises(UsageError, match="travel cost"):
+            session.travel_cost = wrong
+    session = begin(tiny, distance=None)
+    session.travel_cost = lambda a, b: np.nan
+    with pytest.raises(UsageError, match="from 0 on"):
+        session.update(camera.observe(session.pose))
+    assert not session.views
+
+
+def test_reach_and_cost_are_asked_in_the_world(tiny):
+    session, asked = begin(tiny), []
+
+    def reachable(pose):
+        asked.append(pose)
+        return pose[2, 3] > 0.3
+
+    session.reachable = reachable
+    starts = []
+    session.travel_cost = lambda a, b: starts.append(a) or 1.0
+    first = pose_at(35, 40, 0.7, (0, 0, 0.08))
+    session.update(frame(first))
+    centre = session.object.object_frame.centre
+    for pose in asked:
+        assert np.linalg.norm(pose[:3, 3] - centre) == pytest.approx(0.7)
+        np.testing.assert_allclose(pose[:3, 3] + 0.7 * pose[:3, 2], centre, atol=1e-9)
+    assert session.target[2, 3] > 0.3
+    for pose in starts:
+        np.testing.assert_allclose(pose, first, atol=1e-12)
