@@ -1,9 +1,9 @@
-"""Damage files at random and read them: each must be read, or refused in one sentence, soon and in little memory.
+"""Damage files and frames at random and read them: each must be read, or refused in one sentence, soon and in little memory.
 
     python benchmarks/fuzz.py --minutes 5 --seed 0
     python benchmarks/fuzz.py --count 200000 --kinds off obj ply stl glb
 
-Each case runs in a process with a memory limit and a time limit. For each kind of file are counted the cases that were
+Each case runs in a process with a memory limit and a time limit. For each kind are counted the cases that were
 read (loaded), were refused in one sentence (refused), ended their process (crash), ran into the time limit (hang), and
 that raised anything else or printed more than sentences of nextview (error). The exit status is 1 if there was any of
 the last three.
@@ -38,6 +38,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import fuzz_frames
 import numpy as np
 import tyro
 
@@ -60,14 +61,15 @@ class Kind:
 
     Attributes:
         make: writes sound inputs into a folder, and beside them what else they need.
-        damage: writes a damaged one into a folder, made from one of the sound ones; returns its path.
-        take: reads it; raises nothing but a NextviewError.
+        damage: writes a damaged one into a folder, made from one of the sound ones; returns its path. Of what is no
+            file, it writes there what it is, and returns the thing itself.
+        take: reads what ``damage`` returned, or a sound one; raises nothing but a NextviewError.
         inputs: pattern of the names of the inputs.
     """
 
     make: Callable[[Path], None]
-    damage: Callable[[np.random.Generator, list[Path], Path], Path]
-    take: Callable[[Path], None]
+    damage: Callable[[np.random.Generator, list[Path], Path], Any]
+    take: Callable[[Any], None]
     inputs: str = "*"
 
 
@@ -362,6 +364,10 @@ KINDS = {
         partial(make_cards, "nextview.policies"), partial(damage_file, change_json), take_policy_card, "*.json"
     ),
     "store": Kind(make_store, damage_folder, take_store, "*.zarr"),
+    "frame": Kind(fuzz_frames.make_frames, fuzz_frames.damage_frames, fuzz_frames.take_frames),
+    "view": Kind(
+        fuzz_frames.make_views, partial(fuzz_frames.damage, fuzz_frames.read_frame), fuzz_frames.take_views
+    ),
 }
 
 
@@ -373,12 +379,12 @@ def run_case(kinds: dict[str, Kind], sound: Path, seed: int, name: str, number: 
     from nextview.errors import NextviewError
 
     kind, rng = kinds[name], np.random.default_rng([seed, zlib.crc32(name.encode()), number])
-    path = kind.damage(rng, sorted((sound / name).glob(kind.inputs)), case)
+    damaged = kind.damage(rng, sorted((sound / name).glob(kind.inputs)), case)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # a warning is printed, too
             warnings.simplefilter("ignore", DeprecationWarning)
-            kind.take(path)
+            kind.take(damaged)
     except NextviewError as refusal:
         one_sentence = str(refusal).strip() and "\n" not in str(refusal)
         return ("refused", str(refusal)) if one_sentence else ("error", f"not one sentence: {refusal}")

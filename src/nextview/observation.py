@@ -105,7 +105,7 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
     Raises:
         ObservationError: not a rigid motion, or one to a place from which no object can be seen.
     """
-    pose = _numbers(pose, "the pose").astype(np.float64, copy=False)
+    pose = numbers(pose, "the pose").astype(np.float64, copy=False)
     if pose.shape != (4, 4):
         raise ObservationError(f"the pose is a camera-to-world matrix of the shape (4, 4), not {pose.shape}")
     if not np.isfinite(pose).all():
@@ -126,7 +126,16 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
     return pose
 
 
-def _numbers(values: Any, what: str) -> NDArray[Any]:
+def numbers(values: Any, what: str) -> NDArray[Any]:
+    """An array of real numbers.
+
+    Args:
+        values: what a user handed in, perhaps lists.
+        what: it should be, for the message.
+
+    Raises:
+        ObservationError: it is none.
+    """
     try:
         array = np.asarray(values)
     except (ValueError, TypeError) as error:  # rows of different lengths, or what cannot become an array at all
@@ -137,7 +146,7 @@ def _numbers(values: Any, what: str) -> NDArray[Any]:
 
 
 def _depth(depth: Any) -> NDArray[np.float32]:
-    depth = _numbers(depth, "the depth")
+    depth = numbers(depth, "the depth")
     if depth.ndim != 2 or depth.size == 0:
         raise ObservationError(f"the depth is one image of the shape (H, W), not {depth.shape}")
     with np.errstate(over="ignore"):  # what is too large becomes infinity, and so 0
@@ -161,7 +170,7 @@ def _check_unit(given: NDArray[np.float32], near: int) -> None:
 
 
 def _intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    intrinsics = _numbers(intrinsics, "the matrix of intrinsics").astype(np.float64, copy=False)
+    intrinsics = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64, copy=False)
     if intrinsics.shape != (3, 3):
         raise ObservationError(f"the intrinsics are a pinhole matrix of the shape (3, 3), not {intrinsics.shape}")
     if not (np.abs(intrinsics) < 1e6).all():  # not so if there is a NaN
@@ -180,7 +189,7 @@ def _intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _image(image: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    image = _numbers(image, "the image")
+    image = numbers(image, "the image")
     if image.shape != shape:
         raise ObservationError(f"the image is grey and of the depth's shape {shape}, not {image.shape}")
     if image.dtype != np.uint8 and (image.dtype.kind == "f" or image.min() < 0 or image.max() > 255):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nextview.errors import ObservationError
+from nextview.observation import numbers
 
 FARTHEST = 65.0
 """Metres beyond which a float depth is taken for "nothing"; 65.535 m is also what uint16 millimetres can say."""
@@ -115,7 +116,7 @@ class Frame:
 
 
 def _metres(depth: ArrayLike) -> NDArray[np.float32]:
-    depth = np.asarray(depth)
+    depth = numbers(depth, "the depth")
     if depth.ndim != 2 or min(depth.shape) < 2:
         raise ObservationError(f"a depth image is (H, W), not {depth.shape}")
     if depth.dtype == np.uint16:
@@ -143,7 +144,7 @@ def _metres(depth: ArrayLike) -> NDArray[np.float32]:
 
 
 def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    k = np.array(intrinsics, np.float64)
+    k = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64)
     if k.shape != (3, 3) or not np.isfinite(k).all():
         raise ObservationError(f"intrinsics are a (3, 3) matrix of finite numbers, not {k.shape}")
     if not np.array_equal(k[2], [0, 0, 1]) or k[1, 0] != 0 or abs(k[0, 1]) > 1e-3 * abs(k[0, 0]):
@@ -174,7 +175,7 @@ def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ObservationError: it is not rigid; names the likely mistake.
     """
-    pose = np.array(pose, np.float64)
+    pose = numbers(pose, "the pose").astype(np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ObservationError(f"a pose is a (4, 4) matrix of finite numbers, not {pose.shape}")
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
