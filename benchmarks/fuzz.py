@@ -1,4 +1,4 @@
-"""Damage files and frames at random and read them: each must be read, or refused in one sentence, soon and in little memory.
+"""Damage files and frames at random and take them: each must do or be refused in one sentence, soon and in little room.
 
     python benchmarks/fuzz.py --minutes 5 --seed 0
     python benchmarks/fuzz.py --count 200000 --kinds off obj ply stl glb
@@ -365,9 +365,7 @@ KINDS = {
     ),
     "store": Kind(make_store, damage_folder, take_store, "*.zarr"),
     "frame": Kind(fuzz_frames.make_frames, fuzz_frames.damage_frames, fuzz_frames.take_frames),
-    "view": Kind(
-        fuzz_frames.make_views, partial(fuzz_frames.damage, fuzz_frames.read_frame), fuzz_frames.take_views
-    ),
+    "view": Kind(fuzz_frames.make_views, partial(fuzz_frames.damage, fuzz_frames.read_frame), fuzz_frames.take_views),
 }
 
 

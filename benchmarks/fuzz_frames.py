@@ -24,13 +24,18 @@ OTHERS: tuple[Any, ...] = (
 Arguments = dict[str, Any]
 
 
+def rays_of_pixels() -> NDArray[np.float64]:
+    """Rays (x, y, 1) of all pixels, (H, W, 3)."""
+    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]] + 0.5
+    return np.stack([columns, rows, np.ones(SHAPE)], -1) @ np.linalg.inv(INTRINSICS).T
+
+
 def look(elevation: float, azimuth: float, distance: float) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Depth (H, W), metres, of the boxes from a direction, degrees, and the camera's pose: rays against slabs."""
     from nextview.viewsphere import look_at_origin
 
     pose = look_at_origin(np.radians(elevation), np.radians(azimuth), distance)
-    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]] + 0.5
-    rays = np.stack([columns, rows, np.ones(SHAPE)], -1) @ np.linalg.inv(INTRINSICS).T @ pose[:3, :3].T
+    rays = rays_of_pixels() @ pose[:3, :3].T
     depth = np.full(SHAPE, np.inf)
     for corners in BOXES:
         with np.errstate(divide="ignore"):
@@ -45,11 +50,13 @@ def make_frames(folder: Path) -> None:
     rng = np.random.default_rng(0)
     for i, direction in enumerate([(40, 20, 0.7), (35, 100, 0.8), (55, 230, 0.65)]):
         depth, pose = look(*direction)
-        rays = np.stack([*np.mgrid[: SHAPE[0], : SHAPE[1]][::-1] + 0.5, np.ones(SHAPE)], -1) @ np.linalg.inv(INTRINSICS).T
+        rays = rays_of_pixels()
         mask = ((rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3])[..., 2] > 0.004
         image = rng.integers(0, 255, SHAPE).astype(np.uint8)
         noise = (1 + 0.002 * rng.normal(size=SHAPE)).astype(np.float32)
-        np.savez(folder / f"frame{i}.npz", depth=depth * noise, intrinsics=INTRINSICS, pose=pose, mask=mask, image=image)
+        np.savez(
+            folder / f"frame{i}.npz", depth=depth * noise, intrinsics=INTRINSICS, pose=pose, mask=mask, image=image
+        )
 
 
 @lru_cache
@@ -132,7 +139,9 @@ def _other_form(rng: np.random.Generator, array: NDArray) -> Any:
         if choice == 4:
             return array[tuple(slice(int(rng.integers(0, 3)), int(rng.integers(1, n + 1))) for n in array.shape)]
         if choice == 5:
-            return [array[None], array[..., None], array.ravel(), np.stack([array] * 3, -1), array.tolist()][rng.integers(5)]
+            return [array[None], array[..., None], array.ravel(), np.stack([array] * 3, -1), array.tolist()][
+                rng.integers(5)
+            ]
         if choice == 6:
             return np.kron(array, np.ones((int(rng.integers(1, 7)),) * array.ndim)).astype(array.dtype)
         if choice == 7 and array.shape == (4, 4):
@@ -159,7 +168,9 @@ def damage(
             frame[name] = load(sound[rng.integers(len(sound))])[name]
         elif isinstance(frame[name], np.ndarray | float) and np.size(frame[name]):
             frame[name] = change(rng, frame[name])
-    (case / "scene.txt").write_text("\n".join(f"{i} {n}: {_tell(v)}" for i, f in enumerate(scene) for n, v in f.items()))
+    (case / "scene.txt").write_text(
+        "\n".join(f"{i} {n}: {_tell(v)}" for i, f in enumerate(scene) for n, v in f.items())
+    )
     return scene
 
 
@@ -177,7 +188,11 @@ def damage_frames(rng: np.random.Generator, sound: list[Path], case: Path) -> tu
     if asked < 0.15:
         options["point"] = np.array([0, 0, 0.06])
     elif asked < 0.3:
-        options["box"] = {"low": np.array([-0.11, -0.08, 0.002]), "high": np.array([0.11, 0.1, 0.14]), "axes": np.eye(3)}
+        options["box"] = {
+            "low": np.array([-0.11, -0.08, 0.002]),
+            "high": np.array([0.11, 0.1, 0.14]),
+            "axes": np.eye(3),
+        }
     elif asked < 0.4:
         options["known"] = {"centre": np.array([0, 0.01, 0.06]), "radius": 0.15, "axes": np.eye(3)}
     if rng.random() < 0.2:
