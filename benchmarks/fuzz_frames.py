@@ -145,8 +145,8 @@ def _other_form(rng: np.random.Generator, array: NDArray) -> Any:
         if choice == 6:
             return np.kron(array, np.ones((int(rng.integers(1, 7)),) * array.ndim)).astype(array.dtype)
         if choice == 7 and array.shape == (4, 4):
-            inverse = np.linalg.inv(array) if np.isfinite(np.linalg.cond(array)) else array
-            return [inverse, array[:3], array @ np.diag([1, -1, -1, 1.0]), array * 2][rng.integers(4)]
+            turned = np.block([[array[:3, :3].T, -array[:3, :3].T @ array[:3, 3:]], [array[3:]]])  # a pose's inverse
+            return [turned, array[:3], array @ np.diag([1, -1, -1, 1.0]), array * 2][rng.integers(4)]
         return np.broadcast_to(array.ravel()[:1].reshape((1,) * array.ndim), array.shape)
 
 
@@ -176,7 +176,8 @@ def damage(
 
 def _tell(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        return f"{value.shape} {value.dtype} {zlib.crc32(str(value.tolist()).encode()):x}\n{value}"
+        data = str(value.tolist()).encode() if value.dtype == object else np.ascontiguousarray(value).tobytes()
+        return f"{value.shape} {value.dtype} {zlib.crc32(data):x}" + (f"\n{value}" if value.size < 20 else "")
     return repr(value)
 
 
@@ -235,11 +236,11 @@ def take_frames(scene: Any) -> None:
         raise refused
 
 
-@lru_cache(maxsize=1)
-def _system() -> Any:
+@lru_cache
+def _system(policy: str) -> Any:
     import nextview
 
-    return nextview.load(threads=1)
+    return nextview.load(policy=policy, threads=1)
 
 
 def take_views(scene: Any) -> None:
@@ -248,7 +249,8 @@ def take_views(scene: Any) -> None:
     from nextview.observation import Observation
 
     views = [read_frame(scene)] if isinstance(scene, Path) else scene
-    session = _system().session(start=0)
+    # The map networks take most of the time: single views are enough for them.
+    session = _system("gain" if len(views) == 1 else "spread").session(start=0)
     refused: NextviewError | None = None
     for arguments in views:
         if session.done:
