@@ -1,8 +1,9 @@
-"""Damage files at random and read them: each must be read, or refused in one sentence, soon and in little memory.
+"""Damage files and frames at random and take them: each must do or be refused in one sentence, soon and in little room.
 
     python benchmarks/fuzz.py --minutes 5 --seed 0
+    python benchmarks/fuzz.py --count 200000 --kinds off obj ply stl glb
 
-Each case runs in a process with a memory limit and a time limit. For each kind of file are counted the cases that were
+Each case runs in a process with a memory limit and a time limit. For each kind are counted the cases that were
 read (loaded), were refused in one sentence (refused), ended their process (crash), ran into the time limit (hang), and
 that raised anything else or printed more than sentences of nextview (error). The exit status is 1 if there was any of
 the last three.
@@ -28,7 +29,7 @@ import traceback
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
@@ -37,6 +38,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import fuzz_frames
 import numpy as np
 import tyro
 
@@ -44,6 +46,8 @@ MEMORY = 2 << 30
 """Bytes that a process may take beyond what it has when everything is imported."""
 SECONDS, WAIT = 10, 60
 """Seconds of computing, and in all, that a case may take."""
+BATCH = 20
+"""Cases of a kind in a row."""
 PRINTED = "printed"
 """Where the process that reads puts what it prints, in the folder of the sound inputs."""
 GOOD, BAD = ("loaded", "refused"), ("crash", "hang", "error")
@@ -57,14 +61,15 @@ class Kind:
 
     Attributes:
         make: writes sound inputs into a folder, and beside them what else they need.
-        damage: writes a damaged one into a folder, made from one of the sound ones; returns its path.
-        take: reads it; raises nothing but a NextviewError.
+        damage: writes a damaged one into a folder, made from one of the sound ones; returns its path. Of what is no
+            file, it writes there what it is, and returns the thing itself.
+        take: reads what ``damage`` returned, or a sound one; raises nothing but a NextviewError.
         inputs: pattern of the names of the inputs.
     """
 
     make: Callable[[Path], None]
-    damage: Callable[[np.random.Generator, list[Path], Path], Path]
-    take: Callable[[Path], None]
+    damage: Callable[[np.random.Generator, list[Path], Path], Any]
+    take: Callable[[Any], None]
     inputs: str = "*"
 
 
@@ -359,6 +364,8 @@ KINDS = {
         partial(make_cards, "nextview.policies"), partial(damage_file, change_json), take_policy_card, "*.json"
     ),
     "store": Kind(make_store, damage_folder, take_store, "*.zarr"),
+    "frame": Kind(fuzz_frames.make_frames, fuzz_frames.damage_frames, fuzz_frames.take_frames),
+    "view": Kind(fuzz_frames.make_views, partial(fuzz_frames.damage, fuzz_frames.read_frame), fuzz_frames.take_views),
 }
 
 
@@ -370,12 +377,12 @@ def run_case(kinds: dict[str, Kind], sound: Path, seed: int, name: str, number: 
     from nextview.errors import NextviewError
 
     kind, rng = kinds[name], np.random.default_rng([seed, zlib.crc32(name.encode()), number])
-    path = kind.damage(rng, sorted((sound / name).glob(kind.inputs)), case)
+    damaged = kind.damage(rng, sorted((sound / name).glob(kind.inputs)), case)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # a warning is printed, too
             warnings.simplefilter("ignore", DeprecationWarning)
-            kind.take(path)
+            kind.take(damaged)
     except NextviewError as refusal:
         one_sentence = str(refusal).strip() and "\n" not in str(refusal)
         return ("refused", str(refusal)) if one_sentence else ("error", f"not one sentence: {refusal}")
@@ -400,19 +407,22 @@ def _work(connection: Connection, kinds: dict[str, Kind], sound: Path, seed: int
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     connection.send(("ready", ""))
     while (asked := connection.recv()) is not None:
-        name, number = asked
-        before = os.fstat(printed.fileno()).st_size
-        with tempfile.TemporaryDirectory() as case:
-            signal.setitimer(signal.ITIMER_PROF, patience)  # neither is caught: they end even what is lost in C
-            signal.alarm(WAIT)
-            outcome, told = run_case(kinds, sound, seed, name, number, Path(case))
-            signal.alarm(0)
-            signal.setitimer(signal.ITIMER_PROF, 0)
-        printed.seek(before)
-        lines = printed.read().decode(errors="replace").splitlines()
-        if any(not line.startswith("nextview: ") for line in lines):  # our own sentences may be printed
-            outcome, told = "error", f"it prints {lines[:20]}"
-        connection.send((outcome, told))
+        name, numbers = asked
+        for number in numbers:
+            with tempfile.TemporaryDirectory() as case:
+                signal.setitimer(signal.ITIMER_PROF, patience)  # neither is caught: they end even what is lost in C
+                signal.alarm(WAIT)
+                outcome, told = run_case(kinds, sound, seed, name, number, Path(case))
+                signal.alarm(0)
+                signal.setitimer(signal.ITIMER_PROF, 0)
+            if printed.tell():  # the place is one with that of the standard files
+                printed.seek(0)
+                lines = printed.read().decode(errors="replace").splitlines()
+                printed.seek(0)
+                printed.truncate()
+                if any(not line.startswith("nextview: ") for line in lines):  # our own sentences may be printed
+                    outcome, told = "error", f"it prints {lines[:20]}"
+            connection.send((outcome, told if outcome in BAD else ""))
 
 
 class Reader:
@@ -434,23 +444,36 @@ class Reader:
         except EOFError:
             raise SystemExit("a sound input cannot be read") from None
 
-    def run(self, name: str, number: int) -> tuple[str, str]:
-        """What came of a case."""
-        self.connection.send((name, number))
-        try:
-            return self.connection.recv()
-        except EOFError:
-            self.process.join()
-            code = self.process.exitcode or 0
-            printed = (self.arguments[1] / PRINTED).read_text(errors="replace")[-2000:]
-            self.start()
-            if -code in (signal.SIGPROF, signal.SIGALRM):
-                return "hang", f"more than {self.arguments[3]} s of computing or {WAIT} s in all"
-            return "crash", f"the process ended with status {code}: {printed}"
+    def run(self, name: str, numbers: range) -> Iterator[tuple[str, str]]:
+        """What came of each of some cases."""
+        while numbers:
+            self.connection.send((name, numbers))
+            try:
+                while numbers:
+                    yield self.connection.recv()
+                    numbers = numbers[1:]
+            except EOFError:
+                yield self._death()
+                numbers = numbers[1:]
+
+    def _death(self) -> tuple[str, str]:
+        """Why the process died; there is a new one then."""
+        self.process.join()
+        code = self.process.exitcode or 0
+        printed = (self.arguments[1] / PRINTED).read_text(errors="replace")[-2000:]
+        self.start()
+        if -code in (signal.SIGPROF, signal.SIGALRM):
+            return "hang", f"more than {self.arguments[3]} s of computing or {WAIT} s in all"
+        return "crash", f"the process ended with status {code}: {printed}"
 
 
 def fuzz(
-    kinds: dict[str, Kind], seconds: float, seed: int, meshes: Path | None = None, patience: float = SECONDS
+    kinds: dict[str, Kind],
+    seconds: float,
+    seed: int,
+    meshes: Path | None = None,
+    patience: float = SECONDS,
+    count: int | None = None,
 ) -> tuple[dict[str, Counter], list[str]]:
     """Run cases of all kinds in turn until the time is over, each kind at least once.
 
@@ -460,6 +483,7 @@ def fuzz(
         seed: decides the damage.
         meshes: a folder of more meshes to damage, each up to 200 kB.
         patience: seconds of computing that a case may take.
+        count: instead of ``seconds``, so many cases of each kind; told on standard error as it goes on.
 
     Returns:
         How often what came of each kind, and a paragraph on each case that must not be.
@@ -469,15 +493,24 @@ def fuzz(
     with tempfile.TemporaryDirectory() as folder:
         sound = make_sound(kinds, Path(folder), meshes)
         reader, began, number = Reader(kinds, sound, seed, patience), time.monotonic(), 0
-        while number == 0 or time.monotonic() < began + seconds:
+
+        def over() -> bool:
+            return number > 0 and (number == count if count else time.monotonic() > began + seconds)
+
+        while not over():
+            batch = range(number, min(number + BATCH, count) if count else number + (BATCH if number else 1))
             for name in kinds:
-                outcome, told = reader.run(name, number)
-                counts[name][outcome] += 1
-                if outcome in BAD:
-                    failures.append(f"--case {name!r} {number}: {outcome}: {told}")
-                if number and time.monotonic() > began + seconds:
+                for case, (outcome, told) in zip(batch, reader.run(name, batch), strict=True):
+                    counts[name][outcome] += 1
+                    if outcome in BAD:
+                        failures.append(f"--case {name!r} {case}: {outcome}: {told}")
+                        if count:
+                            print(failures[-1], file=sys.stderr, flush=True)
+                if not count and over():
                     break
-            number += 1
+            number = batch.stop
+            if count and number % (100 * BATCH) == 0:
+                print(f"{number} of each kind", file=sys.stderr, flush=True)
         reader.connection.send(None)
         reader.process.join()
     return counts, failures
@@ -496,6 +529,7 @@ def make_sound(kinds: dict[str, Kind], folder: Path, meshes: Path | None) -> Pat
 
 def main(
     minutes: float = 1.0,
+    count: int | None = None,
     seed: int = 0,
     kinds: tuple[str, ...] = tuple(KINDS),
     meshes: Path | None = None,
@@ -506,6 +540,7 @@ def main(
 
     Args:
         minutes: how long.
+        count: instead of that, so many cases of each kind.
         seed: decides the damage.
         kinds: only these.
         meshes: a folder of more meshes to damage, each up to 200 kB.
@@ -520,7 +555,7 @@ def main(
             outcome, told = run_case(chosen, make_sound(chosen, Path(folder), meshes), seed, *case, keep)
         print(f"{outcome}: {told}\nwhat was read is in {keep}")
         sys.exit(outcome in BAD)
-    counts, failures = fuzz(chosen, 60 * minutes, seed, meshes)
+    counts, failures = fuzz(chosen, 60 * minutes, seed, meshes, count=count)
     print(f"{'':12}" + "".join(f"{outcome:>9}" for outcome in (*GOOD, *BAD)))
     for name, count in counts.items():
         print(f"{name:12}" + "".join(f"{count[outcome]:9}" for outcome in (*GOOD, *BAD)))

@@ -113,7 +113,7 @@ def test_results_are_replaced_while_they_are_as_they_were_written(predictions, c
     capsys.readouterr()
     assert "notes.txt" in refused(capsys, predictions, out, command)
     (out / "notes.txt").unlink()
-    table = next(out.glob("*.csv"))
+    table = next(path for path in sorted(out.glob("*.csv")) if b"0" in path.read_bytes())
     table.write_bytes(table.read_bytes().replace(b"0", b"1"))  # as long as before
     assert f"{table.name} has changed" in refused(capsys, predictions, out, command)
     table.rename(predictions.parent / "moved.csv")
@@ -395,3 +395,39 @@ def test_saving_predictions_and_beginning_them_leaves_what_is_called_part(tmp_pa
     _end(part, ["logits"])
     assert tree(part) == {"notes.txt": b"mine"}
     assert hidden(tmp_path) == []
+
+
+KILLED_ASIDE = """
+import os, signal, sys
+from pathlib import Path
+from nextview.outputs import written_results, written_whole
+
+if sys.argv[2] == "file":
+    with written_whole(Path(sys.argv[1])) as part:
+        part.write_text("half")
+        os.kill(os.getpid(), signal.SIGKILL)
+with written_results(Path(sys.argv[1]), "benchmark") as new:
+    (new / "numbers.csv").write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("what", ["file", "results"])
+def test_what_a_killed_run_left_is_removed_by_the_next_but_not_what_is_in_use(tmp_path, what):
+    out = tmp_path / "out"
+    assert subprocess.run([sys.executable, "-c", KILLED_ASIDE, out, what], check=False).returncode == -signal.SIGKILL
+    (left,) = hidden(tmp_path)
+    others = tmp_path / ".nextview-out-2-abcd1234"  # of the place "out-2"
+    others.mkdir()
+    if what == "file":
+        with written_whole(out) as part:
+            part.write_text("first")
+            with written_whole(out) as again:
+                again.write_text("second")
+            assert part.read_text() == "first"
+            assert not left.exists()
+        assert out.read_text() == "first"
+    else:
+        write(out, "new")
+        assert (out / "numbers.csv").read_text() == "new"
+    assert hidden(tmp_path) == [others]

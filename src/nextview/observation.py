@@ -20,6 +20,8 @@ LEAST_SHARE = 0.001
 less than this would be a dozen pixels there, of which no two need touch."""
 LEAST_PIXELS = 9
 """The same in pixels, for small images: 3 x 3 are the fewest of which one has neighbours all around."""
+LARGEST = 1e9
+"""Numbers of poses and intrinsics are smaller, even metres from a far origin. All that is made of such is finite."""
 RIGID = 1e-3
 """How far a pose may be from a rigid motion: room for numbers that were written out with four digits."""
 
@@ -61,8 +63,12 @@ class Observation:
         }
         for name, value in checked.items():
             object.__setattr__(self, name, value)
-        if self.radius is not None and not (isinstance(self.radius, Real) and 0 < self.radius < np.inf):
-            raise ObservationError(f"the object radius is a positive number of metres, or None, not {self.radius}")
+        if self.radius is not None:
+            if not (isinstance(self.radius, Real) and 0 < self.radius < LARGEST):
+                raise ObservationError(
+                    f"the object radius is a positive number of metres, or None, not {self.radius!r}"
+                )
+            object.__setattr__(self, "radius", float(self.radius))
 
     @cached_property
     def visible(self) -> int:
@@ -105,11 +111,11 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
     Raises:
         ObservationError: not a rigid motion, or one to a place from which no object can be seen.
     """
-    pose = _numbers(pose, "the pose").astype(np.float64, copy=False)
+    pose = numbers(pose, "the pose").astype(np.float64, copy=False)
     if pose.shape != (4, 4):
         raise ObservationError(f"the pose is a camera-to-world matrix of the shape (4, 4), not {pose.shape}")
-    if not np.isfinite(pose).all():
-        raise ObservationError("the pose holds NaN or infinity")
+    if not (np.abs(pose) < LARGEST).all():  # not so if there is a NaN
+        raise ObservationError("the pose holds NaN, infinity or a number that no camera has")
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID:
         raise ObservationError(f"the last row of the pose is {pose[3].tolist()}, not 0 0 0 1: is it transposed?")
     rotation = pose[:3, :3]
@@ -126,18 +132,36 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
     return pose
 
 
-def _numbers(values: Any, what: str) -> NDArray[Any]:
-    try:
-        array = np.asarray(values)
-    except (ValueError, TypeError) as error:  # rows of different lengths, or what cannot become an array at all
-        raise ObservationError(f"{what} cannot be taken for an array of numbers ({error})") from None
+def numbers(values: Any, what: str) -> NDArray[Any]:
+    """An array of real numbers.
+
+    Args:
+        values: what a user handed in, perhaps lists.
+        what: it should be, for the message.
+
+    Raises:
+        ObservationError: it is none.
+    """
+    array = array_of(values, what)
     if array.dtype.kind not in "fiu":
         raise ObservationError(f"{what} is an array of numbers, not of {array.dtype}")
     return array
 
 
+def array_of(values: Any, what: str) -> NDArray[Any]:
+    """An array of anything.
+
+    Raises:
+        ObservationError: it cannot become one: ``what`` that should be.
+    """
+    try:
+        return np.asarray(values)
+    except (ValueError, TypeError) as error:  # rows of different lengths, or what cannot become an array at all
+        raise ObservationError(f"{what} cannot be taken for an array of numbers ({error})") from None
+
+
 def _depth(depth: Any) -> NDArray[np.float32]:
-    depth = _numbers(depth, "the depth")
+    depth = numbers(depth, "the depth")
     if depth.ndim != 2 or depth.size == 0:
         raise ObservationError(f"the depth is one image of the shape (H, W), not {depth.shape}")
     with np.errstate(over="ignore"):  # what is too large becomes infinity, and so 0
@@ -161,10 +185,10 @@ def _check_unit(given: NDArray[np.float32], near: int) -> None:
 
 
 def _intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    intrinsics = _numbers(intrinsics, "the matrix of intrinsics").astype(np.float64, copy=False)
+    intrinsics = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64, copy=False)
     if intrinsics.shape != (3, 3):
         raise ObservationError(f"the intrinsics are a pinhole matrix of the shape (3, 3), not {intrinsics.shape}")
-    if not (np.abs(intrinsics) < 1e6).all():  # not so if there is a NaN
+    if not (np.abs(intrinsics) < LARGEST).all():  # not so if there is a NaN
         raise ObservationError("the intrinsics hold NaN, infinity or a number that no camera has")
     if np.abs(intrinsics[2] - (0, 0, 1)).max() > RIGID:
         raise ObservationError(
@@ -180,7 +204,7 @@ def _intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _image(image: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    image = _numbers(image, "the image")
+    image = numbers(image, "the image")
     if image.shape != shape:
         raise ObservationError(f"the image is grey and of the depth's shape {shape}, not {image.shape}")
     if image.dtype != np.uint8 and (image.dtype.kind == "f" or image.min() < 0 or image.max() > 255):

@@ -1,7 +1,8 @@
 """Outputs that appear whole or not at all, and replace nothing but what nextview itself has written.
 
 What is being written lies in a hidden folder of its own, ``.nextview-NAME-XXXXXXXX`` beside its place, until it is
-whole. A run that is killed leaves that folder behind; it may be removed when no run is under way. A folder of results
+whole. A run that is killed leaves that folder behind, and the next one that writes to the same place removes it: each
+run holds a lock on its own, which the system frees when it dies. A folder of results
 lists its files in manifest.json, and is replaced only while it holds these files, unchanged, and no others.
 """
 
@@ -19,7 +20,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from nextview.data.lock import only_one
+from nextview.data.lock import hold, only_one
 from nextview.errors import ResultsError
 
 MANIFEST = "manifest.json"
@@ -38,8 +39,7 @@ def written_whole(path: Path) -> Iterator[Path]:
     with ExitStack() as cleanup:
         with _said_of(path):
             place.parent.mkdir(parents=True, exist_ok=True)
-            aside = _new_folder_beside(place)
-        cleanup.callback(shutil.rmtree, aside, ignore_errors=True)
+            aside = _new_folder_beside(place, cleanup)
         with _disk_full_is_said(path):
             yield aside / place.name
         with _said_of(path):
@@ -78,8 +78,7 @@ def written_results(folder: Path, kind: str) -> Iterator[Path]:
         _finish_cut(place, kind)
         check_folder(folder, kind)
         with _said_of(folder):
-            aside = _new_folder_beside(place)
-        cleanup.callback(shutil.rmtree, aside, ignore_errors=True)
+            aside = _new_folder_beside(place, cleanup)
         new = aside / "new"
         with _disk_full_is_said(folder):
             new.mkdir()
@@ -139,8 +138,7 @@ def added_file(folder: Path, name: str, kind: str) -> Iterator[Path]:
     with only_one(place), ExitStack() as cleanup:
         check_added(folder, name, kind)
         with _said_of(folder):
-            aside = _new_folder_beside(place)
-        cleanup.callback(shutil.rmtree, aside, ignore_errors=True)
+            aside = _new_folder_beside(place, cleanup)
         with _disk_full_is_said(folder / name):
             yield aside / name
             files = _read_manifest(place, kind)
@@ -172,8 +170,7 @@ def left_by_a_cut(folder: Path, kind: str) -> Path | None:
     place = _place(folder)
     if os.path.lexists(place) or not place.parent.is_dir():
         return None
-    ours = re.compile(re.escape(f".nextview-{place.name}-") + "[a-z0-9_]{8}")
-    for aside in sorted(path for path in place.parent.iterdir() if ours.fullmatch(path.name)):
+    for aside in _asides(place):
         if (aside / "new").is_dir() and (aside / "old").is_dir():
             for found in (aside / "new", aside / "old"):
                 files = _read_manifest(found, kind)
@@ -248,8 +245,24 @@ def _place(path: Path) -> Path:
     return Path(os.path.realpath(path.parent)) / path.name
 
 
-def _new_folder_beside(place: Path) -> Path:
-    return Path(tempfile.mkdtemp(prefix=f".nextview-{place.name}-", dir=place.parent))
+def _new_folder_beside(place: Path, cleanup: ExitStack) -> Path:
+    """A hidden folder that is removed by ``cleanup``; before, those that killed runs have left are removed."""
+    for left in _asides(place):
+        # Results that are whole are kept: nothing else may have them.
+        if not (left / "new" / MANIFEST).exists() and not (left / "old").exists():
+            with hold(left) as ours:
+                if ours:
+                    shutil.rmtree(left, ignore_errors=True)
+    aside = Path(tempfile.mkdtemp(prefix=f".nextview-{place.name}-", dir=place.parent))
+    cleanup.callback(shutil.rmtree, aside, ignore_errors=True)
+    cleanup.enter_context(hold(aside))
+    return aside
+
+
+def _asides(place: Path) -> list[Path]:
+    """The hidden folders in which what is to be at ``place`` is or was being written."""
+    ours = re.compile(re.escape(f".nextview-{place.name}-") + "[a-z0-9_]{8}")
+    return sorted(path for path in place.parent.iterdir() if ours.fullmatch(path.name) and not path.is_symlink())
 
 
 @contextmanager

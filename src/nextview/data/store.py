@@ -72,6 +72,9 @@ class ViewStore:
     @classmethod
     def create(cls, path: Path, entries: list[Entry], sphere: ViewSphere, size: int, recipe: dict) -> ViewStore:
         """Make an empty store, whole or not at all; ``recipe`` is kept in the attributes as it is (JSON values)."""
+        for left in path.parent.glob("*.part"):  # of a run that was killed while it did this; no other is under way
+            if re.fullmatch(re.escape(path.name) + r"\.[0-9a-f]{32}\.part", left.name):
+                shutil.rmtree(left, ignore_errors=True)
         part = path.with_name(f"{path.name}.{uuid4().hex}.part")  # nobody else's
         try:
             cls._fill(part, entries, sphere, size, recipe)

@@ -130,6 +130,8 @@ class PolicyCard:
             ModelError or PolicyError: the table makes no sense, or the file cannot be used.
         """
         if self.kind == "gain":
+            if self.table.get("classes") != len(self.classes):
+                raise ModelError(f"the table is of {self.table.get('classes')} classes, not {len(self.classes)}")
             return read_gain(sphere, self.table, self.scope, weights, self.sha256)
         fields = Fields(self.table, "the table")
         policy: Policy

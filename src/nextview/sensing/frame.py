@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nextview.errors import ObservationError
+from nextview.observation import LARGEST, array_of, numbers
 
 FARTHEST = 65.0
 """Metres beyond which a float depth is taken for "nothing"; 65.535 m is also what uint16 millimetres can say."""
@@ -73,7 +74,7 @@ class Frame:
             pose[:3, :3] = pose[:3, :3] @ AXES[axes]
             object.__setattr__(self, "pose", pose)
         if self.mask is not None:
-            mask = np.asarray(self.mask)
+            mask = array_of(self.mask, "the mask")
             if mask.shape != depth.shape or mask.dtype != bool:
                 raise ObservationError(
                     f"a mask is (H, W) bool as the depth is, {depth.shape}, not {mask.shape} {mask.dtype}"
@@ -115,7 +116,7 @@ class Frame:
 
 
 def _metres(depth: ArrayLike) -> NDArray[np.float32]:
-    depth = np.asarray(depth)
+    depth = numbers(depth, "the depth")
     if depth.ndim != 2 or min(depth.shape) < 2:
         raise ObservationError(f"a depth image is (H, W), not {depth.shape}")
     if depth.dtype == np.uint16:
@@ -143,9 +144,10 @@ def _metres(depth: ArrayLike) -> NDArray[np.float32]:
 
 
 def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    k = np.array(intrinsics, np.float64)
-    if k.shape != (3, 3) or not np.isfinite(k).all():
-        raise ObservationError(f"intrinsics are a (3, 3) matrix of finite numbers, not {k.shape}")
+    k = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64)
+    if k.shape != (3, 3) or not (np.abs(k) < LARGEST).all():
+        given = f"of the shape {k.shape}" if k.shape != (3, 3) else "with NaN, infinity or what no camera has"
+        raise ObservationError(f"intrinsics are a (3, 3) matrix of numbers, not one {given}")
     if not np.array_equal(k[2], [0, 0, 1]) or k[1, 0] != 0 or abs(k[0, 1]) > 1e-3 * abs(k[0, 0]):
         raise ObservationError("intrinsics are [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: transposed, or with a skew?")
     k[0, 1] = 0
@@ -174,9 +176,10 @@ def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ObservationError: it is not rigid; names the likely mistake.
     """
-    pose = np.array(pose, np.float64)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise ObservationError(f"a pose is a (4, 4) matrix of finite numbers, not {pose.shape}")
+    pose = numbers(pose, "the pose").astype(np.float64)
+    if pose.shape != (4, 4) or not (np.abs(pose) < LARGEST).all():
+        given = f"of the shape {pose.shape}" if pose.shape != (4, 4) else "with NaN, infinity or what no camera has"
+        raise ObservationError(f"a pose is a (4, 4) matrix of numbers, not one {given}")
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         transposed = np.allclose(pose[:, 3], [0, 0, 0, 1], atol=1e-6)
         raise ObservationError(
@@ -199,7 +202,7 @@ def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
 
 
 def _grey(image: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    given = np.asarray(image)
+    given = array_of(image, "the image")
     if given.dtype != np.uint8 or given.shape not in (shape, (*shape, 3)):
         raise ObservationError(
             f"an image is (H, W) or (H, W, 3) uint8 registered to the depth, {shape}, not {given.shape} {given.dtype}"

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import combinations
+from numbers import Real
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nextview.errors import ObservationError, UsageError
+from nextview.observation import LARGEST, numbers
 
 Float = NDArray[np.float64]
 
@@ -31,13 +34,13 @@ class ObjectFrame:
     axes: Float
 
     def __post_init__(self) -> None:
-        if not 0 < self.radius < np.inf:
-            raise UsageError(f"the object radius is a positive number of metres, not {self.radius}")
-        axes = np.asarray(self.axes, np.float64)
-        if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-3) or np.linalg.det(axes) < 0:
-            raise UsageError("the object's axes are the rows of a (3, 3) rotation matrix")
-        object.__setattr__(self, "centre", np.asarray(self.centre, np.float64))
-        object.__setattr__(self, "axes", axes)
+        if not (isinstance(self.radius, Real) and 0 < self.radius < LARGEST):
+            raise UsageError(f"the object radius is a positive number of metres, not {as_line(self.radius)}")
+        centre = three(self.centre)
+        if centre is None:
+            raise UsageError(f"the object's centre is three numbers, metres, not {as_line(self.centre)}")
+        object.__setattr__(self, "centre", centre)
+        object.__setattr__(self, "axes", _rotation(self.axes, "the object's axes"))
 
     def pose_in_object(self, pose: ArrayLike) -> Float:
         """A camera-to-world pose, (..., 4, 4), metres, as a pose in the object frame, object radii."""
@@ -84,12 +87,11 @@ class Box:
     axes: Float = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        low, high = np.asarray(self.low, np.float64), np.asarray(self.high, np.float64)
-        axes = np.asarray(self.axes, np.float64)
-        if low.shape != (3,) or high.shape != (3,) or not (low < high).all():
-            raise UsageError(f"a box has a low and a high corner of three numbers, not {self.low} and {self.high}")
-        if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-3):
-            raise UsageError("the axes of a box are the rows of a (3, 3) rotation matrix")
+        low, high = three(self.low), three(self.high)
+        if low is None or high is None or not (low < high).all():
+            given = f"{as_line(self.low)} and {as_line(self.high)}"
+            raise UsageError(f"a box has a low and a high corner of three numbers, not {given}")
+        axes = _rotation(self.axes, "the axes of a box")
         for name, value in (("low", low), ("high", high), ("axes", axes)):
             object.__setattr__(self, name, value)
 
@@ -98,6 +100,32 @@ class Box:
         """That of an object which fills the box to its corners."""
         middle, diagonal = (self.low + self.high) / 2, float(np.linalg.norm(self.high - self.low))
         return ObjectFrame(middle @ self.axes, diagonal / 2, self.axes)
+
+
+def three(values: Any) -> Float | None:
+    """Three real numbers that can be metres, (3,) float64; None if they are not."""
+    try:
+        array = numbers(values, "").astype(np.float64)
+    except ObservationError:
+        return None
+    return array if array.shape == (3,) and bool((np.abs(array) < LARGEST).all()) else None
+
+
+def as_line(values: Any) -> str:
+    """What was handed in, for a sentence: in one line and not at length."""
+    text = " ".join(repr(values).split())
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _rotation(values: Any, what: str) -> Float:
+    try:
+        axes = numbers(values, what).astype(np.float64)
+    except ObservationError as error:
+        raise UsageError(str(error)) from None
+    fits = axes.shape == (3, 3) and (np.abs(axes) < 2).all()
+    if not fits or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-3) or np.linalg.det(axes) < 0:
+        raise UsageError(f"{what} are the rows of a (3, 3) rotation matrix")
+    return axes
 
 
 def upright_axes(up: ArrayLike, front: ArrayLike | None = None) -> Float:
@@ -113,11 +141,11 @@ def upright_axes(up: ArrayLike, front: ArrayLike | None = None) -> Float:
     Raises:
         UsageError: no direction.
     """
-    z = np.asarray(up, np.float64)
-    length = np.linalg.norm(z) if z.shape == (3,) else np.nan
-    if not 0 < length < np.inf:
-        raise UsageError(f"up is a direction, three numbers, not {up!r}")
-    z = z / length
+    z = three(up)
+    if z is None or not z.any():
+        raise UsageError(f"up is a direction, three numbers, not {as_line(up)}")
+    z = z / np.abs(z).max()  # first, or squares of the smallest numbers would be zero
+    z = z / np.linalg.norm(z)
     x = np.eye(3)[0 if abs(z[0]) < 0.9 else 1] if front is None else np.asarray(front, np.float64)
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)

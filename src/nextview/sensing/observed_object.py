@@ -16,7 +16,7 @@ from nextview.sensing import segmentation
 from nextview.sensing.facets import Facets, fit_facets
 from nextview.sensing.frame import Frame
 from nextview.sensing.noise import ROWS, Noise, estimate_noise
-from nextview.sensing.object_frame import Box, ObjectFrame, enclose, upright_axes
+from nextview.sensing.object_frame import Box, ObjectFrame, as_line, enclose, three, upright_axes
 from nextview.sensing.plausibility import Doubt, check_observation, check_views
 from nextview.sensing.segmentation import Footprint
 from nextview.sensing.support_plane import Plane, Samples, find_plane, mistake_in_pose, refine_plane, sample
@@ -100,9 +100,9 @@ class ObservedObject:
     ) -> None:
         if sum(asked is not None for asked in (point, box, known)) > 1:
             raise UsageError("an object is asked for by a point, by a box or by its known frame: by one of them")
-        self.point = None if point is None else np.asarray(point, np.float64)
-        if self.point is not None and (self.point.shape != (3,) or not np.isfinite(self.point).all()):
-            raise UsageError(f"a point is three numbers, world, metres, not {point!r}")
+        self.point = None if point is None else three(point)
+        if point is not None and self.point is None:
+            raise UsageError(f"a point is three numbers, world, metres, not {as_line(point)}")
         self.box, self.support, self.known = box, support, known if box is None else box.object_frame
         self.denoise, self.life_size = denoise, life_size
         self.sightings: tuple[Sighting, ...] = ()

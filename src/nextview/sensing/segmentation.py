@@ -26,8 +26,9 @@ CELL = 0.01
 """Side of a cell of the footprint, in distances of the camera from the object. Gaps of up to two cells are bridged."""
 CROWD = 3
 """Pixels that make a cell occupied."""
-REACH = 250
-"""Cells to each side of the middle of what is seen above the plane; farther things are left out."""
+REACH, FAR = 250, 1000
+"""Cells to each side of the middle of what is seen above the plane; farther things are left out. And
+cells from those of the first frame beyond which nothing can be a part of the same object: a wrong pose."""
 
 
 def inside_box(frame: Frame, box: Box) -> Mask:
@@ -102,7 +103,7 @@ def footprint(frame: Frame, above: Mask, axes: Float, cell: float) -> Footprint:
     for axis in axes[:2]:
         a, b, c = (pose[:3, :3].T @ axis / cell).astype(np.float32)
         position = z * (a * x[columns] + b * y[rows] + c) + np.float32(axis @ pose[:3, 3] / cell)
-        ij.append(np.floor(position).astype(np.int32))
+        ij.append(np.floor(position).astype(np.int64))
     low = np.array([np.median(v[::50]) if len(v) else 0 for v in ij]).astype(np.int64) - REACH
     side = 2 * REACH + 1
     i, j = ij[0] - low[0], ij[1] - low[1]
@@ -120,18 +121,23 @@ def footprint(frame: Frame, above: Mask, axes: Float, cell: float) -> Footprint:
 
 def clusters(footprints: Sequence[Footprint]) -> list[NDArray[np.int64]]:
     """Label of each cell in each footprint, (K,) int64 each: 1, 2, ... for the clusters of all taken together, 0 for
-    cells that too few pixels saw.
+    cells that too few pixels saw, or that lie far from all that the first footprint shows.
     """
     cells = np.concatenate([f.cells for f in footprints])
     if len(cells) == 0:
         return [np.zeros(0, np.int64) for _ in footprints]
-    low = cells.min(0) - 1
-    grid = np.zeros(np.ptp(cells, axis=0) + 3, np.int64)
-    np.add.at(grid, tuple((cells - low).T), np.concatenate([f.pixels for f in footprints]))
+    near = [np.abs(f.cells - cells[0]).max(1) <= FAR for f in footprints]
+    kept = cells[np.concatenate(near)]
+    low = kept.min(0) - 1
+    grid = np.zeros(np.ptp(kept, axis=0) + 3, np.int64)
+    np.add.at(grid, tuple((kept - low).T), np.concatenate([f.pixels[n] for f, n in zip(footprints, near, strict=True)]))
     occupied = grid >= CROWD
     labels, _ = ndimage.label(ndimage.binary_dilation(occupied, np.ones((3, 3), bool)), np.ones((3, 3)))
     labels = np.where(occupied, labels, 0)
-    return [labels[tuple((f.cells - low).T)] for f in footprints]
+    return [
+        np.where(n, labels[tuple((np.where(n[:, None], f.cells, low) - low).T)], 0)
+        for f, n in zip(footprints, near, strict=True)
+    ]
 
 
 def on_ground(points: Float, plane: Float) -> Mask:
@@ -141,6 +147,8 @@ def on_ground(points: Float, plane: Float) -> Mask:
         points: (N, 2).
         plane: points of the support plane, (M, 2): what stands within their hull stands on it.
     """
+    if len(plane) < 3:
+        return np.ones(len(points), bool)
     try:
         sides = ConvexHull(plane).equations
     except QhullError:  # a plane of which only a line is seen

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import io
 import logging
 import time
 import warnings
@@ -13,6 +14,7 @@ from typing import Any, Literal
 import lightning as L
 import numpy as np
 import torch
+from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
@@ -57,6 +59,29 @@ class StepSeed(L.Callback):
     ) -> None:
         step = [pl_module.recipe.seed, trainer.current_epoch, batch_idx, trainer.global_rank]
         torch.manual_seed(int(np.random.SeedSequence(step).generate_state(1, np.uint64)[0]))
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Writes checkpoints aside in their own folder, then renames them.
+
+    Lightning writes them to the system's folder for temporary files and moves them. Where that lies on another disk the
+    move is a copy, and a kill in it would cost the checkpoint that was there.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        save_whole(checkpoint, Path(path))
+
+
+def save_whole(values: dict[str, Any], path: Path) -> None:
+    """Write what torch can, whole or not at all.
+
+    Raises:
+        ResultsError: it cannot be written.
+    """
+    written = io.BytesIO()
+    torch.save(values, written)  # into a file it would turn a full disk into a RuntimeError
+    with written_whole(path) as part:
+        part.write_bytes(written.getbuffer())
 
 
 class Log(L.Callback):
@@ -162,6 +187,7 @@ def fit(
             sync_batchnorm=several and hardware.accelerator != "cpu" and torch.cuda.is_available(),
             logger=TensorBoardLogger(out, "log", "") if hardware.tensorboard else False,
             callbacks=callbacks,
+            plugins=[WholeCheckpoints()],
             enable_model_summary=False,
             num_sanity_val_steps=0,
             reload_dataloaders_every_n_epochs=1,

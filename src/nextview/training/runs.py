@@ -9,16 +9,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-import torch
 from torch import nn
 
-from nextview.data.lock import only_one
+from nextview.data.lock import only_one, writing
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError
 from nextview.models.model_card import BUNDLED, file_hash, find_card
 from nextview.outputs import written_whole
-from nextview.training.loop import is_first
+from nextview.training.loop import is_first, save_whole
 
 Recipe = TypeVar("Recipe")
 
@@ -36,7 +35,8 @@ def begin(run: Path, recipe: Any, weights: Path | None = None, commands: Sequenc
         commands: all that lead to the run, its own last, see ``training_commands``.
 
     Raises:
-        ModelError: it holds a run of another recipe, or one that started from other weights; there are none.
+        ModelError: it holds a run of another recipe, or one that started from other weights; there are none. Or it
+            holds anything else, which would be overwritten or taken for a part of the run.
         DatasetError: another process trains there, or it cannot be written.
     """
     with only_one(run) if is_first() else nullcontext():
@@ -45,12 +45,25 @@ def begin(run: Path, recipe: Any, weights: Path | None = None, commands: Sequenc
             _compare(noted, recipe)
             _compare_start(run / "weights.json", start)
         elif is_first():
-            run.mkdir(parents=True, exist_ok=True)
-            (run / COMMANDS).write_text(json.dumps(list(commands), indent=1) + "\n")
-            (run / "weights.json").write_text(json.dumps(start) + "\n")
-            with written_whole(noted) as part:
-                part.write_text(json.dumps(asdict(recipe), indent=1) + "\n")
+            # The recipe comes last: with it the folder is a run's.
+            first = {COMMANDS: json.dumps(list(commands), indent=1), "weights.json": json.dumps(start)}
+            _refuse_others(run, first)
+            with writing(run):
+                run.mkdir(parents=True, exist_ok=True)
+            for name, text in (first | {"recipe.json": json.dumps(asdict(recipe), indent=1)}).items():
+                with written_whole(run / name) as part:
+                    part.write_text(text + "\n")
         yield
+
+
+def _refuse_others(run: Path, ours: dict[str, str]) -> None:
+    """Refuse a folder that holds anything but what a run that was killed at its very beginning leaves there."""
+    for path in sorted(run.iterdir()) if run.is_dir() else ():
+        left = path.name.startswith(tuple(f".nextview-{name}-" for name in (*ours, "recipe.json")))
+        if not left and not (
+            path.is_file() and path.name in ours and path.read_bytes() == (ours[path.name] + "\n").encode()
+        ):
+            raise ModelError(f"{run}: holds {path.name} and no training run; give a new folder, or an empty one")
 
 
 def training_commands(command: str, made: Iterable[ViewStore | Predictions], weights: Path | None) -> tuple[str, ...]:
@@ -105,8 +118,7 @@ def read_recipe(run: Path, kind: type[Recipe]) -> Recipe:
 
 def finish(network: nn.Module, run: Path) -> None:
     """Keep a trained network's parameters as network.pt, whole or not at all."""
-    with written_whole(run / "network.pt") as part:
-        torch.save(network.state_dict(), part)
+    save_whole(network.state_dict(), run / "network.pt")
 
 
 def _hash(weights: Path | None) -> str | None:

@@ -55,8 +55,9 @@ class Gain:
     frame: Frame = "camera"
 
     def __post_init__(self) -> None:
-        if unknown := set(self.inputs) - set(INPUTS):
-            raise PolicyError(f"a gain policy takes some of {', '.join(INPUTS)}, not {', '.join(sorted(unknown))}")
+        unknown = sorted(set(self.inputs) - set(INPUTS))
+        if unknown or not self.inputs:
+            raise PolicyError(f"a gain policy takes some of {', '.join(INPUTS)}, not {', '.join(unknown) or 'nothing'}")
         if not np.isfinite(self.travel_weight) or self.travel_weight < 0:
             raise PolicyError(f"needs a travel weight that is not negative, not {self.travel_weight}")
         if self.frame not in get_args(Frame):

@@ -13,6 +13,7 @@ from nextview.command_line import command_line
 from nextview.data.splits import check_any, deduplicate, split_training
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError
+from nextview.outputs import written_whole
 from nextview.tracking import Track, silently
 from nextview.training.checkpoints import refuse_seen
 from nextview.training.folds import hold_out
@@ -89,7 +90,8 @@ def train_recogniser(
         with begin(run, recipe, weights, commands):
             if is_done(run):
                 continue
-            (run / "held_out.json").write_text(json.dumps([views.names[i] for i in held]) + "\n")
+            with written_whole(run / "held_out.json") as part:
+                part.write_text(json.dumps([views.names[i] for i in held]) + "\n")
             learning = np.setdiff1d(training, held)
             network = fit_recogniser(
                 sources, views.labels, learning, validating, recipe, run, weights, hardware, azimuths
