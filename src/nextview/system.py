@@ -11,12 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from nextview.belief import Stopping
-from nextview.errors import ModelError, OtherUseError
+from nextview.errors import ModelError, OtherUseError, UsageError
 from nextview.mesh import Mesh, load_mesh
 from nextview.models.collection import find_models
 from nextview.models.inference import MapNetwork, Models, Recogniser
@@ -25,6 +25,9 @@ from nextview.policies.base import Policy, maps_among
 from nextview.policies.registry import make_policy
 from nextview.session import Recognition, Session
 from nextview.viewsphere import ViewSphere
+
+if TYPE_CHECKING:
+    from nextview.cameras.sensors import Sensor
 
 DEFAULT = "modelnet10"
 """The models that ship with the package."""
@@ -78,6 +81,7 @@ class System:
         seed: int = 0,
         up: str | None = None,
         unit: str | None = None,
+        sensor: str | Sensor | None = None,
     ) -> Recognition:
         """Look at an object until it is clear what it is, or the views run out.
 
@@ -87,16 +91,19 @@ class System:
             seed: decides the first view and whatever the policy draws.
             up: the up axis of a file, "y" or "z"; z if not given, but y for GLB.
             unit: the unit of length of a file, one of ``mesh.UNITS``, if it is known: size says something of the class.
+            sensor: look at a mesh through this one, or through NAME or NAME:STRENGTH of ``cameras.sensors.SENSORS``;
+                its errors are drawn by the seed. None for clean renders.
 
         Raises:
             MeshError: the file cannot be used.
+            UsageError: there is no such sensor, or it is asked for before a camera.
         """
         if isinstance(what, str | Path):
             what = load_mesh(what, up, unit)
         if isinstance(what, Mesh):
-            from nextview.cameras.simulated import SimulatedCamera
-
-            what = SimulatedCamera(what)
+            what = simulated(what, sensor, seed)
+        elif sensor is not None:
+            raise UsageError("a sensor is for meshes: a camera has its own errors")
         return self.session(start, seed).run(what)
 
     def __repr__(self) -> str:
@@ -105,6 +112,17 @@ class System:
 
     def __reduce__(self) -> tuple[Callable[..., System], tuple[dict[str, Any]]]:
         return _load, (self.loaded,)
+
+
+def simulated(mesh: Mesh, sensor: str | Sensor | None = None, seed: int = 0) -> Camera:
+    """A simulated camera before a mesh, with or without the errors of a sensor; they are drawn by the seed."""
+    if sensor is None:
+        from nextview.cameras.simulated import SimulatedCamera
+
+        return SimulatedCamera(mesh)
+    from nextview.cameras.sensors import SensedCamera
+
+    return SensedCamera(mesh, sensor, np.random.default_rng(seed))
 
 
 def load(

@@ -22,8 +22,10 @@ from nextview.viewsphere import DISTANCE
 
 Float = NDArray[np.float64]
 
-TABLE = 4.0
+TABLE = 1.5
 """Radius of the table that the object stands on, object radii."""
+REACH = 1.3
+"""What is taken for the object lies in a sphere so many radii large: with a wrong pose it sticks out of its own."""
 LEFTOVER = 4.0
 """Size of the patches of the table that are taken for the object, pixels."""
 
@@ -33,8 +35,8 @@ class SensedCamera:
 
     The object stands on a table. What the sensor makes of the picture goes the way of every frame through
     ``ObservedObject``, which knows where the object is and how large, up to the errors of the setup. Its mask is all
-    that was measured inside the object's sphere and is not the table, up to the part of it that is left in: how well
-    table and object are told apart otherwise is not simulated here.
+    that was measured near the object and is not the table, up to the part of it that is left in: how well table and
+    object are told apart otherwise is not simulated here.
 
     Args:
         mesh: a normalised mesh.
@@ -96,8 +98,8 @@ class SensedCamera:
         if np.count_nonzero(measured) < FEWEST:
             return None
         frame = Frame(measured, self.sensor.intrinsics, believed, pixel_centre=0.5)
-        mask = inside_sphere(frame, self.object_frame.centre, 1.02 * self.object_frame.radius) & ~on_table
-        return replace_mask(frame, mask) if np.count_nonzero(mask) >= FEWEST else None
+        mask = inside_sphere(frame, self.object_frame.centre, REACH * self.object_frame.radius) & ~on_table
+        return replace(frame, mask=mask, pixel_centre=0.5) if np.count_nonzero(mask) >= FEWEST else None
 
     def _scene(self, pose: Float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """True depth of object and table, metres, and which pixels show the table."""
@@ -141,12 +143,7 @@ class SensedCamera:
         lines = np.flatnonzero(mask.any(axis=1 - side // 2))
         if not len(lines):
             return depth
-        hidden = int(round(share * (lines[-1] + 1 - lines[0])))
+        hidden = round(share * (lines[-1] + 1 - lines[0]))
         kept = np.arange(mask.shape[side // 2])
         kept = kept >= lines[0] + hidden if side % 2 else kept <= lines[-1] - hidden
         return np.where(kept[:, None] if side // 2 == 0 else kept, depth, np.float32(0))
-
-
-def replace_mask(frame: Frame, mask: NDArray[np.bool_]) -> Frame:
-    """The same frame with a mask."""
-    return Frame(frame.depth, frame.intrinsics, frame.pose, mask, pixel_centre=0.5)

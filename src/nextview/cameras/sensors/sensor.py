@@ -13,6 +13,9 @@ from nextview.cameras.sensors.projector_shadow import in_shadow
 from nextview.cameras.sensors.surface_angle import across_edges, incidence, inverse_depth, slopes
 from nextview.errors import UsageError
 
+MARGIN = 16
+"""How far beside what there is a pixel may show it, pixels."""
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -143,14 +146,30 @@ class Sensor:
             rng: for all that is random.
 
         Returns:
-            Depth, (height, width) float32, 0 where none was measured; and the pixel (row * width + column) whose surface
-            each pixel shows, int64: its own, or one nearby; -1 for one that hangs in the air.
+            Depth, (height, width) float32, 0 where none was measured. And whose surface each pixel shows, its own or
+            that of one nearby: row * width + column, int64, or -1 if it hangs in the air.
         """
+        measured, source = depth.copy(), np.arange(depth.size).reshape(depth.shape)
+        rows, columns = np.flatnonzero(depth.any(1)), np.flatnonzero(depth.any(0))
+        if len(rows):  # where there is nothing there is nothing to do
+            top, left = max(rows[0] - MARGIN, 0), max(columns[0] - MARGIN, 0)
+            part = slice(top, rows[-1] + MARGIN + 1), slice(left, columns[-1] + MARGIN + 1)
+            intrinsics = self.intrinsics - [[0, 0, left], [0, 0, top], [0, 0, 0]]
+            measured[part], source[part] = self._measure(depth[part], source[part], intrinsics, rng)
+        return measured, source
+
+    def _measure(
+        self,
+        depth: NDArray[np.float32],
+        source: NDArray[np.int64],
+        intrinsics: NDArray[np.float64],
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """The same for a part of a picture."""
         axial, lateral, grazing, flying, holes = rng.spawn(5)
         q = inverse_depth(depth)
-        source = np.arange(q.size).reshape(q.shape)
         slope = slopes(q)
-        angle = incidence(q, slope, self.intrinsics)
+        angle = incidence(q, slope, intrinsics)
         lost = (depth < self.nearest) | (depth > self.farthest)
         if self.shadow:
             lost |= in_shadow(q, self.focal, self.shadow)
@@ -195,7 +214,7 @@ class Sensor:
         right = np.rint(reach * normal_field(rng, q.shape, self.grain)).astype(int)
         down = np.rint(reach * normal_field(rng, q.shape, self.grain)).astype(int)
         row, column = np.indices(q.shape)
-        at = np.clip(row + down, 0, self.height - 1), np.clip(column + right, 0, self.width - 1)
+        at = np.clip(row + down, 0, len(q) - 1), np.clip(column + right, 0, q.shape[1] - 1)
         right, down = at[1] - column, at[0] - row
         there = q[at]
         moved = there - slope[0][at] * right - slope[1][at] * down
@@ -208,7 +227,7 @@ _NAMES = tuple(field.name for field in fields(Sensor))
 ERRORS = _NAMES[_NAMES.index("axial") :]
 """The strengths: what ``Sensor.scaled`` multiplies."""
 
-_SETUP = {
+_SETUP: dict[str, Any] = {
     "turned": 0.3,
     "moved": 0.003,
     "centre": 0.05,
