@@ -259,7 +259,7 @@ SENSORS = {
         Sensor(),
         Sensor(
             "kinect",
-            grain=1.8,
+            grain=2.0,
             nearest=0.4,
             farthest=8.0,
             axial=1.0,
