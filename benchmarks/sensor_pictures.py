@@ -46,7 +46,7 @@ def main(mesh: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path], view
             axis.set_ylabel(label)
         for axis in axes.flat:
             axis.set(xticks=[], yticks=[])
-        figure.savefig(out, dpi=80, facecolor="white", bbox_inches="tight", pad_inches=0.05)
+        figure.savefig(out, dpi=78, facecolor="white", bbox_inches="tight", pad_inches=0.05)
 
 
 if __name__ == "__main__":
