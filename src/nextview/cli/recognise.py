@@ -96,9 +96,9 @@ def show(
         watch.lap("thinking")
     result = session.result
     if result.answer is None:
+        why = "is it made of a few small parts far apart?" if sensor is None else "are the sensor's errors too strong?"
         raise ObservationError(
-            f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.views)} views; "
-            "is it made of a few small parts far apart?"
+            f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.views)} views; {why}"
         )
     if json:
         print(as_json(result))
