@@ -100,7 +100,7 @@ def draw(table: dict[tuple[str, bool], tuple[float, ...]], path: Path) -> None:
     from nextview.report.style import STYLE, to_png
 
     with matplotlib.rc_context(STYLE):
-        figure = Figure((8, 3.2))
+        figure = Figure((6.2, 2.6))
         left, right = figure.subplots(1, 2)
         names = list(dict.fromkeys(text.partition(":")[0] for text, _ in table if ":" in text))
         for name, colour in zip(
@@ -113,11 +113,21 @@ def draw(table: dict[tuple[str, bool], tuple[float, ...]], path: Path) -> None:
                 x = [0.0, *(float(t.partition(":")[2] or 1) for t, _ in some)]
                 rows = np.array([table.get(("none", True), some[0][1]), *(v for _, v in some)])
                 label = name + ("" if denoise else ", as it is")
-                left.errorbar(x, rows[:, 0], rows[:, 1], fmt=style, color=colour, ms=4, capsize=2, lw=1.4, label=label)
+                left.errorbar(
+                    x,
+                    rows[:, 0],
+                    rows[:, 1] if denoise else None,
+                    fmt=style,
+                    color=colour,
+                    ms=4,
+                    capsize=2,
+                    lw=1.4,
+                    label=label,
+                )
                 right.plot(x, rows[:, 2], style, color=colour, ms=4, lw=1.4)
         left.set(xlabel="strength", ylabel="accuracy", ylim=(None, 1))
         right.set(xlabel="strength", ylabel="views")
-        left.legend(fontsize=7.5)
+        left.legend(fontsize=6.5)
         figure.tight_layout()
         to_png(figure, path)
 
