@@ -90,13 +90,14 @@ def embree_bounded(files: list[str]) -> Cost:
 
 def one_process(files: list[str]) -> Cost:
     """nextview's work on each object, mesh file to arrays in memory."""
+    from nextview.cameras.simulated import SimulatedCamera
     from nextview.data.rendering import render_object
     from nextview.mesh import load_mesh
     from nextview.viewsphere import ViewSphere
 
     began = now()
     for file in files:
-        render_object(load_mesh(file), ViewSphere.named("40"), SIZE)
+        render_object(SimulatedCamera(load_mesh(file), SIZE, DISTANCE), ViewSphere.named("40"), SIZE)
     return now() - began, 0
 
 

@@ -531,3 +531,14 @@ def test_the_code_of_the_guide_runs():
     assert len(session.views) == 5
     assert len(refused) == 1
     assert np.linalg.norm(session.object.object_frame.centre - true_frame(WEDGE).centre) < 0.01
+
+
+def test_the_guides_simulated_sensors_run(monkeypatch):
+    import re
+
+    monkeypatch.chdir(Path(__file__).parent.parent)  # where samples/ is
+    blocks = re.findall(r"```python\n(.*?)```", Path("docs/your_camera.md").read_text(), re.S)
+    simulated = [block for block in blocks if "samples/" in block]
+    assert simulated
+    for block in simulated:
+        exec(block, {})

@@ -9,6 +9,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("lightning")
 
+from nextview.cameras.simulated import SimulatedCamera  # noqa: E402
 from nextview.data.folders import Entry  # noqa: E402
 from nextview.data.rendering import Deform, render, render_object, turns  # noqa: E402
 from nextview.data.store import DONE, ViewStore  # noqa: E402
@@ -61,7 +62,8 @@ def test_a_turned_object_is_seen_from_the_side_that_its_turn_says():
     _, angle = Deform(turn=True).draw(5, "chair_1")
     c, s = np.cos(-angle), np.sin(-angle)
     back = make_mesh(turned.vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T, mesh.faces)
-    a, b = (render_object(m, SPHERE, 32)["depth"].astype(int) for m in (mesh, back))
+    cameras = (SimulatedCamera(m, 32, SPHERE.distance) for m in (mesh, back))
+    a, b = (render_object(camera, SPHERE, 32)["depth"].astype(int) for camera in cameras)
     assert (np.abs(a - b) > 3).mean() < 0.01
 
 

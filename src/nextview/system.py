@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nextview.belief import Stopping
-from nextview.errors import ModelError, OtherUseError, PolicyError
+from nextview.errors import ModelError, OtherUseError, PolicyError, UsageError
 from nextview.mesh import Mesh, load_mesh
 from nextview.models.collection import find_models
 from nextview.models.inference import MapNetwork, Models, Recogniser
@@ -29,6 +29,7 @@ from nextview.session import Recognition, Session
 from nextview.viewsphere import LAYOUTS, Viewpoints, ViewSphere, viewpoints_of
 
 if TYPE_CHECKING:
+    from nextview.cameras.sensors import Sensor
     from nextview.sensing.observed_object import ObservedObject
 
 DEFAULT = "modelnet10"
@@ -94,6 +95,7 @@ class System:
         seed: int = 0,
         up: str | None = None,
         unit: str | None = None,
+        sensor: str | Sensor | None = None,
     ) -> Recognition:
         """Look at an object until it is clear what it is, or the views run out.
 
@@ -103,16 +105,19 @@ class System:
             seed: decides the first view and whatever the policy draws.
             up: the up axis of a file, "y" or "z"; z if not given, but y for GLB.
             unit: the unit of length of a file, one of ``mesh.UNITS``, if it is known: size says something of the class.
+            sensor: look at a mesh through this one, or through NAME or NAME:STRENGTH of ``cameras.sensors.SENSORS``;
+                its errors are drawn by the seed. None for clean renders.
 
         Raises:
             MeshError: the file cannot be used.
+            UsageError: there is no such sensor, or it is asked for before a camera.
         """
         if isinstance(what, str | Path):
             what = load_mesh(what, up, unit)
         if isinstance(what, Mesh):
-            from nextview.cameras.simulated import SimulatedCamera
-
-            what = SimulatedCamera(what)
+            what = simulated(what, sensor, seed)
+        elif sensor is not None:
+            raise UsageError("a sensor is for meshes: a camera has its own errors")
         return self.session(start, seed).run(what)
 
     def __repr__(self) -> str:
@@ -121,6 +126,17 @@ class System:
 
     def __reduce__(self) -> tuple[Callable[..., System], tuple[dict[str, Any]]]:
         return _load, (self.loaded,)
+
+
+def simulated(mesh: Mesh, sensor: str | Sensor | None = None, seed: int = 0) -> Camera:
+    """A simulated camera before a mesh, with or without the errors of a sensor; they are drawn by the seed."""
+    if sensor is None:
+        from nextview.cameras.simulated import SimulatedCamera
+
+        return SimulatedCamera(mesh)
+    from nextview.cameras.sensors import SensedCamera
+
+    return SensedCamera(mesh, sensor, np.random.default_rng(seed))
 
 
 def load(

@@ -36,11 +36,20 @@ class SimulatedCamera:
         mesh: a normalised mesh.
         size: side of the square image, pixels.
         distance: distance at which the unit sphere just fills the image, object radii.
+        intrinsics: instead, a pinhole matrix, (3, 3), pixels, the first pixel's centre at 0.5.
+        shape: height and width of the image that goes with it.
     """
 
-    def __init__(self, mesh: Mesh, size: int = 224, distance: float = DISTANCE) -> None:
-        self.size = size
-        self.intrinsics = pinhole(size, distance)
+    def __init__(
+        self,
+        mesh: Mesh,
+        size: int = 224,
+        distance: float = DISTANCE,
+        intrinsics: NDArray[np.float64] | None = None,
+        shape: tuple[int, int] | None = None,
+    ) -> None:
+        self.shape = shape or (size, size)
+        self.intrinsics = pinhole(size, distance) if intrinsics is None else intrinsics
         self.radius = mesh.metres
         vertices = mesh.vertices.astype(np.float32)
         self._corners = np.ascontiguousarray(vertices.T)
@@ -50,17 +59,21 @@ class SimulatedCamera:
         self._faces = mesh.faces
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, vertices, np.ascontiguousarray(mesh.faces, dtype=np.int32))
-        centres = (np.arange(size, dtype=np.float32) + 0.5 - size / 2) / self.intrinsics[0, 0].astype(np.float32)
-        self._rays = np.empty((size, size, 3), np.float32)  # z = 1, so that Embree's distance is the depth
-        self._rays[..., 0], self._rays[..., 1], self._rays[..., 2] = centres[None, :], centres[:, None], 1.0
+        across, down = (
+            (np.arange(side, dtype=np.float32) + np.float32(0.5 - self.intrinsics[axis, 2]))
+            / self.intrinsics[axis, axis].astype(np.float32)
+            for axis, side in enumerate(self.shape[::-1])
+        )
+        self._rays = np.empty((*self.shape, 3), np.float32)  # z = 1, so that Embree's distance is the depth
+        self._rays[..., 0], self._rays[..., 1], self._rays[..., 2] = across[None, :], down[:, None], 1.0
         self._ray_length = np.linalg.norm(self._rays, axis=-1)
 
     def observe(self, pose: NDArray[np.float64]) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object radii."""
         pose = checked_pose(pose)
         rotation, origin = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
-        image = np.zeros((self.size, self.size), np.uint8)
-        depth = np.zeros((self.size, self.size), np.float32)
+        image = np.zeros(self.shape, np.uint8)
+        depth = np.zeros(self.shape, np.float32)
         # Only pixels inside the object's projected bound can hit anything: cast no others.
         bound = self._bound(rotation, origin)
         height, width = depth[bound].shape
@@ -84,11 +97,12 @@ class SimulatedCamera:
     def _bound(self, rotation: NDArray[np.float32], origin: NDArray[np.float32]) -> tuple[slice, slice]:
         """Rows and columns that hold the projection of every vertex; the whole image if one is behind the camera."""
         x, y, z = rotation.T @ self._corners - (rotation.T @ origin)[:, None]
+        height, width = self.shape
         if z.min() <= 1e-6:
-            return slice(0, self.size), slice(0, self.size)
-        focal, centre = self.intrinsics[0, 0], self.size / 2
+            return slice(0, height), slice(0, width)
+        (fx, _, cx), (_, fy, cy) = self.intrinsics[:2]
         spans = []
-        for projected in (y / z, x / z):
+        for projected, focal, centre, side in ((y / z, fy, cy, height), (x / z, fx, cx, width)):
             low, high = projected.min() * focal + centre, projected.max() * focal + centre
-            spans.append(slice(*np.clip([int(np.floor(low)) - 1, int(np.ceil(high)) + 1], 0, self.size)))
+            spans.append(slice(*np.clip([int(np.floor(low)) - 1, int(np.ceil(high)) + 1], 0, side)))
         return spans[0], spans[1]

@@ -31,6 +31,7 @@ def recognise(
     unit: Unit | None = None,
     max_faces: int = MAX_FACES,
     seed: int = 0,
+    sensor: str | None = None,
     figure: Path | None = None,
     json: bool = False,
     timing: bool = False,
@@ -52,7 +53,9 @@ def recognise(
         up: the file's up axis; z if not given, but y for GLB.
         unit: the file's unit of length, if it is known: how large an object is says something of its class.
         max_faces: refuse a mesh of more triangles, or a file of more than 60 bytes for each of these.
-        seed: decides the first view and whatever the policy draws.
+        seed: decides the first view, whatever the policy draws and the errors of a sensor.
+        sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist or none, or NAME:STRENGTH
+            (docs/your_camera.md); clean renders if not given.
         figure: write a picture of the episode to this file (PNG, PDF or SVG).
         json: print JSON instead of a table.
         timing: also print where the time went, from the start of the process.
@@ -60,7 +63,8 @@ def recognise(
     from nextview.mesh import load_mesh
 
     options = {"policy": policy, "threshold": threshold, "risk": risk, "max_views": max_views, "viewpoints": viewpoints}
-    show(lambda: load_mesh(mesh, up, unit, max_faces), mesh.name, models, options, start, seed, figure, json, timing)
+    name = mesh.name if sensor is None else f"{mesh.name} through {sensor}"
+    show(lambda: load_mesh(mesh, up, unit, max_faces), name, models, options, start, seed, figure, json, timing, sensor)
 
 
 def show(
@@ -73,17 +77,17 @@ def show(
     figure: Path | None,
     json: bool = False,
     timing: bool = False,
+    sensor: str | None = None,
 ) -> None:
     """Recognise what ``load`` returns and print the episode; ``options`` are those of ``nextview.load``."""
     from nextview import system
-    from nextview.cameras.simulated import SimulatedCamera
     from nextview.cli.episode_table import as_json, print_episode
     from nextview.cli.timing import Stopwatch
     from nextview.errors import ObservationError
 
     watch = Stopwatch()
     watch.lap("importing")
-    camera = SimulatedCamera(load())
+    camera = system.simulated(load(), sensor, seed)
     watch.lap("building the scene")
     opened = system.load(models, **options)
     session = opened.session(start, seed)
@@ -95,9 +99,9 @@ def show(
         watch.lap("thinking")
     result = session.result
     if result.answer is None:
+        why = "is it made of a few small parts far apart?" if sensor is None else "are the sensor's errors too strong?"
         raise ObservationError(
-            f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.views)} views; "
-            "is it made of a few small parts far apart?"
+            f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.views)} views; {why}"
         )
     if json:
         print(as_json(result))

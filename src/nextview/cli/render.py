@@ -23,6 +23,7 @@ def render(
     stretch: float = 0.0,
     turn: bool = False,
     unit: Unit | None = None,
+    sensor: str | None = None,
     max_faces: int = MAX_FACES,
     seed: int = 0,
     workers: int | None = None,
@@ -41,8 +42,10 @@ def render(
         turn: turn each mesh about the vertical by a random angle.
         unit: of length in the mesh files, so that the store knows how large the objects are (ModelNet: inch). Not
             known by default; a store that was made without can be told later.
+        sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist or none, or NAME:STRENGTH
+            (docs/your_camera.md); clean renders if not given.
         max_faces: leave out a mesh of more triangles, or a file of more than 60 bytes for each of these.
-        seed: decides the stretch and the turn of each mesh.
+        seed: decides the stretch and the turn of each mesh, and the errors of a sensor.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler to use instead, as tcp://HOST:8786.
     """
@@ -64,7 +67,7 @@ def render(
     except DatasetError:
         before = 0  # there is none yet, or rendering mends it or says what is wrong
     new = Deform(stretch, turn)
-    jobs = render_dataset(dataset, store, views, size, seed, new, split, unit, workers, scheduler, max_faces)
+    jobs = render_dataset(dataset, store, views, size, seed, new, split, unit, workers, scheduler, max_faces, sensor)
     track((before + n for n, _ in enumerate(jobs, 1)), total, f"rendering {store.name}", before, len(views))
 
     made = ViewStore.open(store)

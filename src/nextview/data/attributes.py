@@ -30,7 +30,7 @@ def validate(attributes: Mapping[str, Any]) -> None:
     """Make sure that the attributes of a store are what the rest of nextview takes them for.
 
     Stores of earlier versions may lack those that came later: failures, seed, stretch, turn, sha256, unit,
-    dataset, commands, checksum.
+    dataset, commands, checksum. Only those rendered through a sensor have one.
 
     Raises:
         DatasetError: which of them is missing, or is not what it has to be; or they do not have their checksum.
@@ -135,6 +135,7 @@ RULES = {
     "seed": Rule(lambda v: _whole(v, 0, MOST), "a whole number from 0", False),
     "stretch": Rule(lambda v: _number(v, 0, LARGEST), "a finite number from 0", False),
     "turn": Rule(lambda v: isinstance(v, bool), "true or false", False),
+    "sensor": Rule(lambda v: isinstance(v, dict) and isinstance(v.get("name"), str), "a sensor", False),
     "sha256": Rule(_texts, "a list of hashes", False),
     "unit": Rule(lambda v: v is None or (isinstance(v, str) and v in UNITS), f"one of {', '.join(UNITS)}", False),
     "dataset": Rule(lambda v: isinstance(v, str), "the name of the mesh folder", False),

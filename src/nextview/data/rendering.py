@@ -15,6 +15,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from nextview.cameras.sensors import SensedCamera, Sensor, sensor_named
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.cloud import POINTS
 from nextview.command_line import command_line
@@ -27,10 +28,14 @@ from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.mesh import Mesh, load_mesh, make_mesh
 from nextview.mesh_format import MAX_FACES
-from nextview.viewsphere import LAYOUTS, ViewSphere
+from nextview.observation import Camera
+from nextview.sensing.observed_object import SIZE
+from nextview.viewsphere import DISTANCE, LAYOUTS, ViewSphere
 
 LARGEST_CHUNK = 2**31 - 2**20
 """Bytes that may be compressed at once, the compressor's own included."""
+SENSING = 256
+"""Sets the draws of a sensor apart from those of a deformation: no byte of a name is as large."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +72,8 @@ class Deform:
         return make_mesh((mesh.vertices * mesh.radius * factors) @ turn.T, mesh.faces, mesh.name)
 
 
-def render_object(mesh: Mesh, sphere: ViewSphere, size: int) -> dict[str, np.ndarray]:
-    """All views of one mesh as the store keeps them: image, depth, points and depth-entropy."""
-    camera = SimulatedCamera(mesh, size, sphere.distance)
+def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np.ndarray]:
+    """All views of one object as the store keeps them: image, depth, points and depth-entropy."""
     image = np.empty((len(sphere), size, size), np.uint8)
     depth = np.empty((len(sphere), size, size), np.uint16)
     points = np.empty((len(sphere), POINTS, 3), np.float32)
@@ -97,6 +101,7 @@ def render(
     workers: int | None = None,
     scheduler: str | None = None,
     max_faces: int = MAX_FACES,
+    sensor: str | None = None,
 ) -> Iterator[tuple[str, str | None]]:
     """Render every mesh that the store does not hold yet; one that failed before is tried again.
 
@@ -107,7 +112,7 @@ def render(
         path: the store.
         sphere: the viewpoints.
         size: side of the images, pixels.
-        seed: decides the deformations.
+        seed: decides the deformations, and the errors of a sensor: those of an object by its name alone.
         deform: how to make a new object of each mesh; not at all by default.
         split: only this split of the dataset.
         unit: of length in the mesh files, one of ``mesh.UNITS``; None if it is not known. A store that was made without
@@ -115,6 +120,7 @@ def render(
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
         max_faces: leave out larger meshes, see ``load_mesh``.
+        sensor: look through this sensor, see ``sensor_named``; clean renders if None.
 
     Yields:
         (name, None) for each object done, (name, reason) for one that cannot be rendered.
@@ -122,7 +128,7 @@ def render(
     Raises:
         DatasetError: the dataset is unusable, the viewpoints are too far, the store was begun from another dataset or
             with other settings or lacks an array, another run is writing it, or it cannot be written.
-        UsageError: a size, a seed or a number of workers that makes no sense.
+        UsageError: a size, a seed, a sensor or a number of workers that makes no sense.
     """
     entries = [e for e in list_dataset(dataset.absolute()) if split in (None, e.split)]
     if not entries:
@@ -134,6 +140,12 @@ def render(
     if not 0 <= seed < 2**63:
         raise UsageError(f"a seed is from 0 to {2**63 - 1}, not {seed}")
     deform = deform or Deform()
+    through = None if sensor is None else sensor_named(sensor)
+    if through is not None and (size, sphere.distance) != (SIZE, DISTANCE):
+        raise UsageError(
+            f"what a sensor saw is shown {SIZE} pixels large from {DISTANCE:g} object radii: a store of a sensor has "
+            f"views of that size and distance, not of {size} pixels from {sphere.distance:g}"
+        )
     farthest = np.iinfo(np.uint16).max * DEPTH_UNIT
     if sphere.distance + 1 > farthest:
         raise DatasetError(
@@ -141,14 +153,14 @@ def render(
             f"{farthest - 1:.2f} at most, not {sphere.distance:g}"
         )
     with only_one(path), writing(path):
-        store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit, dataset.absolute().name)
-        command = _command(dataset, path, sphere, size, seed, deform, split, unit)
+        store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit, dataset.absolute().name, through)
+        command = _command(dataset, path, sphere, size, seed, deform, split, unit, sensor)
         if command not in store.commands:
             store.note(commands=[*store.commands, command])
         todo = [int(i) for i in np.flatnonzero(~store.done)]
         # Largest files first, so that no worker is left with a long one at the end.
         todo.sort(key=lambda i: -entries[i].path.stat().st_size)
-        task = partial(_render_entry, store.path, uuid4().hex, sphere, size, seed, deform, max_faces)
+        task = partial(_render_entry, store.path, uuid4().hex, sphere, size, seed, deform, max_faces, through)
         for (i, entry), reason in each(task, [(i, entries[i]) for i in todo], workers, scheduler):
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is done.
@@ -168,6 +180,7 @@ def _command(
     deform: Deform,
     split: str | None,
     unit: str | None,
+    sensor: str | None,
 ) -> str:
     """The command that renders so; of a sphere that has no name, the part that the command line can say."""
     names = [name for name in LAYOUTS if LAYOUTS[name].elevations == sphere.elevations]
@@ -183,6 +196,7 @@ def _command(
         stretch=deform.stretch,
         turn=deform.turn,
         unit=unit,
+        sensor=sensor,
         seed=seed,
     )
 
@@ -203,11 +217,14 @@ def _begin(
     deform: Deform,
     unit: str | None,
     dataset: str,
+    sensor: Sensor | None,
 ) -> ViewStore:
     """The store as an earlier run left it, if that had the same meshes and settings, or a new one."""
     with ThreadPoolExecutor() as pool:
         hashes = list(pool.map(_file_hash, [e.path for e in entries]))
     recipe = {"seed": seed, "stretch": deform.stretch, "turn": deform.turn, "sha256": hashes}
+    if sensor is not None:
+        recipe["sensor"] = sensor.to_dict()
     if not path.exists():
         return ViewStore.create(path, entries, sphere, size, recipe | {"unit": unit, "dataset": dataset})
     if not (path / "zarr.json").exists():
@@ -228,6 +245,12 @@ def _begin(
     except DatasetError as damage:
         _restore(path, wanted, unit, dataset, damage)
         store = ViewStore.open(path)
+    before = store.group.attrs.get("sensor")
+    if before != wanted.get("sensor"):
+        was = "without a sensor" if before is None else f"through the sensor {before['name']}"
+        now = "without one" if sensor is None else f"through {sensor.name}"
+        same = " of other strengths" if sensor is not None and before and before["name"] == sensor.name else ""
+        raise DatasetError(f"{path}: was begun {was}{same}, and cannot go on {now}; give another store or the same one")
     for key, value in wanted.items():
         if store.group.attrs.get(key, value) != value:
             raise DatasetError(f"{path}: was begun with other {key}; give another store or the same settings")
@@ -285,6 +308,7 @@ def _render_entry(
     seed: int,
     deform: Deform,
     max_faces: int,
+    sensor: Sensor | None,
     item: tuple[int, Entry],
 ) -> str | None:
     """Render one object into the store; the reason if its mesh cannot be used."""
@@ -294,7 +318,11 @@ def _render_entry(
         mesh = load_mesh(entry.path, max_faces=max_faces)
         if deform != Deform():
             mesh = deform(mesh, seed, entry.name)
-        rendered = render_object(mesh, sphere, size)
+        if sensor is None:
+            camera: Camera = SimulatedCamera(mesh, size, sphere.distance)
+        else:
+            camera = SensedCamera(mesh, sensor, np.random.default_rng([seed, SENSING, *entry.name.encode()]))
+        rendered = render_object(camera, sphere, size)
     except MeshError as error:
         return str(error)
     except MemoryError:

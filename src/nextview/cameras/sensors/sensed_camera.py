@@ -1,0 +1,149 @@
+"""A simulated camera behind a sensor: true depth in metres, the sensor's errors, then the product's own way in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from nextview.cameras.sensors.depth_noise import uniform_field
+from nextview.cameras.sensors.sensor import Sensor, sensor_named
+from nextview.cameras.simulated import SimulatedCamera
+from nextview.errors import ObservationError
+from nextview.mesh import Mesh
+from nextview.observation import Observation, pinhole
+from nextview.sensing import Frame, ObjectFrame, ObservedObject
+from nextview.sensing.observed_object import FEWEST, SIZE
+from nextview.sensing.segmentation import inside_sphere
+from nextview.sensing.virtual_view import virtual_pose
+from nextview.viewsphere import DISTANCE
+
+Float = NDArray[np.float64]
+
+TABLE = 1.5
+"""Radius of the table that the object stands on, object radii."""
+REACH = 1.3
+"""What is taken for the object lies in a sphere so many radii large: with a wrong pose it sticks out of its own."""
+LEFTOVER = 4.0
+"""Size of the patches of the table that are taken for the object, pixels."""
+
+
+class SensedCamera:
+    """Looks at a mesh through a sensor, as a robot would see the object.
+
+    The object stands on a table. What the sensor makes of the picture goes the way of every frame through
+    ``ObservedObject``, which knows where the object is and how large, up to the errors of the setup. Its mask is all
+    that was measured near the object and is not the table, up to the part of it that is left in: how well table and
+    object are told apart otherwise is not simulated here.
+
+    Args:
+        mesh: a normalised mesh.
+        sensor: a sensor, or the name of one, see ``sensor_named``.
+        rng: for all errors; those of the object's frame are drawn now, once for the object.
+        denoise: as in ``ObservedObject``; if not, every pixel keeps the depth that was measured.
+
+    Raises:
+        UsageError: there is no such sensor.
+    """
+
+    def __init__(self, mesh: Mesh, sensor: Sensor | str, rng: np.random.Generator, denoise: bool = True) -> None:
+        self.sensor = sensor_named(sensor) if isinstance(sensor, str) else sensor
+        self.denoise, self._rng = denoise, rng
+        self._camera = SimulatedCamera(mesh, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)
+        self._floor = float(mesh.vertices[:, 2].min())
+        self._metres = mesh.metres
+        self._truth = ObjectFrame(np.zeros(3), self.sensor.radius, np.eye(3))
+        self.object_frame = self._wrong_frame()
+
+    def observe(self, pose: Float) -> Observation:
+        """Look from the direction of a pose, (4, 4), object frame, at the sensor's own distance.
+
+        A frame in which too little of the object is found is a view in which nothing is seen.
+        """
+        frame = self.frame(pose)
+        try:
+            thing = ObservedObject(known=self.object_frame, support=False, denoise=self.denoise, life_size=False)
+            if frame is None:
+                raise ObservationError("nothing is seen")
+            observation = thing.add(frame)
+        except ObservationError:
+            asked = virtual_pose(self.object_frame.pose_in_object(self._truth.pose_in_world(pose)))
+            observation = Observation(np.zeros((SIZE, SIZE), np.float32), asked, pinhole(SIZE, DISTANCE))
+        if self._metres is None:
+            return observation
+        return replace(observation, radius=self._metres * self.object_frame.radius / self._truth.radius)
+
+    def frame(self, pose: Float) -> Frame | None:
+        """What the sensor gives, metres, with the mask of the object and the pose that the robot believes in.
+
+        The world is the true object frame, in metres.
+
+        Args:
+            pose: as in ``observe``.
+
+        Returns:
+            The frame; None if less than an object is measured in it.
+        """
+        rng = self._rng.spawn(1)[0]
+        believed = self._truth.pose_in_world(pose, self.sensor.distance)
+        depth, is_table = self._scene(self._shaken(believed, rng))
+        measured, source = self.sensor.measure(depth, rng)
+        on_table = is_table.ravel()[source] & (source >= 0)
+        if self.sensor.table:
+            on_table &= uniform_field(rng, depth.shape, LEFTOVER) >= self.sensor.table
+        if self.sensor.crop:
+            measured = self._cropped(measured, (measured > 0) & ~on_table, rng)
+        if np.count_nonzero(measured) < FEWEST:
+            return None
+        frame = Frame(measured, self.sensor.intrinsics, believed, pixel_centre=0.5)
+        mask = inside_sphere(frame, self.object_frame.centre, REACH * self.object_frame.radius) & ~on_table
+        return replace(frame, mask=mask, pixel_centre=0.5) if np.count_nonzero(mask) >= FEWEST else None
+
+    def _scene(self, pose: Float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """True depth of object and table, metres, and which pixels show the table."""
+        inside = self._truth.pose_in_object(pose)
+        depth = self._camera.observe(inside).depth
+        (fx, _, cx), (_, fy, cy) = self.sensor.intrinsics[:2]
+        x = ((np.arange(self.sensor.width) + 0.5 - cx) / fx)[None, :, None]
+        y = ((np.arange(self.sensor.height) + 0.5 - cy) / fy)[:, None, None]
+        ray = x * inside[:3, 0] + y * inside[:3, 1] + inside[:3, 2]
+        height = inside[2, 3] - self._floor
+        falls = (ray[..., 2] < 0) & (height > 0)
+        along = np.where(falls, -height / np.where(falls, ray[..., 2], -1), np.inf)
+        with np.errstate(invalid="ignore"):
+            reach = np.hypot(*(inside[i, 3] + along * ray[..., i] for i in (0, 1)))
+        is_table = falls & (reach < TABLE) & (depth == 0)
+        return np.where(is_table, along, depth).astype(np.float32) * np.float32(self.sensor.radius), is_table
+
+    def _shaken(self, pose: Float, rng: np.random.Generator) -> Float:
+        """Where the camera really is."""
+        if not (self.sensor.turned or self.sensor.moved):
+            return pose
+        pose = pose.copy()
+        angles = rng.normal(0, self.sensor.turned, 3)
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(angles, degrees=True).as_matrix()
+        pose[:3, 3] += rng.normal(0, self.sensor.moved, 3)
+        return pose
+
+    def _wrong_frame(self) -> ObjectFrame:
+        """Where the robot takes the object to be."""
+        sensor, rng = self.sensor, self._rng.spawn(1)[0]
+        centre = rng.normal(0, sensor.centre * sensor.radius, 3)
+        radius = sensor.radius * np.exp(rng.normal(0, sensor.size))
+        lean = Rotation.from_rotvec([*rng.normal(0, sensor.tilt, 2), 0], degrees=True).as_matrix()
+        return ObjectFrame(centre, float(radius), lean)
+
+    def _cropped(
+        self, depth: NDArray[np.float32], mask: NDArray[np.bool_], rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """The picture without what lies beyond a line across the object, parallel to one of its borders."""
+        side, share = int(rng.integers(4)), float(rng.uniform(0, self.sensor.crop))
+        lines = np.flatnonzero(mask.any(axis=1 - side // 2))
+        if not len(lines):
+            return depth
+        hidden = round(share * (lines[-1] + 1 - lines[0]))
+        kept = np.arange(mask.shape[side // 2])
+        kept = kept >= lines[0] + hidden if side % 2 else kept <= lines[-1] - hidden
+        return np.where(kept[:, None] if side // 2 == 0 else kept, depth, np.float32(0))

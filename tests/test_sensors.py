@@ -1,0 +1,384 @@
+"""The sensor models against closed forms, against casting rays from the projector, and through the front door."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scenes import box, cast, pose_at
+from scipy.stats import norm
+
+import nextview
+from nextview import SimulatedCamera, ViewSphere
+from nextview.cameras.sensors import SENSORS, SensedCamera, Sensor, sensor_named
+from nextview.cameras.sensors.sensor import ERRORS
+from nextview.cli.main import main
+from nextview.data.rendering import render
+from nextview.data.samples import sample_mesh
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, UsageError
+from nextview.mesh import make_mesh
+
+SPHERE = ViewSphere.named("40")
+BALL = make_mesh(trimesh.creation.icosphere(4).vertices, trimesh.creation.icosphere(4).faces)
+REAL = [name for name in SENSORS if name != "none"]
+
+
+def rng(*seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def rays(sensor: Sensor) -> np.ndarray:
+    row, column = np.mgrid[: sensor.height, : sensor.width] + 0.5
+    return np.stack(
+        [(column - sensor.width / 2) / sensor.focal, (row - sensor.height / 2) / sensor.focal, 0 * row + 1], -1
+    )
+
+
+def plane(sensor: Sensor, distance: float, tilt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """A plane that crosses the optical axis at a distance, turned about y by degrees; depth, angles of incidence."""
+    normal = np.array([np.sin(np.radians(tilt)), 0, np.cos(np.radians(tilt))])
+    along = rays(sensor) @ normal
+    depth = np.where(along > 0, distance * normal[2] / np.where(along > 0, along, 1), 0)
+    depth[depth > 4 * distance] = 0
+    return depth.astype(np.float32), np.arccos(np.clip(along / np.linalg.norm(rays(sensor), axis=-1), -1, 1))
+
+
+def nguyen(z: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Nguyen, Izadi, Lovell 2012."""
+    return 0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(z) * angle**2 / (np.pi / 2 - angle) ** 2
+
+
+@pytest.mark.parametrize(("distance", "tilt"), [(0.6, 0), (1.0, 30), (2.0, 0), (3.0, 60), (1.0, 75)])
+@pytest.mark.parametrize("step", [0.0, 1 / 8])
+def test_axial_noise_of_a_kinect_is_the_published_one(distance, tilt, step):
+    sensor = replace(SENSORS["none"], axial=1.0, step=step)
+    depth, angle = plane(sensor, distance, tilt)
+    measured, _ = sensor.measure(depth, rng(1))
+    some = (depth > 0.5 * distance) & (depth < 1.5 * distance) & (angle < np.radians(79))
+    some[:2] = some[-2:] = some[:, :2] = some[:, -2:] = False
+    scaled = (measured[some] - depth[some]) / nguyen(depth[some], angle[some])
+    assert some.sum() > 20_000
+    assert scaled.std() == pytest.approx(1, abs=0.02 if step == 0 else 0.03)
+    assert abs(scaled.mean()) < 0.05
+
+
+@pytest.mark.parametrize("distance", [0.4, 1.0, 3.0])
+def test_stereo_noise_grows_with_the_square_of_the_distance(distance):
+    sensor = replace(SENSORS["none"], disparity=0.1, focal=424.0, baseline=0.05)
+    depth, _ = plane(sensor, distance)
+    measured, _ = sensor.measure(depth, rng(2))
+    assert (measured - depth).std() == pytest.approx(distance**2 * 0.1 / (424 * 0.05), rel=0.02)
+
+
+def test_plain_noise_is_in_metres():
+    depth, _ = plane(SENSORS["none"], 1.0)
+    measured, _ = replace(SENSORS["none"], noise=0.003).measure(depth, rng(3))
+    assert (measured - depth).std() == pytest.approx(0.003, rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["kinect", "stereo"])
+def test_disparity_comes_in_whole_steps(name):
+    sensor = SENSORS[name]
+    measured, _ = sensor.measure(plane(sensor, 1.5, 40)[0], rng(4))
+    steps = sensor.focal * sensor.baseline / measured[measured > 0].astype(float) / sensor.step
+    assert np.abs(steps - np.rint(steps)).max() < 0.01
+    assert len(np.unique(np.rint(steps))) > 20
+
+
+def test_neighbours_err_together_as_far_as_the_grain():
+    sensor = replace(SENSORS["none"], noise=0.001, grain=1.8)
+    depth, _ = plane(sensor, 1.0)
+    error = sensor.measure(depth, rng(5))[0].astype(float) - depth
+    for k in range(1, 7):
+        for a, b in ((error[k:], error[:-k]), (error[:, k:], error[:, :-k])):
+            assert (a * b).mean() / error.var() == pytest.approx(np.exp(-(k**2) / (4 * 1.8**2)), abs=0.03)
+    assert error.std() == pytest.approx(0.001, rel=0.05)
+
+
+def edge(sensor: Sensor, near: float = 0.8, far: float = 1.2) -> np.ndarray:
+    """The left half is near, the right half far."""
+    depth = np.full(sensor.shape, far, np.float32)
+    depth[:, : sensor.width // 2] = near
+    return depth
+
+
+def test_edges_move_by_the_published_pixels_and_planes_stay():
+    sensor = replace(SENSORS["none"], lateral=1.0)
+    measured, source = sensor.measure(edge(sensor), rng(6))
+    middle, rows = sensor.width // 2, sensor.height
+    assert np.abs(measured[:, :, None] - np.array([0.8, 1.2])).min(-1).max() < 1e-4
+    for k in (1, 2, 3):
+        for share in ((measured[:, middle - k] > 1).mean(), (measured[:, middle + k - 1] < 1).mean()):
+            expected = norm.sf((k - 0.5) / 0.8)
+            assert share == pytest.approx(expected, abs=4 * np.sqrt(expected / rows))
+    tilted, _ = plane(sensor, 1.0, 50)
+    np.testing.assert_allclose(sensor.measure(tilted, rng(7))[0][4:-4, 4:-4], tilted[4:-4, 4:-4], rtol=1e-3)
+    assert (source != np.arange(source.size).reshape(source.shape)).mean() > 0.5
+
+
+def test_flying_pixels_hang_between_the_two_surfaces_at_an_edge():
+    sensor = replace(SENSORS["none"], flying=0.4)
+    measured, source = sensor.measure(edge(sensor), rng(8))
+    middle = sensor.width // 2
+    beside = measured[:, middle - 1 : middle + 1]
+    flying = (beside > 0.8) & (beside < 1.2)
+    assert flying.mean() == pytest.approx(0.4, abs=4 * np.sqrt(0.24 / flying.size))
+    np.testing.assert_array_equal(source[:, middle - 1 : middle + 1] == -1, flying)
+    away = np.delete(measured, [middle - 1, middle], 1)
+    np.testing.assert_array_equal(away, np.delete(edge(sensor), [middle - 1, middle], 1))
+
+
+@pytest.mark.parametrize("tilt", [0, 60, 78, 84])
+@pytest.mark.parametrize("grain", [0.0, 1.8])
+def test_grazing_pixels_are_lost(tilt, grain):
+    sensor = replace(SENSORS["none"], grazing=0.3, grain=grain)
+    depth, angle = plane(sensor, 1.0, tilt)
+    some = depth > 0
+    some[:, :1] = some[:, -1:] = False
+    lost = (sensor.measure(depth, rng(9))[0] == 0)[some].mean()
+    assert lost == pytest.approx(np.maximum(0, 1 - np.cos(angle[some]) / 0.3).mean(), abs=0.01 if grain == 0 else 0.03)
+
+
+def box_before_wall(sensor: Sensor, left: int, right: int) -> np.ndarray:
+    depth = np.full(sensor.shape, 1.5, np.float32)
+    depth[100:300, left:right] = 0.75
+    return depth
+
+
+@pytest.mark.parametrize("baseline", [0.05, 0.075])
+def test_the_shadow_of_a_box_on_a_wall_has_the_width_that_geometry_says(baseline):
+    sensor = replace(SENSORS["none"], shadow=baseline)
+    width = sensor.focal * baseline * (1 / 0.75 - 1 / 1.5)  # of the shadow, pixels, on the side away from the projector
+    lost = sensor.measure(box_before_wall(sensor, 300, 400), rng(10))[0] == 0
+    assert not lost[:100].any()
+    assert not lost[300:].any()
+    np.testing.assert_allclose(lost[100:300].sum(1), width, atol=1)
+    assert lost[100:300, int(300 - width + 1) : 300].all()
+    assert not lost[:, 300:].any()
+
+
+def test_a_pole_thinner_than_its_shift_casts_a_shadow_of_its_own_width():
+    sensor = replace(SENSORS["none"], shadow=0.075)
+    shift = sensor.focal * 0.075 * (1 / 0.75 - 1 / 1.5)
+    lost = np.flatnonzero((sensor.measure(box_before_wall(sensor, 300, 306), rng(11))[0] == 0)[200])
+    assert shift > 20
+    assert len(lost) == pytest.approx(6, abs=1)
+    assert lost.min() == pytest.approx(300 - shift, abs=1)
+
+
+def test_shadows_are_where_rays_from_the_projector_do_not_arrive():
+    sensor = replace(SENSORS["none"], shadow=0.075)
+    things = [box((0.3, 0.06, 0.2), (0, 0, 0.2)), box((0.05, 0.05, 0.3), (-0.1, 0.15, 0.1)), box((2, 2, 0.02))]
+    things.append(trimesh.creation.icosphere(4, 0.08).apply_translation((0.15, -0.2, 0.15)))
+    pose = pose_at(35, 60, 1.0)
+    depth, _ = cast(things, pose, sensor.intrinsics, sensor.shape)
+    lost = sensor.measure(depth, rng(12))[0] == 0
+    scene = trimesh.util.concatenate(things)
+    points = (rays(sensor) * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+    projector = pose[:3, 3] + 0.075 * pose[:3, 0]
+    towards = projector - points.reshape(-1, 3)
+    length = np.linalg.norm(towards, axis=1)
+    starts = points.reshape(-1, 3) + 0.004 * towards / length[:, None]
+    hidden = scene.ray.intersects_any(starts, towards / length[:, None]).reshape(depth.shape) & (depth > 0)
+    lost &= depth > 0
+    assert hidden.sum() > 2000
+    differ = hidden != lost
+    assert (differ & hidden).sum() < 0.1 * hidden.sum()
+    assert (differ & lost).sum() < 0.1 * hidden.sum()
+    # They differ at borders only: nothing is left of it after one pixel is taken off all around.
+    inner = differ[1:-1, 1:-1] & differ[:-2, 1:-1] & differ[2:, 1:-1] & differ[1:-1, :-2] & differ[1:-1, 2:]
+    assert inner.sum() < 0.005 * hidden.sum()
+
+
+@pytest.mark.parametrize("grain", [0.0, 2.5])
+def test_the_share_of_holes(grain):
+    sensor = replace(SENSORS["none"], holes=0.2, grain=grain)
+    lost = sensor.measure(plane(sensor, 1.0)[0], rng(13))[0] == 0
+    assert lost.mean() == pytest.approx(0.2, abs=0.02)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_no_strength_no_error_to_the_bit(name):
+    sensor = SENSORS[name].scaled(0)
+    depth, _ = plane(sensor, 1.0, 30)
+    depth[200:220, 300:340] = 0
+    measured, source = sensor.measure(depth, rng(14))
+    np.testing.assert_array_equal(measured, depth)
+    np.testing.assert_array_equal(source.ravel(), np.arange(depth.size))
+    ideal = replace(SENSORS["none"], **{n: getattr(sensor, n) for n in ("height", "width", "focal")})
+    views = [SensedCamera(sample_mesh("chair"), s, rng(15)).observe(SPHERE.poses[20]) for s in (sensor, ideal)]
+    np.testing.assert_array_equal(views[0].depth, views[1].depth)
+    np.testing.assert_array_equal(views[0].pose, views[1].pose)
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_same_seed_same_frames(name):
+    mesh = sample_mesh("table")
+
+    def frames(seed: int) -> list[np.ndarray]:
+        camera = SensedCamera(mesh, name, rng(seed))
+        return [camera.observe(SPHERE.poses[view]).depth for view in (3, 17)]
+
+    for a, b in zip(frames(0), frames(0), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(frames(0)[0], frames(1)[0])
+
+
+@pytest.mark.parametrize(
+    "error", [e for e in ERRORS if e not in ("centre", "size", "tilt", "table", "crop", "turned", "moved")]
+)
+def test_stronger_is_noisier(error):
+    sensor = replace(
+        SENSORS["none"], **{error: getattr(SENSORS["kinect"], error) or getattr(SENSORS["stereo"], error) or 0.002}
+    )
+    depth, _ = plane(sensor, 1.0, 74)
+    depth[200:280, 300:380] = np.minimum(depth[200:280, 300:380], 0.7)
+    wrong = []
+    for strength in (0, 0.5, 1, 2):
+        measured, _ = sensor.scaled(strength).measure(depth, rng(16))
+        wrong.append(np.minimum(np.abs(measured - depth), 0.5).sum())
+    assert wrong[0] == 0
+    assert all(np.diff(wrong) > 0)
+
+
+def test_a_sensor_without_errors_sees_the_ball_and_not_the_table():
+    camera = SensedCamera(BALL, "none", rng(17))
+    frame = camera.frame(SPHERE.poses[20])
+    rows, columns = np.nonzero(frame.mask)
+    on = np.linalg.norm(frame.positions(rows, columns), axis=1)
+    np.testing.assert_allclose(on, 0.12, rtol=0.01)
+    rows, columns = np.nonzero((frame.depth > 0) & ~frame.mask)
+    np.testing.assert_allclose(frame.positions(rows, columns)[:, 2], -0.12, atol=1e-4)
+    clean = SimulatedCamera(BALL).observe(SPHERE.poses[20])
+    seen = camera.observe(SPHERE.poses[20])
+    assert ((seen.depth > 0) != (clean.depth > 0)).mean() < 0.02
+    both = (seen.depth > 0) & (clean.depth > 0)
+    assert np.median(np.abs(seen.depth - clean.depth)[both]) < 0.005
+
+
+def test_errors_of_the_object_frame_have_their_strength():
+    sensor = replace(SENSORS["none"], centre=0.1, size=0.2, tilt=3.0)
+    frames = [SensedCamera(sample_mesh("table"), sensor, rng(18, i)).object_frame for i in range(400)]
+    assert np.std([f.centre / 0.12 for f in frames]) == pytest.approx(0.1, rel=0.12)
+    assert np.std([np.log(f.radius / 0.12) for f in frames]) == pytest.approx(0.2, rel=0.15)
+    lean = [np.arccos(f.axes[2, 2]) ** 2 for f in frames]  # of two axes
+    assert np.degrees(np.sqrt(np.mean(lean))) == pytest.approx(3 * np.sqrt(2), rel=0.15)
+
+
+def test_the_camera_is_not_where_it_believes_to_be():
+    sensor = replace(SENSORS["none"], moved=0.01)
+    camera = SensedCamera(BALL, sensor, rng(19))
+    off = []
+    for view in range(40):
+        frame = camera.frame(SPHERE.poses[view])
+        points = frame.positions(*np.nonzero(frame.mask))
+        a = np.c_[2 * points, np.ones(len(points))]
+        off.append(np.linalg.lstsq(a, (points**2).sum(1), rcond=None)[0][:3])  # centre of the ball as it is seen
+    assert np.std(off) == pytest.approx(0.01, rel=0.25)
+
+
+def test_part_of_the_table_is_left_in_and_part_of_the_object_cut_off():
+    mesh = sample_mesh("table")
+    exact = SensedCamera(mesh, "none", rng(20)).frame(SPHERE.poses[20])
+    around = SensedCamera(mesh, replace(SENSORS["none"], table=1.0), rng(20)).frame(SPHERE.poses[20])
+    left = SensedCamera(mesh, replace(SENSORS["none"], table=0.3), rng(20)).frame(SPHERE.poses[20])
+    extra = [(frame.mask & ~exact.mask).sum() for frame in (around, left)]
+    assert extra[1] == pytest.approx(0.3 * extra[0], rel=0.4)
+    camera = SensedCamera(mesh, replace(SENSORS["none"], crop=0.5), rng(21))
+    kept = [camera.frame(SPHERE.poses[20]).mask.sum() / exact.mask.sum() for _ in range(20)]
+    assert 0.3 < min(kept) < 0.75 < max(kept) <= 1
+
+
+def test_size_is_told_only_where_it_is_known():
+    mesh = sample_mesh("chair")
+    assert SensedCamera(mesh, "kinect", rng(22)).observe(SPHERE.poses[9]).radius is None
+    known = replace(mesh, unit="m")
+    wrong = SensedCamera(known, replace(SENSORS["none"], size=0.1), rng(22))
+    expected = known.metres * wrong.object_frame.radius / 0.12
+    assert wrong.observe(SPHERE.poses[9]).radius == pytest.approx(expected)
+
+
+def test_a_sensor_that_measures_nothing_sees_nothing():
+    blind = SensedCamera(sample_mesh("chair"), replace(SENSORS["none"], holes=1.0), rng(23))
+    assert blind.frame(SPHERE.poses[5]) is None
+    seen = blind.observe(SPHERE.poses[5])
+    assert not seen.seen
+    np.testing.assert_allclose(seen.pose, SPHERE.poses[5], atol=1e-12)
+
+
+@pytest.mark.parametrize("text", ["kinekt", "kinect:", "kinect:x", "kinect:-1", "kinect:inf", "kinect:nan", ""])
+def test_what_is_no_sensor_is_refused(text):
+    with pytest.raises(UsageError, match="sensor"):
+        sensor_named(text)
+
+
+def test_numbers_that_no_sensor_has_are_refused():
+    for wrong in ({"axial": -1}, {"holes": np.nan}, {"focal": 0}, {"distance": 0.1}):
+        with pytest.raises(UsageError, match="sensor none"):
+            replace(SENSORS["none"], **wrong)
+    assert sensor_named("wrist:0.5").table == SENSORS["wrist"].table / 2
+    assert sensor_named("wrist:1") == SENSORS["wrist"]
+
+
+def test_recognise_through_a_sensor_by_python_and_command_line(tmp_path, capsys):
+    path = tmp_path / "chair.off"
+    mesh = sample_mesh("chair")
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
+    system = nextview.load()
+    results = [system.recognise(path, 3, 5, sensor=sensor) for sensor in ("wrist:2", sensor_named("wrist:2"))]
+    main(["recognise", str(path), "--sensor", "wrist:2", "--start", "3", "--seed", "5", "--json"])
+    printed = json.loads(capsys.readouterr().out)
+    assert results[0].answer == results[1].answer == printed["answer"]
+    assert results[0].confidence == results[1].confidence
+    assert printed["views"][0]["belief"][results[0].answer] == pytest.approx(results[0].views[0].belief.max(), abs=1e-4)
+    assert results[0].views[0].belief.max() != system.recognise(path, 3, 5).views[0].belief.max()
+    with pytest.raises(UsageError, match="sensor is for meshes"):
+        system.recognise(SimulatedCamera(mesh), sensor="kinect")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("meshes")
+    for i, mesh in enumerate(
+        (trimesh.creation.box((1, 2, 1)), trimesh.creation.icosphere(2), trimesh.creation.cone(1, 2))
+    ):
+        path = folder / "thing" / "train" / f"thing_{i}.off"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mesh.export(path)
+    return folder
+
+
+FEW = ViewSphere((20.0,), 3)
+
+
+def test_a_store_of_a_sensor_resumes_to_the_bit_and_with_no_other(dataset, tmp_path, capsys):
+    whole, resumed = tmp_path / "whole.zarr", tmp_path / "resumed.zarr"
+    list(render(dataset, whole, FEW, workers=0, sensor="wrist:2"))
+    begun = render(dataset, resumed, FEW, workers=0, sensor="wrist:2")
+    next(begun)
+    begun.close()
+    assert int(ViewStore.open(resumed).done.sum()) == 1
+    for other, words in (("wrist", "through the sensor wrist:2.*through wrist"), (None, "cannot go on without one")):
+        with pytest.raises(DatasetError, match=words):
+            list(render(dataset, resumed, FEW, workers=0, sensor=other))
+    list(render(dataset, resumed, FEW, workers=2, sensor="wrist:2"))
+    a, b = ViewStore.open(whole), ViewStore.open(resumed)
+    assert b.group.attrs["sensor"] == sensor_named("wrist:2").to_dict()
+    assert "--sensor wrist:2" in b.commands[0]
+    for name in ("image", "depth", "points", "digest", "measures/depth_entropy"):
+        np.testing.assert_array_equal(a.group[name][:], b.group[name][:], err_msg=name)
+    clean = tmp_path / "clean.zarr"
+    list(render(dataset, clean, FEW, workers=0))
+    assert "sensor" not in ViewStore.open(clean).group.attrs
+    with pytest.raises(DatasetError, match="begun without a sensor"):
+        list(render(dataset, clean, FEW, workers=0, sensor="wrist:2"))
+
+
+def test_a_store_of_a_sensor_has_the_size_that_sensing_gives(dataset, tmp_path):
+    with pytest.raises(UsageError, match="224 pixels"):
+        list(render(dataset, tmp_path / "a.zarr", FEW, 64, sensor="kinect"))
+    with pytest.raises(UsageError, match="no sensor is called"):
+        list(render(dataset, tmp_path / "a.zarr", FEW, sensor="kinekt"))
+    assert not (tmp_path / "a.zarr").exists()
