@@ -15,7 +15,7 @@ from nextview.errors import SessionError
 from nextview.models.inference import Models
 from nextview.observation import Camera, Observation
 from nextview.policies.base import Policy, ValuesViews, maps_among
-from nextview.viewsphere import ViewSphere
+from nextview.viewsphere import ViewSphere, degrees_between
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,6 +38,7 @@ class View:
             (classes, azimuth bins), in even steps; None if the recogniser was not taught them.
         values: what the policy valued each candidate view at, (V,) float64, NaN for those that it did not consider;
             None where the episode ends, and for policies that value nothing.
+        degrees_off: angle at the object between the candidate viewpoint and where the observation was taken from.
     """
 
     index: int
@@ -50,6 +51,7 @@ class View:
     arc: float
     azimuth_bins: NDArray[np.float64] | None = None
     values: NDArray[np.float64] | None = None
+    degrees_off: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -201,6 +203,7 @@ class Session:
             arc,
             None if azimuth_bins is None else azimuth_bins[0],
             self._values(step),
+            degrees_between(self.sphere.directions[here], observation.pose[:3, 3]),
         )
         self.views.append(view)
         return view

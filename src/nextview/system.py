@@ -8,15 +8,16 @@ chair (belief 0.998, 2 views, 1.41 cells of travel, confident)
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nextview.belief import Stopping
-from nextview.errors import ModelError, OtherUseError
+from nextview.errors import ModelError, NoViewLeftError, OtherUseError, UsageError
 from nextview.mesh import Mesh, load_mesh
 from nextview.models.collection import find_models
 from nextview.models.inference import MapNetwork, Models, Recogniser
@@ -76,28 +77,32 @@ class System:
         what: str | Path | Mesh | Camera,
         start: int | None = None,
         seed: int = 0,
-        up: str | None = None,
+        up: str | ArrayLike | None = None,
         unit: str | None = None,
     ) -> Recognition:
         """Look at an object until it is clear what it is, or the views run out.
 
         Args:
-            what: a mesh file (OFF, OBJ, PLY, STL or GLB), a mesh, or a camera: anything with ``observe(pose)``.
+            what: a mesh file (OFF, OBJ, PLY, STL or GLB), a mesh, a folder of captured views (see
+                ``nextview.cameras.captured``), or a camera: anything with ``observe(pose)``.
             start: the first view, an index of ``sphere``; drawn by the seed if not given.
             seed: decides the first view and whatever the policy draws.
-            up: the up axis of a file, "y" or "z"; z if not given, but y for GLB.
+            up: the up axis of a mesh file, "y" or "z"; z if not given, but y for GLB. Of a folder, the direction
+                against gravity in its world, (3,); by default as its layout has it.
             unit: the unit of length of a file, one of ``mesh.UNITS``, if it is known: size says something of the class.
 
         Raises:
             MeshError: the file cannot be used.
+            DatasetError: the folder, or an image in it, cannot be used.
+            ObservationError: the object is found in none of the captured views.
         """
         if isinstance(what, str | Path):
-            what = load_mesh(what, up, unit)
+            what = _camera_of(Path(what), up) if Path(what).is_dir() else load_mesh(what, up, unit)
         if isinstance(what, Mesh):
             from nextview.cameras.simulated import SimulatedCamera
 
             what = SimulatedCamera(what)
-        return self.session(start, seed).run(what)
+        return run(self.session(start, seed), what)
 
     def __repr__(self) -> str:
         name, views = self.models.recogniser.card.name, len(self.sphere)
@@ -154,6 +159,31 @@ def load(
         made = make_policy(policy, sphere, opened.valley_classes(policy), recogniser.classes)
     stopping = Stopping.of(recogniser.calibration, threshold, risk, max_views)
     return System(opened, made, policy, sphere, stopping, given)
+
+
+def run(session: Session, camera: Camera) -> Recognition:
+    """Go on with a camera to the end of a session, or until the camera has no view left to offer.
+
+    Raises:
+        NoViewLeftError: the camera has not a single one.
+    """
+    try:
+        return session.run(camera)
+    except NoViewLeftError:
+        if not session.views:
+            raise
+    last = replace(session.views[-1], next_view=None, values=None)
+    views = (*session.views[:-1], last)
+    return Recognition(views, session.models.classes, False, session.sphere, session.stopping)
+
+
+def _camera_of(folder: Path, up: ArrayLike | None) -> Camera:
+    from nextview.cameras.captured import read_capture
+    from nextview.cameras.captured_camera import UP, CapturedCamera
+
+    if isinstance(up, str) and up not in UP:
+        raise UsageError(f"{folder}: up is {', '.join(UP)} or a direction, three numbers, not {up!r}")
+    return CapturedCamera(read_capture(folder), UP[up] if isinstance(up, str) else up)
 
 
 def _default_policy(own: dict[str, Path], sphere: ViewSphere, recogniser: Recogniser) -> tuple[str, Policy]:

@@ -45,6 +45,12 @@ def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = D
     return pose
 
 
+def degrees_between(a: Float, b: Float) -> float:
+    """The angle between two directions, (3,) of any length, degrees."""
+    # arctan2 keeps its precision for equal and for opposite directions, where arccos loses half the digits.
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
 def _fixed(array: NDArray) -> NDArray:
     array.flags.writeable = False
     return array

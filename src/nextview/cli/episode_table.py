@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import numpy as np
 from rich import box
@@ -20,8 +21,8 @@ def _angles(sphere: ViewSphere, view: int) -> str:
     return f"{view}\n{elevation:.0f}°, {azimuth:.0f}°"
 
 
-def print_episode(result: Recognition, name: str, policy: str) -> None:
-    """Print each view and the answer."""
+def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[str] = ()) -> None:
+    """Print each view and the answer; of captured views, which frame answered and how far off it was."""
     sphere = result.sphere
     table = Table(
         box=box.SIMPLE,
@@ -31,7 +32,8 @@ def print_episode(result: Recognition, name: str, policy: str) -> None:
         title=f"Looking at {name}, next views by {policy}",
         caption=f"view: number, elevation, azimuth; travel: grid cells; stops at {result.stopping}",
     )
-    for column in ("step", "view", "this view alone", "belief, top 3", "stops at", "next", "travel"):
+    captured = ["captured"] if frames else []
+    for column in ("step", "view", *captured, "this view alone", "belief, top 3", "stops at", "next", "travel"):
         table.add_column(column, justify="right" if column in ("step", "travel") else "left", no_wrap=True)
     for step, view in enumerate(result.views, 1):
         top = np.argsort(-view.belief)[:3]
@@ -39,6 +41,7 @@ def print_episode(result: Recognition, name: str, policy: str) -> None:
         table.add_row(
             str(step),
             _angles(sphere, view.index),
+            *([f"{frames[step - 1]}\n{view.degrees_off:.0f}° off"] if frames else []),
             f"{result.classes[own]}\n{view.alone[own]:.3f}" if view.observation.seen else "nothing\nis seen",
             "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top),
             f"{float(result.stopping.threshold_at(step)):.2f}",
@@ -55,7 +58,7 @@ def print_episode(result: Recognition, name: str, policy: str) -> None:
     console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), rest))
 
 
-def as_json(result: Recognition) -> str:
+def as_json(result: Recognition, frames: Sequence[str] = ()) -> str:
     """Everything the table shows, and the whole beliefs and maps, as one JSON object."""
 
     sphere = result.sphere
@@ -75,6 +78,8 @@ def as_json(result: Recognition) -> str:
                 "view": view.index,
                 "elevation": sphere.angles(view.index)[0],
                 "azimuth": sphere.angles(view.index)[1],
+                "degrees_off": round(view.degrees_off, 6),
+                **({"frame": frames[step - 1]} if frames else {}),
                 "seen": view.observation.seen,
                 "alone": dict(zip(result.classes, rounded(view.alone), strict=True)),
                 "belief": dict(zip(result.classes, rounded(view.belief), strict=True)),
