@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from nextview.belief import Stopping
-from nextview.errors import ModelError, NoViewLeftError, OtherUseError, UsageError
+from nextview.errors import MeshError, ModelError, NoViewLeftError, OtherUseError, UsageError
 from nextview.mesh import Mesh, load_mesh
 from nextview.models.collection import find_models
 from nextview.models.inference import MapNetwork, Models, Recogniser
@@ -77,7 +76,7 @@ class System:
         what: str | Path | Mesh | Camera,
         start: int | None = None,
         seed: int = 0,
-        up: str | ArrayLike | None = None,
+        up: str | tuple[float, float, float] | None = None,
         unit: str | None = None,
     ) -> Recognition:
         """Look at an object until it is clear what it is, or the views run out.
@@ -97,7 +96,12 @@ class System:
             ObservationError: the object is found in none of the captured views.
         """
         if isinstance(what, str | Path):
-            what = _camera_of(Path(what), up) if Path(what).is_dir() else load_mesh(what, up, unit)
+            if Path(what).is_dir():
+                what = _camera_of(Path(what), up)
+            elif up is None or isinstance(up, str):
+                what = load_mesh(what, up, unit)
+            else:
+                raise MeshError(f"{what}: the up axis of a mesh file is y or z, not {up}")
         if isinstance(what, Mesh):
             from nextview.cameras.simulated import SimulatedCamera
 
@@ -177,7 +181,7 @@ def run(session: Session, camera: Camera) -> Recognition:
     return Recognition(views, session.models.classes, False, session.sphere, session.stopping)
 
 
-def _camera_of(folder: Path, up: ArrayLike | None) -> Camera:
+def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> Camera:
     from nextview.cameras.captured import read_capture
     from nextview.cameras.captured_camera import UP, CapturedCamera
 

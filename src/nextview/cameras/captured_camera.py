@@ -39,8 +39,9 @@ class CapturedCamera:
     """Answers each request with the captured view that is nearest in direction, as seen from the object, and unused.
 
     The object is found by the masks of the folder, unless a point or a box is given. Where it is has to be known before
-    any view is asked for: from the box; else about, from the first frame in which it is found. Views whose picture does not hold the object's centre come last. A view that turns out not to show the
-    object is left out, and the next nearest answers.
+    any view is asked for: from the box; else about, from the first frame in which it is found. Views whose picture does
+    not hold the object's centre come last. A view that turns out not to show the object is left out, and the next
+    nearest answers.
 
     Args:
         capture: the views.

@@ -21,13 +21,8 @@ def demo(
     from nextview.cli.recognise import show
     from nextview.data.samples import sample_mesh
 
-    show(
-        lambda: SimulatedCamera(sample_mesh(shape)),
-        f"the sample {shape}",
-        "modelnet10",
-        {},
-        start,
-        seed=0,
-        figure=figure,
-    )
+    def camera() -> SimulatedCamera:
+        return SimulatedCamera(sample_mesh(shape))
+
+    show(camera, f"the sample {shape}", "modelnet10", {}, start, seed=0, figure=figure)
     console.print(f"The picture is in {figure}; now try your own: nextview recognise MESH --figure out.png")

@@ -32,16 +32,16 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
         title=f"Looking at {name}, next views by {policy}",
         caption=f"view: number, elevation, azimuth; travel: grid cells; stops at {result.stopping}",
     )
-    captured = ["captured"] if frames else []
-    for column in ("step", "view", *captured, "this view alone", "belief, top 3", "stops at", "next", "travel"):
+    for column in ("step", "view", "this view alone", "belief, top 3", "stops at", "next", "travel"):
         table.add_column(column, justify="right" if column in ("step", "travel") else "left", no_wrap=True)
+    if frames:
+        table.columns[1].no_wrap, table.columns[1].max_width = False, 12
     for step, view in enumerate(result.views, 1):
         top = np.argsort(-view.belief)[:3]
         own = int(view.alone.argmax())
         table.add_row(
             str(step),
-            _angles(sphere, view.index),
-            *([f"{frames[step - 1]}\n{view.degrees_off:.0f}° off"] if frames else []),
+            _angles(sphere, view.index) + (f"\n{frames[step - 1]}\n{view.degrees_off:.1f}° off" if frames else ""),
             f"{result.classes[own]}\n{view.alone[own]:.3f}" if view.observation.seen else "nothing\nis seen",
             "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top),
             f"{float(result.stopping.threshold_at(step)):.2f}",
