@@ -95,10 +95,10 @@ def _open(path: Path, formats: tuple[str, ...], load: bool = True) -> Image.Imag
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            image = Image.open(path, formats=formats)
-            if load:
-                image.load()
-            return image
+            with Image.open(path, formats=formats) as image:
+                if load:
+                    image.load()
+                return image  # its file is closed, its pixels stay
     except FileNotFoundError:
         raise DatasetError(f"{path}: there is no such file") from None
     except Image.UnidentifiedImageError:

@@ -38,5 +38,6 @@ def read_seven_scenes(folder: Path, intrinsics: NDArray[np.float64] | None) -> t
         name = depth.name.removesuffix(".depth.png")
         path, mask = folder / f"{name}.pose.txt", folder / f"{name}.mask.png"
         pose = rigid(read_numbers(path, "the camera's pose", (4, 4)), str(path))
-        frames.append(CapturedFrame(name, depth, MILLIMETRES, intrinsics, pose, mask if mask.exists() else None))
+        number = name.removeprefix("frame-")
+        frames.append(CapturedFrame(number, depth, MILLIMETRES, intrinsics, pose, mask if mask.exists() else None))
     return frames, notes

@@ -34,8 +34,9 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
     )
     for column in ("step", "view", "this view alone", "belief, top 3", "stops at", "next", "travel"):
         table.add_column(column, justify="right" if column in ("step", "travel") else "left", no_wrap=True)
-    if frames:
-        table.columns[1].no_wrap, table.columns[1].max_width = False, 12
+    if frames:  # their names may be long
+        table.columns[1].no_wrap, table.columns[1].overflow = False, "fold"
+        table.columns[1].min_width, table.columns[1].max_width = 9, 12
     for step, view in enumerate(result.views, 1):
         top = np.argsort(-view.belief)[:3]
         own = int(view.alone.argmax())
