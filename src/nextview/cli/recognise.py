@@ -180,7 +180,7 @@ def show(
     watch.lap("thinking")
     if result.answer is None:
         raise ObservationError(
-            f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.views)} views; "
+            f"{name}: there is no answer, for nothing of it is seen from any of {len(result.views)} views; "
             "is it made of a few small parts far apart?"
         )
     frames = [taken.frame.name for taken in getattr(camera, "taken", ())]
