@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -308,6 +309,18 @@ def test_which_object_is_meant(how, captures, capsys):
     options = ["--point", "0.1", "-0.1", "0.4"] if how == "point" else ["--up", "z", "--box", *numbers]
     main(["recognise", str(captures / "7scenes"), "--start", "3", "--json", *options])
     assert json.loads(capsys.readouterr().out)["answer"] == "chair"
+
+
+def test_the_section_of_the_guide_runs(tmp_path, monkeypatch, capsys):
+    root = Path(__file__).parent.parent
+    section = (root / "docs" / "your_camera.md").read_text().split("## Captured images\n")[1].split("\n## ")[0]
+    shutil.copytree(root / "samples", tmp_path / "samples")
+    monkeypatch.chdir(tmp_path)
+    for line in re.search(r"```sh\n(.*?)```", section, re.S)[1].splitlines():
+        main(line.partition("#")[0].split()[1:])
+    assert "It is a chair" in capsys.readouterr().out
+    exec(re.search(r"```python\n(.*?)```", section, re.S)[1], {"nextview": nextview})
+    assert "chair (belief" in capsys.readouterr().out
 
 
 # What is wrong is said in one sentence
