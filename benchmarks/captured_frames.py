@@ -40,9 +40,8 @@ def main(
             continue
         answer = recogniser.classes[int(recogniser([seen]).logits.argmax())]
         rows.append((seen.visible, answer))
-    print(
-        f"{len(rows)} of {len(capture.frames)} frames show it\n\n| pixels | frames | {label} | others |\n|---|---|---|---|"
-    )
+    print(f"{len(rows)} of {len(capture.frames)} frames show it\n")
+    print(f"| pixels | frames | {label} | others |\n|---|---|---|---|")
     visible, answers = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
     for least in LEAST:
         here = answers[visible >= least]
