@@ -27,6 +27,10 @@ class ObservationError(NextviewError):
     """What a camera gave cannot be taken for a view of an object."""
 
 
+class NoViewLeftError(ObservationError):
+    """A camera that cannot go everywhere has no view left to offer."""
+
+
 class SessionError(NextviewError):
     """A session is asked for what it cannot do: it has ended, has not ended yet, or lacks what its policy needs."""
 

@@ -57,6 +57,18 @@ def check_file(path: Path) -> None:
         raise ResultsError(f"{path}: is a folder; give the name of a file")
 
 
+def check_new_folder(folder: Path) -> None:
+    """See, before any work is done, that a new folder can be written with ``written_whole``; nothing is touched.
+
+    Raises:
+        ResultsError: ``folder`` is a link or a file, holds something, lies below a file, or cannot be written.
+    """
+    _check_place(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        what = "holds something already" if folder.is_dir() else "is a file"
+        raise ResultsError(f"{folder}: {what}; give the name of a new folder")
+
+
 @contextmanager
 def written_results(folder: Path, kind: str) -> Iterator[Path]:
     """A new folder to write results into, which then takes the place of ``folder``.

@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nextview.belief import Stopping, fuse
 from nextview.episode import Episodes, Step
-from nextview.errors import SessionError, UsageError
+from nextview.errors import NoViewLeftError, ObservationError, SessionError, UsageError
 from nextview.models.inference import Models
 from nextview.observation import Camera, Observation
 from nextview.policies.base import EpisodeState, Evidence, Policy, ValuesViews, maps_among, travel_from
@@ -37,6 +37,28 @@ CONTRADICTABLE = 3
 """Views before the last with whose geometry it is compared."""
 
 
+@runtime_checkable
+class FrameCamera(Protocol):
+    """A camera in the world, with what it is to look at: it gives frames, and need not be where it was asked to be."""
+
+    @property
+    def object(self) -> ObservedObject:
+        """The object that it is to look at."""
+        ...
+
+    def observe(self, pose: Float) -> Frame:
+        """Look from a pose in the object frame, object radii, or from near it.
+
+        Raises:
+            NoViewLeftError: there is no view left to offer.
+        """
+        ...
+
+    def refused(self, error: ObservationError) -> None:
+        """The object is not found in the last frame. Returns if there may be another one; else raises the error."""
+        ...
+
+
 @dataclass(frozen=True)
 class View:
     """One view and what followed from it.
@@ -56,6 +78,8 @@ class View:
         values: what the policy valued each candidate view at, (V,) float64, NaN for those that it did not consider;
             None where the episode ends, and for policies that value nothing.
         doubts: what is likely to be wrong with the view though it was taken in; usually nothing.
+        degrees_off: angle at the object between the view that was asked for and where the camera stood; 0 for the first
+            frame of a camera in the world, which begins where it stands.
     """
 
     index: int
@@ -70,6 +94,7 @@ class View:
     azimuth_bins: NDArray[np.float64] | None = None
     values: NDArray[np.float64] | None = None
     doubts: tuple[Doubt, ...] = ()
+    degrees_off: float = 0.0
 
     @property
     def angles(self) -> tuple[float, float]:
@@ -442,6 +467,7 @@ class Session:
     def _take(self, observations: Sequence[Observation], doubts: Sequence[Doubt], here: Float) -> View:
         """Take in the last of some observations, and whichever of the others has changed."""
         last, self._here = len(observations) - 1, here
+        asked = self.sphere.directions[self.view] if self.views or self.object is None or self.object.known else None
         changed = [k for k in range(last) if observations[k] is not self.views[k].observation] + [last]
         evidence, new = (
             [*self._evidence, Evidence(np.zeros((1, 1)))],
@@ -463,7 +489,9 @@ class Session:
             seen = self._view(episodes.steps[k], observations[k], directions[k], travel[k])
             if k < last:
                 was = views[k]
-                views[k] = replace(seen, next_view=was.next_view, values=was.values, doubts=was.doubts)
+                views[k] = replace(
+                    seen, next_view=was.next_view, values=was.values, doubts=was.doubts, degrees_off=was.degrees_off
+                )
             else:
                 views.append(
                     replace(
@@ -471,6 +499,7 @@ class Session:
                         next_view=None if to < 0 else to,
                         values=self._values(step, to < 0),
                         doubts=tuple(doubts),
+                        degrees_off=0.0 if asked is None else float(np.degrees(angle_between(asked, directions[k]))),
                     )
                 )
         self._episodes, self._evidence, self.views = episodes, evidence, views
@@ -523,10 +552,32 @@ class Session:
             self._rng.bit_generator.state = drawn
             raise
 
-    def run(self, camera: Camera) -> Recognition:
-        """Go on to the end with a camera that goes where it is told."""
+    def run(self, camera: Camera | FrameCamera, lap: Callable[[str], None] = lambda done: None) -> Recognition:
+        """Go on to the end with a camera that goes where it is told, or to where the camera has no view left to offer.
+
+        Args:
+            camera: looks.
+            lap: is told what was done, "looking" or "thinking", whenever it is: to time it.
+
+        Raises:
+            ObservationError: the camera gives what cannot be used, or has not a single view (``NoViewLeftError``).
+        """
         while not self.done:
-            self.update(camera.observe(self.pose))
+            try:
+                seen = camera.observe(self.pose)
+            except NoViewLeftError:
+                if not self.views:
+                    raise
+                self.reachable = np.zeros(len(self.sphere), bool)
+                break
+            lap("looking")
+            try:
+                self.update(seen)
+            except ObservationError as error:
+                if not isinstance(camera, FrameCamera):
+                    raise
+                camera.refused(error)
+            lap("thinking")
         return self.result
 
     def _values(self, step: Step, ended: bool) -> Float | None:

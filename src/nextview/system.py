@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nextview.belief import Stopping
-from nextview.errors import ModelError, OtherUseError, PolicyError, UsageError
+from nextview.errors import MeshError, ModelError, OtherUseError, PolicyError, UsageError
 from nextview.mesh import Mesh, load_mesh
 from nextview.models.collection import find_models
 from nextview.models.inference import MapNetwork, Models, Recogniser
@@ -25,10 +25,11 @@ from nextview.observation import Camera
 from nextview.policies.base import Policy, maps_among
 from nextview.policies.maps import MapPeak
 from nextview.policies.registry import make_policy_anywhere
-from nextview.session import Recognition, Session
+from nextview.session import FrameCamera, Recognition, Session
 from nextview.viewsphere import LAYOUTS, Viewpoints, ViewSphere, viewpoints_of
 
 if TYPE_CHECKING:
+    from nextview.cameras.captured_camera import CapturedCamera
     from nextview.cameras.sensors import Sensor
     from nextview.sensing.observed_object import ObservedObject
 
@@ -88,22 +89,28 @@ class System:
         first = drawn if start is None else start
         return Session(self.models, self.policy, self.sphere, first, self.stopping, rng, object, distance)
 
+    def session_with(self, camera: Camera | FrameCamera, start: int | None = None, seed: int = 0) -> Session:
+        """A session for a camera that ``Session.run`` is to go on with: of one in the world, for its object."""
+        return self.session(start, seed, camera.object if isinstance(camera, FrameCamera) else None)
+
     def recognise(
         self,
-        what: str | Path | Mesh | Camera,
+        what: str | Path | Mesh | Camera | FrameCamera,
         start: int | None = None,
         seed: int = 0,
-        up: str | None = None,
+        up: str | tuple[float, float, float] | None = None,
         unit: str | None = None,
         sensor: str | Sensor | None = None,
     ) -> Recognition:
         """Look at an object until it is clear what it is, or the views run out.
 
         Args:
-            what: a mesh file (OFF, OBJ, PLY, STL or GLB), a mesh, or a camera: anything with ``observe(pose)``.
+            what: a mesh file (OFF, OBJ, PLY, STL or GLB), a mesh, a folder of captured views (see
+                ``nextview.cameras.captured``), or a camera: anything with ``observe(pose)``.
             start: the first view, an index of ``sphere``; drawn by the seed if not given.
             seed: decides the first view and whatever the policy draws.
-            up: the up axis of a file, "y" or "z"; z if not given, but y for GLB.
+            up: the up axis of a mesh file, "y" or "z"; z if not given, but y for GLB. Of a folder, the direction
+                against gravity in its world, (3,); by default as its layout has it.
             unit: the unit of length of a file, one of ``mesh.UNITS``, if it is known: size says something of the class.
             sensor: look at a mesh through this one, or through NAME or NAME:STRENGTH of ``cameras.sensors.SENSORS``;
                 its errors are drawn by the seed. None for clean renders.
@@ -111,14 +118,21 @@ class System:
         Raises:
             MeshError: the file cannot be used.
             UsageError: there is no such sensor, or it is asked for before a camera.
+            DatasetError: the folder, or an image in it, cannot be used.
+            ObservationError: the object is found in none of the captured views.
         """
         if isinstance(what, str | Path):
-            what = load_mesh(what, up, unit)
+            if Path(what).is_dir():
+                what = _camera_of(Path(what), up)
+            elif up is None or isinstance(up, str):
+                what = load_mesh(what, up, unit)
+            else:
+                raise MeshError(f"{what}: the up axis of a mesh file is y or z, not {up}")
         if isinstance(what, Mesh):
             what = simulated(what, sensor, seed)
         elif sensor is not None:
             raise UsageError("a sensor is for meshes: a camera has its own errors")
-        return self.session(start, seed).run(what)
+        return self.session_with(what, start, seed).run(what)
 
     def __repr__(self) -> str:
         name, views = self.models.recogniser.card.name, len(self.sphere)
@@ -202,6 +216,15 @@ def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
     )
 
 
+def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> CapturedCamera:
+    from nextview.cameras.captured import read_capture
+    from nextview.cameras.captured_camera import UP, CapturedCamera
+
+    if isinstance(up, str) and up not in UP:
+        raise UsageError(f"{folder}: up is {', '.join(UP)} or a direction, three numbers, not {up!r}")
+    return CapturedCamera(read_capture(folder), UP[up] if isinstance(up, str) else up)
+
+
 def _default_policy(own: dict[str, Path], sphere: Viewpoints, recogniser: Recogniser) -> tuple[str, Policy]:
     """ "gain", where one fits, else "spread", which asks for nothing."""
     try:
@@ -221,7 +244,7 @@ def _load(given: dict[str, Any]) -> System:
 _bundled = lru_cache(maxsize=1)(load)
 
 
-def recognise(what: str | Path | Mesh | Camera, **options: Any) -> Recognition:
+def recognise(what: str | Path | Mesh | Camera | FrameCamera, **options: Any) -> Recognition:
     """What an object is, by the bundled models, in one call. Options as for ``System.recognise``.
 
     >>> recognise("chair.off")                                                  # doctest: +SKIP

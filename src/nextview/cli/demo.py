@@ -16,9 +16,13 @@ def demo(
         start: first view, 0 to 39.
         figure: where to write the picture.
     """
+    from nextview.cameras.simulated import SimulatedCamera
     from nextview.cli.progress import console
     from nextview.cli.recognise import show
     from nextview.data.samples import sample_mesh
 
-    show(lambda: sample_mesh(shape), f"the sample {shape}", "modelnet10", {}, start, seed=0, figure=figure)
+    def camera() -> SimulatedCamera:
+        return SimulatedCamera(sample_mesh(shape))
+
+    show(camera, f"the sample {shape}", "modelnet10", {}, start, seed=0, figure=figure)
     console.print(f"The picture is in {figure}; now try your own: nextview recognise MESH --figure out.png")

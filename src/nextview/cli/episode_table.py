@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import numpy as np
 from rich import box
@@ -19,8 +20,8 @@ def _angles(view: int, angles: tuple[float, float]) -> str:
     return f"{view}\n{elevation:.0f}°, {azimuth:.0f}°"
 
 
-def print_episode(result: Recognition, name: str, policy: str) -> None:
-    """Print each view and the answer."""
+def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[str] = ()) -> None:
+    """Print each view and the answer; of captured views, which frame answered and how far off it was."""
     sphere = result.sphere
     table = Table(
         box=box.SIMPLE,
@@ -32,12 +33,15 @@ def print_episode(result: Recognition, name: str, policy: str) -> None:
     )
     for column in ("step", "view", "this view alone", "belief, top 3", "stops at", "next", "travel"):
         table.add_column(column, justify="right" if column in ("step", "travel") else "left", no_wrap=True)
+    if frames:  # their names may be long
+        table.columns[1].no_wrap, table.columns[1].overflow = False, "fold"
+        table.columns[1].min_width, table.columns[1].max_width = 9, 12
     for step, view in enumerate(result.views, 1):
         top = np.argsort(-view.belief)[:3]
         own = int(view.alone.argmax())
         table.add_row(
             str(step),
-            _angles(view.index, view.angles),
+            _angles(view.index, view.angles) + (f"\n{frames[step - 1]}\n{view.degrees_off:.1f}° off" if frames else ""),
             f"{result.classes[own]}\n{view.alone[own]:.3f}" if view.observation.seen else "nothing\nis seen",
             "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top),
             f"{float(result.stopping.threshold_at(step)):.2f}",
@@ -58,7 +62,7 @@ def print_episode(result: Recognition, name: str, policy: str) -> None:
     console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), rest))
 
 
-def as_json(result: Recognition) -> str:
+def as_json(result: Recognition, frames: Sequence[str] = ()) -> str:
     """Everything the table shows, and the whole beliefs and maps, as one JSON object."""
 
     def rounded(values: np.ndarray) -> list:
@@ -76,6 +80,8 @@ def as_json(result: Recognition) -> str:
                 "view": view.index,
                 "elevation": round(view.angles[0], 6),
                 "azimuth": round(view.angles[1], 6),
+                "degrees_off": round(view.degrees_off, 6),
+                **({"frame": frames[step - 1]} if frames else {}),
                 "seen": view.observation.seen,
                 "alone": dict(zip(result.classes, rounded(view.alone), strict=True)),
                 "belief": dict(zip(result.classes, rounded(view.belief), strict=True)),

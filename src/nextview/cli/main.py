@@ -10,6 +10,7 @@ import tyro
 
 from nextview import __version__
 from nextview.cli.benchmark import benchmark
+from nextview.cli.capture import capture
 from nextview.cli.check import check
 from nextview.cli.correspond import correspond
 from nextview.cli.demo import demo
@@ -35,6 +36,7 @@ from nextview.cli.train_recogniser import train_recogniser
 COMMANDS: dict[str, Any] = {
     "recognise": recognise,
     "demo": demo,
+    "capture": capture,
     "models": models,
     "download": download,
     "render": render,

@@ -1,24 +1,27 @@
-"""``nextview recognise``: look at one mesh until it is clear what it is."""
+"""``nextview recognise``: look at one object, a mesh or captured views, until it is clear what it is."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from nextview.mesh_format import MAX_FACES
 
 if TYPE_CHECKING:
-    from nextview.mesh import Mesh
+    from nextview.cameras.captured_camera import CapturedCamera
+    from nextview.observation import Camera
+    from nextview.session import FrameCamera
 
 Unit = Literal["mm", "cm", "inch", "foot", "m"]
 """The keys of ``mesh.UNITS``, without the time that it takes to import them."""
+Three = tuple[float, float, float]
 
 
 def recognise(
-    mesh: tyro.conf.Positional[Path],
+    path: tyro.conf.Positional[Path],
     /,
     models: str = "modelnet10",
     policy: str | None = None,
@@ -27,19 +30,29 @@ def recognise(
     max_views: int = 5,
     viewpoints: str = "40",
     start: int | None = None,
-    up: Literal["y", "z"] | None = None,
+    up: Literal["y", "z"] | Three | None = None,
     unit: Unit | None = None,
     max_faces: int = MAX_FACES,
+    point: Three | None = None,
+    box: tuple[float, float, float, float, float, float] | Path | None = None,
+    object_id: int | None = None,
+    intrinsics: tuple[float, float, float, float] | Path | None = None,
+    raw: bool = False,
+    any_size: bool = False,
     seed: int = 0,
     sensor: str | None = None,
     figure: Path | None = None,
     json: bool = False,
     timing: bool = False,
 ) -> None:
-    """Recognise the object in a mesh file by next best views, and show where it looked and why.
+    """Recognise an object by next best views, and show where it looked and why.
+
+    The object is in a mesh file, or in a folder of captured depth images with poses in the layout of BOP, TUM RGB-D or
+    7-Scenes. Of these the view nearest to the one asked for answers. The object is what the masks show; else what lies
+    in the box; else the thing on the support plane that is nearest to the point, or the largest.
 
     Args:
-        mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
+        path: OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder of captured views.
         models: bundled models by name, or a folder with models of your own.
         policy: how the next view is chosen: gain (the predicted gain of a view less its weighted travel; the default),
             lem, lem-peak, lcm, lcm-peak, random, random-all, furthest, unidirectional, spread, spread-local, another
@@ -50,63 +63,124 @@ def recognise(
         viewpoints: where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in degrees by views on
             each ring), or fibonacci:60 (spread evenly over the upper half).
         start: first view; of the 40, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
-        up: the file's up axis; z if not given, but y for GLB.
-        unit: the file's unit of length, if it is known: how large an object is says something of its class.
+        up: a mesh file's up axis; z if not given, but y for GLB. Of a folder, also a direction in its world; z if not
+            given, but the normal of the support plane for 7-Scenes.
+        unit: a mesh file's unit of length, if it is known: how large an object is says something of its class.
         max_faces: refuse a mesh of more triangles, or a file of more than 60 bytes for each of these.
+        point: of a folder: near the object that is meant, metres, in the capture's world.
+        box: of a folder: the upright box into which the object just fits, its low and its high corner, metres (heights
+            along --up), or a JSON file with low, high and axes.
+        object_id: of a BOP folder with several objects: the one that is meant.
+        intrinsics: of a folder: FX FY CX CY, pixels, or a file with the pinhole matrix.
+        raw: of a folder: take the depth as it is, without denoising.
+        any_size: of a folder: the object's size says nothing of its class, as with toys.
         seed: decides the first view, whatever the policy draws and the errors of a sensor.
-        sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist or none, or NAME:STRENGTH
-            (docs/your_camera.md); clean renders if not given.
+        sensor: look at a mesh through a sensor with all its errors: kinect, stereo, setup, wrist or none, or
+            NAME:STRENGTH (docs/your_camera.md); clean renders if not given.
         figure: write a picture of the episode to this file (PNG, PDF or SVG).
         json: print JSON instead of a table.
         timing: also print where the time went, from the start of the process.
     """
-    from nextview.mesh import load_mesh
+    from nextview.errors import UsageError
 
     options = {"policy": policy, "threshold": threshold, "risk": risk, "max_views": max_views, "viewpoints": viewpoints}
-    name = mesh.name if sensor is None else f"{mesh.name} through {sensor}"
-    show(lambda: load_mesh(mesh, up, unit, max_faces), name, models, options, start, seed, figure, json, timing, sensor)
+    if path.is_dir():
+        if unit is not None:
+            raise UsageError(f"{path}: --unit is for mesh files; a folder of captured views has lengths of its own")
+        if sensor is not None:
+            raise UsageError(f"{path}: --sensor is for mesh files; captured views have the errors of their own")
+
+        def make() -> Camera | FrameCamera:
+            return _captured_camera(path, up, point, box, object_id, intrinsics, raw, any_size)
+    else:
+        captured = {"point": point, "box": box, "object-id": object_id, "intrinsics": intrinsics}
+        captured |= {"raw": raw or None, "any-size": any_size or None}
+        for name, value in captured.items():
+            if value is not None:
+                raise UsageError(f"{path}: --{name} is for folders of captured views, and this is none")
+        if isinstance(up, tuple):
+            raise UsageError(f"{path}: the up axis of a mesh file is y or z, not {up}")
+
+        def make() -> Camera | FrameCamera:
+            from nextview.mesh import load_mesh
+            from nextview.system import simulated
+
+            return simulated(load_mesh(path, up, unit, max_faces), sensor, seed)
+
+    name = path.name if sensor is None else f"{path.name} through {sensor}"
+    show(make, name, models, options, start, seed, figure, json, timing)
+
+
+def _captured_camera(
+    folder: Path,
+    up: str | Three | None,
+    point: Three | None,
+    box: tuple[float, ...] | Path | None,
+    object_id: int | None,
+    intrinsics: tuple[float, float, float, float] | Path | None,
+    raw: bool,
+    any_size: bool,
+) -> CapturedCamera:
+    """Say what was found in a folder, and make a camera of it."""
+    import numpy as np
+
+    from nextview.cameras.captured import read_box, read_capture
+    from nextview.cameras.captured_camera import UP, CapturedCamera
+    from nextview.cli.progress import console
+    from nextview.errors import UsageError
+    from nextview.sensing.object_frame import Box, upright_axes
+
+    capture = read_capture(folder, intrinsics, object_id)
+    console.print(f"{capture!r}", highlight=False)
+    direction = UP[up] if isinstance(up, str) else up
+    if isinstance(box, Path):
+        found = read_box(box)
+    elif box is not None:
+        upwards = direction or capture.up
+        if upwards is None:
+            raise UsageError(f"{folder}: a box is upright, and in this layout nothing tells where up is: give --up")
+        found = Box(np.array(box[:3]), np.array(box[3:]), upright_axes(upwards))
+    return CapturedCamera(capture, direction, point, None if box is None else found, not raw, not any_size)
 
 
 def show(
-    load: Callable[[], Mesh],
+    make_camera: Callable[[], Camera | FrameCamera],
     name: str,
     models: str,
-    options: dict,
+    options: dict[str, Any],
     start: int | None,
     seed: int,
     figure: Path | None,
     json: bool = False,
     timing: bool = False,
-    sensor: str | None = None,
 ) -> None:
-    """Recognise what ``load`` returns and print the episode; ``options`` are those of ``nextview.load``."""
+    """Recognise what a camera sees and print the episode; ``options`` are those of ``nextview.load``."""
     from nextview import system
     from nextview.cli.episode_table import as_json, print_episode
+    from nextview.cli.progress import console
     from nextview.cli.timing import Stopwatch
     from nextview.errors import ObservationError
 
     watch = Stopwatch()
     watch.lap("importing")
-    camera = system.simulated(load(), sensor, seed)
+    camera = make_camera()
     watch.lap("building the scene")
     opened = system.load(models, **options)
-    session = opened.session(start, seed)
+    session = opened.session_with(camera, start, seed)
     watch.lap("loading the models")
-    while not session.done:
-        seen = camera.observe(session.pose)
-        watch.lap("looking")
-        session.update(seen)
-        watch.lap("thinking")
-    result = session.result
+    result = session.run(camera, watch.lap)
     if result.answer is None:
-        why = "is it made of a few small parts far apart?" if sensor is None else "are the sensor's errors too strong?"
         raise ObservationError(
-            f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.views)} views; {why}"
+            f"{name}: there is no answer, for nothing of it is seen from any of {len(result.views)} views; "
+            "is it made of a few small parts far apart, or are a sensor's errors too strong?"
         )
+    frames = [taken.frame.name for taken in getattr(camera, "taken", ())]
     if json:
-        print(as_json(result))
+        print(as_json(result, frames))
     else:
-        print_episode(result, name, opened.policy_name)
+        print_episode(result, name, opened.policy_name, frames)
+    for frame, reason in getattr(camera, "left_out", {}).items():
+        console.print(f"left out: {frame}: {reason}", style="yellow", highlight=False)
     if timing:
         watch.show()
     if figure:
