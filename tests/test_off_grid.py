@@ -178,14 +178,15 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(da
         reachable = rng.random(len(sphere)) < share
         episodes = Episodes(
             sphere, policy, np.array([0]), FixedLength(max_views=8), np.random.default_rng(seed), Calibration(0.8, 0.5),
-            lambda state, mask=reachable: replace(state, reachable=mask[None]),
         )  # fmt: skip
         places, path = [], []
         while len(episodes.running):
             place = sphere.directions[episodes.current] + jitter * rng.normal(size=(1, 3))
             place /= np.linalg.norm(place)
             places.append(place[0])
-            step = episodes.update(evidence(rng), place)
+            step = episodes.update(
+                evidence(rng), place, lambda state, mask=reachable: replace(state, reachable=mask[None])
+            )
             assert step.belief.sum() == pytest.approx(1)
             to = int(step.next_views[0])
             path.append(to)
@@ -212,15 +213,16 @@ def test_a_policy_that_knows_nothing_of_reach_is_kept_from_what_is_out_of_it():
 
     reach = np.zeros(40, bool)
     reach[[5, 17]] = True
-    episodes = Episodes(
-        SPHERE, First(), np.array([3, 5]), Stopping(1.0, 9), np.random.default_rng(0),
-        constrain=lambda state: replace(state, reachable=np.tile(reach, (len(state.current), 1))),
-    )  # fmt: skip
+    episodes = Episodes(SPHERE, First(), np.array([3, 5]), Stopping(1.0, 9), np.random.default_rng(0))
     rng = np.random.default_rng(0)
-    assert episodes.update(evidence(rng, 2)).next_views.tolist() == [5, 17]
-    step = episodes.update(evidence(rng, 2))
+
+    def within(state):
+        return replace(state, reachable=np.tile(reach, (len(state.current), 1)))
+
+    assert episodes.update(evidence(rng, 2), constrain=within).next_views.tolist() == [5, 17]
+    step = episodes.update(evidence(rng, 2), constrain=within)
     assert step.next_views.tolist() == [17, -1]
     assert step.stopped.tolist() == [False, True]
-    assert episodes.update(evidence(rng)).stopped.tolist() == [True]
+    assert episodes.update(evidence(rng), constrain=within).stopped.tolist() == [True]
     assert episodes.outcome.n_views.tolist() == [3, 2]
     assert not episodes.outcome.confident.any()

@@ -79,6 +79,11 @@ class _Sums:
     places: NDArray[np.float64] | None
 
 
+def unconstrained(state: EpisodeState) -> EpisodeState:
+    """Every view can be reached, and travel costs what it is."""
+    return state
+
+
 class Episodes:
     """B episodes side by side. Give ``update`` what was seen from ``current``, until ``running`` is empty.
 
@@ -89,8 +94,6 @@ class Episodes:
         stopping: when an episode ends; a sphere with fewer views than ``max_views`` ends it too.
         rng: for policies that draw.
         calibration: how far to trust the sum of the logits; fully by default.
-        constrain: before the policy is asked, says where the robot can go and what that costs it: the state with
-            ``reachable`` and ``travel``. An episode without a free view ends.
     """
 
     def __init__(
@@ -101,10 +104,9 @@ class Episodes:
         stopping: Stopping,
         rng: np.random.Generator,
         calibration: Calibration = PLAIN_SUM,
-        constrain: Callable[[EpisodeState], EpisodeState] | None = None,
     ) -> None:
         self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
-        self.calibration, self.constrain = calibration, constrain
+        self.calibration = calibration
         self.running = np.arange(len(starts))
         self.current = np.array(starts, np.int64)
         if ((self.current < 0) | (self.current >= len(sphere))).any():
@@ -115,7 +117,12 @@ class Episodes:
         self._seen = np.zeros(len(starts), np.int64)
         self._places: NDArray[np.float64] | None = None
 
-    def update(self, evidence: Evidence, directions: NDArray[np.float64] | None = None) -> Step:
+    def update(
+        self,
+        evidence: Evidence,
+        directions: NDArray[np.float64] | None = None,
+        constrain: Callable[[EpisodeState], EpisodeState] = unconstrained,
+    ) -> Step:
         """Take in the evidence of one view in every running episode; stop or choose its next view.
 
         A view in which nothing was seen is taken, but changes no belief and ends no episode as a confident one. Where
@@ -126,6 +133,8 @@ class Episodes:
             directions: unit vectors towards where the cameras really stood, (A, 3); in all updates or in none. The
                 nearest views then count as taken, those within VISITED as visited too, and azimuths and travel are
                 measured from the places themselves. By default the cameras stood at ``current``.
+            constrain: before the policy is asked, says where the robots can go and what that costs them: the state with
+                ``reachable`` and ``travel``. An episode without a free view ends.
 
         Raises:
             UsageError: the evidence is of another number of episodes, or a logit is not finite.
@@ -152,7 +161,8 @@ class Episodes:
                     step.episodes[going],
                     azimuth_bins,
                     places=places,
-                )
+                ),
+                constrain,
             )
             step.next_views[going] = next_views
             step = replace(step, state=state)
@@ -166,8 +176,8 @@ class Episodes:
         """
         self._keep(*self._taken(evidence, directions))
 
-    def choose_again(self) -> Step:
-        """Ask the policy once more where to go from here, for what ``constrain`` says has changed.
+    def choose_again(self, constrain: Callable[[EpisodeState], EpisodeState] = unconstrained) -> Step:
+        """Ask the policy once more where to go from here, for what ``constrain`` says has changed; see ``update``.
 
         Returns:
             The last step, with other ``next_views``. Where no view is free any more the episode has ended.
@@ -179,7 +189,7 @@ class Episodes:
         if not self.steps or self.steps[-1].state is None or len(self.running) == 0:
             raise SessionError("there is nothing to choose: no view was taken yet, or the episodes have ended")
         step, here = self.steps[-1], np.isin(self.steps[-1].state.episodes, self.running)
-        state, chosen = self._move(self.steps[-1].state.of(here))
+        state, chosen = self._move(self.steps[-1].state.of(here), constrain)
         next_views = np.full(len(step.episodes), -1)
         next_views[np.isin(step.episodes, self.running)] = chosen
         self.steps[-1] = replace(step, next_views=next_views, stopped=next_views < 0, state=state)
@@ -229,11 +239,11 @@ class Episodes:
         self.current[step.episodes[moved]] = step.next_views[moved]
         self.running = step.episodes[~step.stopped]
 
-    def _move(self, state: EpisodeState) -> tuple[EpisodeState, NDArray[np.int64]]:
+    def _move(
+        self, state: EpisodeState, constrain: Callable[[EpisodeState], EpisodeState]
+    ) -> tuple[EpisodeState, NDArray[np.int64]]:
         """What the policy is shown, and where it goes, -1 where no view is free."""
-        state = replace(state, reachable=None, travel=self._travel(state))
-        if self.constrain is not None:
-            state = self.constrain(state)
+        state = constrain(replace(state, reachable=None, travel=self._travel(state)))
         chosen, free = np.full(len(state.current), -1), state.free.any(1)
         if free.all():
             chosen = self._choose(state)

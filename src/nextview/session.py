@@ -248,9 +248,7 @@ class Session:
 
     def _begin(self, start: int) -> Episodes:
         starts, calibration = np.array([start]), self.models.recogniser.calibration
-        return Episodes(
-            self.sphere, self._chooser, starts, self.stopping, self._rng, calibration, constrain=self._constrain
-        )
+        return Episodes(self.sphere, self._chooser, starts, self.stopping, self._rng, calibration)
 
     # Where to look
 
@@ -366,7 +364,7 @@ class Session:
             if not self._can_reach(np.array([self.view]))[0]:
                 drawn = self._rng.bit_generator.state
                 try:
-                    step = self._episodes.choose_again()
+                    step = self._episodes.choose_again(self._constrain)
                 except BaseException:
                     self._rng.bit_generator.state = drawn
                     raise
@@ -481,7 +479,7 @@ class Session:
             episodes = self._begin(self.view)
             for each, direction in zip(evidence[:-1], directions, strict=False):
                 episodes.take(each, direction[None])
-        step = episodes.update(evidence[-1], directions[-1][None])
+        step = episodes.update(evidence[-1], directions[-1][None], self._constrain)
         to = int(step.next_views[0])
         travel = self._travelled([int(step.views[0]) for step in episodes.steps], directions)
         views = list(self.views)
