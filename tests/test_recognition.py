@@ -162,7 +162,8 @@ def test_between_two_steps_what_is_said_of_sides_is_interpolated():
     azimuth_bins = np.random.default_rng(0).normal(size=(1, 3, 4))
     between = reorient(azimuth_bins, np.array([0.375]))  # one and a half of four steps
     np.testing.assert_allclose(
-        between, (reorient(azimuth_bins, np.array([0.25])) + reorient(azimuth_bins, np.array([0.5]))) / 2
+        np.exp(between),
+        (np.exp(reorient(azimuth_bins, np.array([0.25]))) + np.exp(reorient(azimuth_bins, np.array([0.5])))) / 2,
     )
 
 

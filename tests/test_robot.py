@@ -10,11 +10,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scenes import TABLE, box, cast, pose_at
 from scipy.spatial.transform import Rotation
+from scipy.special import softmax
 from tests.tiny_models import make_map_network, make_recogniser
 
 import nextview
 from nextview import Observation, SessionError, SimulatedCamera, Stopping, UsageError, ViewSphere
-from nextview.belief import Calibration, log_evidence_of
+from nextview.belief import Calibration, log_evidence_of, reorient
 from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError, PolicyError
 from nextview.models.inference import MapNetwork, Models, Recogniser
@@ -425,3 +426,22 @@ def test_reach_and_cost_are_asked_in_the_world(tiny):
     assert session.target[2, 3] > 0.3
     for pose in starts:
         np.testing.assert_allclose(pose, first, atol=1e-12)
+
+
+@given(st.integers(0, 10**6), st.floats(0, 1))
+def test_one_view_says_the_same_from_wherever_azimuths_are_counted(seed, azimuth):
+    rng, calibration = np.random.default_rng(seed), Calibration(0.8, 1.0, bin_correlation=1.5)
+    logits, bins = rng.normal(size=(1, 3)), np.log(rng.dirichlet(np.full(8, 0.2), (1, 3)) + 1e-9)
+    bins -= np.log(np.exp(bins).sum(2, keepdims=True))
+    total = log_evidence_of(logits, bins, np.array([azimuth]))
+    np.testing.assert_allclose(calibration.belief(total, 1, 3)[0], softmax(logits[0] / 0.8), atol=1e-9)
+
+
+@given(st.integers(0, 10**6), st.integers(0, 7), st.floats(0, 1))
+def test_bins_between_two_azimuths_are_those_of_both_by_their_nearness(seed, step, share):
+    bins = np.log(np.random.default_rng(seed).dirichlet(np.ones(8), (1, 3)))
+    found = np.exp(reorient(bins, np.array([(step + share) / 8])))
+    for pointing in range(8):
+        expected = (1 - share) * np.exp(bins[0, :, (step - pointing) % 8])
+        expected += share * np.exp(bins[0, :, (step + 1 - pointing) % 8])
+        np.testing.assert_allclose(found[0, :, pointing], expected, atol=1e-6)

@@ -51,7 +51,9 @@ def reorient(azimuth_bins: NDArray[np.floating], azimuth: NDArray[np.floating]) 
 
     Args:
         azimuth_bins: (..., classes, azimuth bins), in even steps of azimuth.
-        azimuth: of the views, parts of a full turn, (...). Between two steps it is interpolated.
+        azimuth: of the views, parts of a full turn, (...). Between two steps the likelihoods are interpolated, not
+            their logarithms: over all azimuths they sum up to the same, so that one view alone says as much of the
+            classes from wherever azimuths are counted.
 
     Returns:
         The same shape.
@@ -65,7 +67,13 @@ def reorient(azimuth_bins: NDArray[np.floating], azimuth: NDArray[np.floating]) 
         source = (by.astype(np.int64) - np.arange(n)) % n
         return np.take_along_axis(azimuth_bins, np.broadcast_to(source, azimuth_bins.shape), -1)
 
-    return turned(low) if not (share > 1e-9).any() else (1 - share) * turned(low) + share * turned(low + 1)
+    before = turned(low)
+    if not (share > 1e-9).any():
+        return before
+    after = turned(low + 1)
+    top = np.maximum(before, after)
+    mixed = top + np.log((1 - share) * np.exp(before - top) + share * np.exp(after - top))
+    return np.where(share > 1e-9, mixed, before)
 
 
 def log_evidence_of(
