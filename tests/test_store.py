@@ -438,9 +438,9 @@ def test_objects_that_changed_places_are_found(views):
     assert found["a"] == found["b"] == "image, depth, points, radius and name are not together what was rendered"
 
 
-def test_a_store_without_its_root_is_named_with_the_way_to_go_on(views, dataset):
+def test_a_store_without_its_root_is_named_with_the_way_to_go_on(views):
     (views / "zarr.json").unlink()
-    for use in (ViewStore.open, lambda path: list(render(dataset, path, ViewSphere.named("12"), 32, workers=0))):
+    for use in (ViewStore.open, lambda path: list(render(path.parent / "meshes", path, SPHERE, 48, workers=0))):
         with pytest.raises(DatasetError, match=r"^[^\n]*: its zarr\.json, .*is gone; copy it back, or move[^\n]*$"):
             use(views)
 
