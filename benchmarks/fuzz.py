@@ -44,8 +44,8 @@ import tyro
 
 MEMORY = 2 << 30
 """Bytes that a process may take beyond what it has when everything is imported."""
-SECONDS, WAIT = 10, 60
-"""Seconds of computing, and in all, that a case may take."""
+SECONDS, WAIT = 10, 300
+"""Seconds of computing, and in all, that a case may take; the latter are for what waits for ever."""
 BATCH = 20
 """Cases of a kind in a row."""
 PRINTED = "printed"
@@ -463,7 +463,8 @@ class Reader:
         printed = (self.arguments[1] / PRINTED).read_text(errors="replace")[-2000:]
         self.start()
         if -code in (signal.SIGPROF, signal.SIGALRM):
-            return "hang", f"more than {self.arguments[3]} s of computing or {WAIT} s in all"
+            took = f"{self.arguments[3]} s of computing" if -code == signal.SIGPROF else f"{WAIT} s in all"
+            return "hang", f"more than {took}"
         return "crash", f"the process ended with status {code}: {printed}"
 
 

@@ -11,8 +11,9 @@ from nextview.command_line import command_line
 from nextview.errors import ModelError, PolicyError
 from nextview.models.inference import MapNetwork, Recogniser
 from nextview.models.model_card import bundled_cards, read_card, write_card
-from nextview.policies.policy_card import bundled_policies, read_policy_card, write_policy_card
+from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card, write_policy_card
 from nextview.training.recipes import MapRecipe
+from nextview.viewsphere import ViewSphere
 
 CLASSES = [f"class{k}" for k in range(10)]
 
@@ -63,6 +64,18 @@ def test_a_card_that_makes_no_sense_is_refused_in_one_sentence(tmp_path, values,
     change(card, **values)
     with pytest.raises(ModelError, match=rf"^[^\n]*tiny\.json: not a model card \([^\n]*({sentence})[^\n]*$"):
         read_card(card)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"), [({"inputs": []}, "not nothing"), ({"classes": 150_000_000}, "the table is of 150000000")]
+)
+def test_a_gain_policy_without_inputs_or_of_other_classes_is_refused_in_one_sentence(tmp_path, changes, sentence):
+    bundled = bundled_policies()["gain"]
+    (tmp_path / "gain.onnx").symlink_to(bundled.with_suffix(".onnx"))
+    values = json.loads(bundled.read_text())
+    (tmp_path / "gain.json").write_text(json.dumps(values | {"table": values["table"] | changes}))
+    with pytest.raises(PolicyError, match=rf"^[^\n]*gain\.json: not a policy card \([^\n]*{sentence}[^\n]*$"):
+        read_policy(tmp_path / "gain.json", ViewSphere.named("40"))
 
 
 NO_CARDS = [b"[" * 10**6, b"\xff\xfe{}", b"", b"[]", b'{"schema": 1', b'{"schema": 1' + b"0" * 9999]

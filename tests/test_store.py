@@ -438,6 +438,13 @@ def test_objects_that_changed_places_are_found(views):
     assert found["a"] == found["b"] == "image, depth, points, radius and name are not together what was rendered"
 
 
+def test_a_store_without_its_root_is_named_with_the_way_to_go_on(views):
+    (views / "zarr.json").unlink()
+    for use in (ViewStore.open, lambda path: list(render(path.parent / "meshes", path, SPHERE, 48, workers=0))):
+        with pytest.raises(DatasetError, match=r"^[^\n]*: its zarr\.json, .*is gone; copy it back, or move[^\n]*$"):
+            use(views)
+
+
 @pytest.mark.parametrize("place", [*(f"{name}/zarr.json" for name in (*RENDERED, "digest")), "measures/zarr.json"])
 @pytest.mark.parametrize("damage", ["{", '{"zarr_format": 3}', None])
 def test_arrays_that_cannot_be_opened_are_mended_and_keep_what_they_hold(views, capsys, place, damage):

@@ -5,6 +5,8 @@ import inspect
 import json
 import os
 import re
+import resource
+import signal
 import subprocess
 import sys
 from dataclasses import asdict, replace
@@ -23,12 +25,13 @@ from nextview.data.folders import Entry  # noqa: E402
 from nextview.data.lock import only_one  # noqa: E402
 from nextview.data.splits import split_training  # noqa: E402
 from nextview.data.store import DONE, ViewStore  # noqa: E402
-from nextview.errors import DatasetError, ModelError  # noqa: E402
+from nextview.errors import DatasetError, ModelError, ResultsError  # noqa: E402
 from nextview.models.image_input import image_input  # noqa: E402
 from nextview.models.inference import RECOGNISER  # noqa: E402
 from nextview.models.model_card import bundled_cards, find_card  # noqa: E402
 from nextview.training.architectures import ResNet  # noqa: E402
 from nextview.training.inputs import load_inputs, prepare_inputs  # noqa: E402
+from nextview.training.loop import WholeCheckpoints  # noqa: E402
 from nextview.training.packed import load_packed, pack, save_packed  # noqa: E402
 from nextview.training.recipes import THESIS_RECOGNISER, MapRecipe, RecogniserRecipe  # noqa: E402
 from nextview.training.recogniser.grid_training import published_cells  # noqa: E402
@@ -358,6 +361,54 @@ def test_a_run_resumes_with_a_recipe_from_before_new_options_and_refuses_what_it
             begin(run, RecogniserRecipe()),
         ):
             pass
+
+
+@pytest.mark.parametrize("name", ["weights.json", "held_out.json", "curves.png", "thesis.txt", "photos/a.png"])
+def test_a_folder_of_others_is_not_trained_in(tmp_path, name):
+    """It would get files of the run, some of the same names."""
+    file = tmp_path / "run" / name
+    file.parent.mkdir(parents=True)
+    file.write_text("years of work")
+    holds = name.partition("/")[0]
+    with (
+        pytest.raises(ModelError, match=f"^[^\\n]*run: holds {holds} and no training run; give a new folder[^\\n]*$"),
+        begin(tmp_path / "run", RecogniserRecipe()),
+    ):
+        pass
+    assert file.read_text() == "years of work"
+    assert [str(path.relative_to(tmp_path / "run")) for path in (tmp_path / "run").rglob("*") if path.is_file()] == [
+        name
+    ]
+
+
+def test_a_run_that_was_killed_before_its_recipe_was_written_begins_anew(tmp_path):
+    with begin(tmp_path / "run", RecogniserRecipe()):
+        pass
+    (tmp_path / "run/recipe.json").unlink()
+    (tmp_path / "run/.nextview-recipe.json-abcd1234").mkdir()
+    with begin(tmp_path / "run", RecogniserRecipe()):
+        pass
+    names = ["commands.json", "recipe.json", "weights.json"]
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == names
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before_and_nothing_elsewhere(tmp_path, monkeypatch):
+    """Lightning would write it to the folder for temporary files, and copy it if that is on another disk."""
+    elsewhere = tmp_path / "elsewhere"
+    monkeypatch.setattr("tempfile.tempdir", str(elsewhere))
+    file = tmp_path / "run/last.ckpt"
+    WholeCheckpoints().save_checkpoint({"epoch": 1}, file)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+    try:
+        with pytest.raises(ResultsError, match=r"last\.ckpt: cannot be written \(File too large\)"):
+            WholeCheckpoints().save_checkpoint({"epoch": 2, "weights": torch.zeros(10_000)}, file)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert torch.load(file, weights_only=True) == {"epoch": 1}
+    assert [path.name for path in file.parent.iterdir()] == ["last.ckpt"]
+    assert not elsewhere.exists()
 
 
 def test_two_processes_do_not_train_in_one_folder(tmp_path):

@@ -115,7 +115,7 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
     if pose.shape != (4, 4):
         raise ObservationError(f"the pose is a camera-to-world matrix of the shape (4, 4), not {pose.shape}")
     if not (np.abs(pose) < LARGEST).all():  # not so if there is a NaN
-        raise ObservationError("the pose holds NaN, infinity or a number that no camera has")
+        raise ObservationError("the pose holds NaN or infinity, or a number that no camera has")
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID:
         raise ObservationError(f"the last row of the pose is {pose[3].tolist()}, not 0 0 0 1: is it transposed?")
     rotation = pose[:3, :3]

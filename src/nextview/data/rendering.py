@@ -23,7 +23,17 @@ from nextview.data.attributes import FORMAT, restored
 from nextview.data.folders import Entry, list_dataset
 from nextview.data.lock import only_one, writing
 from nextview.data.pool import count, each
-from nextview.data.store import DEPTH_UNIT, DIGEST, DONE, FAILED, POINT_UNIT, RENDERED, ViewStore, digest
+from nextview.data.store import (
+    DEPTH_UNIT,
+    DIGEST,
+    DONE,
+    FAILED,
+    POINT_UNIT,
+    RENDERED,
+    ViewStore,
+    digest,
+    refuse_without_root,
+)
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.mesh import Mesh, load_mesh, make_mesh
@@ -228,6 +238,7 @@ def _begin(
     if not path.exists():
         return ViewStore.create(path, entries, sphere, size, recipe | {"unit": unit, "dataset": dataset})
     if not (path / "zarr.json").exists():
+        refuse_without_root(path)
         raise DatasetError(f"{path}: is there, and is no view store; give another name")
     wanted = {
         "format": FORMAT,

@@ -149,6 +149,7 @@ class ViewStore:
         path = Path(path)
         file = path / "zarr.json"
         if not file.exists():
+            refuse_without_root(path)
             raise DatasetError(f"{path}: there is no view store; make one with nextview render")
         state = file.stat()
         try:
@@ -393,6 +394,19 @@ class ViewStore:
             DatasetError: it is not there, or not of every rendered object.
         """
         return self.rows(f"measures/{name}")
+
+
+def refuse_without_root(path: Path) -> None:
+    """Say what to do with a store of which only the file is gone that says what its arrays are of.
+
+    Raises:
+        DatasetError: that is so.
+    """
+    if (path / "status" / "zarr.json").exists() and not (path / "zarr.json").exists():
+        raise DatasetError(
+            f"{path}: its zarr.json, which tells whose views these are, is gone; copy it back, or move the folder away "
+            "and run nextview render again"
+        )
 
 
 def _chunk_exists(store: Path, array: zarr.Array, i: int) -> bool:

@@ -147,7 +147,7 @@ def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[
     k = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64)
     if k.shape != (3, 3) or not (np.abs(k) < LARGEST).all():
         given = f"of the shape {k.shape}" if k.shape != (3, 3) else "with NaN, infinity or what no camera has"
-        raise ObservationError(f"intrinsics are a (3, 3) matrix of numbers, not one {given}")
+        raise ObservationError(f"intrinsics are a (3, 3) matrix of finite numbers, not one {given}")
     if not np.array_equal(k[2], [0, 0, 1]) or k[1, 0] != 0 or abs(k[0, 1]) > 1e-3 * abs(k[0, 0]):
         raise ObservationError("intrinsics are [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: transposed, or with a skew?")
     k[0, 1] = 0
@@ -179,7 +179,7 @@ def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
     pose = numbers(pose, "the pose").astype(np.float64)
     if pose.shape != (4, 4) or not (np.abs(pose) < LARGEST).all():
         given = f"of the shape {pose.shape}" if pose.shape != (4, 4) else "with NaN, infinity or what no camera has"
-        raise ObservationError(f"a pose is a (4, 4) matrix of numbers, not one {given}")
+        raise ObservationError(f"a pose is a (4, 4) matrix of finite numbers, not one {given}")
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         transposed = np.allclose(pose[:, 3], [0, 0, 0, 1], atol=1e-6)
         raise ObservationError(

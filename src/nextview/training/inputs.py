@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 
 from nextview.data.lock import only_one
+from nextview.data.pool import WorkerDied, each
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.models.network_input import CHANNELS_OF, InputKind, InputSpec, from_store
@@ -41,10 +39,17 @@ def prepare_inputs(path: Path, size: int, kind: InputKind = "geometry", workers:
     chosen = np.flatnonzero(store.done).tolist()
     for first in chosen[:1]:  # a size that the views do not have is refused before anything is made
         from_store(InputSpec(kind, size), store, first)
-    with ProcessPoolExecutor(workers or os.cpu_count(), get_context("spawn")) as pool:
-        packed = pool.map(partial(_packed, path, size=size, kind=kind), chosen, chunksize=5)
-        shape = (len(store), len(store.sphere), CHANNELS_OF[kind], size, size)
-        yield from save_packed(target, shape, zip(chosen, packed, strict=True))
+    shape = (len(store), len(store.sphere), CHANNELS_OF[kind], size, size)
+    yield from save_packed(target, shape, _all_packed(path, chosen, size, kind, workers))
+
+
+def _all_packed(
+    path: Path, chosen: list[int], size: int, kind: InputKind, workers: int | None
+) -> Iterator[tuple[int, list[bytes]]]:
+    for i, packed in each(partial(_packed, path, size=size, kind=kind), chosen, workers):
+        if isinstance(packed, WorkerDied):
+            raise DatasetError(f"{path}: the inputs of {ViewStore.open(path).names[i]} cannot be computed: {packed}")
+        yield i, packed
 
 
 def ready_inputs(path: Path, size: int, kind: InputKind = "geometry", track: Track = silently) -> PackedViews:
