@@ -199,6 +199,7 @@ def fixed_views(stage: Path) -> Iterator[str]:
     """Everybody takes so many views: the table that the script wrote."""
     (page,) = stage.glob("*.md")
     yield page.read_text()
+    yield ""
     if stage.name == "views":
         yield "![Accuracy against travel, the gain policy at several travel weights and its rivals](images/front.png)"
         yield ""
@@ -263,6 +264,7 @@ def thesis(stage: Path) -> Iterator[str]:
 def page_as_is(stage: Path) -> Iterator[str]:
     """Markdown that a script printed."""
     yield stage.read_text()
+    yield ""
 
 
 def text_as_is(stage: Path) -> Iterator[str]:
