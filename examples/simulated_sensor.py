@@ -28,3 +28,11 @@ def square(half, height=0.0):
     """A level square about the z axis."""
     corners = np.array([[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]])
     return corners, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def disc(radius, height=0.0):
+    """A level disc about the z axis."""
+    around = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+    rim = np.stack([radius * np.cos(around), radius * np.sin(around), np.full(360, height)], 1)
+    k = np.arange(360)
+    return np.vstack([[[0, 0, height]], rim]), np.stack([0 * k, 1 + k, 1 + (k + 1) % 360], 1)

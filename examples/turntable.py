@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from simulated_sensor import INTRINSICS, look, square
+from simulated_sensor import INTRINSICS, disc, look
 
 import nextview
 from nextview.sensing import Frame, ObservedObject
@@ -32,7 +32,7 @@ class Turntable:
         """Depth, and where the camera is, seen from the plate."""
         pose = look_at_origin(np.radians(ELEVATION), np.radians(-self.angle), DISTANCE)
         pose[2, 3] += 0.08  # it aims a little over the plate
-        return look([square(0.25), square(9.0, -0.1), *([] if empty else [self.thing])], pose, self.rng), pose
+        return look([disc(0.25), disc(9.0, -0.1), *([] if empty else [self.thing])], pose, self.rng), pose
 
     def turn_to(self, angle):
         self.angle = angle
@@ -54,7 +54,7 @@ def recognise(turntable: Turntable) -> nextview.Recognition:
     session.travel_cost = seconds
     while not session.done:
         depth, pose = turntable.look()
-        mask = np.nan_to_num(depth, nan=9.0) < np.nan_to_num(empty, nan=0.0) - 0.006
+        mask = np.nan_to_num(depth, nan=9.0) < np.nan_to_num(empty, nan=0.0) - 0.01
         session.update(Frame(depth, INTRINSICS, pose, mask))
         turntable.turn_to(-azimuth(session.target))
     return session.result
