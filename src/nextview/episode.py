@@ -219,7 +219,8 @@ def select(evidence: Evidence, keep: NDArray[np.bool_]) -> Evidence:
     """The evidence of some of the episodes."""
     azimuth_bins = None if evidence.azimuth_bins is None else evidence.azimuth_bins[keep]
     seen = None if evidence.seen is None else evidence.seen[keep]
-    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, azimuth_bins, seen)
+    novelty = None if evidence.novelty is None else evidence.novelty[keep]
+    return Evidence(evidence.logits[keep], {k: m[keep] for k, m in evidence.maps.items()}, azimuth_bins, seen, novelty)
 
 
 def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
@@ -233,7 +234,8 @@ def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
 
     azimuth_bins = None if evidence.azimuth_bins is None else kept(evidence.azimuth_bins)
     maps = {name: kept(values) for name, values in evidence.maps.items()}
-    return Evidence(kept(evidence.logits), maps, azimuth_bins, seen), seen
+    novelty = None if evidence.novelty is None else kept(evidence.novelty)
+    return Evidence(kept(evidence.logits), maps, azimuth_bins, seen, novelty), seen
 
 
 def run_episodes(

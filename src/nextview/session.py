@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from nextview.belief import Stopping, fuse
 from nextview.episode import Episodes, Step
-from nextview.errors import SessionError
+from nextview.errors import SessionError, UsageError
 from nextview.models.inference import Models
+from nextview.novelty import Novelty
 from nextview.observation import Camera, Observation
 from nextview.policies.base import Policy, ValuesViews, maps_among
 from nextview.viewsphere import ViewSphere
@@ -38,6 +39,8 @@ class View:
             (classes, azimuth bins), in even steps; None if the recogniser was not taught them.
         values: what the policy valued each candidate view at, (V,) float64, NaN for those that it did not consider;
             None where the episode ends, and for policies that value nothing.
+        novelty: how strange this view is, see ``nextview.novelty``; None if nothing is seen in it, or the recogniser
+            cannot tell.
     """
 
     index: int
@@ -50,6 +53,7 @@ class View:
     arc: float
     azimuth_bins: NDArray[np.float64] | None = None
     values: NDArray[np.float64] | None = None
+    novelty: float | None = None
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,8 @@ class Recognition:
         confident: whether the threshold was reached (else the views ran out); never if nothing was seen.
         sphere: the candidate viewpoints.
         stopping: the rule that ended it.
+        score: tells how strange views are; None if the recogniser cannot.
+        unknown_rate: the share of objects of known classes that may be taken for unknown ones; 0 to take none.
     """
 
     views: tuple[View, ...]
@@ -69,6 +75,8 @@ class Recognition:
     confident: bool
     sphere: ViewSphere
     stopping: Stopping
+    score: Novelty | None = None
+    unknown_rate: float = 0.0
 
     @property
     def seen(self) -> bool:
@@ -76,16 +84,34 @@ class Recognition:
         return any(view.observation.seen for view in self.views)
 
     @property
-    def answer(self) -> str | None:
-        """The class believed most; None if nothing was seen."""
-        if not self.seen:
+    def novelty(self) -> float | None:
+        """The share of known objects that look at least as strange (a p-value); None if the recogniser cannot tell.
+
+        It holds for objects that are seen as the known ones were, without noise say; see ``nextview.novelty``.
+        """
+        if self.score is None or not self.seen:
             return None
-        return self.classes[int(self.views[-1].belief.argmax())]
+        return self.score.of_views([view.novelty for view in self.views if view.novelty is not None])
+
+    @property
+    def unknown(self) -> bool:
+        """Whether the object is taken to be of no class that the recogniser knows."""
+        return self.novelty is not None and self.novelty < self.unknown_rate
+
+    @property
+    def most_like(self) -> str | None:
+        """The class believed most, also of an unknown object; None if too little was seen."""
+        return self.classes[int(self.views[-1].belief.argmax())] if self.seen else None
+
+    @property
+    def answer(self) -> str | None:
+        """The class believed most; None if too little was seen, or the object is of none of them."""
+        return None if self.unknown else self.most_like
 
     @property
     def confidence(self) -> float:
         """The belief in the answer; 0 if there is none."""
-        return float(self.views[-1].belief.max()) if self.seen else 0.0
+        return 0.0 if self.answer is None else float(self.views[-1].belief.max())
 
     @property
     def travel(self) -> float:
@@ -95,8 +121,11 @@ class Recognition:
     def __repr__(self) -> str:
         """One line: ``chair (belief 0.998, 2 views, 1.41 cells of travel, confident)``."""
         views = f"{len(self.views)} view{'s' * (len(self.views) > 1)}, {self.travel:.2f} cells of travel"
-        if self.answer is None:
+        if not self.seen:
             return f"nothing is seen ({views})"
+        if self.unknown:
+            belief = self.views[-1].belief.max()
+            return f"unknown (most like {self.most_like}, {belief:.2f}; novelty p {self.novelty:.3f}, {views})"
         sure = "confident" if self.confident else "not confident"
         return f"{self.answer} (belief {self.confidence:.3f}, {views}, {sure})"
 
@@ -133,6 +162,7 @@ class Session:
         start: the first view.
         stopping: when to stop; by default the rule that goes with the recogniser, see ``Stopping.of``.
         rng: for policies that draw; seed 0 by default.
+        unknown: the share of objects of known classes that may be taken for unknown ones; 0 to take none.
     """
 
     def __init__(
@@ -143,7 +173,10 @@ class Session:
         start: int = 0,
         stopping: Stopping | None = None,
         rng: np.random.Generator | None = None,
+        unknown: float = 0.0,
     ) -> None:
+        if not 0 <= unknown < 1:
+            raise UsageError(f"the rate of known objects taken for unknown ones lies from 0 to below 1, not {unknown}")
         if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:
             raise SessionError(
                 "this policy wants to know the azimuth bin that is seen, and the recogniser was not taught it"
@@ -156,6 +189,7 @@ class Session:
         rng = rng or np.random.default_rng(0)
         calibration = models.recogniser.calibration
         self.stopping = stopping or Stopping.of(calibration)
+        self.unknown = unknown
         self._episodes = Episodes(sphere, policy, np.array([start]), self.stopping, rng, calibration)
 
     @property
@@ -201,6 +235,7 @@ class Session:
             arc,
             None if azimuth_bins is None else azimuth_bins[0],
             self._values(step),
+            float(step.evidence.novelty[0]) if step.evidence.novelty is not None and observation.seen else None,
         )
         self.views.append(view)
         return view
@@ -230,4 +265,6 @@ class Session:
             bool(self._episodes.outcome.confident[0]),
             self.sphere,
             self.stopping,
+            self.models.recogniser.novelty,
+            self.unknown,
         )

@@ -42,6 +42,7 @@ class System:
         policy_name: what it is called.
         sphere: the candidate viewpoints.
         stopping: when an episode ends.
+        unknown: the share of objects of known classes that may be taken for unknown ones; 0 where none is.
         loaded: the arguments of ``load`` that make it.
     """
 
@@ -50,6 +51,7 @@ class System:
     policy_name: str
     sphere: ViewSphere
     stopping: Stopping
+    unknown: float
     loaded: dict[str, Any] = field(repr=False)
 
     @property
@@ -69,7 +71,8 @@ class System:
         """
         rng = np.random.default_rng(seed)
         drawn = int(rng.integers(len(self.sphere)))
-        return Session(self.models, self.policy, self.sphere, drawn if start is None else start, self.stopping, rng)
+        start = drawn if start is None else start
+        return Session(self.models, self.policy, self.sphere, start, self.stopping, rng, self.unknown)
 
     def recognise(
         self,
@@ -115,6 +118,7 @@ def load(
     max_views: int = 5,
     viewpoints: str = "40",
     threads: int = 0,
+    unknown: float = 0.0,
 ) -> System:
     """Open models, and what belongs to them.
 
@@ -129,18 +133,23 @@ def load(
         max_views: stop after so many views.
         viewpoints: name of the layout of candidate viewpoints.
         threads: of ONNX Runtime, 0 for one on each core.
+        unknown: answer None where an object looks as strange as at most this share of the objects of known classes: so
+            often one of these is taken for unknown. 0 always names a class.
 
     Raises:
-        ModelError: there are no such models, or one of them cannot be used.
+        ModelError: there are no such models, or one of them cannot be used, or this recogniser cannot tell unknown
+            objects.
         PolicyError: there is no such policy, or it cannot be made.
         RiskError: the error rate cannot be promised.
-        UsageError: a threshold or a number of views makes no sense.
+        UsageError: a threshold, a rate or a number of views makes no sense.
     """
     given = {k: v for k, v in locals().items() if k != "models"} | {"models": str(models)}
     Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
     found = find_models(models)
     sphere = ViewSphere.named(viewpoints)
     recogniser = Recogniser(found.recogniser, threads)
+    if unknown and recogniser.novelty is None:
+        raise ModelError(f"{found.recogniser}: cannot tell unknown objects; nextview fit unknown teaches it")
     if policy is None:
         policy, made = _default_policy(found.policies, sphere, recogniser)
     else:
@@ -153,7 +162,7 @@ def load(
     if policy in names:  # "lem" and "lcm" go to the valley for some classes, which the map's card names
         made = make_policy(policy, sphere, opened.valley_classes(policy), recogniser.classes)
     stopping = Stopping.of(recogniser.calibration, threshold, risk, max_views)
-    return System(opened, made, policy, sphere, stopping, given)
+    return System(opened, made, policy, sphere, stopping, unknown, given)
 
 
 def _default_policy(own: dict[str, Path], sphere: ViewSphere, recogniser: Recogniser) -> tuple[str, Policy]:

@@ -25,6 +25,7 @@ def recognise(
     threshold: float = 0.97,
     risk: float | None = None,
     max_views: int = 5,
+    unknown: float = 0.0,
     start: int | None = None,
     up: Literal["y", "z"] | None = None,
     unit: Unit | None = None,
@@ -45,6 +46,8 @@ def recognise(
         threshold: stop when the belief in one class reaches this after one view, less after several.
         risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
         max_views: stop after so many views.
+        unknown: say "unknown" of an object that looks as strange as at most this share of the objects of known
+            classes (0.05: so one in 20 of these is taken for unknown); 0 always names a class. Ends with status 0 too.
         start: first view, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
         up: the file's up axis; z if not given, but y for GLB.
         unit: the file's unit of length, if it is known: how large an object is says something of its class.
@@ -56,7 +59,7 @@ def recognise(
     """
     from nextview.mesh import load_mesh
 
-    options = {"policy": policy, "threshold": threshold, "risk": risk, "max_views": max_views}
+    options = {"policy": policy, "threshold": threshold, "risk": risk, "max_views": max_views, "unknown": unknown}
     show(lambda: load_mesh(mesh, up, unit, max_faces), mesh.name, models, options, start, seed, figure, json, timing)
 
 
@@ -91,7 +94,7 @@ def show(
         session.update(seen)
         watch.lap("thinking")
     result = session.result
-    if result.answer is None:
+    if not result.seen:
         raise ObservationError(
             f"{name}: there is no answer, for nothing of the mesh is seen from any of {len(result.views)} views; "
             "is it made of a few small parts far apart?"

@@ -28,12 +28,14 @@ class Evidence:
             settled on for the class. None if the recogniser cannot tell.
         seen: whether anything was seen, (B,) bool; None if something was in all. A view without is no evidence: in
             episodes all the above counts as zero there.
+        novelty: how strange each view is, (B,) float, see ``nextview.novelty``; None if the recogniser cannot tell.
     """
 
     logits: NDArray[np.floating]
     maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
     azimuth_bins: NDArray[np.floating] | None = None
     seen: NDArray[np.bool_] | None = None
+    novelty: NDArray[np.floating] | None = None
 
 
 @dataclass(frozen=True)
