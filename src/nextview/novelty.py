@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import io
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -149,7 +151,7 @@ def read_novelty(path: Path, sha256: str) -> Novelty:
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {f.name: file[f.name] for f in fields(Novelty)}
-    except (ValueError, KeyError, OSError) as error:
+    except (ValueError, KeyError, OSError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         raise ModelError(f"{path}: not a novelty score ({error})") from None
     wide = {k: v.astype(np.float32) if v.dtype == np.float16 else v for k, v in arrays.items()}
     try:

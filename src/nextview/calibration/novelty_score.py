@@ -16,7 +16,7 @@ Float = NDArray[np.floating]
 
 DISTANCE_DIRECTIONS, PERCEPTRON_DIRECTIONS, HIDDEN, DECAY, STEPS = 64, 128, 64, 1e-3, 100
 """Principal components for either part; the perceptron's hidden units, weight decay and steps of L-BFGS."""
-NEIGHBOURS = 5000
+NEIGHBOURS = 4500
 """Known views that are kept."""
 LEVELS = 201
 """Of the quantiles."""

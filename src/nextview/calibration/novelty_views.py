@@ -30,8 +30,7 @@ def known_features(item: Known) -> NDArray[np.float32]:
     """Features of some stored views of one object, (views, F)."""
     store, card, i, views = item
     opened, recogniser = _open(store, card)
-    inputs = from_store(recogniser.card.input, opened, i)[list(views)]
-    return recogniser.features(inputs)
+    return recogniser.features(from_store(recogniser.card.input, opened, i, np.array(views)))
 
 
 def made_up_features(item: MadeUp) -> NDArray[np.float32]:
