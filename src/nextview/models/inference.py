@@ -23,7 +23,7 @@ RECOGNISER = "recogniser-modelnet10"
 BINS_OUTPUT = "sides"
 """The name that the azimuth bins have in a recogniser's ONNX file."""
 FEATURES_OUTPUT = "features"
-"""The name there of what the last layer makes the logits of, (B, F): only the novelty score needs it."""
+"""The name there of what the last layers make the logits of, (B, F): only the novelty score needs it."""
 MAPS = {"lem": "lem-modelnet10", "lcm": "lcm-modelnet10"}
 
 
