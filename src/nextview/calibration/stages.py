@@ -239,6 +239,8 @@ def fit_unknown(
         rng,
     )
     number = sum(len(rows) > 0 for rows in strange)
+    # Killed between the two files, this leaves a card that knows of no score, and not one of another score's hash.
+    write_card(card, replace(model, novelty_sha256=""))
     sha256 = found.save(novelty_path(model.path))
     about = (
         f"{len(learned)} objects of the training split and {number} made-up ones, calibrated on {len(held_out)} others"
