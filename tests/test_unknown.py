@@ -352,3 +352,37 @@ def test_a_recogniser_that_was_not_taught_never_answers_unknown(tmp_path):
     assert result.answer in ("ball", "box")
     with pytest.raises(ModelError, match="cannot tell unknown objects; nextview fit unknown teaches it"):
         nextview.load(tmp_path, unknown=0.05)
+
+
+@pytest.fixture(scope="module")
+def wary():
+    return nextview.load(unknown=0.05)
+
+
+def scrambled(seed):
+    """A chair whose triangles lie anywhere."""
+    mesh, rng = sample_mesh("chair"), np.random.default_rng(seed)
+    corners = mesh.vertices[mesh.faces]
+    corners = corners - corners.mean(1, keepdims=True) + rng.uniform(-0.6, 0.6, (len(corners), 1, 3))
+    return make_mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+
+
+def test_a_ball_and_a_scrambled_chair_are_unknown_and_the_samples_are_not(wary):
+    ball = trimesh.creation.icosphere(3)
+    for mesh in (make_mesh(ball.vertices, ball.faces), scrambled(0), scrambled(1)):
+        result = wary.recognise(mesh, start=3)
+        assert (result.answer, result.unknown) == (None, True)
+        assert result.novelty < 0.05
+    for name in ("chair", "table", "monitor"):
+        assert wary.recognise(sample_mesh(name), start=3).answer == name
+
+
+def test_the_command_says_that_it_does_not_know(tmp_path, capsys):
+    mesh = scrambled(0)
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / "heap.off")
+    main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0.05"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "It is of no known class: most like a " in said
+    assert "look at least as strange" in said
+    main(["recognise", str(tmp_path / "heap.off"), "--start", "3"])
+    assert "It is a " in capsys.readouterr().out
