@@ -349,7 +349,8 @@ def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
 
     azimuth_bins = None if evidence.azimuth_bins is None else kept(evidence.azimuth_bins)
     maps = {name: kept(values) for name, values in evidence.maps.items()}
-    return Evidence(kept(evidence.logits), maps, azimuth_bins, seen), seen
+    novelty = None if evidence.novelty is None else kept(evidence.novelty)
+    return Evidence(kept(evidence.logits), maps, azimuth_bins, seen, novelty), seen
 
 
 def run_episodes(

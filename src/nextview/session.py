@@ -15,6 +15,7 @@ from nextview.belief import Stopping, fuse
 from nextview.episode import Episodes, Step
 from nextview.errors import NoViewLeftError, ObservationError, SessionError, UsageError
 from nextview.models.inference import Models
+from nextview.novelty import Novelty
 from nextview.observation import Camera, Observation
 from nextview.policies.base import EpisodeState, Evidence, Policy, ValuesViews, maps_among, travel_from
 from nextview.policies.off_grid import anywhere
@@ -80,6 +81,8 @@ class View:
         doubts: what is likely to be wrong with the view though it was taken in; usually nothing.
         degrees_off: angle at the object between the view that was asked for and where the camera stood; 0 for the first
             frame of a camera in the world, which begins where it stands.
+        novelty: how strange this view is, see ``nextview.novelty``; None if nothing is seen in it, or the recogniser
+            cannot tell.
     """
 
     index: int
@@ -93,6 +96,7 @@ class View:
     direction: NDArray[np.float64]
     azimuth_bins: NDArray[np.float64] | None = None
     values: NDArray[np.float64] | None = None
+    novelty: float | None = None
     doubts: tuple[Doubt, ...] = ()
     degrees_off: float = 0.0
 
@@ -113,6 +117,8 @@ class Recognition:
         sphere: the candidate viewpoints.
         stopping: the rule that ended it.
         stranded: whether it ended because no view that was left could be reached; then it is not confident.
+        score: tells how strange views are; None if the recogniser cannot.
+        unknown_rate: the share of objects of known classes that may be taken for unknown ones; 0 to take none.
     """
 
     views: tuple[View, ...]
@@ -121,6 +127,8 @@ class Recognition:
     sphere: Viewpoints
     stopping: Stopping
     stranded: bool = False
+    score: Novelty | None = None
+    unknown_rate: float = 0.0
 
     @property
     def seen(self) -> bool:
@@ -128,16 +136,34 @@ class Recognition:
         return any(view.observation.seen for view in self.views)
 
     @property
-    def answer(self) -> str | None:
-        """The class believed most; None if nothing was seen."""
-        if not self.seen:
+    def novelty(self) -> float | None:
+        """The share of known objects that look at least as strange (a p-value); None if the recogniser cannot tell.
+
+        It holds for objects that are seen as the known ones were, without noise say; see ``nextview.novelty``.
+        """
+        if self.score is None or not self.seen:
             return None
-        return self.classes[int(self.views[-1].belief.argmax())]
+        return self.score.of_views([view.novelty for view in self.views if view.novelty is not None])
+
+    @property
+    def unknown(self) -> bool:
+        """Whether the object is taken to be of no class that the recogniser knows."""
+        return self.novelty is not None and self.novelty < self.unknown_rate
+
+    @property
+    def most_like(self) -> str | None:
+        """The class believed most, also of an unknown object; None if too little was seen."""
+        return self.classes[int(self.views[-1].belief.argmax())] if self.seen else None
+
+    @property
+    def answer(self) -> str | None:
+        """The class believed most; None if too little was seen, or the object is of none of them."""
+        return None if self.unknown else self.most_like
 
     @property
     def confidence(self) -> float:
         """The belief in the answer; 0 if there is none."""
-        return float(self.views[-1].belief.max()) if self.seen else 0.0
+        return 0.0 if self.answer is None else float(self.views[-1].belief.max())
 
     @property
     def travel(self) -> float:
@@ -147,8 +173,11 @@ class Recognition:
     def __repr__(self) -> str:
         """One line: ``chair (belief 0.998, 2 views, 1.41 cells of travel, confident)``."""
         views = f"{len(self.views)} view{'s' * (len(self.views) > 1)}, {self.travel:.2f} cells of travel"
-        if self.answer is None:
+        if not self.seen:
             return f"nothing is seen ({views})"
+        if self.unknown:
+            belief = self.views[-1].belief.max()
+            return f"unknown (most like {self.most_like}, {belief:.2f}; novelty p {self.novelty:.3f}, {views})"
         sure = "confident" if self.confident else "not confident" + ", no other view in reach" * self.stranded
         names = dict.fromkeys(doubt.name for view in self.views for doubt in view.doubts)
         doubts = f", doubtful: {', '.join(names)}" if names else ""
@@ -202,6 +231,7 @@ class Session:
         object: which object to find in frames; the largest on the support plane by default.
         distance: how far from the object's centre the camera shall stand, metres; as ``sphere.distance`` says, in
             object radii, by default.
+        unknown: the share of objects of known classes that may be taken for unknown ones; 0 to take none.
 
     Raises:
         SessionError: the models lack what the policy needs.
@@ -218,7 +248,10 @@ class Session:
         rng: np.random.Generator | None = None,
         object: ObservedObject | None = None,
         distance: float | None = None,
+        unknown: float = 0.0,
     ) -> None:
+        if not 0 <= unknown < 1:
+            raise UsageError(f"the rate of known objects taken for unknown ones lies from 0 to below 1, not {unknown}")
         if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:
             raise SessionError(
                 "this policy wants to know the azimuth bin that is seen, and the recogniser was not taught it"
@@ -236,6 +269,7 @@ class Session:
             object = ObservedObject()
         self.object = object
         self.stopping = stopping or Stopping.of(models.recogniser.calibration)
+        self.unknown = unknown
         self._evidence: list[Evidence] = []
         self._before = 0 if object is None else len(object.sightings)
         self._chooser = anywhere(policy, sphere)
@@ -518,6 +552,8 @@ class Session:
             *travel,
             direction,
             None if azimuth_bins is None else azimuth_bins[0],
+            None,
+            float(step.evidence.novelty[0]) if step.evidence.novelty is not None and observation.seen else None,
         )
 
     def _snapped(self, direction: Float) -> Float:
@@ -594,5 +630,13 @@ class Session:
         """
         confident = bool(self._episodes.outcome.confident[0])
         all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
-        stranded = not confident and not all_taken
-        return Recognition(tuple(self.views), self.models.classes, confident, self.sphere, self.stopping, stranded)
+        return Recognition(
+            tuple(self.views),
+            self.models.classes,
+            confident,
+            self.sphere,
+            self.stopping,
+            stranded=not confident and not all_taken,
+            score=self.models.recogniser.novelty,
+            unknown_rate=self.unknown,
+        )

@@ -49,6 +49,7 @@ class System:
         policy_name: what it is called.
         sphere: the candidate viewpoints.
         stopping: when an episode ends.
+        unknown: the share of objects of known classes that may be taken for unknown ones; 0 where none is.
         loaded: the arguments of ``load`` that make it.
     """
 
@@ -57,6 +58,7 @@ class System:
     policy_name: str
     sphere: Viewpoints
     stopping: Stopping
+    unknown: float
     loaded: dict[str, Any] = field(repr=False)
 
     @property
@@ -87,7 +89,7 @@ class System:
         rng = np.random.default_rng(seed)
         drawn = int(rng.integers(len(self.sphere)))
         first = drawn if start is None else start
-        return Session(self.models, self.policy, self.sphere, first, self.stopping, rng, object, distance)
+        return Session(self.models, self.policy, self.sphere, first, self.stopping, rng, object, distance, self.unknown)
 
     def session_with(self, camera: Camera | FrameCamera, start: int | None = None, seed: int = 0) -> Session:
         """A session for a camera that ``Session.run`` is to go on with: of one in the world, for its object."""
@@ -161,6 +163,7 @@ def load(
     max_views: int = 5,
     viewpoints: str | Viewpoints | ArrayLike = "40",
     threads: int = 0,
+    unknown: float = 0.0,
 ) -> System:
     """Open models, and what belongs to them.
 
@@ -177,18 +180,23 @@ def load(
             see ``viewsphere.viewpoints_of``. Policies that know one grid of views are asked as ``policies.off_grid``
             says.
         threads: of ONNX Runtime, 0 for one on each core.
+        unknown: answer None where an object looks as strange as at most this share of the objects of known classes: so
+            often one of these is taken for unknown. 0 always names a class.
 
     Raises:
-        ModelError: there are no such models, or one of them cannot be used.
+        ModelError: there are no such models, or one of them cannot be used, or this recogniser cannot tell unknown
+            objects.
         PolicyError: there is no such policy, or it cannot be made.
         RiskError: the error rate cannot be promised.
-        UsageError: a threshold or a number of views makes no sense.
+        UsageError: a threshold, a rate or a number of views makes no sense.
     """
     given = {k: v for k, v in locals().items() if k != "models"} | {"models": str(models)}
     Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
     found = find_models(models)
     sphere = viewpoints_of(viewpoints)
     recogniser = Recogniser(found.recogniser, threads)
+    if unknown and recogniser.novelty is None:
+        raise ModelError(f"{found.recogniser}: cannot tell unknown objects; nextview fit unknown teaches it")
     if policy is None:
         policy, made = _default_policy(found.policies, sphere, recogniser)
     else:
@@ -203,7 +211,7 @@ def load(
     if isinstance(made, MapPeak):
         made = replace(made, sphere=_grid_of(opened.maps[made.map_name], made.sphere))
     stopping = Stopping.of(recogniser.calibration, threshold, risk, max_views)
-    return System(opened, made, policy, sphere, stopping, given)
+    return System(opened, made, policy, sphere, stopping, unknown, given)
 
 
 def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:

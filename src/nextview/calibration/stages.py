@@ -1,4 +1,4 @@
-"""What is fitted to predictions, from files to a file: in seconds and without torch."""
+"""What is fitted to predictions or stored views, from files to a file: without torch."""
 
 from __future__ import annotations
 
@@ -9,18 +9,25 @@ import numpy as np
 
 from nextview.belief import PLAIN_SUM, Calibration
 from nextview.calibration.fitting_set import FittingSet, fitting_set, held_out_by
+from nextview.calibration.novelty_score import fit_novelty
+from nextview.calibration.novelty_views import features_of, known_features, made_up_features
+from nextview.calibration.outliers import FAMILIES
 from nextview.calibration.policy_tables import fit_class_table, fit_ring, fit_sequence
 from nextview.calibration.size_density import densities, fit_weight
 from nextview.calibration.temperature import fit_risk, fit_temperature, loss
 from nextview.calibration.valleys import valley_gains
 from nextview.command_line import command_line
+from nextview.data.folders import list_dataset
 from nextview.data.predictions import Predictions
+from nextview.data.splits import deduplicated
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, ModelError, PredictionsError, UsageError
 from nextview.models.model_card import file_hash, read_card, write_card
 from nextview.models.size_evidence import SizeEvidence
+from nextview.novelty import novelty_path
 from nextview.policies.base import Scope
 from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
+from nextview.tracking import Track, silently
 
 
 @dataclass(frozen=True)
@@ -144,6 +151,104 @@ def fit_size(store: Path, predictions: Path, card: Path) -> FittedSize:
     command = command_line("fit size", store, predictions, card)
     write_card(card, model.made_by(*views.commands, *table.commands, command))
     return FittedSize(size, len(taught), len(data), before, after)
+
+
+@dataclass(frozen=True)
+class FittedUnknown:
+    """What ``fit_unknown`` found.
+
+    Attributes:
+        objects: known, that the recogniser learned.
+        made_up: objects that were made up.
+        held_out: known objects that it did not learn, to which the false-alarm rate was calibrated.
+    """
+
+    objects: int
+    made_up: int
+    held_out: int
+
+
+LEARNED_VIEWS, MADE_UP_VIEWS, HELD_OUT_VIEWS = 3, 4, 12
+"""Views of each object to which a novelty score is fitted."""
+
+
+def fit_unknown(
+    store: Path,
+    meshes: Path,
+    card: Path,
+    made_up: int = 1700,
+    seed: int = 0,
+    workers: int | None = None,
+    progress: Track = silently,
+) -> FittedUnknown:
+    """Teach a recogniser to tell objects of no class that it knows.
+
+    Nothing is learned from the test split. The objects that the card calls held out calibrate the false-alarm rate.
+
+    Args:
+        store: view store of the recogniser's training objects.
+        meshes: folder of their meshes, from which objects of no class are made up.
+        card: of the recogniser; is written anew, and NAME.novelty.npz beside it.
+        made_up: so many objects.
+        seed: of all that is drawn.
+        workers: processes; one for each core by default.
+        progress: of rendering and of running the recogniser.
+
+    Raises:
+        UsageError, DatasetError, ModelError: what was given makes no sense, or does not fit together.
+    """
+    if made_up < 1:
+        raise UsageError(f"at least one object has to be made up, not {made_up}")
+    model, views = read_card(card), ViewStore.open(store)
+    if not model.is_recogniser:
+        raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
+    known = np.array([name in model.classes for name in views.classes])[views.labels]
+    usable = np.flatnonzero(views.done & (views.splits != "test") & known)
+    kept_out = np.isin(np.array(views.names)[usable], model.held_out)
+    learned, held_out = usable[~kept_out], usable[kept_out]
+    if len(learned) == 0 or len(held_out) == 0:
+        raise DatasetError(f"{store}: holds no object that {card} was trained on, or none that it calls held out")
+    held_out = held_out[deduplicated(views.labels[held_out], views.measure()[held_out])]
+    entries = [e for e in list_dataset(meshes) if e.split != "test" and e.name not in model.held_out]
+    if not entries:
+        raise DatasetError(f"{meshes}: holds no mesh of which an object could be made up")
+    rng, places = np.random.default_rng(seed), (str(store.absolute()), str(card.absolute()))
+
+    def drawn(n: int) -> tuple[int, ...]:
+        return tuple(rng.permutation(len(views.sphere))[:n].tolist())
+
+    of_learned = [(*places, int(i), drawn(LEARNED_VIEWS)) for i in learned]
+    of_held_out = [(*places, int(i), drawn(HELD_OUT_VIEWS)) for i in held_out]
+    of_made_up = []
+    for k, at in enumerate(rng.integers(len(entries), size=(made_up, 2))):
+        one, other = (str(entries[j].path.absolute()) for j in at)
+        of_made_up.append((*places, FAMILIES[k % len(FAMILIES)], one, other, drawn(MADE_UP_VIEWS), k + seed * made_up))
+    strange = features_of(made_up_features, of_made_up, workers, progress, "made-up objects")
+    if not any(map(len, strange)):
+        raise DatasetError(f"{meshes}: no object could be made up of its meshes")
+    ordinary = features_of(known_features, of_learned, workers, progress, "objects that it learned")
+    calibrating = features_of(known_features, of_held_out, workers, progress, "held-out objects")
+    classes = np.array([model.classes.index(name) if name in model.classes else -1 for name in views.classes])
+    labels = classes[views.labels[learned]].repeat([len(rows) for rows in ordinary])
+    found = fit_novelty(
+        np.concatenate(ordinary),
+        labels,
+        np.concatenate([rows for rows in strange if len(rows)]),
+        np.stack(calibrating),
+        classes[views.labels[held_out]],
+        rng,
+    )
+    number = sum(len(rows) > 0 for rows in strange)
+    # Killed between the two files, this leaves a card that knows of no score, and not one of another score's hash.
+    write_card(card, replace(model, novelty_sha256=""))
+    sha256 = found.save(novelty_path(model.path))
+    about = (
+        f"{len(learned)} objects of the training split and {number} made-up ones, calibrated on {len(held_out)} others"
+    )
+    model = replace(model, novelty_sha256=sha256, fitted_to={**model.fitted_to, "novelty": about})
+    command = command_line("fit unknown", store, meshes, card, made_up=made_up, seed=seed)
+    write_card(card, model.made_by(*views.commands, command))
+    return FittedUnknown(len(learned), number, len(held_out))
 
 
 @dataclass(frozen=True)

@@ -55,11 +55,19 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
             console.print(f"Step {step} is doubtful ({doubt.name}): {doubt.message}.", markup=False, highlight=False)
     left = "no other view in reach" if result.stranded else "no views left"
     reason = "threshold reached" if result.confident else left
+    belief = float(result.views[-1].belief.max())
     rest = (
-        f", belief {result.confidence:.3f}, after {len(result.views)} view{'s' * (len(result.views) > 1)} "
+        f"belief {belief:.3f}, after {len(result.views)} view{'s' * (len(result.views) > 1)} "
         f"and {result.travel:.2f} cells of travel ({reason})."
     )
-    console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), rest))
+    if result.unknown:
+        most_like = f": most like a {printable(f'{result.most_like}')}, "
+        console.print(Text.assemble("It is ", ("of no known class", "bold"), most_like, rest))
+    else:
+        console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), ", ", rest))
+    if result.novelty is not None:
+        share = f"{100 * result.novelty:.2g} %"
+        console.print(f"Of objects of known classes, {share} look at least as strange.")
 
 
 def as_json(result: Recognition, frames: Sequence[str] = ()) -> str:
@@ -101,6 +109,9 @@ def as_json(result: Recognition, frames: Sequence[str] = ()) -> str:
         {
             "answer": result.answer,
             "confidence": round(result.confidence, 6),
+            "most_like": result.most_like,
+            "unknown": result.unknown,
+            "novelty": None if result.novelty is None else round(result.novelty, 6),
             "threshold_reached": result.confident,
             "views": views,
         },

@@ -18,7 +18,7 @@ from nextview.cli.download import download
 from nextview.cli.ending import orderly_end
 from nextview.cli.evaluate import evaluate
 from nextview.cli.export import export_lcm, export_lem, export_recogniser
-from nextview.cli.fit import fit_calibration, fit_size, fit_valleys
+from nextview.cli.fit import fit_calibration, fit_size, fit_unknown, fit_valleys
 from nextview.cli.fit_policies import fit_policies
 from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
@@ -53,7 +53,13 @@ COMMANDS: dict[str, Any] = {
     },
     "export": {"recogniser": export_recogniser, "lem": export_lem, "lcm": export_lcm},
     "predict": predict,
-    "fit": {"size": fit_size, "calibration": fit_calibration, "valleys": fit_valleys, "policies": fit_policies},
+    "fit": {
+        "size": fit_size,
+        "calibration": fit_calibration,
+        "unknown": fit_unknown,
+        "valleys": fit_valleys,
+        "policies": fit_policies,
+    },
     "evaluate": evaluate,
     "benchmark": benchmark,
     "report": report,
@@ -61,7 +67,7 @@ COMMANDS: dict[str, Any] = {
 GROUPS = {
     "train": "Train a network on a view store.",
     "export": "Turn a training run into an ONNX model with a card.",
-    "fit": "Fit what sizes mean, a recogniser's calibration, a map's valleys or simple policies to predictions.",
+    "fit": "Fit what sizes mean, a recogniser's calibration, what it does not know, a map's valleys, simple policies.",
 }
 
 

@@ -29,6 +29,7 @@ def recognise(
     risk: float | None = None,
     max_views: int = 5,
     viewpoints: str = "40",
+    unknown: float = 0.0,
     start: int | None = None,
     up: Literal["y", "z"] | Three | None = None,
     unit: Unit | None = None,
@@ -62,6 +63,8 @@ def recognise(
         max_views: stop after so many views.
         viewpoints: where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in degrees by views on
             each ring), or fibonacci:60 (spread evenly over the upper half).
+        unknown: say "unknown" of an object that looks as strange as at most this share of the objects of known
+            classes (0.05: so one in 20 of these is taken for unknown); 0 always names a class. Ends with status 0 too.
         start: first view; of the 40, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
         up: a mesh file's up axis; z if not given, but y for GLB. Of a folder, also a direction in its world; z if not
             given, but the normal of the support plane for 7-Scenes.
@@ -84,6 +87,7 @@ def recognise(
     from nextview.errors import UsageError
 
     options = {"policy": policy, "threshold": threshold, "risk": risk, "max_views": max_views, "viewpoints": viewpoints}
+    options["unknown"] = unknown
     if path.is_dir():
         if unit is not None:
             raise UsageError(f"{path}: --unit is for mesh files; a folder of captured views has lengths of its own")
@@ -169,7 +173,7 @@ def show(
     session = opened.session_with(camera, start, seed)
     watch.lap("loading the models")
     result = session.run(camera, watch.lap)
-    if result.answer is None:
+    if not result.seen:
         raise ObservationError(
             f"{name}: there is no answer, for nothing of it is seen from any of {len(result.views)} views; "
             "is it made of a few small parts far apart, or are a sensor's errors too strong?"

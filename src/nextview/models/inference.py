@@ -15,12 +15,15 @@ from nextview.errors import ModelError
 from nextview.models.model_card import ModelCard, find_card
 from nextview.models.network_input import from_observations
 from nextview.models.onnx_file import check_end, open_onnx
+from nextview.novelty import novelty_path, read_novelty
 from nextview.observation import Observation
 from nextview.policies.base import Evidence, maps_among
 
 RECOGNISER = "recogniser-modelnet10"
 BINS_OUTPUT = "sides"
 """The name that the azimuth bins have in a recogniser's ONNX file."""
+FEATURES_OUTPUT = "features"
+"""The name there of what the last layers make the logits of, (B, F): only the novelty score needs it."""
 MAPS = {"lem": "lem-modelnet10", "lcm": "lcm-modelnet10"}
 
 
@@ -43,6 +46,8 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
         shapes = {"logits": (len(card.classes),)}
         if card.azimuth_bins:
             shapes[BINS_OUTPUT] = (len(card.classes), card.azimuth_bins)
+        if card.novelty_sha256:
+            shapes[FEATURES_OUTPUT] = (None,)
     else:
         shapes = {"map": (None, 3)} | ({"sphere": (None, None)} if card.output == "sphere" else {})
     for end in session.get_inputs():
@@ -57,7 +62,8 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
 class Recogniser:
     """Names the object in each view, by what is seen and, where the camera knows it, by how large the object is.
 
-    ``azimuth_bins`` is how many azimuth bins of the object it tells apart, 0 if it was not taught to.
+    ``azimuth_bins`` is how many azimuth bins of the object it tells apart, 0 if it was not taught to. ``novelty`` tells
+    how strange a view is, see ``nextview.novelty``; None if that was not fitted.
 
     Args:
         model: name of a bundled model, or path of a card.
@@ -72,6 +78,8 @@ class Recogniser:
         self.azimuth_bins = self.card.azimuth_bins
         self.calibration = self.card.calibration
         self._session = open_weights(self.card, threads)
+        sha256 = self.card.novelty_sha256
+        self.novelty = read_novelty(novelty_path(self.card.path), sha256) if sha256 else None
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
         """Evidence of B views from one camera: logits, and azimuth bins if it knows them.
@@ -87,10 +95,20 @@ class Recogniser:
 
     def from_inputs(self, inputs: NDArray[Any]) -> Evidence:
         """The same by what is seen alone, see ``network_input``."""
-        logits, *azimuth_bins = self._session.run(
-            ["logits", BINS_OUTPUT] if self.azimuth_bins else ["logits"], {"input": inputs}
-        )
-        return Evidence(logits, azimuth_bins=azimuth_bins[0] if azimuth_bins else None)
+        names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins) + [FEATURES_OUTPUT] * (self.novelty is not None)
+        found = dict(zip(names, self._session.run(names, {"input": inputs}), strict=True))
+        novelty = None if self.novelty is None else self.novelty.scores(found[FEATURES_OUTPUT])
+        return Evidence(found["logits"], azimuth_bins=found.get(BINS_OUTPUT), novelty=novelty)
+
+    def features(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
+        """What the last layer makes the logits of, (B, F), see ``network_input``.
+
+        Raises:
+            ModelError: the file does not give it.
+        """
+        if FEATURES_OUTPUT not in [end.name for end in self._session.get_outputs()]:
+            raise ModelError(f"{self.card.path}: gives no {FEATURES_OUTPUT}; export the recogniser again")
+        return self._session.run([FEATURES_OUTPUT], {"input": inputs})[0]
 
 
 class MapNetwork:

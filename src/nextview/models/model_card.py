@@ -69,6 +69,8 @@ class ModelCard:
         azimuth_bins: of an object that a recogniser tells apart; 0 if it was not taught to.
         calibration: of a recogniser; its temperature is the only one there is.
         size: what a recogniser knows of the sizes of objects; None if nothing.
+        novelty_sha256: of the file beside the card by which it tells objects of no known class, see
+            ``nextview.novelty``; "" if there is none: such a recogniser never answers that it does not know an object.
         output: what a map network predicts: the local window, or the whole sphere, of which the window is a part.
         valley_classes: for which the valley of its map is the better view.
         valley_gain: by how much, for each class; see ``calibration.valleys``.
@@ -77,7 +79,7 @@ class ModelCard:
         largest_difference_to_torch: of the file's answers; None if it was not measured.
         note: what else is to be said.
         held_out: objects of the training split that it was not trained on; () if it does not say.
-        fitted_to: what calibration, size and valleys were fitted to, in words, by their names.
+        fitted_to: what calibration, size, novelty and valleys were fitted to, in words, by their names.
         schema: version of the card's own form.
 
     Raises:
@@ -94,6 +96,7 @@ class ModelCard:
     azimuth_bins: int = 0
     calibration: Calibration = PLAIN_SUM
     size: SizeEvidence | None = None
+    novelty_sha256: str = ""
     output: Literal["window", "sphere"] = "window"
     valley_classes: tuple[str, ...] = ()
     valley_gain: Mapping[str, float] = field(default_factory=dict)
@@ -143,6 +146,7 @@ class ModelCard:
                 "azimuth_bins": fields.whole("azimuth_bins", 0),
                 "calibration": PLAIN_SUM if said is None else Calibration.from_dict(said),
                 "size": None if size is None else SizeEvidence.from_dict(size),
+                "novelty_sha256": fields.sha256("novelty_sha256", ""),
             }
         else:
             own = {
@@ -193,6 +197,8 @@ class ModelCard:
             values["calibration"] = self.calibration.to_dict()
         if self.size is not None:
             values["size"] = self.size.to_dict()
+        if self.novelty_sha256:
+            values["novelty_sha256"] = self.novelty_sha256
         return values | {"fitted_to": dict(self.fitted_to)}
 
     def made_by(self, *commands: str) -> ModelCard:

@@ -86,8 +86,10 @@ def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> N
     return _network_input(spec, views, np.stack([o.pose for o in observations]), first.intrinsics)
 
 
-def from_store(spec: InputSpec, store: StoredViews, i: int) -> NDArray[Any]:
-    """What a network takes of all V views of object i of a store: the same as it takes of these views live.
+def from_store(
+    spec: InputSpec, store: StoredViews, i: int, chosen: NDArray[np.int64] | slice = slice(None)
+) -> NDArray[Any]:
+    """What a network takes of all V views of object i of a store, or of some: the same as it takes of these live.
 
     Returns:
         Geometry (V, 4, size, size) or image (V, 1, size, size), uint8; or clouds (V, 1024, 3) float32.
@@ -96,7 +98,7 @@ def from_store(spec: InputSpec, store: StoredViews, i: int) -> NDArray[Any]:
         views: NDArray[Any] = store.depth(i)
     else:
         views = store.image(i) if spec.kind == "image" else store.points(i)
-    return _network_input(spec, views, store.sphere.poses, store.intrinsics)
+    return _network_input(spec, views[chosen], store.sphere.poses[chosen], store.intrinsics)
 
 
 def _network_input(

@@ -28,18 +28,21 @@ class Evidence:
             settled on for the class. None if the recogniser cannot tell.
         seen: whether anything was seen, (B,) bool; None if something was in all. A view without is no evidence: in
             episodes all the above counts as zero there.
+        novelty: how strange each view is, (B,) float, see ``nextview.novelty``; None if the recogniser cannot tell.
     """
 
     logits: NDArray[np.floating]
     maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
     azimuth_bins: NDArray[np.floating] | None = None
     seen: NDArray[np.bool_] | None = None
+    novelty: NDArray[np.floating] | None = None
 
     def of(self, rows: Any) -> Evidence:
         """That of some of the episodes, by index or mask."""
         azimuth_bins = None if self.azimuth_bins is None else self.azimuth_bins[rows]
         seen = None if self.seen is None else self.seen[rows]
-        return Evidence(self.logits[rows], {k: m[rows] for k, m in self.maps.items()}, azimuth_bins, seen)
+        novelty = None if self.novelty is None else self.novelty[rows]
+        return Evidence(self.logits[rows], {k: m[rows] for k, m in self.maps.items()}, azimuth_bins, seen, novelty)
 
 
 @dataclass(frozen=True)

@@ -107,10 +107,17 @@ class ResNet(nn.Module):
                 nn.init.zeros_(module.bn3.weight)
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
+        return self.answers(self.features(x))
+
+    def features(self, x: Tensor) -> Tensor:
+        """Of images, (B, F)."""
         x = self.maxpool(self.relu(self.bn1(self.conv1(x))))
         for stage in (self.layer1, self.layer2, self.layer3, self.layer4):
             x = stage(x)
-        features = self.avgpool(x).flatten(1)
+        return self.avgpool(x).flatten(1)
+
+    def answers(self, features: Tensor) -> tuple[Tensor, ...]:
+        """What ``forward`` returns, by features."""
         logits = self.fc(features)
         if self.side is None:
             return (logits,)

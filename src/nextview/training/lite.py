@@ -97,9 +97,16 @@ class LiteNet(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
+        return self.answers(self.features(x))
+
+    def features(self, x: Tensor) -> Tensor:
+        """Of images, (B, F)."""
         x = self.stages(self.relu(self.norm0(self.stem(x))))
-        x = self.avgpool(self.relu(self.norm1(self.head(x)))).flatten(1)
-        features = F.dropout(x, self.dropout, self.training)
+        return self.avgpool(self.relu(self.norm1(self.head(x)))).flatten(1)
+
+    def answers(self, features: Tensor) -> tuple[Tensor, ...]:
+        """What ``forward`` returns, by features."""
+        features = F.dropout(features, self.dropout, self.training)
         logits = self.fc(features)
         if self.side is None:
             return (logits,)

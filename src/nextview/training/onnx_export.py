@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from nextview.models.inference import BINS_OUTPUT
+from nextview.models.inference import BINS_OUTPUT, FEATURES_OUTPUT
 from nextview.outputs import written_whole
 
 OPSET = 18
@@ -21,9 +21,9 @@ SMALL = 2**17
 
 
 class ShippedRecogniser(nn.Module):
-    """The recogniser as it ships: raw input bytes in, logits out.
+    """The recogniser as it ships: raw input bytes in, logits out, and the features of all networks side by side.
 
-    Where all networks know the azimuth bins of objects, a second output is what they say of them, see
+    Where all networks know the azimuth bins of objects, a third output is what they say of them, see
     ``networks.ResNet``.
 
     Args:
@@ -39,15 +39,16 @@ class ShippedRecogniser(nn.Module):
     @property
     def outputs(self) -> list[str]:
         """Names of what it gives."""
-        return ["logits", BINS_OUTPUT] if self.azimuth_bins else ["logits"]
+        return ["logits", FEATURES_OUTPUT] + [BINS_OUTPUT] * bool(self.azimuth_bins)
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         x = x.float() / 255
-        outputs = [network(x) for network in self.networks]
-        logits = torch.stack([each[0] for each in outputs]).mean(0)
+        features = [network.features(x) for network in self.networks]
+        outputs = [network.answers(seen) for network, seen in zip(self.networks, features, strict=True)]
+        logits, joined = torch.stack([each[0] for each in outputs]).mean(0), torch.cat(features, 1)
         if not self.azimuth_bins:
-            return (logits,)
-        return logits, torch.stack([each[1] for each in outputs]).mean(0).log_softmax(2)
+            return logits, joined
+        return logits, joined, torch.stack([each[1] for each in outputs]).mean(0).log_softmax(2)
 
 
 class ShippedMap(nn.Module):
