@@ -337,12 +337,12 @@ def test_where_nothing_is_seen_there_is_no_answer_and_no_novelty():
 
 
 def test_novelty_of_views_in_which_nothing_is_seen_does_not_count():
-    from nextview.episode import _without_unseen, select
+    from nextview.episode import _without_unseen
 
     evidence = Evidence(np.zeros((2, 3)), seen=np.array([True, False]), novelty=np.array([1.5, np.nan]))
     kept, seen = _without_unseen(evidence)
     np.testing.assert_array_equal(kept.novelty, [1.5, 0.0])
-    np.testing.assert_array_equal(select(evidence, seen).novelty, [1.5])
+    np.testing.assert_array_equal(evidence.of(seen).novelty, [1.5])
 
 
 def test_a_recogniser_that_was_not_taught_never_answers_unknown(tmp_path):
