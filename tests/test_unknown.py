@@ -386,3 +386,15 @@ def test_the_command_says_that_it_does_not_know(tmp_path, capsys):
     assert "look at least as strange" in said
     main(["recognise", str(tmp_path / "heap.off"), "--start", "3"])
     assert "It is a " in capsys.readouterr().out
+
+
+def test_features_that_hardly_vary_can_be_learned_too(tmp_path):
+    """Those of a network that learned next to nothing: the first layer then holds numbers beyond half precision."""
+    rng = np.random.default_rng(0)
+    known, made_up = (1 + 1e-6 * rng.normal(size=(n, 6)) for n in (60, 30))
+    held_out = 1 + 1e-6 * rng.normal(size=(9, 4, 6))
+    score = fit_novelty(known, rng.integers(0, 2, 60), made_up, held_out, rng.integers(0, 2, 9), rng)
+    assert np.abs(score.hidden).max() > np.finfo(np.float16).max
+    sha = score.save(tmp_path / "a.novelty.npz")
+    read = read_novelty(tmp_path / "a.novelty.npz", sha)
+    np.testing.assert_array_equal(read.scores(held_out[0]), score.scores(held_out[0]))

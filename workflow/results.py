@@ -284,6 +284,7 @@ SECTIONS: list[tuple[str, str, Callable[[Path], Iterator[str]]]] = [
     ("agreement.md", "Views that agree on the azimuth bin", page_as_is),
     ("size.md", "The size of the object", page_as_is),
     ("unseen.txt", "Classes that no network has seen", text_as_is),
+    ("unknown.md", "Objects of no known class", page_as_is),
     ("latency.txt", "Latency", text_as_is),
 ]
 """Stage, heading, and what writes the section."""

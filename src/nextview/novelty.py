@@ -115,15 +115,19 @@ class Novelty:
         return float(self.p_value(float(np.mean(scores)), len(scores))) if scores else 1.0
 
     def save(self, path: Path) -> str:
-        """Write a .npz file, the large tables in half precision; returns its SHA-256."""
-        small = ("directions", "neighbours", "hidden")
+        """Write a .npz file, the large tables in half precision where that holds them; returns its SHA-256."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self)}
-        arrays |= {name: arrays[name].astype(np.float16) for name in small}
+        arrays |= {name: in_half(arrays[name]) for name in ("directions", "neighbours", "hidden")}
         buffer = io.BytesIO()
         np.savez_compressed(buffer, allow_pickle=False, **arrays)
         with written_whole(path) as part:
             part.write_bytes(buffer.getvalue())
         return hashlib.sha256(buffer.getvalue()).hexdigest()
+
+
+def in_half(table: Float) -> Float:
+    """A table in half precision; in single precision if it holds numbers too large for that."""
+    return table.astype(np.float16 if np.abs(table).max() < np.finfo(np.float16).max else np.float32)
 
 
 def unit(rows: Float) -> Float:

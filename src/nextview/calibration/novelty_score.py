@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from nextview.novelty import Novelty, unit
+from nextview.novelty import Novelty, in_half, unit
 
 Float = NDArray[np.floating]
 
@@ -68,7 +68,7 @@ def fit_novelty(
 
 def _as_stored(table: Float) -> NDArray[np.float32]:
     """Rounded as ``Novelty.save`` rounds, so that what is calibrated is what is read."""
-    return table.astype(np.float16).astype(np.float32)
+    return in_half(table).astype(np.float32)
 
 
 def principal_components(rows: Float, most: int) -> tuple[Float, Float, Float]:
