@@ -269,7 +269,8 @@ def page_as_is(stage: Path) -> Iterator[str]:
 
 def text_as_is(stage: Path) -> Iterator[str]:
     """Text that a script printed."""
-    yield f"```\n{stage.read_text().rstrip()}\n```\n"
+    yield f"```\n{stage.read_text().rstrip()}\n```"
+    yield ""
 
 
 SECTIONS: list[tuple[str, str, Callable[[Path], Iterator[str]]]] = [

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import ThreadpoolController
 
 from nextview.belief import Stopping, fuse
 from nextview.episode import Episodes, Step
@@ -199,6 +201,12 @@ class Recognition:
         if path is not None:
             save_figure(figure, Path(path))
         return figure
+
+
+@lru_cache(maxsize=1)
+def _blas() -> ThreadpoolController:
+    """The libraries below NumPy. Their threads wait for more work in a loop, and take the cores from the networks."""
+    return ThreadpoolController().select(user_api="blas")
 
 
 class Session:
@@ -470,6 +478,10 @@ class Session:
         """
         if self.done:
             raise SessionError("this session has ended; begin another one")
+        with _blas().limit(limits=1):
+            return self._update(seen)
+
+    def _update(self, seen: Observation | Frame) -> View:
         if isinstance(seen, Frame):
             if self.object is None:
                 if self.views:
