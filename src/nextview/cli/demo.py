@@ -18,7 +18,7 @@ def demo(
     """
     from nextview.cameras.simulated import SimulatedCamera
     from nextview.cli.progress import console
-    from nextview.cli.recognise import show
+    from nextview.cli.show import show
     from nextview.data.samples import sample_mesh
 
     def camera() -> SimulatedCamera:

@@ -18,8 +18,9 @@ from nextview.cli.download import download
 from nextview.cli.ending import orderly_end
 from nextview.cli.evaluate import evaluate
 from nextview.cli.export import export_lcm, export_lem, export_recogniser
-from nextview.cli.fit import fit_calibration, fit_size, fit_unknown, fit_valleys
+from nextview.cli.fit import fit_calibration, fit_size, fit_valleys
 from nextview.cli.fit_policies import fit_policies
+from nextview.cli.fit_unknown import fit_unknown
 from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
 from nextview.cli.models import models

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from nextview.mesh_format import MAX_FACES
 
 if TYPE_CHECKING:
-    from nextview.cameras.captured_camera import CapturedCamera
     from nextview.observation import Camera
     from nextview.session import FrameCamera
 
@@ -84,6 +82,7 @@ def recognise(
         json: print JSON instead of a table.
         timing: also print where the time went, from the start of the process.
     """
+    from nextview.cli.show import show
     from nextview.errors import UsageError
 
     options = {"policy": policy, "threshold": threshold, "risk": risk, "max_views": max_views, "viewpoints": viewpoints}
@@ -95,7 +94,9 @@ def recognise(
             raise UsageError(f"{path}: --sensor is for mesh files; captured views have the errors of their own")
 
         def make() -> Camera | FrameCamera:
-            return _captured_camera(path, up, point, box, object_id, intrinsics, raw, any_size)
+            from nextview.cli.captured_folder import captured_camera
+
+            return captured_camera(path, up, point, box, object_id, intrinsics, raw, any_size)
     else:
         captured = {"point": point, "box": box, "object-id": object_id, "intrinsics": intrinsics}
         captured |= {"raw": raw or None, "any-size": any_size or None}
@@ -113,79 +114,3 @@ def recognise(
 
     name = path.name if sensor is None else f"{path.name} through {sensor}"
     show(make, name, models, options, start, seed, figure, json, timing)
-
-
-def _captured_camera(
-    folder: Path,
-    up: str | Three | None,
-    point: Three | None,
-    box: tuple[float, ...] | Path | None,
-    object_id: int | None,
-    intrinsics: tuple[float, float, float, float] | Path | None,
-    raw: bool,
-    any_size: bool,
-) -> CapturedCamera:
-    """Say what was found in a folder, and make a camera of it."""
-    import numpy as np
-
-    from nextview.cameras.captured import read_box, read_capture
-    from nextview.cameras.captured_camera import UP, CapturedCamera
-    from nextview.cli.progress import console
-    from nextview.errors import UsageError
-    from nextview.sensing.object_frame import Box, upright_axes
-
-    capture = read_capture(folder, intrinsics, object_id)
-    console.print(f"{capture!r}", highlight=False)
-    direction = UP[up] if isinstance(up, str) else up
-    if isinstance(box, Path):
-        found = read_box(box)
-    elif box is not None:
-        upwards = direction or capture.up
-        if upwards is None:
-            raise UsageError(f"{folder}: a box is upright, and in this layout nothing tells where up is: give --up")
-        found = Box(np.array(box[:3]), np.array(box[3:]), upright_axes(upwards))
-    return CapturedCamera(capture, direction, point, None if box is None else found, not raw, not any_size)
-
-
-def show(
-    make_camera: Callable[[], Camera | FrameCamera],
-    name: str,
-    models: str,
-    options: dict[str, Any],
-    start: int | None,
-    seed: int,
-    figure: Path | None,
-    json: bool = False,
-    timing: bool = False,
-) -> None:
-    """Recognise what a camera sees and print the episode; ``options`` are those of ``nextview.load``."""
-    from nextview import system
-    from nextview.cli.episode_table import as_json, print_episode
-    from nextview.cli.progress import console
-    from nextview.cli.timing import Stopwatch
-    from nextview.errors import ObservationError
-
-    watch = Stopwatch()
-    watch.lap("importing")
-    camera = make_camera()
-    watch.lap("building the scene")
-    opened = system.load(models, **options)
-    session = opened.session_with(camera, start, seed)
-    watch.lap("loading the models")
-    result = session.run(camera, watch.lap)
-    if not result.seen:
-        raise ObservationError(
-            f"{name}: there is no answer, for nothing of it is seen from any of {len(result.views)} views; "
-            "is it made of a few small parts far apart, or are a sensor's errors too strong?"
-        )
-    frames = [taken.frame.name for taken in getattr(camera, "taken", ())]
-    if json:
-        print(as_json(result, frames))
-    else:
-        print_episode(result, name, opened.policy_name, frames)
-    for frame, reason in getattr(camera, "left_out", {}).items():
-        console.print(f"left out: {frame}: {reason}", style="yellow", highlight=False)
-    if timing:
-        watch.show()
-    if figure:
-        result.plot(figure, name)
