@@ -100,8 +100,10 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
 
 def test_the_graph_from_the_bundled_models_makes_tables_alone(tmp_path):
     (tmp_path / "ModelNet10/chair/train").mkdir(parents=True)
-    result = snakemake(tmp_path, "-n", "-p", config=(f"data={tmp_path / 'ModelNet10'}", "models=bundled"))
+    options = (f"data={tmp_path / 'ModelNet10'}", "models=bundled", "latency=false")
+    result = snakemake(tmp_path, "-n", "-p", config=options)
     assert result.returncode == 0, result.stdout + result.stderr
+    assert "latency.txt" not in result.stdout + result.stderr
     assert "nextview train" not in result.stdout + result.stderr
     assert "docs/results.md" in result.stdout + result.stderr
 
