@@ -102,9 +102,9 @@ class ViewStore:
         for name in (*RENDERED, DIGEST):
             store.add(name)
 
-    def note(self, **facts: Any) -> None:
+    def note(self, **changes: Any) -> None:
         """Change attributes, and with them their checksum."""
-        attributes = self.group.attrs.asdict() | facts
+        attributes = self.group.attrs.asdict() | changes
         self.group.attrs.put(attributes | {CHECKSUM: checksum(attributes)})
 
     def add(self, name: str) -> None:

@@ -87,9 +87,9 @@ def store_figure(store: ViewStore) -> Figure:
 
     table, axes = right.subplots(2, 1, height_ratios=[1.2, 1])
     table.axis("off")
-    facts = summary(store)
-    for row, (what, value) in enumerate(facts.items()):
-        y = 1 - row / len(facts)
+    rows = summary(store)
+    for row, (what, value) in enumerate(rows.items()):
+        y = 1 - row / len(rows)
         table.text(0, y, what, color=GREY, fontsize=11, va="top")
         table.text(1, y, value, fontsize=11, va="top", ha="right")
     axes.set_title("mean depth entropy of the views", fontsize=11)
@@ -143,7 +143,7 @@ def summary(store: ViewStore) -> dict[str, str]:
     copies = sum(map(len, store.duplicates)) - len(store.duplicates)
     conflicting = sum(len(set(labels[group])) > 1 for group in store.duplicates)
     side = store.group.attrs["size"]
-    facts = {
+    rows = {
         "objects": f"{len(store):,} in {len(store.classes)} classes",
         "rendered": f"{rendered:,}",
         "left out": f"{len(store.failures):,}",
@@ -153,17 +153,17 @@ def summary(store: ViewStore) -> dict[str, str]:
         "size on disk": f"{size / 1e9:.2f} GB" if size > 1e9 else f"{size / 1e6:.1f} MB",
     }
     if rendered:
-        facts["per view"] = "  ".join(
+        rows["per view"] = "  ".join(
             f"{name} {sizes[name] / rendered / views / 1e3:.1f} kB"
             for name in ("image", "depth", "points")
             if name in sizes
         )
     missing = [name for name in RENDERED if not store.holds(name)]
     if missing:
-        facts["arrays that are missing"] = ", ".join(missing)
+        rows["arrays that are missing"] = ", ".join(missing)
     if "sha256" not in store.group.attrs:
-        facts["byte-identical copies"] = "unknown, made without hashes"
-    return facts
+        rows["byte-identical copies"] = "unknown, made without hashes"
+    return rows
 
 
 def median_radii(store: ViewStore) -> dict[str, float]:
