@@ -29,6 +29,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from multiprocessing.util import _exit_function
 from pathlib import Path
 from typing import Any
 
@@ -230,6 +231,7 @@ def _be_command(arguments: list[str], printed: int, counted: int, events: int | 
             status = 0
         except SystemExit as ended:
             status = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+        _exit_function()  # what the interpreter does for pools of processes when it ends: a fork has to ask for it
         os.write(counted, str(seen).encode())
         sys.stdout.flush()
         sys.stderr.flush()

@@ -375,6 +375,14 @@ def test_an_object_is_asked_for_in_one_way():
         ObservedObject(point=(0, 0))
 
 
+def test_a_point_in_the_camera_names_no_object():
+    seen = frame([TABLE, WEDGE], pose_at(45, 20, 0.9), seed=1)
+    thing = ObservedObject(point=seen.camera_to_world[:3, 3])
+    with pytest.raises(ObservationError, match="0 m from the camera"):
+        thing.add(seen)
+    assert not thing.sightings
+
+
 # Doubts about observations
 
 

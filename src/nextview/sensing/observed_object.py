@@ -30,6 +30,8 @@ SIZE = 224
 """Side of the observations' images: what the bundled networks take."""
 FEWEST = 60
 """Pixels that an object has to have in a frame."""
+NEAREST = 0.01
+"""Metres between the camera and the point that names an object: nothing nearer can be measured."""
 MENDED = 0.03
 """Share of an object's pixels in an earlier frame that has to change before they are looked at again."""
 SAME = 0.01
@@ -267,7 +269,12 @@ class ObservedObject:
         """About how far the object is from the camera, metres."""
         camera = frame.camera_to_world[:3, 3]
         if self.point is not None:
-            return float(np.linalg.norm(self.point - camera))
+            distance = float(np.linalg.norm(self.point - camera))
+            if distance < NEAREST:
+                raise ObservationError(
+                    f"the point of the object lies {distance:.2g} m from the camera: is it in the world, in metres?"
+                )
+            return distance
         on = above.points[segmentation.on_ground(above.points @ axes[:2].T, ground)]
         return float(np.median(np.linalg.norm(on - camera, axis=1))) if len(on) else 1.0
 
