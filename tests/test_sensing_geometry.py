@@ -1,5 +1,6 @@
 """Object frames, support planes, noise and facets against closed forms and brute force."""
 
+import time
 from itertools import combinations
 
 import numpy as np
@@ -12,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from nextview.errors import ObservationError, UsageError
 from nextview.mesh import make_mesh
 from nextview.sensing import Box, Frame, ObjectFrame
-from nextview.sensing.facets import drop_flying, fit_facets
+from nextview.sensing.facets import Facets, drop_flying, fit_facets
 from nextview.sensing.noise import Noise, estimate_noise
 from nextview.sensing.object_frame import enclose, smallest_circle, upright_axes
 from nextview.sensing.support_plane import Plane, Samples, find_plane, mistake_in_pose, refine_plane, sample
+from nextview.sensing.virtual_view import look_again
 
 UP = np.array([0, 0, 1.0])
 CORNERS = np.array(np.meshgrid([0, 1.0], [0, 1.0], [0, 1.0])).reshape(3, -1).T
@@ -326,3 +328,16 @@ def test_samples_are_spread_over_the_picture():
     found = sample(frame, frame.depth > 0, Noise(np.ones(1), np.zeros(1)))
     assert 1000 < len(found.points) < 3000
     np.testing.assert_allclose(found.points[:, 2], 0, atol=1e-4)
+
+
+def test_a_pixel_that_is_wider_than_the_image_takes_no_time():
+    """Of a sensor with a focal length of a pixel, say: drawn pixel by pixel it took minutes."""
+    n = 50
+    rays = np.column_stack([rng().uniform(-0.1, 0.1, (n, 2)), np.ones(n)])
+    where = np.zeros(n, int)
+    wide = Facets(np.tile([0.0, 0.0, 1.0], (n, 1)), rays, where, where, np.array([1e3, 1e3]))
+    began = time.process_time()
+    depth, _ = look_again(wide, pose_at(30, 20, 1.0), 0.5, 224)
+    assert time.process_time() - began < 5
+    assert np.isfinite(depth).all()
+    assert depth.any()

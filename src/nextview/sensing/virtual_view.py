@@ -13,6 +13,8 @@ Float = NDArray[np.float64]
 
 NEAREST, FARTHEST = 0.5, 100.0
 """Depth of what can be shown, object radii; all of the object is between 2 and 4."""
+WIDEST = 1 / 16
+"""Half the width of what one pixel of the sensor shows here at most, as a part of the image: it bounds the time."""
 LAYER = 0.03
 """Facets that lie within so many object radii of depth are of one surface, where the nearest to a pixel is shown."""
 
@@ -68,7 +70,8 @@ def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[N
     front = np.flatnonzero((z > NEAREST) & (z < FARTHEST))
     x, y = focal * points[front, :2].T / z[front] + size / 2
     # A facet is as wide as a sensor's pixel: so many pixels here, half to each side; somewhat more where it is turned.
-    half = np.maximum(0.6 * focal * facets.pitch.mean() * seen_from[front] / z[front], 0.5) + 0.05
+    # A sensor that stands within the object has wider ones; they fill gaps no farther than WIDEST.
+    half = np.clip(0.6 * focal * facets.pitch.mean() * seen_from[front] / z[front], 0.5, WIDEST * size) + 0.05
     # The first column and row whose centres it covers:
     left, top = (np.clip(np.ceil(at - half - 0.5), -size, size).astype(np.int64) for at in (x, y))
     layer = (z[front] / LAYER).astype(np.int64) << 48 | front
