@@ -121,7 +121,7 @@ def test_mistakes_end_in_one_sentence(chair, monkeypatch, capsys, arguments, wor
 def test_bundled_models_are_what_their_cards_say():
     cards = bundled_cards()
     assert {card.kind for card in cards.values()} >= {"recogniser", "lem"}
-    assert {path.suffix for path in BUNDLED.iterdir()} <= {".onnx", ".json", ".npz"}  # nothing that is pickled
+    assert {path.suffix for path in BUNDLED.iterdir()} <= {".onnx", ".json", ".safetensors"}  # nothing that is pickled
     assert sum(card.path.stat().st_size for card in cards.values()) < 60e6
     for card in cards.values():
         training = card.training

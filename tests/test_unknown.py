@@ -192,17 +192,17 @@ def test_a_lathe_turns_a_cone_of_the_right_volume():
 
 def test_a_score_is_read_as_it_was_written(tmp_path):
     score = some_score(np.random.default_rng(6))
-    sha256 = score.save(tmp_path / "a.npz")
-    again = read_novelty(tmp_path / "a.npz", sha256)
+    sha256 = score.save(tmp_path / "a.novelty.safetensors")
+    again = read_novelty(tmp_path / "a.novelty.safetensors", sha256)
     for name, values in vars(score).items():
         np.testing.assert_array_equal(getattr(again, name), values)
 
 
 def test_a_score_that_is_missing_damaged_or_another_is_refused(tmp_path):
-    path = tmp_path / "a.npz"
+    path = tmp_path / "a.novelty.safetensors"
     sha256 = some_score(np.random.default_rng(6)).save(path)
     with pytest.raises(ModelError, match="missing"):
-        read_novelty(tmp_path / "b.npz", sha256)
+        read_novelty(tmp_path / "b.novelty.safetensors", sha256)
     with pytest.raises(ModelError, match="SHA-256 differs"):
         read_novelty(path, "0" * 64)
     for content in (b"", b"PK\x03\x04", path.read_bytes()[:200]):
@@ -395,6 +395,6 @@ def test_features_that_hardly_vary_can_be_learned_too(tmp_path):
     held_out = 1 + 1e-6 * rng.normal(size=(9, 4, 6))
     score = fit_novelty(known, rng.integers(0, 2, 60), made_up, held_out, rng.integers(0, 2, 9), rng)
     assert np.abs(score.hidden).max() > np.finfo(np.float16).max
-    sha = score.save(tmp_path / "a.novelty.npz")
-    read = read_novelty(tmp_path / "a.novelty.npz", sha)
+    sha = score.save(tmp_path / "a.novelty.safetensors")
+    read = read_novelty(tmp_path / "a.novelty.safetensors", sha)
     np.testing.assert_array_equal(read.scores(held_out[0]), score.scores(held_out[0]))

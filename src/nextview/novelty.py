@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import io
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 
 from nextview.errors import ModelError
 from nextview.outputs import written_whole
+from nextview.weights_file import checked_content
 
 Float = NDArray[np.floating]
 
@@ -115,14 +115,13 @@ class Novelty:
         return float(self.p_value(float(np.mean(scores)), len(scores))) if scores else 1.0
 
     def save(self, path: Path) -> str:
-        """Write a .npz file, the large tables in half precision where that holds them; returns its SHA-256."""
+        """Write a .safetensors file, the large tables in half precision if that holds them; returns its SHA-256."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self)}
         arrays |= {name: in_half(arrays[name]) for name in ("directions", "neighbours", "hidden")}
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, allow_pickle=False, **arrays)
+        content = save({name: np.ascontiguousarray(values) for name, values in arrays.items()})
         with written_whole(path) as part:
-            part.write_bytes(buffer.getvalue())
-        return hashlib.sha256(buffer.getvalue()).hexdigest()
+            part.write_bytes(content)
+        return hashlib.sha256(content).hexdigest()
 
 
 def in_half(table: Float) -> Float:
@@ -136,28 +135,23 @@ def unit(rows: Float) -> Float:
 
 
 def novelty_path(weights: Path) -> Path:
-    """Where the novelty score of a recogniser lies: NAME.novelty.npz beside NAME.onnx."""
-    return weights.with_suffix(".novelty.npz")
+    """Where the novelty score of a recogniser lies: NAME.novelty.safetensors beside NAME.onnx."""
+    return weights.with_suffix(".novelty.safetensors")
 
 
 def read_novelty(path: Path, sha256: str) -> Novelty:
-    """Read what ``Novelty.save`` wrote. Nothing is unpickled.
+    """Read what ``Novelty.save`` wrote.
 
     Raises:
         ModelError: it is missing, is not the file that the card describes, or does not fit together.
     """
+    content = checked_content(path, sha256, "the novelty score is")
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ModelError(f"{path}: the novelty score is missing or cannot be read ({error.strerror})") from None
-    if hashlib.sha256(content).hexdigest() != sha256:
-        raise ModelError(f"{path}: is not the file that its card describes (the SHA-256 differs)")
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            arrays = {f.name: file[f.name] for f in fields(Novelty)}
-    except (ValueError, KeyError, OSError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        arrays = load(content)
+        wide = {f.name: arrays[f.name] for f in fields(Novelty)}
+    except (SafetensorError, KeyError) as error:
         raise ModelError(f"{path}: not a novelty score ({error})") from None
-    wide = {k: v.astype(np.float32) if v.dtype == np.float16 else v for k, v in arrays.items()}
+    wide = {k: v.astype(np.float32) if v.dtype == np.float16 else v for k, v in wide.items()}
     try:
         return Novelty(**wide)
     except ModelError as error:

@@ -188,7 +188,7 @@ def fit_unknown(
     Args:
         store: view store of the recogniser's training objects.
         meshes: folder of their meshes, from which objects of no class are made up.
-        card: of the recogniser; is written anew, and NAME.novelty.npz beside it.
+        card: of the recogniser; is written anew, and NAME.novelty.safetensors beside it.
         made_up: so many objects.
         seed: of all that is drawn.
         workers: processes; one for each core by default.

@@ -18,8 +18,8 @@ def fit_unknown(
 ) -> None:
     """Teach a recogniser to tell objects of no class that it knows, at a false-alarm rate that can be chosen.
 
-    What it finds goes into NAME.novelty.npz beside the card, and its SHA-256 into the card. Nothing is learned from the
-    test split.
+    What it finds goes into NAME.novelty.safetensors beside the card, and its SHA-256 into the card. Nothing is learned
+    from the test split.
 
     Args:
         store: view store of the recogniser's training objects.

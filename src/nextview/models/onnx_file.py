@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import onnxruntime as ort
 
 from nextview.errors import ModelError
+from nextview.weights_file import checked_content
 
 
 def open_onnx(path: Path, sha256: str, threads: int = 0) -> ort.InferenceSession:
@@ -21,12 +21,7 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> ort.InferenceSession
     Raises:
         ModelError: the file is missing, is not the one that the card describes, or ONNX Runtime refuses it.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ModelError(f"{path}: the weights are missing or cannot be read ({error.strerror})") from None
-    if hashlib.sha256(content).hexdigest() != sha256:
-        raise ModelError(f"{path}: is not the file that its card describes (the SHA-256 differs)")
+    content = checked_content(path, sha256)
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
