@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import logging
 import os
-import shutil
 import signal
 import sys
 import threading
@@ -14,8 +13,8 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import NoReturn
 
-NARROWEST, WIDEST = 20, 500
-"""Columns that help and tables are laid out for: in five, laying out the help never ends and takes all memory."""
+from nextview.cli.columns import sensible_columns
+
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
 
 
@@ -52,7 +51,7 @@ def orderly_end(advice: str) -> Iterator[None]:
     from nextview.errors import NextviewError
 
     _open_what_is_closed()
-    with _columns(), _sigterm():
+    with sensible_columns(), _sigterm():
         try:
             try:
                 yield
@@ -78,9 +77,8 @@ def orderly_end(advice: str) -> Iterator[None]:
             say(f"standard output or a file cannot be written ({error.strerror or 'it is closed'})")
             _forget_output(1)
         except (KeyboardInterrupt, SystemExit) as ended:
-            interrupt = (
-                ended.__context__ if isinstance(ended, SystemExit) else ended
-            )  # Lightning makes one of the other
+            # Lightning makes one of the other.
+            interrupt = ended.__context__ if isinstance(ended, SystemExit) else ended
             if not isinstance(interrupt, KeyboardInterrupt):
                 raise
             # The reads that zarr has begun would complain, at great length, of being left.
@@ -102,22 +100,6 @@ def _open_what_is_closed() -> None:
     for name, mode in (("stdin", "r"), ("stdout", "r"), ("stderr", "w")):  # writing to the second fails, as it should
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
-
-
-@contextmanager
-def _columns() -> Iterator[None]:
-    """Lay out for no fewer and no more columns than make sense."""
-    before = os.environ.get("COLUMNS")
-    columns = shutil.get_terminal_size().columns
-    if before is not None or not NARROWEST <= columns <= WIDEST:
-        os.environ["COLUMNS"] = str(min(max(columns, NARROWEST), WIDEST))
-    try:
-        yield
-    finally:
-        if before is None:
-            os.environ.pop("COLUMNS", None)
-        else:
-            os.environ["COLUMNS"] = before
 
 
 @contextmanager

@@ -1,0 +1,65 @@
+"""The commands of ``nextview`` by name; each is one file beside this one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from nextview.cli.benchmark import benchmark
+from nextview.cli.capture import capture
+from nextview.cli.check import check
+from nextview.cli.correspond import correspond
+from nextview.cli.demo import demo
+from nextview.cli.download import download
+from nextview.cli.evaluate import evaluate
+from nextview.cli.export import export_lcm, export_lem, export_recogniser
+from nextview.cli.fit import fit_calibration, fit_size, fit_valleys
+from nextview.cli.fit_policies import fit_policies
+from nextview.cli.fit_unknown import fit_unknown
+from nextview.cli.inspect import inspect
+from nextview.cli.measure import measure
+from nextview.cli.models import models
+from nextview.cli.predict import predict
+from nextview.cli.recognise import recognise
+from nextview.cli.render import render
+from nextview.cli.report import report
+from nextview.cli.train_gain import train_gain
+from nextview.cli.train_grid import train_grid
+from nextview.cli.train_maps import train_lcm, train_lem
+from nextview.cli.train_recogniser import train_recogniser
+
+COMMANDS: dict[str, Any] = {
+    "recognise": recognise,
+    "demo": demo,
+    "capture": capture,
+    "models": models,
+    "download": download,
+    "render": render,
+    "check": check,
+    "measure": measure,
+    "correspond": correspond,
+    "inspect": inspect,
+    "train": {
+        "recogniser": train_recogniser,
+        "grid": train_grid,
+        "lem": train_lem,
+        "lcm": train_lcm,
+        "gain": train_gain,
+    },
+    "export": {"recogniser": export_recogniser, "lem": export_lem, "lcm": export_lcm},
+    "predict": predict,
+    "fit": {
+        "size": fit_size,
+        "calibration": fit_calibration,
+        "unknown": fit_unknown,
+        "valleys": fit_valleys,
+        "policies": fit_policies,
+    },
+    "evaluate": evaluate,
+    "benchmark": benchmark,
+    "report": report,
+}
+GROUPS = {
+    "train": "Train a network on a view store.",
+    "export": "Turn a training run into an ONNX model with a card.",
+    "fit": "Fit what sizes mean, a recogniser's calibration, what it does not know, a map's valleys, simple policies.",
+}
