@@ -144,7 +144,7 @@ def _other_form(rng: np.random.Generator, array: NDArray) -> Any:
             ]
         if choice == 6:
             return np.kron(array, np.ones((int(rng.integers(1, 7)),) * array.ndim)).astype(array.dtype)
-        if choice == 7 and array.shape == (4, 4):
+        if choice == 7 and array.shape == (4, 4) and array.dtype.kind in "fi":
             turned = np.block([[array[:3, :3].T, -array[:3, :3].T @ array[:3, 3:]], [array[3:]]])  # a pose's inverse
             return [turned, array[:3], array @ np.diag([1, -1, -1, 1.0]), array * 2][rng.integers(4)]
         return np.broadcast_to(array.ravel()[:1].reshape((1,) * array.ndim), array.shape)
@@ -156,7 +156,7 @@ def damage(
     """One to three frames or views of which a few arguments are changed, taken out, or those of another."""
     scene = [dict(load(sound[i])) for i in rng.permutation(len(sound))[: rng.integers(1, 4)]]
     for frame in scene:
-        for name in set(frame) - {"depth", "intrinsics", "pose"}:
+        for name in sorted(set(frame) - {"depth", "intrinsics", "pose"}):  # in the same order in every process
             if rng.random() < 0.6:
                 del frame[name]
     for _ in range(rng.integers(1, 4)):
@@ -204,8 +204,8 @@ def damage_frames(rng: np.random.Generator, sound: list[Path], case: Path) -> tu
         options["up"] = None if rng.random() < 0.5 else change(rng, np.array([0, 0, 1.0]))
     if rng.random() < 0.2 and options:
         name = sorted(options)[rng.integers(len(options))]
-        if isinstance(options[name], dict):
-            inner = sorted(options[name])[rng.integers(3)]
+        if name in ("box", "known"):
+            inner = sorted(options[name])[rng.integers(len(options[name]))]
             options[name][inner] = change(rng, options[name][inner])
         elif name == "point":
             options[name] = change(rng, options[name])
