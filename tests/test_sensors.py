@@ -11,7 +11,8 @@ from scipy.stats import norm
 
 import nextview
 from nextview import SimulatedCamera, ViewSphere
-from nextview.cameras.sensors import SENSORS, SensedCamera, Sensor, sensor_named
+from nextview.cameras.sensors import SENSORS, SensedCamera, Sensor, SensorMix, sensor_named
+from nextview.cameras.sensors.boxes_around import boxes_around
 from nextview.cameras.sensors.sensor import ERRORS
 from nextview.cli.main import main
 from nextview.data.rendering import render
@@ -227,7 +228,7 @@ def test_same_seed_same_frames(name):
 
 
 @pytest.mark.parametrize(
-    "error", [e for e in ERRORS if e not in ("centre", "size", "tilt", "table", "crop", "turned", "moved")]
+    "error", [e for e in ERRORS if e not in ("centre", "size", "tilt", "table", "crop", "boxes", "turned", "moved")]
 )
 def test_stronger_is_noisier(error):
     sensor = replace(
@@ -291,6 +292,50 @@ def test_part_of_the_table_is_left_in_and_part_of_the_object_cut_off():
     assert 0.3 < min(kept) < 0.75 < max(kept) <= 1
 
 
+def test_boxes_stand_on_the_ground_beside_the_object():
+    mesh = sample_mesh("table")
+    boxes = boxes_around(mesh.vertices, 7, rng(24))
+    each = boxes.vertices.reshape(7, 8, 3)
+    np.testing.assert_allclose(each[:, :, 2].min(1), mesh.vertices[:, 2].min())
+    reach = np.hypot(*mesh.vertices[:, :2].T).max()
+    for one in each:
+        solid = trimesh.Trimesh(one, boxes.faces[:12], process=False)
+        assert solid.is_volume
+        assert solid.volume == pytest.approx(trimesh.convex.convex_hull(one).volume)
+        assert np.hypot(*solid.sample(2000, seed=0)[:, :2].T).min() > reach
+        assert np.hypot(*one[:, :2].T).max() < 3  # no camera stands in it
+
+
+def test_boxes_hide_what_is_behind_them_and_are_not_taken_for_the_object():
+    mesh = sample_mesh("table")
+    alone = SensedCamera(mesh, "none", rng(25))
+    among = SensedCamera(mesh, replace(SENSORS["none"], boxes=9.0), rng(25))
+    shares = []
+    for pose in SPHERE.poses[::3]:
+        whole, hidden = alone.frame(pose), among.frame(pose)
+        kept = np.zeros_like(whole.mask) if hidden is None else hidden.mask
+        assert not (kept & ~whole.mask).any()
+        if hidden is not None:
+            np.testing.assert_array_equal(hidden.depth[kept], whole.depth[kept])
+            assert (hidden.depth[whole.mask & ~kept] < whole.depth[whole.mask & ~kept]).all()
+            assert kept.sum() / whole.mask.sum() == pytest.approx(among.visible_share(pose), abs=0.02)
+        shares.append(among.visible_share(pose))
+    assert min(shares) < 0.5 < max(shares)
+    assert alone.visible_share(SPHERE.poses[0]) == 1
+
+
+def test_a_mix_is_another_sensor_for_every_object():
+    drawn = [SensedCamera(BALL, "mix", rng(26, i)).sensor for i in range(300)]
+    assert drawn == [SensedCamera(BALL, SensorMix(), rng(26, i)).sensor for i in range(300)]
+    assert {sensor.name.partition(":")[0] for sensor in drawn} == {"render", "kinect", "stereo"}
+    for error, chance in (("tilt", 0.5), ("crop", 0.4), ("boxes", 0.5), ("table", 0.2)):
+        assert np.mean([getattr(s, error) > 0 for s in drawn]) == pytest.approx(chance, abs=0.1)
+    weak = [SensorMix(0.5).draw(rng(27, i)) for i in range(50)]
+    strong = [SensorMix().draw(rng(27, i)) for i in range(50)]
+    for error in ERRORS:
+        assert [getattr(s, error) for s in weak] == pytest.approx([getattr(s, error) / 2 for s in strong])
+
+
 def test_size_is_told_only_where_it_is_known():
     mesh = sample_mesh("chair")
     assert SensedCamera(mesh, "kinect", rng(22)).observe(SPHERE.poses[9]).radius is None
@@ -308,7 +353,9 @@ def test_a_sensor_that_measures_nothing_sees_nothing():
     np.testing.assert_allclose(seen.pose, SPHERE.poses[5], atol=1e-12)
 
 
-@pytest.mark.parametrize("text", ["kinekt", "kinect:", "kinect:x", "kinect:-1", "kinect:inf", "kinect:nan", ""])
+@pytest.mark.parametrize(
+    "text", ["kinekt", "kinect:", "kinect:x", "kinect:-1", "kinect:inf", "kinect:nan", "mix:-1", ""]
+)
 def test_what_is_no_sensor_is_refused(text):
     with pytest.raises(UsageError, match="sensor"):
         sensor_named(text)
@@ -320,6 +367,7 @@ def test_numbers_that_no_sensor_has_are_refused():
             replace(SENSORS["none"], **wrong)
     assert sensor_named("wrist:0.5").table == SENSORS["wrist"].table / 2
     assert sensor_named("wrist:1") == SENSORS["wrist"]
+    assert sensor_named("mix:0.5") == SensorMix(0.5)
 
 
 def test_recognise_through_a_sensor_by_python_and_command_line(tmp_path, capsys):

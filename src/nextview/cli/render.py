@@ -42,8 +42,8 @@ def render(
         turn: turn each mesh about the vertical by a random angle.
         unit: of length in the mesh files, so that the store knows how large the objects are (ModelNet: inch). Not
             known by default; a store that was made without can be told later.
-        sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist or none, or NAME:STRENGTH
-            (docs/your_camera.md); clean renders if not given.
+        sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist, none, or a mix of all that is
+            drawn anew for each object; or NAME:STRENGTH (docs/your_camera.md). Clean renders if not given.
         max_faces: leave out a mesh of more triangles, or a file of more than 60 bytes for each of these.
         seed: decides the stretch and the turn of each mesh, and the errors of a sensor.
         workers: processes; one for each core by default.

@@ -15,7 +15,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from nextview.cameras.sensors import SensedCamera, Sensor, sensor_named
+from nextview.cameras.sensors import SensedCamera, Sensor, SensorMix, sensor_named
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.cloud import POINTS
 from nextview.command_line import command_line
@@ -227,7 +227,7 @@ def _begin(
     deform: Deform,
     unit: str | None,
     dataset: str,
-    sensor: Sensor | None,
+    sensor: Sensor | SensorMix | None,
 ) -> ViewStore:
     """The store as an earlier run left it, if that had the same meshes and settings, or a new one."""
     with ThreadPoolExecutor() as pool:
@@ -319,7 +319,7 @@ def _render_entry(
     seed: int,
     deform: Deform,
     max_faces: int,
-    sensor: Sensor | None,
+    sensor: Sensor | SensorMix | None,
     item: tuple[int, Entry],
 ) -> str | None:
     """Render one object into the store; the reason if its mesh cannot be used."""

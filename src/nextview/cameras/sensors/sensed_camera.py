@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from nextview.cameras.sensors.boxes_around import boxes_around
 from nextview.cameras.sensors.depth_noise import uniform_field
-from nextview.cameras.sensors.sensor import Sensor, sensor_named
+from nextview.cameras.sensors.sensor import Sensor
+from nextview.cameras.sensors.sensor_mix import SensorMix, sensor_named
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.errors import ObservationError
 from nextview.mesh import Mesh
@@ -28,34 +30,44 @@ REACH = 1.3
 """What is taken for the object lies in a sphere so many radii large: with a wrong pose it sticks out of its own."""
 LEFTOVER = 4.0
 """Size of the patches of the table that are taken for the object, pixels."""
+OBJECT, TABLE_TOP, BOX = 0, 1, 2
+"""What a pixel shows; where it shows nothing, the first."""
 
 
 class SensedCamera:
     """Looks at a mesh through a sensor, as a robot would see the object.
 
-    The object stands on a table. What the sensor makes of the picture goes the way of every frame through
-    ``ObservedObject``, which knows where the object is and how large, up to the errors of the setup. Its mask is all
-    that was measured near the object and is not the table, up to the part of it that is left in: how well table and
-    object are told apart otherwise is not simulated here.
+    The object stands on a table, among boxes if the sensor's setup has any. What the sensor makes of the picture goes
+    the way of every frame through ``ObservedObject``, which knows where the object is and how large, up to the errors
+    of the setup. Its mask is all that was measured near the object and is neither the table, up to the part of it that
+    is left in, nor a box: how well these and the object are told apart otherwise is not simulated here.
 
     Args:
         mesh: a normalised mesh.
-        sensor: a sensor, or the name of one, see ``sensor_named``.
-        rng: for all errors; those of the object's frame are drawn now, once for the object.
+        sensor: a sensor, or the name of one, see ``sensor_named``. Of a mix, one is drawn now.
+        rng: for all errors; those of the object's frame, and the boxes, are drawn now, once for the object.
         denoise: as in ``ObservedObject``; if not, every pixel keeps the depth that was measured.
 
     Raises:
         UsageError: there is no such sensor.
     """
 
-    def __init__(self, mesh: Mesh, sensor: Sensor | str, rng: np.random.Generator, denoise: bool = True) -> None:
-        self.sensor = sensor_named(sensor) if isinstance(sensor, str) else sensor
+    def __init__(
+        self, mesh: Mesh, sensor: Sensor | SensorMix | str, rng: np.random.Generator, denoise: bool = True
+    ) -> None:
+        known = sensor_named(sensor) if isinstance(sensor, str) else sensor
+        self.sensor = known.draw(rng.spawn(1)[0]) if isinstance(known, SensorMix) else known
         self.denoise, self._rng = denoise, rng
         self._camera = SimulatedCamera(mesh, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)
         self._floor = float(mesh.vertices[:, 2].min())
         self._metres = mesh.metres
         self._truth = ObjectFrame(np.zeros(3), self.sensor.radius, np.eye(3))
         self.object_frame = self._wrong_frame()
+        self._boxes: SimulatedCamera | None = None
+        count, around = 0, rng.spawn(1)[0] if self.sensor.boxes else None
+        if around is not None and (count := int(around.poisson(self.sensor.boxes))):
+            boxes = boxes_around(mesh.vertices, count, around)
+            self._boxes = SimulatedCamera(boxes, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)
 
     def observe(self, pose: Float) -> Observation:
         """Look from the direction of a pose, (4, 4), object frame, at the sensor's own distance.
@@ -88,34 +100,62 @@ class SensedCamera:
         """
         rng = self._rng.spawn(1)[0]
         believed = self._truth.pose_in_world(pose, self.sensor.distance)
-        depth, is_table = self._scene(self._shaken(believed, rng))
+        depth, whose = self._scene(self._shaken(believed, rng))
         measured, source = self.sensor.measure(depth, rng)
-        on_table = is_table.ravel()[source] & (source >= 0)
+        other = (whose.ravel()[source] != OBJECT) & (source >= 0)
         if self.sensor.table:
-            on_table &= uniform_field(rng, depth.shape, LEFTOVER) >= self.sensor.table
+            left_in = uniform_field(rng, depth.shape, LEFTOVER) < self.sensor.table
+            other &= (whose.ravel()[source] != TABLE_TOP) | ~left_in
         if self.sensor.crop:
-            measured = self._cropped(measured, (measured > 0) & ~on_table, rng)
+            measured = self._cropped(measured, (measured > 0) & ~other, rng)
         if np.count_nonzero(measured) < FEWEST:
             return None
         frame = Frame(measured, self.sensor.intrinsics, believed, pixel_centre=0.5)
-        mask = inside_sphere(frame, self.object_frame.centre, REACH * self.object_frame.radius) & ~on_table
+        mask = inside_sphere(frame, self.object_frame.centre, REACH * self.object_frame.radius) & ~other
         return replace(frame, mask=mask, pixel_centre=0.5) if np.count_nonzero(mask) >= FEWEST else None
 
-    def _scene(self, pose: Float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """True depth of object and table, metres, and which pixels show the table."""
+    def visible_share(self, pose: Float) -> float:
+        """How much of the object's picture from a pose, (4, 4), object frame, no box hides; 0 if there is none."""
+        pose = self._truth.pose_in_object(self._truth.pose_in_world(pose, self.sensor.distance))
+        alone = self._camera.observe(pose).depth
+        if self._boxes is None or not alone.any():
+            return float(alone.any())
+        before = self._boxes.observe(pose).depth
+        return float(((before == 0) | (before > alone))[alone > 0].mean())
+
+    def _scene(self, pose: Float) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """True depth of object, boxes and table, metres, and what each pixel shows."""
         inside = self._truth.pose_in_object(pose)
         depth = self._camera.observe(inside).depth
-        (fx, _, cx), (_, fy, cy) = self.sensor.intrinsics[:2]
-        x = ((np.arange(self.sensor.width) + 0.5 - cx) / fx)[None, :, None]
-        y = ((np.arange(self.sensor.height) + 0.5 - cy) / fy)[:, None, None]
-        ray = x * inside[:3, 0] + y * inside[:3, 1] + inside[:3, 2]
-        height = inside[2, 3] - self._floor
-        falls = (ray[..., 2] < 0) & (height > 0)
-        along = np.where(falls, -height / np.where(falls, ray[..., 2], -1), np.inf)
+        whose = np.full(depth.shape, OBJECT, np.uint8)
+        table, part = self._table(inside)
+        shown = np.isfinite(table) & (depth[part] == 0)
+        depth[part][shown], whose[part][shown] = table[shown], TABLE_TOP
+        if self._boxes is not None:
+            boxes = self._boxes.observe(inside).depth
+            nearer = (boxes > 0) & ((depth == 0) | (boxes < depth))
+            depth, whose = np.where(nearer, boxes, depth), np.where(nearer, np.uint8(BOX), whose)
+        return depth * np.float32(self.sensor.radius), whose
+
+    def _table(self, pose: Float) -> tuple[Float, tuple[slice, slice]]:
+        """Depth of the table, object radii, infinite beside it; and the part of the picture that holds it."""
+        height = pose[2, 3] - self._floor
+        x = (np.arange(self.sensor.width) + 0.5 - self.sensor.width / 2) / self.sensor.focal
+        y = (np.arange(self.sensor.height) + 0.5 - self.sensor.height / 2) / self.sensor.focal
+        if height <= 0:
+            return np.zeros((0, 0)), (slice(0), slice(0))
+        corners = np.array([[a, b, self._floor] for a in (-TABLE, TABLE) for b in (-TABLE, TABLE)])
+        right, down, forward = ((corners - pose[:3, 3]) @ pose[:3, :3]).T
+        rows, columns = slice(None), slice(None)
+        if forward.min() > 0:  # else its border is beside the camera, and it may be anywhere in the picture
+            rows = slice(*np.searchsorted(y, [(down / forward).min(), (down / forward).max()]))
+            columns = slice(*np.searchsorted(x, [(right / forward).min(), (right / forward).max()]))
+        x, y = x[columns], y[rows, None]
+        falls = x * pose[2, 0] + y * pose[2, 1] + pose[2, 2]
+        along = np.where(falls < 0, -height / np.where(falls < 0, falls, -1), np.inf)
         with np.errstate(invalid="ignore"):
-            reach = np.hypot(*(inside[i, 3] + along * ray[..., i] for i in (0, 1)))
-        is_table = falls & (reach < TABLE) & (depth == 0)
-        return np.where(is_table, along, depth).astype(np.float32) * np.float32(self.sensor.radius), is_table
+            across = [pose[i, 3] + along * (x * pose[i, 0] + y * pose[i, 1] + pose[i, 2]) for i in (0, 1)]
+            return np.where(across[0] ** 2 + across[1] ** 2 < TABLE**2, along, np.inf), (rows, columns)
 
     def _shaken(self, pose: Float, rng: np.random.Generator) -> Float:
         """Where the camera really is."""

@@ -51,6 +51,7 @@ class Sensor:
         tilt: standard deviation of the error of the vertical, about both horizontal axes, degrees.
         table: share of the table around the object that is taken for the object.
         crop: up to this share of the object's width, or height, lies outside of the picture.
+        boxes: so many boxes stand around the object on average and hide parts of it; see ``boxes_around``.
 
     Raises:
         UsageError: numbers that no sensor has.
@@ -84,6 +85,7 @@ class Sensor:
     tilt: float = 0.0
     table: float = 0.0
     crop: float = 0.0
+    boxes: float = 0.0
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -226,71 +228,3 @@ class Sensor:
 _NAMES = tuple(field.name for field in fields(Sensor))
 ERRORS = _NAMES[_NAMES.index("axial") :]
 """The strengths: what ``Sensor.scaled`` multiplies."""
-
-_SETUP: dict[str, Any] = {
-    "turned": 0.3,
-    "moved": 0.003,
-    "centre": 0.05,
-    "size": 0.05,
-    "tilt": 2.0,
-    "table": 0.05,
-    "crop": 0.1,
-}
-_STEREO = Sensor(
-    "stereo",
-    height=480,
-    width=848,
-    focal=424.0,
-    baseline=0.05,
-    grain=2.5,
-    nearest=0.2,
-    farthest=10.0,
-    disparity=0.08,
-    step=1 / 32,
-    lateral=1.5,
-    grazing=0.3,
-    flying=0.3,
-    shadow=0.05,
-    holes=0.03,
-)
-SENSORS = {
-    sensor.name: sensor
-    for sensor in (
-        Sensor(),
-        Sensor(
-            "kinect",
-            grain=2.0,
-            nearest=0.4,
-            farthest=8.0,
-            axial=1.0,
-            step=1 / 8,
-            lateral=1.0,
-            grazing=0.25,
-            flying=0.2,
-            shadow=0.075,
-            holes=0.01,
-        ),
-        _STEREO,
-        Sensor("setup", **_SETUP),
-        replace(_STEREO, name="wrist", **_SETUP),
-    )
-}
-"""Sensors by name: "none" has no errors; "kinect" is the first Kinect; "stereo" is like a RealSense D435 of 848 x 480;
-"setup" has no errors but those of pose, object frame, table and picture; "wrist" is "stereo" in such a setup."""
-
-
-def sensor_named(text: str) -> Sensor:
-    """A sensor by name, or NAME:STRENGTH.
-
-    Raises:
-        UsageError: there is no such sensor, or the strength is no number.
-    """
-    name, given, strength = text.partition(":")
-    if name not in SENSORS:
-        raise UsageError(f"no sensor is called {name!r}; there are {', '.join(SENSORS)}")
-    try:
-        return SENSORS[name].scaled(float(strength)) if given else SENSORS[name]
-    except ValueError as error:
-        if isinstance(error, UsageError):
-            raise
-        raise UsageError(f"{text}: a sensor is NAME or NAME:STRENGTH, a number of at least 0") from None
