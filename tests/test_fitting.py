@@ -297,6 +297,34 @@ def test_a_calibration_is_fitted_to_what_the_card_calls_held_out_whatever_the_si
     assert sized["temperature"] == pytest.approx(by_shape["temperature"], abs=1e-3)
 
 
+def test_a_calibration_that_knows_a_bad_sensor_trusts_views_less(training_predictions, tmp_path, capsys):
+    card, path = training_predictions
+    p = Predictions.load(path)
+    card.write_text(json.dumps(json.loads(card.read_text()) | {"held_out": list(p.names[:60])}))
+    main(["fit", "calibration", str(path), str(card)])
+    clean = Recogniser(card).calibration
+    order = np.random.default_rng(1).permutation(90)  # the same objects, in another order
+    noise = np.random.default_rng(2).normal(0, 4, p.logits.shape)
+    sensed = replace(p, logits=(p.logits + noise).astype(np.float32)).of(order)
+    sensed.save(tmp_path / "sensed.npz")
+    main(["fit", "calibration", str(path), str(card), "--sensed", str(tmp_path / "sensed.npz")])
+    assert Recogniser(card).calibration.temperature > 1.5 * clean.temperature
+    assert "60 objects" in json.loads(card.read_text())["fitted_to"]["calibration"]
+    assert "through sensors" in json.loads(card.read_text())["fitted_to"]["calibration"]
+    sensed.of(np.arange(50)).save(tmp_path / "few.npz")
+    replace(sensed, models={**p.models, "lem": ("other", "f" * 64)}).save(tmp_path / "other.npz")
+    capsys.readouterr()
+    for arguments, sentence in [
+        (["--sensed", str(tmp_path / "few.npz")], "lacks"),
+        (["--sensed", str(tmp_path / "other.npz")], "of other models"),
+        (["--sensed", str(tmp_path / "sensed.npz"), "--validation", "0.5"], "no --validation"),
+    ]:
+        with pytest.raises(SystemExit) as end:
+            main(["fit", "calibration", str(path), str(card), *arguments])
+        assert end.value.code == 2
+        assert sentence in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("spoil", "sentence"),
     [

@@ -520,6 +520,28 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
     assert policy.frame == "object"
 
 
+def test_it_learns_from_what_sensors_made_of_the_same_objects(unseen, tmp_path, capsys):
+    from nextview.data.predictions import Predictions
+
+    p = Predictions.load(unseen)
+    replace(p, logits=p.logits[:, ::-1]).of(np.arange(90)[::-1]).save(tmp_path / "sensed.npz")
+    sensed = Predictions.load(tmp_path / "sensed.npz").of(np.arange(90)[::-1])
+    kept = np.array([3, 50, 7])
+    table = ReplayTable.of(p, kept, np.random.default_rng(0), [sensed])
+    np.testing.assert_array_equal(table.data.logits[3:], p.logits[kept][:, ::-1])
+    np.testing.assert_array_equal(table.data.labels, np.tile(p.labels[kept], 2))
+    np.testing.assert_array_equal(table.maps["lem-sphere"], np.tile(p.maps["lem-sphere"][kept], (2, 1, 1, 1)))
+    card = tmp_path / "mine.json"
+    start = ["train", "gain", str(unseen), str(card), "--sensed", str(tmp_path / "sensed.npz"), "--epochs", "1"]
+    main(start)
+    assert "90 objects of the training split, clean and through sensors" in json.loads(card.read_text())["learned_from"]
+    assert isinstance(make_policy(str(card), SPHERE, classes=("ball", "box", "pillar")), Gain)
+    with pytest.raises(SystemExit) as end:
+        main([*start, "--validation", str(unseen)])
+    assert end.value.code == 2
+    assert "no --validation" in capsys.readouterr().err
+
+
 def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsys):
     from nextview.data.predictions import Predictions
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +51,17 @@ class FittingSet:
         p = predictions
         return cls(p.logits, p.labels, p.sphere, p.classes, p.azimuth_bins)
 
+    @classmethod
+    def joined(cls, parts: Sequence[FittingSet]) -> FittingSet:
+        """All objects of some sets of the same classes and viewpoints, one set after the other."""
+        first, bins = parts[0], [part.azimuth_bins for part in parts if part.azimuth_bins is not None]
+        return replace(
+            first,
+            logits=np.concatenate([part.logits for part in parts]),
+            labels=np.concatenate([part.labels for part in parts]),
+            azimuth_bins=np.concatenate(bins) if len(bins) == len(parts) else None,
+        )
+
     def __len__(self) -> int:
         return len(self.labels)
 
@@ -73,6 +86,29 @@ def held_out_by(card: ModelCard, predictions: Predictions) -> NDArray[np.int64]:
     """Objects on which a network was not trained, as its card says, duplicates left out: their indices."""
     once = deduplicated(predictions.labels, predictions.depth_entropy)
     return once[np.isin(np.array(predictions.names)[once], card.held_out)]
+
+
+def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
+    """Predictions of the same objects as seen otherwise, through sensors, in the order of ``table``.
+
+    Args:
+        paths: of them.
+        table: predictions that tell the objects and their order.
+
+    Raises:
+        PredictionsError: one lacks an object, or is of another recogniser, of other classes or viewpoints.
+    """
+    found = []
+    for path in paths:
+        other = Predictions.load(path).by_shape()
+        row = {name: i for i, name in enumerate(other.names)}
+        missing = [name for name in table.names if name not in row]
+        if missing:
+            raise PredictionsError(f"{path}: lacks {len(missing)} of the {len(table)} objects, {missing[0]} among them")
+        if (other.classes, other.sphere, other.models) != (table.classes, table.sphere, table.models):
+            raise PredictionsError(f"{path}: is of other models, classes or viewpoints")
+        found.append(other.of(np.array([row[name] for name in table.names])))
+    return found
 
 
 def fitting_set(predictions: Predictions, validation: float, seed: int) -> FittingSet:

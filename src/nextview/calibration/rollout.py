@@ -39,16 +39,25 @@ class ReplayTable:
     calibration: Calibration
 
     @classmethod
-    def of(cls, predictions: Predictions, kept: NDArray, rng: np.random.Generator) -> ReplayTable:
+    def of(
+        cls, predictions: Predictions, kept: NDArray, rng: np.random.Generator, sensed: Sequence[Predictions] = ()
+    ) -> ReplayTable:
         """Some of the objects of predictions, by index; calibrated anew where their recogniser is not.
+
+        Args:
+            predictions: of the objects.
+            kept: some of them.
+            rng: for the calibration.
+            sensed: the same objects through sensors, in the same order: they come after.
 
         Raises:
             PredictionsError: there are test objects among the predictions, or none is kept.
         """
         if len(kept) == 0:
             raise PredictionsError("no object is left to learn from")
-        data = FittingSet.of_all(predictions).of(kept)
-        maps = {name: values[kept] for name, values in predictions.maps.items()}
+        parts = [part.of(kept) for part in (predictions, *sensed)]
+        data = FittingSet.joined([FittingSet.of_all(part) for part in parts])
+        maps = {name: np.concatenate([part.maps[name] for part in parts]) for name in predictions.maps}
         known = predictions.calibration != PLAIN_SUM
         return cls(data, maps, predictions.calibration if known else fit_temperature(data, rng))
 

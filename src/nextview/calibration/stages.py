@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from nextview.belief import PLAIN_SUM, Calibration
-from nextview.calibration.fitting_set import FittingSet, fitting_set, held_out_by
+from nextview.calibration.fitting_set import FittingSet, fitting_set, held_out_by, load_sensed
 from nextview.calibration.novelty_score import fit_novelty
 from nextview.calibration.novelty_views import features_of, known_features, made_up_features
 from nextview.calibration.outliers import FAMILIES
@@ -53,6 +54,7 @@ def fit_calibration(
     split_seed: int = 0,
     delta: float = 0.1,
     seed: int = 0,
+    sensed: Sequence[Path] = (),
 ) -> FittedCalibration:
     """Calibrate a recogniser: how far to trust the sum of several views, and which error rates can be promised.
 
@@ -66,6 +68,7 @@ def fit_calibration(
         split_seed: the recogniser's seed, which decided that part.
         delta: how often a promised error rate may not hold.
         seed: of the walks over which is fitted.
+        sensed: predictions of the same objects through sensors, fitted to as well.
 
     Raises:
         UsageError, ModelError, PredictionsError: what was given makes no sense, or does not fit together.
@@ -78,9 +81,13 @@ def fit_calibration(
     if validation != 1 and table.models["recogniser"][1] != model.sha256:
         raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
     if validation is None:
-        data = FittingSet.of_all(table).of(held_out_by(model, table))
-        if len(data) == 0:
+        kept = held_out_by(model, table)
+        if len(kept) == 0:
             raise PredictionsError(f"{predictions}: holds no object that {card} calls held out; see --validation")
+        table = table.of(kept)
+        data = FittingSet.joined([FittingSet.of_all(part) for part in (table, *load_sensed(sensed, table))])
+    elif sensed:
+        raise UsageError("predictions through sensors are of the objects that the card calls held out: no --validation")
     else:
         data = fitting_set(table, validation, split_seed)
     walks = 1 + 8000 // len(data)  # few objects are walked over more often
@@ -88,9 +95,11 @@ def fit_calibration(
     risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
     calibration = replace(calibration, risk=risk)
     command = command_line(
-        "fit calibration", predictions, card, validation=validation, split_seed=split_seed, delta=delta, seed=seed
-    )
-    fitted_to = {**model.fitted_to, "calibration": _objects(len(data))}
+        "fit calibration", predictions, card,
+        validation=validation, split_seed=split_seed, delta=delta, seed=seed, sensed=tuple(sensed),
+    )  # fmt: skip
+    about = _objects(len(data) // (1 + len(sensed))) + ", clean and through sensors" * bool(sensed)
+    fitted_to = {**model.fitted_to, "calibration": about}
     model = replace(model, calibration=calibration, fitted_to=fitted_to)
     write_card(card, model.made_by(*table.commands, command))
     before, after = (loss(data, c, np.random.default_rng([seed, 2]), walks=walks) for c in (PLAIN_SUM, calibration))

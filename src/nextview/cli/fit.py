@@ -13,6 +13,7 @@ def fit_calibration(
     /,
     validation: float | None = None,
     split_seed: int = 0,
+    sensed: tuple[Path, ...] = (),
     delta: float = 0.1,
     seed: int = 0,
 ) -> None:
@@ -27,13 +28,14 @@ def fit_calibration(
         validation: take this part of every class instead, as training kept it out of the whole split; 1 for
             out-of-fold predictions. A card that names no held-out objects needs it.
         split_seed: the recogniser's seed, which decided that part.
+        sensed: predictions of the same objects through sensors (nextview render --sensor mix), to be fitted to as well.
         delta: how often a promised error rate may not hold.
         seed: decides the walks over which is fitted.
     """
     from nextview.calibration import stages
     from nextview.cli.progress import console
 
-    found = stages.fit_calibration(predictions, card, validation, split_seed, delta, seed)
+    found = stages.fit_calibration(predictions, card, validation, split_seed, delta, seed, sensed)
     console.print(
         f"{found.objects} objects: temperature of one view {found.calibration.temperature}, correlation of two views "
         f"{found.calibration.correlation}; negative log-likelihood over 1 to 5 views {found.before:.3f} before, "

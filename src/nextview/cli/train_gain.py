@@ -17,6 +17,7 @@ def train_gain(
     folds: int = 20,
     travel_weight: float | None = None,
     local: bool = False,
+    sensed: tuple[Path, ...] = (),
     recipe: tyro.conf.OmitArgPrefixes[GainRecipe] = GainRecipe(),
 ) -> None:
     """Train the gain policy on predictions of objects that the recogniser was not trained on. Takes a few minutes.
@@ -33,6 +34,7 @@ def train_gain(
         travel_weight: of a grid cell of travel; by default the lowest at which the policy travels no farther than a
             random walk in the local window.
         local: let it choose in the local window only.
+        sensed: predictions of the same objects through sensors (nextview render --sensor mix), to learn from as well.
         recipe: how to train.
     """
     from nextview.cli.progress import console, track
@@ -40,7 +42,7 @@ def train_gain(
 
     made = stage.train_gain(
         predictions, out, recipe,
-        validation=validation, folds=folds, travel_weight=travel_weight, local=local, track=track,
+        validation=validation, folds=folds, travel_weight=travel_weight, local=local, sensed=sensed, track=track,
     )  # fmt: skip
     console.print(
         f"learned from {made.objects} objects; on {made.validated_on} the {recipe.outcome} after 2, 3, ... views is "

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.calibration.fitting_set import load_sensed
 from nextview.calibration.rollout import ReplayTable, Value, fit_travel_weight
 from nextview.command_line import command_line
 from nextview.data.predictions import Predictions
@@ -55,6 +56,7 @@ def train_gain(
     folds: int = 20,
     travel_weight: float | None = None,
     local: bool = False,
+    sensed: Sequence[Path] = (),
     track: Track = silently,
 ) -> TrainedGain:
     """Train the gain policy on predictions of objects that the recogniser was not trained on.
@@ -70,6 +72,8 @@ def train_gain(
         travel_weight: of a grid cell of travel; by default the lowest at which the policy travels no farther than a
             random walk in the local window.
         local: let it choose in the local window only.
+        sensed: predictions of the objects of ``predictions`` through sensors: it learns from these too, and they choose
+            with them.
         track: follows the epochs.
 
     Raises:
@@ -85,6 +89,10 @@ def train_gain(
     if (other.classes, other.sphere) != (table.classes, table.sphere):
         raise PredictionsError(f"{validation}: is of other classes or viewpoints than {predictions}")
     sources = [(path, p) for path, p in ((predictions, table), (validation, other)) if path is not None]
+    if sensed and validation is not None:
+        raise UsageError("predictions through sensors choose with those that are learned from: no --validation")
+    variants = load_sensed(sensed, table)
+    sources += list(zip(sensed, variants, strict=True))
     for path, p in sources:
         _check(path, p, recipe)
     everything = np.arange(len(table))
@@ -96,8 +104,8 @@ def train_gain(
         validating, learning = [np.arange(len(other))], [everything[~np.isin(table.names, other.names)]]
         validated_on = f"{len(other)} others"
     rng = np.random.default_rng([recipe.seed, 1])
-    learned = [ReplayTable.of(table, part, rng) for part in learning]
-    validated = [ReplayTable.of(other, part, rng) for part in validating]
+    learned = [ReplayTable.of(table, part, rng, variants) for part in learning]
+    validated = [ReplayTable.of(other, part, rng, variants) for part in validating]
     best, value = _best_epoch(learned, validated, recipe, track)
     policies = [replace(policy, scope="local" if local else "global") for policy in best]
     asked_travel_weight = travel_weight
@@ -108,7 +116,8 @@ def train_gain(
     objects = len(np.unique(np.concatenate(learning)))
     command = command_line(
         "train gain", predictions, card,
-        validation=validation, folds=folds, travel_weight=asked_travel_weight, local=local, recipe=recipe,
+        validation=validation, folds=folds, travel_weight=asked_travel_weight, local=local, sensed=tuple(sensed),
+        recipe=recipe,
     )  # fmt: skip
     about = PolicyCard(
         "gain",
@@ -117,8 +126,8 @@ def train_gain(
         table.sphere.azimuths,
         table.classes,
         {},
-        f"{objects} objects of the training split, classes weighted evenly; epoch and travel weight "
-        f"chosen on {validated_on}",
+        f"{objects} objects of the training split{', clean and through sensors' * bool(sensed)}, classes weighted "
+        f"evenly; epoch and travel weight chosen on {validated_on}",
         tuple(LearnedFrom(file_hash(path), p.models) for path, p in sources),
         tuple((part.calibration.temperature, part.calibration.correlation) for part in learned),
         asdict(recipe),
