@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from scenes import box, cast, pose_at
 from scipy.stats import norm
+from tiny_models import make_recogniser
 
 import nextview
 from nextview import SimulatedCamera, ViewSphere
@@ -430,3 +431,22 @@ def test_a_store_of_a_sensor_has_the_size_that_sensing_gives(dataset, tmp_path):
     with pytest.raises(UsageError, match="no sensor is called"):
         list(render(dataset, tmp_path / "a.zarr", FEW, sensor="kinekt"))
     assert not (tmp_path / "a.zarr").exists()
+
+
+def test_only_objects_that_a_card_calls_held_out_are_rendered(tmp_path):
+    for name in ("a", "b", "c"):
+        folder = tmp_path / "things" / "ball" / "train"
+        folder.mkdir(parents=True, exist_ok=True)
+        trimesh.Trimesh(BALL.vertices, BALL.faces, process=False).export(folder / f"{name}.off")
+    card = make_recogniser(tmp_path, ["ball"])
+    values = json.loads(card.read_text())
+    arguments = ["render", str(tmp_path / "things"), str(tmp_path / "some.zarr"), "--held-out", str(card)]
+    card.write_text(json.dumps(values | {"held_out": ["b", "elsewhere"]}))
+    main([*arguments, "--azimuths", "3", "--size", "16"])
+    store = ViewStore.open(tmp_path / "some.zarr")
+    assert store.names == ["b"]
+    assert store.done.all()
+    assert "--held-out" in store.commands[0]
+    card.write_text(json.dumps(values | {"held_out": ["elsewhere"]}))
+    with pytest.raises(DatasetError, match="holds no object that .* calls held out"):
+        list(render(tmp_path / "things", tmp_path / "none.zarr", SPHERE, held_out=card))

@@ -24,6 +24,7 @@ def render(
     turn: bool = False,
     unit: Unit | None = None,
     sensor: str | None = None,
+    held_out: Path | None = None,
     max_faces: int = MAX_FACES,
     seed: int = 0,
     workers: int | None = None,
@@ -44,6 +45,7 @@ def render(
             known by default; a store that was made without can be told later.
         sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist, none, or a mix of all that is
             drawn anew for each object; or NAME:STRENGTH (docs/your_camera.md). Clean renders if not given.
+        held_out: only the objects that the model of this card (NAME.json) calls held out of its training.
         max_faces: leave out a mesh of more triangles, or a file of more than 60 bytes for each of these.
         seed: decides the stretch and the turn of each mesh, and the errors of a sensor.
         workers: processes; one for each core by default.
@@ -52,8 +54,7 @@ def render(
     from dataclasses import replace
 
     from nextview.cli.progress import console, track
-    from nextview.data.folders import list_dataset
-    from nextview.data.rendering import Deform
+    from nextview.data.rendering import Deform, entries_of
     from nextview.data.rendering import render as render_dataset
     from nextview.data.store import ViewStore
     from nextview.viewsphere import ViewSphere
@@ -61,13 +62,15 @@ def render(
     views = ViewSphere.named(sphere)
     if azimuths is not None:
         views = replace(views, azimuths=azimuths)
-    total = sum(split in (None, entry.split) for entry in list_dataset(dataset))
+    total = len(entries_of(dataset, split, held_out))
     try:
         before = int(ViewStore.open(store).done.sum())
     except DatasetError:
         before = 0  # there is none yet, or rendering mends it or says what is wrong
     new = Deform(stretch, turn)
-    jobs = render_dataset(dataset, store, views, size, seed, new, split, unit, workers, scheduler, max_faces, sensor)
+    jobs = render_dataset(
+        dataset, store, views, size, seed, new, split, unit, workers, scheduler, max_faces, sensor, held_out
+    )
     track((before + n for n, _ in enumerate(jobs, 1)), total, f"rendering {store.name}", before, len(views))
 
     made = ViewStore.open(store)

@@ -38,6 +38,7 @@ from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.mesh import Mesh, load_mesh, make_mesh
 from nextview.mesh_format import MAX_FACES
+from nextview.models.model_card import read_card
 from nextview.observation import Camera
 from nextview.sensing.observed_object import SIZE
 from nextview.viewsphere import DISTANCE, LAYOUTS, ViewSphere
@@ -112,6 +113,7 @@ def render(
     scheduler: str | None = None,
     max_faces: int = MAX_FACES,
     sensor: str | None = None,
+    held_out: Path | None = None,
 ) -> Iterator[tuple[str, str | None]]:
     """Render every mesh that the store does not hold yet; one that failed before is tried again.
 
@@ -131,6 +133,7 @@ def render(
         scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
         max_faces: leave out larger meshes, see ``load_mesh``.
         sensor: look through this sensor, see ``sensor_named``; clean renders if None.
+        held_out: only the objects that the model of this card calls held out of its training.
 
     Yields:
         (name, None) for each object done, (name, reason) for one that cannot be rendered.
@@ -140,9 +143,7 @@ def render(
             with other settings or lacks an array, another run is writing it, or it cannot be written.
         UsageError: a size, a seed, a sensor or a number of workers that makes no sense.
     """
-    entries = [e for e in list_dataset(dataset.absolute()) if split in (None, e.split)]
-    if not entries:
-        raise DatasetError(f"{dataset}: no meshes in CLASS/{split}/MESH below it")
+    entries = entries_of(dataset.absolute(), split, held_out)
     if not (size > 0 and 2 * len(sphere) * size**2 < LARGEST_CHUNK):
         most = int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere)))
         raise UsageError(f"the size of {len(sphere)} views is from 1 to {most} pixels, not {size}")
@@ -164,7 +165,7 @@ def render(
         )
     with only_one(path), writing(path):
         store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit, dataset.absolute().name, through)
-        command = _command(dataset, path, sphere, size, seed, deform, split, unit, sensor)
+        command = _command(dataset, path, sphere, size, seed, deform, split, unit, sensor, held_out)
         if command not in store.commands:
             store.note(commands=[*store.commands, command])
         todo = [int(i) for i in np.flatnonzero(~store.done)]
@@ -181,6 +182,25 @@ def render(
             yield entry.name, None if reason is None else f"{reason}"
 
 
+def entries_of(dataset: Path, split: str | None = None, held_out: Path | None = None) -> list[Entry]:
+    """The meshes of a dataset folder that are asked for; see ``render``.
+
+    Raises:
+        DatasetError: there are none, or there is no such folder.
+        ModelError: the card is none.
+    """
+    entries = [e for e in list_dataset(dataset) if split in (None, e.split)]
+    if not entries:
+        raise DatasetError(f"{dataset}: no meshes in CLASS/{split}/MESH below it")
+    if held_out is None:
+        return entries
+    kept = set(read_card(held_out).held_out)
+    entries = [e for e in entries if e.name in kept]
+    if not entries:
+        raise DatasetError(f"{dataset}: holds no object that {held_out} calls held out")
+    return entries
+
+
 def _command(
     dataset: Path,
     path: Path,
@@ -191,6 +211,7 @@ def _command(
     split: str | None,
     unit: str | None,
     sensor: str | None,
+    held_out: Path | None,
 ) -> str:
     """The command that renders so; of a sphere that has no name, the part that the command line can say."""
     names = [name for name in LAYOUTS if LAYOUTS[name].elevations == sphere.elevations]
@@ -207,6 +228,7 @@ def _command(
         turn=deform.turn,
         unit=unit,
         sensor=sensor,
+        held_out=held_out,
         seed=seed,
     )
 
