@@ -448,5 +448,5 @@ def test_only_objects_that_a_card_calls_held_out_are_rendered(tmp_path):
     assert store.done.all()
     assert "--held-out" in store.commands[0]
     card.write_text(json.dumps(values | {"held_out": ["elsewhere"]}))
-    with pytest.raises(DatasetError, match="holds no object that .* calls held out"):
+    with pytest.raises(DatasetError, match=r"holds no object that .* calls held out"):
         list(render(tmp_path / "things", tmp_path / "none.zarr", SPHERE, held_out=card))
