@@ -12,6 +12,7 @@ from nextview.belief import Stopping
 from nextview.errors import (
     DatasetError,
     EntryError,
+    MeasureError,
     MeshError,
     MissingExtraError,
     ModelError,
@@ -45,6 +46,7 @@ __all__ = [
     "EpisodeState",
     "Evidence",
     "Mesh",
+    "MeasureError",
     "MeshError",
     "MissingExtraError",
     "ModelError",
