@@ -34,7 +34,7 @@ def visible_area_ratio(view: MeasuredView) -> float:
     Returns:
         Between 0 and 1: of a sphere from distance d, (1 - 1/d) / 2.
     """
-    return float(view.seen_area.sum() / view.surface.area)
+    return min(float(view.seen_area.sum() / view.surface.area), 1.0)
 
 
 def surface_visibility(view: MeasuredView) -> float:

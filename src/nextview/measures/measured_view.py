@@ -12,6 +12,10 @@ from nextview.depth import object_depth
 from nextview.errors import MeasureError
 from nextview.measures.surface import Surface
 
+GRAZING = 0.05
+"""Where a surface turns farther from the camera than this cosine, it counts as turned so far: one row of pixels more or
+less on a plane that is seen from its edge would else decide over as much area as all the rest."""
+
 
 @dataclass(frozen=True)
 class MeasuredView:
@@ -90,7 +94,8 @@ class MeasuredView:
         """How much of each of these faces is seen, (k,), square object radii.
 
         A pixel shows z^2 / (fx fy |n . r|) of a face: z is its depth, n the face's unit normal, r the pixel's ray whose
-        z is 1. Never more than the face has.
+        z is 1. Pixels are samples: of a face smaller than one, more may be counted than there is, and of others none;
+        over many it evens out.
         """
         faces, _ = self.pixels
         normals = (self.surface.normals @ self.pose[:3, :3])[faces]
@@ -102,12 +107,12 @@ class MeasuredView:
         a, b, c = normals.T[:, at]
         across = np.abs(a * x[column[n]] + b * y[row[n]] + c)
         focal = self.intrinsics[0, 0] * self.intrinsics[1, 1]
-        patches = self.depths[n] ** 2 / (focal * np.maximum(across, 1e-6))
-        return np.minimum(np.bincount(at, patches, len(faces)), self.surface.areas[faces])
+        patches = self.depths[n] ** 2 / (focal * np.maximum(across, GRAZING))
+        return np.bincount(at, patches, len(faces))
 
     @cached_property
     def seen_share(self) -> NDArray[np.float64]:
-        """Which share of each of these faces is seen, (k,), 0 .. 1; 0 of a face without area."""
+        """Which share of each of these faces is seen, (k,), about 0 .. 1; 0 of a face without area."""
         areas = self.surface.areas[self.pixels[0]]
         return np.divide(self.seen_area, areas, out=np.zeros(len(areas)), where=areas > 0)
 

@@ -27,7 +27,7 @@ def mesh_saliency(view: MeasuredView) -> float:
     vertices; as meshes have many vertices here and few there, each counts by the area around it instead.
 
     Returns:
-        0 on a sphere or where nothing is seen; otherwise of no unit.
+        Object radii; 0 on a sphere, or where nothing is seen.
     """
     return float((saliency_of(view.surface)[view.pixels[0]] * view.seen_area).sum())
 
@@ -63,7 +63,10 @@ def _saliency(surface: Surface) -> NDArray[np.float64]:
 def _salient(
     points: NDArray[np.float64], area: NDArray[np.float64], curvature: NDArray[np.float64], unit: float
 ) -> NDArray[np.float64]:
-    """Saliency of points, (n,): over all scales, how the averages of their curvature at two widths differ."""
+    """Saliency of points, (n,): over all scales, how the averages of their curvature at two widths differ.
+
+    Lee scales each scale's map to a maximum of 1 first. Here it stays a curvature: the rounding of a sphere is none.
+    """
     pairs = cKDTree(points).sparse_distance_matrix(
         cKDTree(points), 4 * SCALES[-1] * unit, output_type="coo_matrix"
     )  # the pairs of a point with itself are among them
@@ -81,13 +84,12 @@ def _salient(
         salient = np.abs(average(scale * unit) - average(2 * scale * unit))
         if salient.max() <= 0:
             continue
-        salient = salient / salient.max()
         near = square <= (2 * scale * unit) ** 2
         highest = np.zeros(len(points))
         np.maximum.at(highest, i[near], salient[j[near]])
         peaks = salient[(salient >= highest) & (salient > 0)]
-        others = (peaks.sum() - 1) / max(len(peaks) - 1, 1)  # Lee's suppression of maps with many peaks alike
-        found += salient * (1 - others) ** 2
+        others = (peaks.sum() / salient.max() - 1) / max(len(peaks) - 1, 1)
+        found += salient * (1 - others) ** 2  # Lee's suppression of scales at which many peaks are alike
     return found
 
 

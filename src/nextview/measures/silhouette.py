@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,8 +13,10 @@ from nextview.measures.measured_view import MeasuredView
 ARM = 1 / 24
 """Length of outline on both sides of a point between which its turn is measured, sides of the image. Over that much, 9
 pixels of 224, the steps of pixels even out."""
-TURN = np.radians(10)
-"""Turns that differ by less count as equal."""
+ACCURACY = np.radians(5)
+"""Standard deviation of the error with which a turn is taken to be known."""
+CELLS = 360
+"""Of the histogram of turns, once round."""
 
 
 def silhouette_length(view: MeasuredView) -> float:
@@ -36,11 +40,13 @@ def silhouette_length(view: MeasuredView) -> float:
 def silhouette_entropy(view: MeasuredView) -> float:
     """Shannon entropy of the distribution of turns along the object's outline, holes included.
 
-    At every pixel's length of outline, the angle between what comes before and what comes after. Page et al. 2003,
-    Polonsky et al. 2005 ("silhouette entropy"); thesis, section 3.4.2: the curvature entropy of the silhouette.
+    At every pixel's length of outline, the angle between what comes before and what comes after; their histogram is
+    blurred by the accuracy of an angle, whose own entropy is taken off again, so that no border between two cells
+    decides. Page et al. 2003, Polonsky et al. 2005 ("silhouette entropy"); thesis, section 3.4.2: the curvature entropy
+    of the silhouette.
 
     Returns:
-        Bits; 0 for a circle, which turns everywhere alike, and where nothing is seen.
+        Bits; 0 for a circle, which turns everywhere alike, but for its pixels, and where nothing is seen.
     """
     from skimage.measure import find_contours  # takes longer to import than all other measures
 
@@ -49,8 +55,18 @@ def silhouette_entropy(view: MeasuredView) -> float:
     arm = ARM * max(view.depth.shape)
     outlines = find_contours(np.pad(view.seen, 1).astype(np.float32), 0.5)
     turns = np.concatenate([_turns(outline, arm) for outline in outlines])
-    counts = np.bincount(np.rint((turns + np.pi) / TURN).astype(np.int64))
-    return bits(counts / counts.sum())
+    counts = np.bincount(np.rint((turns / (2 * np.pi) + 0.5) * CELLS).astype(np.int64) % CELLS, minlength=CELLS)
+    blur, own = _blur()
+    return max(bits(blur @ (counts / counts.sum())) - own, 0.0)
+
+
+@lru_cache(maxsize=1)
+def _blur() -> tuple[NDArray[np.float64], float]:
+    """The blur of the histogram, as a matrix, and the entropy of a single cell that is blurred."""
+    apart = np.angle(np.exp(2j * np.pi / CELLS * np.subtract.outer(np.arange(CELLS), np.arange(CELLS))))
+    blur = np.exp(-((apart / ACCURACY) ** 2) / 2)
+    blur /= blur[0].sum()
+    return blur, bits(blur[0])
 
 
 def _turns(outline: NDArray[np.float64], arm: float) -> NDArray[np.float64]:
