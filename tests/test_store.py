@@ -163,7 +163,7 @@ def test_a_missing_chunk_ends_every_command_that_reads_it(views, capsys):
     recogniser, maps = make_recogniser(views.parent, ["box"]), make_map_network(views.parent, rings=1)
     for command in (
         ["predict", views, out, "--recogniser", recogniser, "--maps", f"lem={maps}", "--workers", 1],
-        ["measure", views, "max_depth", "--workers", 1],
+        ["measure", views, "--measures", "max_depth", "--workers", 1],
         ["inspect", views, views.parent / "b.png", "--object", "b"],
     ):
         message = refused(capsys, *command)
@@ -290,7 +290,10 @@ def test_inspect_draws_what_is_there(views, capsys):
 
 def test_a_damaged_object_is_named(views, capsys):
     flip_a_byte(chunk(views, "depth", 1))
-    for command in (["measure", views, "max_depth"], ["inspect", views, views.parent / "b.png", "--object", "b"]):
+    for command in (
+        ["measure", views, "--measures", "max_depth"],
+        ["inspect", views, views.parent / "b.png", "--object", "b"],
+    ):
         message = refused(capsys, *command) if command[0] == "inspect" else refused(capsys, *command, "--workers", 1)
         assert "depth of b cannot be read" in message
 

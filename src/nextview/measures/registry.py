@@ -16,13 +16,11 @@ from nextview.measures.depth_entropy import depth_entropy
 from nextview.measures.depth_spread import depth_distribution, max_depth
 from nextview.measures.fused_descriptor import fused_descriptor
 from nextview.measures.gradient_entropy import gradient_entropy
+from nextview.measures.map_names import Good
 from nextview.measures.measured_view import MeasuredView
 from nextview.measures.saliency import mesh_saliency
 from nextview.measures.semantic import above_preference, base_avoidance
 from nextview.measures.silhouette import silhouette_entropy, silhouette_length
-
-Good = Literal["peak", "valley"]
-"""Where a measure's map has the better views: at its highest values or its lowest."""
 
 
 @dataclass(frozen=True)
@@ -70,23 +68,6 @@ MEASURES: dict[str, Measure] = {
     "gradient_entropy": Measure(gradient_entropy, "depth", "suggested in the thesis, section 6"),
 }
 """The sixteen of the thesis's chapter 3, and one that it suggests."""
-
-CONFIDENCE = "confidence"
-"""The recogniser's confidence where it is right, as a measure of views; it takes predictions instead of views, see
-``confidence_map``."""
-
-MAP_NAMES = {"depth_entropy": "lem", CONFIDENCE: "lcm"}
-"""The maps of two measures have names of their own, the thesis's; those of all others are called as the measure."""
-
-
-def map_name(measure: str) -> str:
-    """What the map of a measure is called in cards, predictions and policies."""
-    return MAP_NAMES.get(measure, measure)
-
-
-def measure_of(name: str) -> str:
-    """The measure whose map is called so."""
-    return next((measure for measure, own in MAP_NAMES.items() if own == name), name)
 
 
 def find_measure(name: str) -> Measure:

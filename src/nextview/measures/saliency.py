@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from nextview.measures.measured_view import MeasuredView
 from nextview.measures.surface import Surface
@@ -67,6 +66,8 @@ def _salient(
 
     Lee scales each scale's map to a maximum of 1 first. Here it stays a curvature: the rounding of a sphere is none.
     """
+    from scipy.spatial import cKDTree
+
     pairs = cKDTree(points).sparse_distance_matrix(
         cKDTree(points), 4 * SCALES[-1] * unit, output_type="coo_matrix"
     )  # the pairs of a point with itself are among them

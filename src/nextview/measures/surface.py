@@ -20,7 +20,7 @@ class Surface:
     and corners lies in these: in an edge, its length by the angle it bends by; in a corner, its angle deficit.
 
     Attributes:
-        vertices: (V, 3) float64, object radii.
+        vertices: (V, 3) float64, object radii; no two farther apart than 2, as those of a ``Mesh``.
         faces: (F, 3) int, indices into the vertices.
     """
 
@@ -51,7 +51,10 @@ class Surface:
     @cached_property
     def corners(self) -> NDArray[np.int64]:
         """The faces by places instead of vertices, (F, 3) int64: vertices in one place count as one."""
-        return np.unique(np.rint(self.vertices / SAME), axis=0, return_inverse=True)[1].reshape(-1)[self.faces]
+        cell = np.rint((self.vertices - self.vertices.min(0)) / SAME).astype(np.int64)
+        width = cell.max(0) + 1  # 2e6 at most: one number holds a place, and numbers are sorted ten times as fast
+        key = (cell[:, 0] * width[1] + cell[:, 1]) * width[2] + cell[:, 2]
+        return np.unique(key, return_inverse=True)[1].reshape(-1)[self.faces]
 
     @cached_property
     def angles(self) -> NDArray[np.float64]:
