@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import trimesh
+from scenes import of_depth, view_of
 from skimage.draw import disk, polygon
 from skimage.measure import perimeter_crofton
-from tests.scenes import of_depth, view_of
 
 from nextview.cli.main import main
 from nextview.data.checking import check

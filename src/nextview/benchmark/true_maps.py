@@ -29,7 +29,7 @@ def true_lcm(p: Predictions) -> NDArray[np.float32]:
 
 
 IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {"lem": true_lem, "lcm": true_lcm}
-"""Maps whose truth the predictions themselves tell; that of others stands in the view store that they were made from."""
+"""Maps whose truth the predictions themselves tell; that of others stands in the store that they were made from."""
 
 
 def true_map(p: Predictions, name: str) -> NDArray[np.float32]:

@@ -25,8 +25,8 @@ def gradient_entropy(view: MeasuredView) -> float:
 
     The gradient of the inverse depth is the same all over a plane: together with its value it is the plane's normal,
     whatever the slant. The normals of all visible pixels are laid out in an equal-area map, as a histogram that is
-    blurred by the accuracy of a direction. Its entropy, less that of the blur itself, is what a look at one random pixel
-    tells of the surface there. It is the same for a plane seen from the front and at a slant, 0, and is made by
+    blurred by the accuracy of a direction. Its entropy, less that of the blur itself, is what a look at one random
+    pixel tells of the surface there. It is the same for a plane seen from the front and at a slant, 0, and is made by
     directions that differ. Holes and the background do not count.
 
     Returns:
