@@ -8,6 +8,11 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from scipy.spatial.transform import Rotation
 
+from nextview.cameras.simulated import SimulatedCamera
+from nextview.measures.measured_view import MeasuredView
+from nextview.measures.surface import Surface
+from nextview.mesh import Mesh
+from nextview.observation import pinhole
 from nextview.viewsphere import look_at_origin
 
 INTRINSICS = np.array([[520.0, 0, 310.5], [0, 530.0, 246.5], [0, 0, 1]])
@@ -46,3 +51,16 @@ def pose_at(elevation, azimuth, distance, target=(0.0, 0.0, 0.0), turn=(0.0, 0.0
     pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
     pose[:3, 3] += target
     return pose
+
+
+def of_depth(depth, distance=3.0) -> MeasuredView:
+    """What a measure is handed where the depth alone is known, from straight ahead."""
+    depth = np.asarray(depth)
+    return MeasuredView(depth, look_at_origin(0, 0, distance), pinhole(max(depth.shape), distance))
+
+
+def view_of(mesh: Mesh, pose, size=224, distance=3.0) -> MeasuredView:
+    """What a measure is handed of a mesh that is seen from a pose."""
+    camera = SimulatedCamera(mesh, size, distance)
+    seen = camera.observe(pose)
+    return MeasuredView(seen.depth, pose, seen.intrinsics, Surface(mesh.vertices, mesh.faces), camera.face_ids(pose))

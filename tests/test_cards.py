@@ -10,7 +10,7 @@ from tiny_models import make_map_network, make_recogniser
 from nextview.command_line import command_line
 from nextview.errors import ModelError, PolicyError
 from nextview.models.inference import MapNetwork, Recogniser
-from nextview.models.model_card import bundled_cards, read_card, write_card
+from nextview.models.model_card import ModelCard, bundled_cards, read_card, write_card
 from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card, write_policy_card
 from nextview.training.recipes import MapRecipe
 from nextview.viewsphere import ViewSphere
@@ -21,7 +21,15 @@ CLASSES = [f"class{k}" for k in range(10)]
 def test_the_bundled_cards_are_written_as_they_are_read(tmp_path):
     for card in bundled_cards().values():
         write_card(tmp_path / "card.json", card)
-        assert (tmp_path / "card.json").read_bytes() == card.path.with_suffix(".json").read_bytes()
+        written = json.loads((tmp_path / "card.json").read_text())
+        before = json.loads(card.path.with_suffix(".json").read_text())
+        if before["schema"] == 1:  # the name of a map told its measure
+            measures = {"lem": "depth_entropy", "lcm": "confidence"}
+            own = {} if card.is_recogniser else {"measure": measures[card.kind], "good": "peak"}
+            assert written == before | {"schema": 2} | own
+            before = written
+        assert written == before
+        assert ModelCard.from_dict(written, card.path) == card
     for path in bundled_policies().values():
         write_policy_card(tmp_path / "card.json", read_policy_card(path))
         assert (tmp_path / "card.json").read_bytes() == path.read_bytes()
@@ -34,7 +42,7 @@ def change(path, **values):
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
-        ({"schema": 2}, "of schema 2, and this version of nextview reads schema 1"),
+        ({"schema": 3}, "of schema 3, and this version of nextview reads schema 1 and 2"),
         ({"schema": None}, "of schema None"),
         ({"schema": True}, "of schema True"),
         ({"name": 7}, "'name' of the card is not a string"),
@@ -106,6 +114,16 @@ def test_a_card_of_other_classes_or_inputs_than_its_network_is_refused_when_that
         card.write_text(before)
     lem = make_map_network(tmp_path)
     MapNetwork(lem)
+    change(lem, schema=2)
+    with pytest.raises(ModelError, match="'measure'"):
+        MapNetwork(lem)
+    change(lem, measure="depth_entropy", good="hill")
+    with pytest.raises(ModelError, match="'good'"):
+        MapNetwork(lem)
+    change(lem, good="valley")
+    assert MapNetwork(lem).card.valleys(("a", "b")) == ("a", "b")
+    change(lem, valley_gain={"a": -0.1, "b": 0.1}, valley_classes=["b"])
+    assert MapNetwork(lem).card.valleys(("a", "b")) == ("b",)
     change(lem, output="sphere")
     with pytest.raises(ModelError, match="gives no sphere"):
         MapNetwork(lem)

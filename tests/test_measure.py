@@ -1,18 +1,24 @@
-"""View measures against closed forms and scikit-image, and their place in the store."""
+"""Measures of a depth image against closed forms and scikit-image, and the place of measures in the store."""
 
 import numpy as np
 import pytest
 import trimesh
+from scenes import of_depth, view_of
 from skimage.draw import disk, polygon
 from skimage.measure import perimeter_crofton
 
-from nextview.data.measuring import measure
-from nextview.data.rendering import render
+from nextview.cli.main import main
+from nextview.data.checking import check
+from nextview.data.measuring import Cost, measure
+from nextview.data.rendering import Deform, render
 from nextview.data.store import DEPTH_UNIT, ViewStore
-from nextview.errors import DatasetError
+from nextview.errors import DatasetError, MeasureError
+from nextview.measures.area import view_area
 from nextview.measures.depth_spread import BIN, depth_distribution, max_depth
+from nextview.measures.measured_view import MeasuredView
 from nextview.measures.registry import MEASURES
-from nextview.measures.silhouette import silhouette_area, silhouette_length
+from nextview.measures.silhouette import silhouette_length
+from nextview.mesh import make_mesh
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("12")
@@ -27,9 +33,12 @@ def ball(size=224, distance=3.0):
     return np.where(root > 0, (distance - np.sqrt(np.maximum(root, 0))) / (1 + r2), 0)
 
 
+DEPTH = [name for name, found in MEASURES.items() if found.needs == "depth"]
+
+
 def test_a_ball_fills_the_circle_that_fits_the_image():
-    depth = ball()
-    assert silhouette_area(depth) == pytest.approx(np.pi / 4, rel=0.003)
+    depth = of_depth(ball())
+    assert view_area(depth) == pytest.approx(np.pi / 4, rel=0.003)
     assert silhouette_length(depth) == pytest.approx(np.pi, rel=0.01)
     assert max_depth(depth) == pytest.approx((3 - 1 / 3) - 2, abs=0.06)  # to the tangent circle, which pixels just miss
 
@@ -39,8 +48,8 @@ def test_outline_of_a_turned_square(degrees):
     a = np.radians(degrees + np.array([45, 135, 225, 315]))
     depth = np.zeros((400, 400))
     depth[polygon(200 + 150 * np.sin(a), 200 + 150 * np.cos(a))] = 2.0
-    assert silhouette_length(depth) == pytest.approx(4 * 150 * np.sqrt(2) / 400, rel=0.06)
-    assert silhouette_area(depth) == pytest.approx((150 * np.sqrt(2)) ** 2 / 400**2, rel=0.015)
+    assert silhouette_length(of_depth(depth)) == pytest.approx(4 * 150 * np.sqrt(2) / 400, rel=0.06)
+    assert view_area(of_depth(depth)) == pytest.approx((150 * np.sqrt(2)) ** 2 / 400**2, rel=0.015)
 
 
 def test_outline_agrees_with_scikit_image_holes_and_borders_included():
@@ -50,31 +59,31 @@ def test_outline_agrees_with_scikit_image_holes_and_borders_included():
         for _ in range(6):
             seen[disk(rng.integers(0, 100, 2), rng.integers(5, 30), shape=seen.shape)] ^= True
         expected = perimeter_crofton(np.pad(seen, 2), directions=4) / 100
-        assert silhouette_length(seen.astype(float)) == pytest.approx(expected, rel=1e-9)
+        assert silhouette_length(of_depth(seen.astype(float))) == pytest.approx(expected, rel=1e-9)
 
 
 def test_depth_distribution_of_planes():
     facing = np.full((100, 100), 2.505)
     facing[:10] = 0  # background does not count
-    assert depth_distribution(facing) == 0
+    assert depth_distribution(of_depth(facing)) == 0
     slanted = np.broadcast_to(2 + (np.arange(100) + 0.5) * BIN, (100, 100))  # one column in each of 100 bins
-    assert depth_distribution(slanted) == pytest.approx(1 - 1 / 100, abs=1e-3)
+    assert depth_distribution(of_depth(slanted)) == pytest.approx(1 - 1 / 100, abs=1e-3)
     two = np.where(np.arange(100) < 30, 2.505, 3.505) * np.ones((100, 1))
-    assert depth_distribution(two) == pytest.approx(2 * 0.3 * 0.7)  # the chance that two pixels differ
+    assert depth_distribution(of_depth(two)) == pytest.approx(2 * 0.3 * 0.7)  # the chance that two pixels differ
 
 
-@pytest.mark.parametrize("name", MEASURES)
+@pytest.mark.parametrize("name", DEPTH)
 def test_an_empty_view_measures_nothing(name):
-    assert MEASURES[name](np.zeros((20, 20))) == 0
+    assert MEASURES[name](of_depth(np.zeros((20, 20)))) == 0
 
 
-@pytest.mark.parametrize("name", MEASURES)
+@pytest.mark.parametrize("name", DEPTH)
 @pytest.mark.parametrize("nothing", [np.nan, np.inf, -np.inf, -2.0, 65535.0])
 def test_what_a_sensor_gives_for_nothing_is_no_object(name, nothing):
     depth = ball(64)
     sensed = np.where(depth > 0, depth, nothing)
-    assert MEASURES[name](sensed) == MEASURES[name](depth)
-    assert MEASURES[name](np.full((8, 8), nothing)) == 0
+    assert MEASURES[name](of_depth(sensed)) == MEASURES[name](of_depth(depth))
+    assert MEASURES[name](of_depth(np.full((8, 8), nothing))) == 0
     assert np.isnan(sensed).any() == np.isnan(nothing)  # what was handed in is left alone
 
 
@@ -90,29 +99,91 @@ def views(tmp_path):
 
 def test_measures_are_kept_in_the_store_and_not_made_twice(views):
     before = ViewStore.open(views).measure()
-    assert list(measure(views, workers=0)) == [(0, 2), (1, 2), (2, 2)]
+    cost = Cost()
+    assert list(measure(views, workers=0, cost=cost)) == [(0, 2), (1, 2), (2, 2)]
+    assert cost.views == 24
+    assert set(DEPTH) < set(cost.per_second())
+    assert cost.peak > 2**20
     store = ViewStore.open(views)
     row = store.names.index("ball")
-    for name, function in MEASURES.items():
+    for name in DEPTH:
         depth = store.group["depth"][row] * DEPTH_UNIT
-        np.testing.assert_allclose(store.measure(name)[row], [function(d) for d in depth], rtol=1e-6)
-        np.testing.assert_allclose(store.measure(name)[row], function(ball(96)), rtol=0.1)  # its rim is steep
+        seen = [MeasuredView(d, pose, store.intrinsics) for d, pose in zip(depth, SPHERE.poses, strict=True)]
+        np.testing.assert_allclose(store.measure(name)[row], [MEASURES[name](view) for view in seen], rtol=1e-6)
+    for name in ("depth_entropy", "view_area", "silhouette_length", "depth_distribution"):
+        np.testing.assert_allclose(store.measure(name)[row], MEASURES[name](of_depth(ball(96))), rtol=0.1)
     np.testing.assert_array_equal(store.measure(), before)
     assert np.isnan(store.measure("max_depth")[store.names.index("broken")]).all()
     assert list(measure(views, workers=0)) == [(2, 2)]
 
 
+def test_all_measures_of_a_store_and_its_meshes(views):
+    with pytest.raises(MeasureError, match="the measure viewpoint_entropy needs the meshes"):
+        next(measure(views, ["all"], workers=0))
+    main(["measure", str(views), str(views.parent / "meshes"), "--measures", "all", "--workers", "0"])
+    store = ViewStore.open(views)
+    assert set(store.measures) == set(MEASURES)
+    row = store.names.index("box")
+    box = trimesh.creation.box([1, 2, 3])
+    top = SPHERE.poses[0]
+    own = MEASURES["visible_area_ratio"](view_of(make_mesh(box.vertices, box.faces), top, 96))
+    assert store.measure("visible_area_ratio")[row, 0] == pytest.approx(own, abs=1e-3)
+    assert {problem for _, problem in check(views, workers=0)} == {None}
+
+
+def test_a_deformed_store_is_measured_on_the_deformed_meshes(views):
+    """Faces would not lie where the depth is: three sides of a box are half of it whatever its proportions."""
+    meshes = views.parent / "meshes"
+    list(render(meshes, views.parent / "new.zarr", SPHERE, 64, 3, Deform(0.8, True), workers=0))
+    list(measure(views.parent / "new.zarr", ["visible_area_ratio"], workers=0, meshes=meshes))
+    store = ViewStore.open(views.parent / "new.zarr")
+    np.testing.assert_allclose(store.measure("visible_area_ratio")[store.names.index("box")], 0.5, atol=0.02)
+
+
+def test_meshes_that_are_not_those_of_the_store_are_refused(views):
+    meshes = views.parent / "meshes"
+    with pytest.raises(DatasetError, match="there is no such folder"):
+        next(measure(views, ["max_depth", "mesh_saliency"], workers=0, meshes=views.parent / "nothing"))
+    trimesh.creation.box([1, 2, 4]).export(meshes / "box/box.off")
+    with pytest.raises(DatasetError, match=r"box.off: is not the mesh that .*views.zarr was rendered from"):
+        list(measure(views, ["view_area", "base_avoidance"], workers=0, meshes=meshes))
+    (meshes / "box/box.off").unlink()
+    with pytest.raises(DatasetError, match="holds no mesh called box"):
+        next(measure(views, ["base_avoidance"], workers=0, meshes=meshes))
+
+
+def test_a_measure_of_ones_own_is_kept_by_its_import_path(views, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine_to_measure.py").write_text(
+        "def rows(view):\n    return view.near.shape[0]\ndef broken(view):\n    return view.nothing\n"
+        "def endless(view):\n    return float('inf')\nconstant = 3\n"
+    )
+    list(measure(views, ["mine_to_measure:rows"], workers=0))
+    assert 40 < ViewStore.open(views).measure("mine_to_measure:rows")[0].min() <= 96
+    for name, problem in {
+        "mine_to_measure:broken": "measure mine_to_measure:broken of b.*: AttributeError",
+        "mine_to_measure:endless": "of b.*, view 0, is not finite",
+        "mine_to_measure:constant": "is no function",
+        "mine_to_measure:none": "cannot be imported",
+        "no_such_module:none": "cannot be imported .ModuleNotFoundError",
+    }.items():
+        with pytest.raises(MeasureError, match=problem):
+            list(measure(views, [name], workers=0))
+
+
 def test_a_stopped_run_is_completed_by_the_next(views):
-    steps = measure(views, ["silhouette_area"], workers=0)
+    steps = measure(views, ["view_area"], workers=0)
     next(steps), next(steps)
     steps.close()
-    with pytest.raises(DatasetError, match=r"silhouette_area of b.* is missing; nextview measure .* makes it"):
-        ViewStore.open(views).measure("silhouette_area")  # half of it is of no use
-    steps = measure(views, ["silhouette_area"], workers=1)
+    with pytest.raises(
+        DatasetError, match=r"view_area of b.* is missing; nextview measure .* --measures view_area makes it"
+    ):
+        ViewStore.open(views).measure("view_area")  # half of it is of no use
+    steps = measure(views, ["view_area"], workers=1)
     assert list(steps) == [(1, 2), (2, 2)]
-    assert np.isfinite(ViewStore.open(views).measure("silhouette_area")).all(1).sum() == 2
+    assert np.isfinite(ViewStore.open(views).measure("view_area")).all(1).sum() == 2
 
 
 def test_unknown_measures_are_refused(views):
-    with pytest.raises(DatasetError, match=r"no measure is called 'beauty'; there are depth_entropy"):
+    with pytest.raises(MeasureError, match=r"no measure is called 'beauty'; there are viewpoint_entropy"):
         next(measure(views, ["beauty"]))

@@ -20,6 +20,7 @@ from nextview.errors import DatasetError
 from nextview.measures.registry import MEASURES
 from nextview.viewsphere import ViewSphere
 
+DEPTH = [name for name, found in MEASURES.items() if found.needs == "depth"]
 SPHERE = ViewSphere.named("12")
 
 
@@ -163,7 +164,7 @@ def test_a_missing_chunk_ends_every_command_that_reads_it(views, capsys):
     recogniser, maps = make_recogniser(views.parent, ["box"]), make_map_network(views.parent, rings=1)
     for command in (
         ["predict", views, out, "--recogniser", recogniser, "--maps", f"lem={maps}", "--workers", 1],
-        ["measure", views, "max_depth", "--workers", 1],
+        ["measure", views, "--measures", "max_depth", "--workers", 1],
         ["inspect", views, views.parent / "b.png", "--object", "b"],
     ):
         message = refused(capsys, *command)
@@ -178,7 +179,7 @@ def test_a_missing_chunk_ends_every_command_that_reads_it(views, capsys):
 
 def test_measure_makes_damaged_measures_anew(views):
     list(measure(views, workers=0))
-    before = {name: ViewStore.open(views).measure(name) for name in MEASURES}
+    before = {name: ViewStore.open(views).measure(name) for name in DEPTH}
     shutil.rmtree(views / "measures/depth_entropy/c/0")
     flip_a_byte(chunk(views, "measures/max_depth", 2))
     assert list(measure(views, workers=0)) == [(1, 3), (2, 3), (3, 3)]
@@ -262,7 +263,7 @@ def test_measure_needs_the_depth_alone(views, capsys):
         shutil.rmtree(views / name)
     main(["measure", str(views), "--workers", "1"])
     store = ViewStore.open(views)
-    assert store.measures == sorted(MEASURES)
+    assert store.measures == sorted(DEPTH)
     np.testing.assert_array_equal(store.measure(), before)
     capsys.readouterr()
     shutil.rmtree(views / "depth")
@@ -290,7 +291,10 @@ def test_inspect_draws_what_is_there(views, capsys):
 
 def test_a_damaged_object_is_named(views, capsys):
     flip_a_byte(chunk(views, "depth", 1))
-    for command in (["measure", views, "max_depth"], ["inspect", views, views.parent / "b.png", "--object", "b"]):
+    for command in (
+        ["measure", views, "--measures", "max_depth"],
+        ["inspect", views, views.parent / "b.png", "--object", "b"],
+    ):
         message = refused(capsys, *command) if command[0] == "inspect" else refused(capsys, *command, "--workers", 1)
         assert "depth of b cannot be read" in message
 
@@ -464,7 +468,7 @@ def test_arrays_that_cannot_be_opened_are_mended_and_keep_what_they_hold(views, 
 @pytest.mark.parametrize("place", ["measures", "measures/depth_entropy", "measures/max_depth"])
 def test_measure_mends_what_it_writes(views, place):
     list(measure(views, workers=0))
-    before = {name: ViewStore.open(views).measure(name) for name in MEASURES}
+    before = {name: ViewStore.open(views).measure(name) for name in DEPTH}
     (views / place / "zarr.json").write_text("{")
     assert ViewStore.open(views).measures == sorted(MEASURES)
     list(measure(views, workers=0))

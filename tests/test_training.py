@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import onnxruntime as ort
@@ -15,6 +16,9 @@ from scipy.special import softmax
 from tests.test_lite import checkpoint
 from tests.test_readme import write_off
 
+import nextview
+from nextview.benchmark.replay import make_specs, replay
+from nextview.benchmark.true_maps import known_maps
 from nextview.calibration.valleys import valley_gains
 from nextview.cli.main import main
 from nextview.data import splits
@@ -29,7 +33,7 @@ from nextview.viewsphere import ViewSphere
 torch = pytest.importorskip("torch")
 
 from nextview.metrics import map_scores, recogniser_scores  # noqa: E402
-from nextview.models.model_card import find_card  # noqa: E402
+from nextview.models.model_card import find_card, read_card  # noqa: E402
 from nextview.models.network_input import InputSpec, from_store  # noqa: E402
 from nextview.training.architectures import PointNet, ResNet, orthogonality  # noqa: E402
 from nextview.training.checkpoints import load_exported, load_run  # noqa: E402
@@ -329,6 +333,60 @@ def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
     card = MapNetwork(models / "tiny-lcm.json").card
     assert card.kind == "lcm"
     assert set(card.held_out) == {views.names[i] for i in validation}  # also of which it could not be judged
+
+
+def test_a_measure_of_ones_own_is_learned_followed_and_compared(trained, tmp_path, monkeypatch):
+    """With no change in the package: measured, trained for, exported, predicted, a policy, in the benchmark, live."""
+    monkeypatch.chdir(tmp_path)
+    Path("height_of_mine.py").write_text(
+        "from nextview.measures.registry import Measure\n"
+        "rows = Measure(lambda view: view.near.shape[0] / view.depth.shape[0], good='valley')\n"
+    )
+    store, name = str(trained / "views.zarr"), "height_of_mine:rows"
+    main(["measure", store, "--measures", name, "--workers", "0"])
+    main(["inspect", store, "table.png", "--object", "table_0"])
+    small = ["--epochs", "1", "--views", "2", "--batch", "8", "--validation", "0.25", "--output", "window"]
+    main(["train", "map", store, "run", "--measure", name, *small])
+    main(["export", "map", "run", store, "models"])
+    path = Path("models/height_of_mine-rows-meshes.json")
+    card = read_card(path)
+    assert (card.kind, card.measure, card.good) == (name, name, "valley")
+    assert json.loads(path.read_text())["schema"] == 2
+    for end in (".json", ".onnx"):
+        shutil.copy(trained / f"models/tiny{end}", "models")
+    maps = ["--maps", f"{name}={path}"]
+    main(["predict", store, "p.npz", "--split", "train", "--models", "models", *maps, "--workers", "1"])
+    p = Predictions.load("p.npz")
+    assert p.valley_classes == {name: p.classes}  # low values are good, and nothing else was fitted
+    specs = make_specs(p, 1, 0)
+    first, peak, true = (replay(each, specs, 2, 0).views for each in (name, f"{name}-peak", f"true-{name}-peak"))
+    predicted = p.maps[name].reshape(len(p), 40, 15)[np.arange(len(p)), specs.starts]
+    there = p.sphere.windows.reshape(40, 15)[specs.starts]
+    free = there != specs.starts[:, None]
+    for found, values in ((first, -predicted), (peak, predicted)):
+        assert (found[:, 1] == there[np.arange(len(p)), np.where(free, values, -np.inf).argmax(1)]).mean() > 0.6
+    rows = [ViewStore.open(store).names.index(name) for name in p.names]
+    measured = ViewStore.open(store).measure(name)[rows]
+    at, best = measured[np.arange(len(p)), true[:, 1]], np.where(free, np.take_along_axis(measured, there, 1), 0).max(1)
+    assert (at == best).mean() > 0.6  # where the window's highest cell is a peak of it
+    assert name in known_maps(p)
+    system = nextview.load("models", policy=name)
+    assert system.policy.valley_classes == (0, 1)
+    assert len(system.recognise(trained / "meshes/table/test/table_8.off").views) >= 1
+
+
+def test_maps_of_what_is_not_there_are_refused(trained, tmp_path, capsys):
+    store = str(trained / "views.zarr")
+    for arguments, sentence in (
+        (["map", store, "--measure", "mesh_saliency"], "--measures mesh_saliency makes it"),
+        (["map", store, "--measure", "confidence"], "learned from predictions"),
+        (["map", store, "--predictions", str(tmp_path / "none.npz")], "there is no such file"),
+        (["lem", store, "--measure", "max_depth"], "nextview train map takes --measure max_depth"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main(["train", *arguments[:2], str(tmp_path / "run"), *arguments[2:]])
+        assert end.value.code == 2
+        assert sentence in capsys.readouterr().err
 
 
 def test_valley_classes_are_fitted_to_objects_that_neither_network_has_seen(trained, capsys):

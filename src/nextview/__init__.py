@@ -12,6 +12,7 @@ from nextview.belief import Stopping
 from nextview.errors import (
     DatasetError,
     EntryError,
+    MeasureError,
     MeshError,
     MissingExtraError,
     ModelError,
@@ -44,6 +45,7 @@ __all__ = [
     "EntryError",
     "EpisodeState",
     "Evidence",
+    "MeasureError",
     "Mesh",
     "MeshError",
     "MissingExtraError",

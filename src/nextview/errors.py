@@ -64,6 +64,10 @@ class DatasetError(NextviewError):
     """A dataset folder or a view store that cannot be used."""
 
 
+class MeasureError(NextviewError):
+    """A view measure that is not known, cannot be computed of these views, or failed."""
+
+
 class PredictionsError(NextviewError):
     """Predictions that cannot be used."""
 

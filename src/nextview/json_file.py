@@ -152,11 +152,13 @@ class Fields:
             raise self.wrong(name, "a SHA-256 in 64 hexadecimal digits")
         return value
 
-    def schema(self, known: int) -> None:
-        """Refuse an object of another schema version than the one known."""
+    def schema(self, *known: int) -> int:
+        """The schema version of an object; refuse one that is not known."""
         version = self.take("schema", None)
-        if version != known or isinstance(version, bool):
-            raise ModelError(f"{self.what} is of schema {version!r}, and this version of nextview reads schema {known}")
+        if version not in known or isinstance(version, bool):
+            reads = " and ".join(map(str, known))
+            raise ModelError(f"{self.what} is of schema {version!r}, and this version of nextview reads schema {reads}")
+        return int(version)
 
     def end(self) -> None:
         """Refuse what was not taken."""

@@ -200,14 +200,15 @@ def load(
     if policy is None:
         policy, made = _default_policy(found.policies, sphere, recogniser)
     else:
-        made = make_policy_anywhere(str(found.policies.get(policy, policy)), sphere, (), recogniser.classes)
+        name = str(found.policies.get(policy, policy))
+        made = make_policy_anywhere(name, sphere, (), recogniser.classes, found.maps)
     names = dict.fromkeys(name.removesuffix("-sphere") for name in maps_among(made.needs))
     missing = [name for name in names if name not in found.maps]
     if missing:
         raise ModelError(f"policy {policy} needs the map {missing[0]!r}; there are {', '.join(found.maps)}")
     opened = Models(recogniser, {name: MapNetwork(found.maps[name], threads) for name in names})
-    if policy in names:  # "lem" and "lcm" go to the valley for some classes, which the map's card names
-        made = make_policy_anywhere(policy, sphere, opened.valley_classes(policy), recogniser.classes)
+    if policy in names:  # a map's own policy goes to the valley for some classes, which the map's card names
+        made = make_policy_anywhere(policy, sphere, opened.valley_classes(policy), recogniser.classes, found.maps)
     if isinstance(made, MapPeak):
         made = replace(made, sphere=_grid_of(opened.maps[made.map_name], made.sphere))
     stopping = Stopping.of(recogniser.calibration, threshold, risk, max_views)

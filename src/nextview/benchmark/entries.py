@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_softmax
 
+from nextview.benchmark.true_maps import TRUE, known_maps
 from nextview.data.predictions import Predictions
 from nextview.errors import EntryError, OtherUseError
-from nextview.measures.confidence_map import confidence_maps
-from nextview.measures.depth_entropy import normalise_per_object
 from nextview.policies.base import Policy, Scope
 from nextview.policies.fixed import orbit, ranked
 from nextview.policies.maps import MapPeak
@@ -30,33 +29,43 @@ class EpisodeSpecs:
         predictions: what the models say, and the truth.
         objects: row of each episode's object, (E,) int64.
         starts: first view of each, (E,) int64.
-        valley_classes: classes (indices) for which the valley of the LEM is taken to be the better view.
-        lcm_valley_classes: the same for the LCM.
+        valleys: classes (indices) for which the valley of a map is taken to be the better view, of every map; None for
+            those that each map's card names.
     """
 
     predictions: Predictions
     objects: NDArray[np.int64]
     starts: NDArray[np.int64]
-    valley_classes: tuple[int, ...]
-    lcm_valley_classes: tuple[int, ...] = ()
+    valleys: tuple[int, ...] | None = None
 
     @property
     def labels(self) -> NDArray[np.int64]:
         """True class of each episode's object, (E,) int64."""
         return self.predictions.labels[self.objects]
 
+    def valley_classes(self, map_name: str = "lem") -> tuple[int, ...]:
+        """Classes (indices) for which the valley of a map is taken to be the better view."""
+        if self.valleys is not None:
+            return self.valleys
+        named, classes = self.predictions.valley_classes.get(map_name, ()), self.predictions.classes
+        return tuple(classes.index(name) for name in named if name in classes)
+
 
 ORACLES: dict[str, Callable[[EpisodeSpecs], Policy]] = {
-    "oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes),
-    "true-lem": lambda t: MapPeak(t.predictions.sphere, "true-lem", t.valley_classes),
+    "oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes()),
+    "true-lem": lambda t: MapPeak(t.predictions.sphere, "true-lem", t.valley_classes()),
     "true-lem-peak": lambda t: MapPeak(t.predictions.sphere, "true-lem"),
-    "true-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes, "true-lem"),
-    "lcm-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.lcm_valley_classes, "lcm"),
+    "true-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes(), "true-lem"),
+    "lcm-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes("lcm"), "lcm"),
     "true-lcm": lambda t: MapPeak(t.predictions.sphere, "true-lcm"),
     "oracle-gain": lambda t: _gain(t, "local"),
     "oracle-gain-all": lambda t: _gain(t, "global"),
 }
-"""Policies that are told the truth, or climb the true map."""
+"""Policies that are told the truth, or climb the true map. Every other map has such too, see ``MAP_ENTRY``."""
+
+MAP_ENTRY = re.compile(r"(true-)?(.+?)(-peak|-oracle-valley)?")
+"""Names of entries that climb a map, the predicted or the true one: to its peak, or to its valley for some classes, by
+the belief or by the truth."""
 
 FIXED = {
     "best": "the views in which the true class has the most confidence",
@@ -78,7 +87,9 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
     """All that these predictions allow."""
     sphere = specs.predictions.sphere
     n, v = sphere.azimuths, len(sphere)
-    names = [*POLICIES, *(name for name in bundled_policies() if _fits(name, specs)), *ORACLES]
+    maps = [name for name in specs.predictions.maps if name not in POLICIES and not name.endswith("-sphere")]
+    names = [*POLICIES, *(each for name in maps for each in (name, f"{name}-peak"))]
+    names = [*names, *(name for name in bundled_policies() if _fits(name, specs)), *ORACLES]
     names = [name for name in names if not _lacking(_make(name, specs), specs)]
     names += [f"{kind}-{min(5, v)}" for kind in FIXED if kind != "orbit"]
     return names + [f"orbit-{k}" for k in sorted({n, v})]
@@ -105,13 +116,28 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
 def _make(name: str, specs: EpisodeSpecs) -> Policy:
     if name in ORACLES:
         return ORACLES[name](specs)
-    card = name.partition("@")[0]
+    card, p = name.partition("@")[0], specs.predictions
+    by_map = None if name in POLICIES or card in bundled_policies() else _map_policy(name, specs)
+    if by_map is not None:
+        return by_map
     if name in POLICIES or card in bundled_policies() or card.endswith(".json") or ":" in name:
-        p = specs.predictions
-        valleys = specs.lcm_valley_classes if name.startswith("lcm") else specs.valley_classes
-        return make_policy(name, p.sphere, valleys, p.classes)
+        return make_policy(name, p.sphere, specs.valley_classes(name.removesuffix("-peak")), p.classes)
     names = [*POLICIES, *bundled_policies(), *ORACLES, *(f"{kind}-K" for kind in FIXED)]
     raise EntryError(f"no policy is called {name!r}; there are {', '.join(names)}")
+
+
+def _map_policy(name: str, specs: EpisodeSpecs) -> Policy | None:
+    """The policy that climbs a map which the predictions hold, or whose truth can be told; None if there is none."""
+    match = MAP_ENTRY.fullmatch(name)
+    assert match is not None
+    true, of, how = match.groups()
+    p = specs.predictions
+    if of not in (known_maps(p) if true else p.maps):
+        return None
+    climbed = f"{true or ''}{of}"
+    if how == "-oracle-valley":
+        return OracleValley(p.sphere, specs.labels, specs.valley_classes(of), climbed)
+    return MapPeak(p.sphere, climbed, () if how == "-peak" else specs.valley_classes(of))
 
 
 def _fits(name: str, specs: EpisodeSpecs) -> bool:
@@ -125,7 +151,11 @@ def _fits(name: str, specs: EpisodeSpecs) -> bool:
 
 def _lacking(policy: Policy, specs: EpisodeSpecs) -> list[str]:
     p = specs.predictions
-    there = {*p.maps, *TRUE_MAPS, *(["azimuth_bins"] if p.azimuth_bins is not None else [])}
+    there = {
+        *p.maps,
+        *(TRUE + name for name in known_maps(p)),
+        *(["azimuth_bins"] if p.azimuth_bins is not None else []),
+    }
     return [wanted for wanted in policy.needs if wanted not in there]
 
 
@@ -146,17 +176,3 @@ def fixed_views(name: str, specs: EpisodeSpecs, rng: np.random.Generator) -> NDA
     else:
         values = log_softmax(p.logits.astype(np.float64), axis=2)[np.arange(len(p)), :, p.labels]
     return ranked(values if kind in ("high-entropy", "best") else -values, k)[objects]
-
-
-def true_lem(p: Predictions) -> NDArray[np.float32]:
-    """Local windows of the true entropy map, (N, V, R, 3)."""
-    return normalise_per_object(p.depth_entropy)[:, p.sphere.windows]
-
-
-def true_lcm(p: Predictions) -> NDArray[np.float32]:
-    """Local windows of the recogniser's confidence, 0 where it is wrong (section 4.1.3), (N, V, R, 3)."""
-    return confidence_maps(p.logits, p.labels)[:, p.sphere.windows]
-
-
-TRUE_MAPS: dict[str, Callable[[Predictions], NDArray]] = {"true-lem": true_lem, "true-lcm": true_lcm}
-"""Maps that no model predicts."""

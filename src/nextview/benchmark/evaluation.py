@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -13,16 +13,14 @@ from numpy.typing import NDArray
 from nextview import metrics
 from nextview.belief import Calibration
 from nextview.benchmark import statistics as st
-from nextview.benchmark.entries import true_lcm, true_lem
 from nextview.benchmark.published import published_map, published_recognisers
+from nextview.benchmark.true_maps import known_maps, true_map
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError
+from nextview.measures.map_names import CONFIDENCE, measure_of
 from nextview.models.model_card import ModelCard
 
 Float = NDArray[np.float64]
-
-TRUTHS: dict[str, Callable[[Predictions], NDArray]] = {"lem": true_lem, "lcm": true_lcm}
-"""Maps whose truth the predictions tell."""
 
 RELIABILITY_LOOKS = (1, 2, 5)
 """Views after which confidence is compared with accuracy, beside all of them."""
@@ -215,9 +213,9 @@ def _reliability(right: NDArray[np.bool_], confidence: NDArray[np.float32]) -> p
 
 
 def judged_objects(p: Predictions, name: str) -> NDArray[np.int64]:
-    """The objects whose true map can be told: for the LCM those that are right from any view (section 4.1.3)."""
+    """The objects whose true map can be told: of the confidence those that are right from any view (section 4.1.3)."""
     right = p.logits.argmax(2) == p.labels[:, None]
-    return np.flatnonzero(right.any(1)) if name == "lcm" else np.arange(len(p))
+    return np.flatnonzero(right.any(1)) if measure_of(name) == CONFIDENCE else np.arange(len(p))
 
 
 def baselines(true: NDArray[np.floating], labels: NDArray[np.int64]) -> dict[str, NDArray[np.floating]]:
@@ -235,11 +233,12 @@ def baselines(true: NDArray[np.floating], labels: NDArray[np.int64]) -> dict[str
 def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]:
     rows: list[tuple] = []
     left_out = {} if p.maps else {"maps": "these predictions hold none"}
+    known = known_maps(p)
     for name, predicted in p.maps.items():
         if name.endswith("-sphere"):  # its window is judged
             continue
-        if name not in TRUTHS:
-            left_out[name] = f"what is true of this map is not known; known are {', '.join(TRUTHS)}"
+        if name not in known:
+            left_out[name] = f"what is true of this map is not known; known are {', '.join(known)}"
             continue
         kept = judged_objects(p, name)
         if len(kept) == 0:
@@ -247,7 +246,7 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
             continue
         if len(kept) < len(p):
             left_out[name] = f"without the objects that are recognised from no view: {len(p) - len(kept)} of {len(p)}"
-        true, labels = TRUTHS[name](p)[kept], p.labels[kept]
+        true, labels = true_map(p, name)[kept], p.labels[kept]
         for by, maps in {"network": predicted[kept], **baselines(true, labels)}.items():
             window = true.shape[2:]
             errors = metrics.map_errors(maps.reshape(-1, *window), true.reshape(-1, *window))
@@ -274,7 +273,7 @@ def scores_for_card(card: ModelCard, p: Predictions) -> dict[str, Any]:
     if card.kind == "recogniser":
         return metrics.recogniser_scores(p.logits, p.labels)
     kept = judged_objects(p, card.kind)
-    if card.kind not in TRUTHS or len(kept) == 0:
+    if card.kind not in known_maps(p) or len(kept) == 0:
         raise ResultsError(f"these predictions hold no object by which model {card.name} can be judged")
     shape = (-1, p.sphere.rings, 3)
-    return metrics.map_scores(p.maps[card.kind][kept].reshape(shape), TRUTHS[card.kind](p)[kept].reshape(shape))
+    return metrics.map_scores(p.maps[card.kind][kept].reshape(shape), true_map(p, card.kind)[kept].reshape(shape))

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.belief import FixedLength, Stopping
-from nextview.benchmark.entries import TRUE_MAPS, EpisodeSpecs, entry_policy, fixed_views
+from nextview.benchmark.entries import EpisodeSpecs, entry_policy, fixed_views
+from nextview.benchmark.true_maps import TRUE, true_map
 from nextview.data.predictions import Predictions
 from nextview.episode import run_episodes
 from nextview.errors import EntryError, PolicyError, UsageError
@@ -71,14 +72,8 @@ def make_specs(
     if runs < 1:
         raise UsageError(f"at least one run is needed, not {runs}")
     n = len(predictions)
-
-    def on_card(map_name: str) -> tuple[int, ...]:
-        named = predictions.valley_classes.get(map_name, ())
-        return tuple(predictions.classes.index(name) for name in named if name in predictions.classes)
-
-    lem, lcm = (on_card(name) if valley_classes is None else valley_classes for name in ("lem", "lcm"))
     starts = np.random.default_rng([seed]).integers(len(predictions.sphere), size=runs * n)
-    return EpisodeSpecs(predictions, np.tile(np.arange(n), runs), starts, lem, lcm)
+    return EpisodeSpecs(predictions, np.tile(np.arange(n), runs), starts, valley_classes)
 
 
 def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int) -> Trajectories:
@@ -115,7 +110,10 @@ PART = 4096
 def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng: np.random.Generator) -> Trajectories:
     """Follow a policy through all episodes."""
     p, objects = specs.predictions, specs.objects
-    maps = {name: TRUE_MAPS[name](p) if name in TRUE_MAPS else p.maps[name] for name in maps_among(policy.needs)}
+    maps = {
+        name: true_map(p, name.removeprefix(TRUE)) if name.startswith(TRUE) else p.maps[name]
+        for name in maps_among(policy.needs)
+    }
 
     def observe(which: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
         rows = objects[which]

@@ -121,7 +121,7 @@ def run_benchmark(
             "threshold_decay": threshold_decay,
             "runs": runs,
             "max_views": max_views,
-            "valley_classes": [table.classes[i] for i in specs.valley_classes],
+            "valley_classes": [table.classes[i] for i in specs.valley_classes()],
             "samples": samples,
             "seed": seed,
         }

@@ -94,6 +94,25 @@ class SimulatedCamera:
             depth[bound] = np.where(hit, hits["tfar"], 0).reshape(height, width)
         return Observation(depth, pose, self.intrinsics, self.radius, image)
 
+    def face_ids(self, pose: NDArray[np.float64], where: NDArray[np.bool_] | None = None) -> NDArray[np.int32]:
+        """Which face of the mesh each pixel shows.
+
+        Args:
+            pose: camera-to-world, (4, 4), OpenCV axes, object radii.
+            where: the pixels to ask for, (H, W); by default those in which ``observe`` sees the object.
+
+        Returns:
+            (H, W) int32, indices of the mesh's faces, -1 for none.
+        """
+        pose = checked_pose(pose)
+        where = self.observe(pose).depth > 0 if where is None else where
+        found = np.full(self.shape, -1, np.int32)
+        rays = self._rays[where] @ np.ascontiguousarray(pose[:3, :3].astype(np.float32).T)
+        if len(rays):
+            origins = np.tile(pose[:3, 3].astype(np.float32), len(rays)).reshape(-1, 3)
+            found[where] = self._scene.run(origins, rays)  # the nearest face alone: distances and normals cost more
+        return found
+
     def _bound(self, rotation: NDArray[np.float32], origin: NDArray[np.float32]) -> tuple[slice, slice]:
         """Rows and columns that hold the projection of every vertex; the whole image if one is behind the camera."""
         x, y, z = rotation.T @ self._corners - (rotation.T @ origin)[:, None]

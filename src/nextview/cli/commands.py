@@ -11,12 +11,14 @@ from nextview.cli.correspond import correspond
 from nextview.cli.demo import demo
 from nextview.cli.download import download
 from nextview.cli.evaluate import evaluate
-from nextview.cli.export import export_lcm, export_lem, export_recogniser
+from nextview.cli.export import export_recogniser
+from nextview.cli.export_maps import export_lcm, export_lem, export_map
 from nextview.cli.fit import fit_calibration, fit_size, fit_valleys
 from nextview.cli.fit_policies import fit_policies
 from nextview.cli.fit_unknown import fit_unknown
 from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
+from nextview.cli.measures import measures
 from nextview.cli.models import models
 from nextview.cli.predict import predict
 from nextview.cli.recognise import recognise
@@ -24,7 +26,7 @@ from nextview.cli.render import render
 from nextview.cli.report import report
 from nextview.cli.train_gain import train_gain
 from nextview.cli.train_grid import train_grid
-from nextview.cli.train_maps import train_lcm, train_lem
+from nextview.cli.train_maps import train_lcm, train_lem, train_map
 from nextview.cli.train_recogniser import train_recogniser
 
 COMMANDS: dict[str, Any] = {
@@ -36,16 +38,18 @@ COMMANDS: dict[str, Any] = {
     "render": render,
     "check": check,
     "measure": measure,
+    "measures": measures,
     "correspond": correspond,
     "inspect": inspect,
     "train": {
         "recogniser": train_recogniser,
         "grid": train_grid,
+        "map": train_map,
         "lem": train_lem,
         "lcm": train_lcm,
         "gain": train_gain,
     },
-    "export": {"recogniser": export_recogniser, "lem": export_lem, "lcm": export_lcm},
+    "export": {"recogniser": export_recogniser, "map": export_map, "lem": export_lem, "lcm": export_lcm},
     "predict": predict,
     "fit": {
         "size": fit_size,

@@ -1,4 +1,4 @@
-"""``nextview export``: from a training run to an ONNX model with its card."""
+"""``nextview export recogniser``: from a training run to an ONNX model with its card."""
 
 from __future__ import annotations
 
@@ -35,62 +35,11 @@ def export_recogniser(
     from nextview.cli.progress import track
     from nextview.training.export import export_recogniser as export
 
-    _say(export((run, *also), store, out, bits, name, note, track))
+    say_exported(export((run, *also), store, out, bits, name, note, track))
 
 
-def export_lem(
-    run: tyro.conf.Positional[Path],
-    store: tyro.conf.Positional[Path],
-    out: tyro.conf.Positional[Path],
-    /,
-    bits: Literal[8, 16] = 16,
-    name: str | None = None,
-    note: str = "",
-) -> None:
-    """Export a trained LEM: ONNX, with a card of its validation scores.
-
-    Args:
-        run: folder made by nextview train lem.
-        store: the store that it was trained on.
-        out: folder for NAME.onnx and NAME.json.
-        bits: that a weight takes in the file.
-        name: what to call the model; by default lem-DATASET, after the mesh folder of the store.
-        note: what else the card should say.
-    """
-    from nextview.cli.progress import track
-    from nextview.training.export import export_map
-
-    _say(export_map("lem", run, store, out, None, bits, name, note, track))
-
-
-def export_lcm(
-    run: tyro.conf.Positional[Path],
-    store: tyro.conf.Positional[Path],
-    predictions: tyro.conf.Positional[Path],
-    out: tyro.conf.Positional[Path],
-    /,
-    bits: Literal[8, 16] = 16,
-    name: str | None = None,
-    note: str = "",
-) -> None:
-    """Export a trained LCM: ONNX, with a card of its validation scores.
-
-    Args:
-        run: folder made by nextview train lcm.
-        store: the store that it was trained on.
-        predictions: those that it was trained on.
-        out: folder for NAME.onnx and NAME.json.
-        bits: that a weight takes in the file.
-        name: what to call the model; by default lcm-DATASET, after the mesh folder of the store.
-        note: what else the card should say.
-    """
-    from nextview.cli.progress import track
-    from nextview.training.export import export_map
-
-    _say(export_map("lcm", run, store, out, predictions, bits, name, note, track))
-
-
-def _say(made: Exported) -> None:
+def say_exported(made: Exported) -> None:
+    """Print what was made, and how exactly."""
     from nextview.cli.progress import console
 
     console.print(f"{made.card}: largest difference between torch and ONNX on real views {made.difference:.2g}")

@@ -6,11 +6,15 @@ from pathlib import Path
 
 import tyro
 
+from nextview.mesh_format import MAX_FACES
+
 
 def measure(
     store: tyro.conf.Positional[Path],
-    names: tyro.conf.Positional[tuple[str, ...]] = (),
+    meshes: tyro.conf.Positional[Path | None] = None,
     /,
+    measures: tuple[str, ...] = (),
+    max_faces: int = MAX_FACES,
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> None:
@@ -18,16 +22,30 @@ def measure(
 
     Args:
         store: view store made by nextview render.
-        names: depth_entropy, silhouette_area, silhouette_length, depth_distribution, max_depth; all by default.
+        meshes: the dataset folder that it was rendered from: measures that need the mesh find there which face each
+            pixel shows.
+        measures: names (nextview measures lists them), all, or MODULE:FUNCTION for one of your own; by default all that
+            need the depth alone, or with MESHES all.
+        max_faces: of a mesh, as for nextview render.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler to use instead.
     """
-    from nextview.cli.progress import track
+    from rich.table import Table
+
+    from nextview.cli.progress import console, track
+    from nextview.data.measuring import Cost
     from nextview.data.measuring import measure as measure_store
     from nextview.data.store import ViewStore
-    from nextview.measures.registry import MEASURES
 
-    steps = measure_store(store, names or tuple(MEASURES), workers, scheduler)
+    cost = Cost()
+    steps = measure_store(store, measures, workers, scheduler, meshes, max_faces, cost)
     before, total = next(steps)
     views = len(ViewStore.open(store).sphere)
     track((done for done, _ in steps), total, f"measuring {store.name}", before, views)
+    if cost.views:
+        peak = f"{cost.peak / 2**20:,.0f} MiB in the largest process"
+        table = Table("measure", "views/s of one core", title=f"{cost.views:,} views, {peak}")
+        table.columns[1].justify = "right"
+        for name, rate in cost.per_second().items():
+            table.add_row(name, f"{rate:,.0f}")
+        console.print(table)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.measuring import keep
+from nextview.data.measuring import Made, keep
 from nextview.data.store import ViewStore
 
 ARRAY = "correspondence"
@@ -31,8 +31,8 @@ def correspond(path: Path, workers: int | None = None, scheduler: str | None = N
     yield from keep(path, [ARRAY], _correspond, workers, scheduler)
 
 
-def _correspond(store: ViewStore, i: int) -> dict[str, NDArray[np.float32]]:
-    return {ARRAY: correspondence(store.points(i), store.depth(i), store.sphere.poses, store.intrinsics)}
+def _correspond(store: ViewStore, i: int) -> Made:
+    return {ARRAY: correspondence(store.points(i), store.depth(i), store.sphere.poses, store.intrinsics)}, None
 
 
 def correspondence(

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import resource
+import sys
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -10,61 +15,164 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from nextview.cameras.simulated import SimulatedCamera
+from nextview.data.folders import list_dataset
 from nextview.data.lock import only_one, writing
 from nextview.data.pool import WorkerDied, each
+from nextview.data.rendering import deformed
 from nextview.data.store import DEPTH_UNIT, ViewStore
-from nextview.errors import DatasetError
-from nextview.measures.registry import MEASURES
+from nextview.errors import DatasetError, MeasureError
+from nextview.measures.measured_view import MeasuredView
+from nextview.measures.registry import find_measure, names_of
+from nextview.measures.surface import Surface
+from nextview.mesh import load_mesh
+from nextview.mesh_format import MAX_FACES
+from nextview.models.model_card import file_hash
+
+READING, CASTING = "reading depth", "finding faces"
+"""What is done for all measures, beside them."""
+Made = tuple[dict[str, NDArray[np.float32]], "Cost | None"]
+"""Arrays by name, and what they cost if anyone wants to know."""
+
+
+@dataclass
+class Cost:
+    """What measuring cost.
+
+    Attributes:
+        seconds: of one processor, by measure; what several measures share is counted to the first of them.
+        views: measured.
+        peak: memory of the largest process, bytes.
+    """
+
+    seconds: Counter[str] = field(default_factory=Counter)
+    views: int = 0
+    peak: int = 0
+
+    def add(self, other: Cost) -> None:
+        """Count another one in."""
+        self.seconds.update(other.seconds)
+        self.views += other.views
+        self.peak = max(self.peak, other.peak)
+
+    def per_second(self) -> dict[str, float]:
+        """Views a second of one processor, by measure, and "all" together."""
+        rates = {name: self.views / seconds for name, seconds in self.seconds.items() if seconds}
+        return rates | {"all": self.views / max(sum(self.seconds.values()), 1e-9)}
 
 
 def measure(
     path: Path,
-    names: Sequence[str] = tuple(MEASURES),
+    names: Sequence[str] = (),
     workers: int | None = None,
     scheduler: str | None = None,
+    meshes: Path | None = None,
+    max_faces: int = MAX_FACES,
+    cost: Cost | None = None,
 ) -> Iterator[tuple[int, int]]:
     """Put view measures into a store, as ``measures/NAME`` (N, V) float32.
 
     Args:
         path: the store.
-        names: of the measures; all that are known by default.
+        names: of the measures, "all", or "module:function", see ``measures.registry``; by default all that can be had.
         workers: processes; one for each core by default; 0 to work in this one.
         scheduler: address of a dask.distributed scheduler, to use instead.
+        meshes: the dataset folder that the store was rendered from, for measures that need the mesh.
+        max_faces: of a mesh, as it was rendered.
+        cost: is told what this run costs.
 
     Yields:
         Objects done so far, and how many there are.
 
     Raises:
-        DatasetError: there is no store, no such measure, or the store cannot be written.
+        DatasetError: there is no store, the meshes are not those that it was rendered from, or it cannot be written.
+        MeasureError: there is no such measure, it needs the meshes, or it failed.
     """
-    for name in names:
-        if name not in MEASURES:
-            raise DatasetError(f"no measure is called {name!r}; there are {', '.join(MEASURES)}")
+    names = names_of(names, meshes is not None)
     store = ViewStore.open(path)
     store.array("depth")  # says if it is missing, before anything is begun
-    yield from keep(path, [f"measures/{name}" for name in names], partial(_measure, tuple(names)), workers, scheduler)
+    files = {}
+    if any(find_measure(name).needs == "mesh" for name in names):
+        assert meshes is not None  # or names_of had said so
+        files = _files(store, meshes.absolute())
+    function = partial(_measure, names, files, max_faces)
+    yield from keep(path, [f"measures/{name}" for name in names], function, workers, scheduler, cost)
 
 
-def _measure(names: tuple[str, ...], store: ViewStore, i: int) -> dict[str, NDArray[np.float32]]:
-    depth = store.read("depth", i) * DEPTH_UNIT  # float64, as when it was rendered
-    return {f"measures/{name}": np.array([MEASURES[name](d) for d in depth], np.float32) for name in names}
+def _files(store: ViewStore, meshes: Path) -> dict[int, Path]:
+    """The mesh file of each rendered object.
+
+    Raises:
+        DatasetError: one is not there, or the store looked through a sensor.
+    """
+    if "sensor" in store.group.attrs:
+        raise DatasetError(f"{store.path}: was rendered through a sensor, whose depth does not tell which face is seen")
+    found = {entry.name: entry.path for entry in list_dataset(meshes)}
+    lacking = [store.names[i] for i in np.flatnonzero(store.done) if store.names[i] not in found]
+    if lacking:
+        raise DatasetError(f"{meshes}: holds no mesh called {lacking[0]}, of which {store.path} has views")
+    return {int(i): found[store.names[i]] for i in np.flatnonzero(store.done)}
+
+
+def _measure(names: tuple[str, ...], files: dict[int, Path], max_faces: int, store: ViewStore, i: int) -> Made:
+    cost = Cost(views=len(store.sphere))
+    began = time.process_time()
+
+    def lap(name: str) -> None:
+        nonlocal began
+        now = time.process_time()
+        cost.seconds[name] += now - began
+        began = now
+
+    measures = {name: find_measure(name) for name in names}
+    depths = store.read("depth", i) * DEPTH_UNIT  # float64, as when it was rendered
+    lap(READING)
+    surface = camera = None
+    if files:
+        hashes = store.group.attrs.get("sha256")
+        if hashes and file_hash(files[i]) != hashes[i]:
+            raise DatasetError(f"{files[i]}: is not the mesh that {store.path} was rendered from")
+        mesh = deformed(store, load_mesh(files[i], max_faces=max_faces), store.names[i])
+        surface = Surface(mesh.vertices, mesh.faces)
+        camera = SimulatedCamera(mesh, depths.shape[-1], store.sphere.distance)
+        lap(CASTING)
+    values = {name: np.empty(len(depths), np.float32) for name in names}
+    for k, (depth, pose) in enumerate(zip(depths, store.sphere.poses, strict=True)):
+        faces = None if camera is None else camera.face_ids(pose, depth > 0)
+        view = MeasuredView(depth, pose, store.intrinsics, surface, faces)
+        lap(CASTING if files else READING)
+        for name, function in measures.items():
+            try:
+                values[name][k] = function(view)
+            except Exception as error:  # whatever a user's measure may raise
+                if ":" not in name or isinstance(error, MeasureError):
+                    raise
+                raise MeasureError(f"measure {name} of {store.names[i]}: {type(error).__name__}: {error}") from error
+            lap(name)
+    for name, found in values.items():
+        if not np.isfinite(found).all():
+            raise MeasureError(f"measure {name} of {store.names[i]}, view {np.isfinite(found).argmin()}, is not finite")
+    cost.peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return {f"measures/{name}": found for name, found in values.items()}, cost
 
 
 def keep(
     path: Path,
     names: Sequence[str],
-    function: Callable[[ViewStore, int], dict[str, NDArray[np.float32]]],
+    function: Callable[[ViewStore, int], Made],
     workers: int | None = None,
     scheduler: str | None = None,
+    cost: Cost | None = None,
 ) -> Iterator[tuple[int, int]]:
     """Call ``function(store, i)`` for the objects that lack a sound row of the arrays, and keep what it returns.
 
     Args:
         path: the store.
         names: of the arrays; one that is missing or cannot be opened is made.
-        function: returns one array of finite numbers for each name.
+        function: returns one array of finite numbers for each name, and what they cost.
         workers: processes; one for each core by default; 0 to work in this one.
         scheduler: address of a dask.distributed scheduler, to use instead.
+        cost: is told what this run costs.
 
     Yields:
         Objects done so far, and how many there are.
@@ -86,16 +194,19 @@ def keep(
         items = sorted(lacking)
         yield len(done) - len(items), len(done)
         finished = len(done) - len(items)
-        for i, died in each(partial(_keep_object, store.path, function), items, workers, scheduler):
-            if isinstance(died, WorkerDied):
-                raise DatasetError(f"{path}: object {store.names[i]} cannot be computed ({died})")
+        for i, spent in each(partial(_keep_object, store.path, function), items, workers, scheduler):
+            if isinstance(spent, WorkerDied):
+                raise DatasetError(f"{path}: object {store.names[i]} cannot be computed ({spent})")
+            if cost is not None and spent is not None:
+                cost.add(spent)
             finished += 1
             yield finished, len(done)
 
 
-def _keep_object(path: Path, function: Callable[[ViewStore, int], dict[str, NDArray[np.float32]]], i: int) -> None:
+def _keep_object(path: Path, function: Callable[[ViewStore, int], Made], i: int) -> Cost | None:
     store = ViewStore.open(path)
-    found = function(store, i)
+    found, cost = function(store, i)
     with zarr.config.set({"array.write_empty_chunks": True}):  # zeros too: an object without a chunk is a damaged one
         for name, values in found.items():
             store.group[name][i] = values
+    return cost

@@ -97,7 +97,7 @@ def predict(
         raise DatasetError(f"{path}: recogniser {recogniser.name} does not know the class {unknown[0]!r}")
     names = tuple(store.names[i] for i in chosen)
     models = {"recogniser": identity(recognisers), **{name: identity([card]) for name, card in maps.items()}}
-    valleys = {name: card.valley_classes for name, card in maps.items()}
+    valleys = {name: card.valleys(classes) for name, card in maps.items()}
     calibration = recogniser.calibration
     own = [card for card in (*recognisers, *maps.values()) if card.path.parent != BUNDLED]
     commands = tuple(

@@ -240,6 +240,13 @@ def turns(store: ViewStore) -> NDArray[np.float64]:
     return np.array([deform.draw(int(recipe.get("seed", 0)), name)[1] for name in store.names])
 
 
+def deformed(store: ViewStore, mesh: Mesh, name: str) -> Mesh:
+    """A mesh as it was deformed when a store's object of that name was rendered."""
+    recipe = store.group.attrs
+    deform = Deform(float(recipe.get("stretch", 0.0)), bool(recipe.get("turn", False)))
+    return mesh if deform == Deform() else deform(mesh, int(recipe.get("seed", 0)), name)
+
+
 def _begin(
     path: Path,
     entries: list[Entry],

@@ -169,7 +169,7 @@ class ViewStore:
         """
         remedy = f"nextview check {self.path} --repair makes it, and nextview render fills it"
         if name.startswith("measures/"):
-            remedy = f"nextview measure {self.path} {name.removeprefix('measures/')} makes it"
+            remedy = f"nextview measure {self.path} --measures {name.removeprefix('measures/')} makes it"
         try:
             array = self.group[name]
         except KeyError:
@@ -267,7 +267,7 @@ class ViewStore:
     def _damage(self, name: str, i: int, error: ChunkError) -> str:
         remedy = f"nextview check {self.path} --repair takes the object out, and nextview render makes it anew"
         if name.startswith("measures/"):
-            remedy = f"nextview measure {self.path} {name.removeprefix('measures/')} makes it"
+            remedy = f"nextview measure {self.path} --measures {name.removeprefix('measures/')} makes it"
         return f"{self.path}: {name} of {self.names[i]} {error}; {remedy}"
 
     def __len__(self) -> int:

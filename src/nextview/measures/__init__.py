@@ -1,1 +1,1 @@
-"""View-quality measures by name."""
+"""What makes a view good: measures by name, one file a family."""

@@ -125,7 +125,6 @@ class MapNetwork:
         self.card = find_card(model)
         if self.card.is_recogniser:
             raise ModelError(f"model {self.card.name} is a recogniser, not a map network")
-        self.valley_classes = self.card.valley_classes
         self._session = open_weights(self.card, threads)
         rings = next(end.shape[1] for end in self._session.get_outputs() if end.name == "map")
         self.rings: int | None = rings if isinstance(rings, int) else None
@@ -162,9 +161,8 @@ class Models:
     def valley_classes(self, map_name: str) -> tuple[int, ...]:
         """Classes (indices) for which a map's valley is the better view, as its card says; none without that map."""
         network = self.maps.get(map_name)
-        return (
-            () if network is None else tuple(self.classes.index(c) for c in network.valley_classes if c in self.classes)
-        )
+        valleys = () if network is None else network.card.valleys(self.classes)
+        return tuple(self.classes.index(c) for c in valleys if c in self.classes)
 
     def evidence(self, observations: Sequence[Observation]) -> Evidence:
         """What the models say of views from one camera."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,12 +12,14 @@ from typing import Any, Literal
 from nextview.belief import PLAIN_SUM, Calibration
 from nextview.errors import ModelError
 from nextview.json_file import Fields, read_object
+from nextview.measures.map_names import Good, measure_of
 from nextview.models.network_input import InputSpec
 from nextview.models.size_evidence import SizeEvidence
 from nextview.outputs import written_whole
 
 BUNDLED = Path(__file__).parent / "bundled"
-SCHEMA = 1
+SCHEMA = 2
+"""Version 1 did not say which measure a map is of: its name told that, and peaks were good."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +73,10 @@ class ModelCard:
         size: what a recogniser knows of the sizes of objects; None if nothing.
         novelty_sha256: of the file beside the card by which it tells objects of no known class, see
             ``nextview.novelty``; "" if there is none: such a recogniser never answers that it does not know an object.
+        measure: of which a map network predicts the map; "" of a recogniser.
+        good: where such a map has the better views: at its peaks, or its valleys.
         output: what a map network predicts: the local window, or the whole sphere, of which the window is a part.
-        valley_classes: for which the valley of its map is the better view.
+        valley_classes: for which the valley of its map was found to be the better view.
         valley_gain: by how much, for each class; see ``calibration.valleys``.
         training: how it was made.
         scores: on each set of objects, by what that is.
@@ -97,6 +101,8 @@ class ModelCard:
     calibration: Calibration = PLAIN_SUM
     size: SizeEvidence | None = None
     novelty_sha256: str = ""
+    measure: str = ""
+    good: Good = "peak"
     output: Literal["window", "sphere"] = "window"
     valley_classes: tuple[str, ...] = ()
     valley_gain: Mapping[str, float] = field(default_factory=dict)
@@ -133,7 +139,7 @@ class ModelCard:
             ModelError: it makes no sense.
         """
         fields = Fields(values, "the card")
-        fields.schema(SCHEMA)
+        version = fields.schema(1, SCHEMA)
         seen = Fields(fields.take("input"), "the input")
         spec = InputSpec(seen.text("kind"), seen.whole("size", 0))  # type: ignore[arg-type]  # checked on making
         seen.end()
@@ -150,6 +156,8 @@ class ModelCard:
             }
         else:
             own = {
+                "measure": measure_of(kind) if version == 1 else fields.text("measure"),
+                "good": "peak" if version == 1 else fields.one_of("good", ("peak", "valley")),
                 "output": fields.one_of("output", ("window", "sphere")),
                 "valley_classes": fields.texts("valley_classes", (), unique=True),
                 "valley_gain": _by_name(fields, "valley_gain", float),
@@ -185,6 +193,8 @@ class ModelCard:
             values |= {"classes": list(self.classes), "azimuth_bins": self.azimuth_bins}
         else:
             values |= {
+                "measure": self.measure,
+                "good": self.good,
                 "output": self.output,
                 "valley_classes": list(self.valley_classes),
                 "valley_gain": dict(self.valley_gain),
@@ -200,6 +210,10 @@ class ModelCard:
         if self.novelty_sha256:
             values["novelty_sha256"] = self.novelty_sha256
         return values | {"fitted_to": dict(self.fitted_to)}
+
+    def valleys(self, classes: Sequence[str]) -> tuple[str, ...]:
+        """The classes for which the valley of its map is the better view: as was fitted, or else all or none."""
+        return tuple(classes) if self.good == "valley" and not self.valley_gain else self.valley_classes
 
     def made_by(self, *commands: str) -> ModelCard:
         """The same with further commands; one that it names already is not named again."""

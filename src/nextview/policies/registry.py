@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,17 +39,23 @@ DEFAULT = "gain"
 
 
 def make_policy(
-    name: str, sphere: Viewpoints, valley_classes: Sequence[int] = (), classes: Sequence[str] | None = None
+    name: str,
+    sphere: Viewpoints,
+    valley_classes: Sequence[int] = (),
+    classes: Sequence[str] | None = None,
+    maps: Collection[str] = (),
 ) -> Policy:
     """A policy by name.
 
     Args:
-        name: one of POLICIES, a learned one that is bundled, the path of a learned one's card (.json), or
+        name: one of POLICIES, a map's name ("view_area": its peak, or its valley for the valley classes), the same with
+            "-peak" (always that), a learned one that is bundled, the path of a learned one's card (.json), or
             "module:Class" for one of your own, which is called with the sphere alone. A learned one that weighs
             travel takes another travel weight as NAME@WEIGHT.
         sphere: the viewpoints; a ``ViewSphere`` but for those of ANYWHERE and your own.
-        valley_classes: classes (indices) whose believers go to the map's valley; only "lem" and "lcm" use it.
+        valley_classes: classes (indices) whose believers go to the map's valley.
         classes: names of the recogniser's classes; a learned policy for others is refused.
+        maps: names of the maps that are predicted, beside those of POLICIES.
 
     Raises:
         PolicyError: there is no such policy, or it cannot be made.
@@ -58,6 +64,10 @@ def make_policy(
         if name not in ANYWHERE and not isinstance(sphere, ViewSphere):
             raise PolicyError(f"policy {name} needs viewpoints on rings")
         return POLICIES[name](sphere, tuple(valley_classes))
+    if name.removesuffix("-peak") in maps:
+        if not isinstance(sphere, ViewSphere):
+            raise PolicyError(f"policy {name} needs viewpoints on rings")
+        return MapPeak(sphere, name.removesuffix("-peak"), () if name.endswith("-peak") else tuple(valley_classes))
     learned = bundled_policies()
     card, weighted, travel_weight = name.partition("@")
     if card in learned or card.endswith(".json"):
@@ -65,11 +75,15 @@ def make_policy(
         return _at_travel_weight(policy, name, travel_weight) if weighted else policy
     if ":" in name:
         return _import_policy(name, sphere)
-    raise PolicyError(f"no policy is called {name!r}; there are {', '.join([*POLICIES, *learned])}")
+    raise PolicyError(f"no policy is called {name!r}; there are {', '.join([*POLICIES, *maps, *learned])}")
 
 
 def make_policy_anywhere(
-    name: str, viewpoints: Viewpoints, valley_classes: Sequence[int] = (), classes: Sequence[str] | None = None
+    name: str,
+    viewpoints: Viewpoints,
+    valley_classes: Sequence[int] = (),
+    classes: Sequence[str] | None = None,
+    maps: Collection[str] = (),
 ) -> Policy:
     """A policy by name for live use, whatever the viewpoints: see ``policies.off_grid``.
 
@@ -81,9 +95,10 @@ def make_policy_anywhere(
     if path is not None:
         about = read_policy_card(path)
         return make_policy(name, ViewSphere(about.elevations, about.azimuths), valley_classes, classes)
-    if name in POLICIES and name not in ANYWHERE and not isinstance(viewpoints, ViewSphere):
-        return make_policy(name, ViewSphere.named("40"), valley_classes, classes)
-    return make_policy(name, viewpoints, valley_classes, classes)
+    on_grid = (name in POLICIES and name not in ANYWHERE) or name.removesuffix("-peak") in maps
+    if on_grid and not isinstance(viewpoints, ViewSphere):
+        return make_policy(name, ViewSphere.named("40"), valley_classes, classes, maps)
+    return make_policy(name, viewpoints, valley_classes, classes, maps)
 
 
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from nextview.benchmark.evaluation import TRUTHS, Evaluation, judged_objects
+from nextview.benchmark.evaluation import Evaluation, judged_objects
+from nextview.benchmark.true_maps import true_map
 from nextview.data.predictions import Predictions
 from nextview.report.diagrams import confusion_matrix, draw_reliability, reliability_figure
 from nextview.report.style import INK, STYLE, PlainFigure, legend, new_figure, percent_axis
@@ -162,7 +163,7 @@ def example_maps(p: Predictions, name: str, rng: np.random.Generator) -> Figure:
     """
     kept = judged_objects(p, name)
     view = rng.integers(len(p.sphere), size=len(kept))
-    true, predicted = TRUTHS[name](p)[kept, view], p.maps[name][kept, view]
+    true, predicted = true_map(p, name)[kept, view], p.maps[name][kept, view]
     error = ((true.astype(np.float64) - predicted) ** 2).mean((1, 2))
     labels = p.labels[kept]
     classes = np.unique(labels)

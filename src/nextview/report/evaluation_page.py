@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from nextview.benchmark.evaluation import Evaluation
 from nextview.benchmark.published import published_recognisers
 from nextview.data.predictions import Predictions
+from nextview.measures.map_names import CONFIDENCE, measure_of
 from nextview.report import evaluation_figures as drawn
 from nextview.report.elements import (
     NONE,
@@ -220,11 +221,13 @@ def _calibration(e: Evaluation, figures: dict[str, Figure]) -> list[Picture]:
     ]
 
 
-TRUTH = {
-    "lem": "the depth-entropy of the neighbouring views, scaled to 0 .. 1 over the object's views",
-    "lcm": "the recogniser's confidence in the neighbouring views, 0 where it is wrong",
-}
-"""What the maps tell."""
+def _truth(name: str) -> str:
+    """What a map tells."""
+    measure = measure_of(name)
+    if measure == CONFIDENCE:
+        return "the recogniser's confidence in the neighbouring views, 0 where it is wrong"
+    called = measure.replace("_", " ").replace("depth entropy", "depth-entropy")
+    return f"the {called} of the neighbouring views, scaled to 0 .. 1 over the object's views"
 
 
 def _map(e: Evaluation, name: str, figures: dict[str, Figure]) -> dict[str, Any]:
@@ -244,7 +247,7 @@ def _map(e: Evaluation, name: str, figures: dict[str, Figure]) -> dict[str, Any]
     classes = [name for name in e.maps[e.maps["map"] == name]["label"].unique() if name]
     return {
         "name": name,
-        "truth": TRUTH[name],
+        "truth": _truth(name),
         "scores": Table(head, rows, "The predicted maps and the baselines. Small print: 95\u00a0% intervals."),
         "figures": [
             picture(

@@ -16,6 +16,8 @@ from nextview.report.style import PlainFigure
 from nextview.viewsphere import ViewSphere
 
 BLUE, ORANGE, GREY = "#2f6db3", "#e08a2e", "#8a8a8a"
+MAPS_ACROSS = 6
+"""Maps of measures side by side; more go into further rows."""
 CELL = 112
 """Largest side of one view in a mosaic, pixels."""
 
@@ -37,7 +39,9 @@ def object_figure(store: ViewStore, i: int) -> Figure:
     wide = sphere.azimuths / sphere.rings
     rows, columns = (2, 1) if wide > 3 else (1, 2)
     views_height = rows * (14 / columns / wide + 0.6)
-    maps_height = 2.2 if sphere.rings > 1 else 1.3
+    across = min(max(len(names), 3), MAPS_ACROSS)
+    down = -(-max(len(names), 1) // across)
+    maps_height = down * (2.2 if sphere.rings > 1 else 1.3)
     figure = PlainFigure(figsize=(14, views_height + maps_height), layout="constrained")
     label = store.classes[store.labels[i]]
     figure.suptitle(
@@ -57,7 +61,7 @@ def object_figure(store: ViewStore, i: int) -> Figure:
     for axes in (left, right):
         _mosaic_ticks(axes, sphere, depth.shape[-1])
 
-    panels = bottom.subplots(1, max(len(names), 3))
+    panels = np.ravel(bottom.subplots(down, across, squeeze=False))
     for axes in panels[len(names) :]:
         axes.axis("off")
     if len(names) < len(panels):

@@ -15,6 +15,8 @@ from nextview.data.predictions import Predictions
 from nextview.data.splits import deduplicate, split_training
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError
+from nextview.measures.map_names import CONFIDENCE, Good, map_name
+from nextview.measures.registry import find_measure
 from nextview.metrics import map_scores, recogniser_scores
 from nextview.models.inference import MapNetwork, Recogniser
 from nextview.models.model_card import ModelCard, Training, file_hash, write_card
@@ -22,7 +24,7 @@ from nextview.models.network_input import InputSpec, from_store
 from nextview.training.architectures import map_network
 from nextview.training.checkpoints import load_run
 from nextview.training.inputs import load_inputs
-from nextview.training.maps.map_targets import confidence_target, entropy_target
+from nextview.training.maps.map_targets import target_of
 from nextview.training.onnx_export import ShippedMap, ShippedRecogniser, answer, export_onnx
 from nextview.training.recipes import MapRecipe
 from nextview.training.recogniser.members import member, member_networks
@@ -129,11 +131,11 @@ def export_recogniser(
 
 
 def export_map(
-    kind: Literal["lem", "lcm"],
     run: Path,
     store: Path,
     out: Path,
     predictions: Path | None = None,
+    measure: str | None = None,
     bits: Literal[8, 16] = 16,
     name: str | None = None,
     note: str = "",
@@ -142,14 +144,13 @@ def export_map(
     """Export a trained map network with a card of its validation scores.
 
     Args:
-        kind: "lem", depth-entropy, 0 .. 1 over the object's views; or "lcm", the recogniser's confidence where it is
-            right, else 0.
         run: folder of the finished training run.
         store: that it was trained on.
         out: folder for NAME.onnx and NAME.json.
-        predictions: that an LCM was trained on.
+        predictions: that a map of the confidence was trained on.
+        measure: whose map it predicts, for runs that do not say so; by default as the run's recipe has it.
         bits: that a weight takes in the file.
-        name: what to call the model; by default KIND-DATASET, after the meshes that the store was made from.
+        name: what to call the model; by default MAP-DATASET, after the meshes that the store was made from.
         note: what else the card should say.
         progress: of judging the validation views.
 
@@ -157,10 +158,14 @@ def export_map(
         ModelError: the run is not finished, or the file's answers differ from the network's.
     """
     views = ViewStore.open(store)
-    name = name or f"{kind}-{views.dataset}"
     sphere, recipe = views.sphere, read_recipe(run, MapRecipe)
-    made = () if predictions is None else Predictions.load(predictions).commands
-    target = entropy_target(views) if predictions is None else confidence_target(views, Predictions.load(predictions))
+    measure = measure or recipe.measure
+    kind = map_name(measure)
+    good: Good = "peak" if measure == CONFIDENCE else find_measure(measure).good
+    name = name or f"{kind.replace(':', '-')}-{views.dataset}"
+    predicted = None if predictions is None else Predictions.load(predictions)
+    made = () if predicted is None else predicted.commands
+    target = target_of(measure, views, predicted)
     parts = split_training(views, recipe.validation, recipe.seed)
     training, validation = (target.known(part) for part in parts)
     network = load_run(map_network(recipe, sphere), run)
@@ -170,8 +175,8 @@ def export_map(
 
     weights, card = out / f"{name}.onnx", out / f"{name}.json"
     export_onnx(shipped, sample, "seen", ["map", "sphere"] if shipped.whole else ["map"], weights, bits)
-    sources = (run, store) if predictions is None else (run, store, predictions)
-    command = command_line(f"export {kind}", *sources, out, bits=bits, name=name)
+    options = {"predictions": predictions, "bits": bits, "name": name}
+    command = command_line("export map", run, store, out, **options)
     model = ModelCard(
         name,
         kind,
@@ -179,6 +184,8 @@ def export_map(
         file_hash(weights),
         weights,
         network="PointNet with both transforms" if spec.kind == "cloud" else f"ResNet-{recipe.depth}",
+        measure=measure,
+        good=good,
         output="sphere" if shipped.whole else "window",
         training=Training(
             f"{len(training)} objects of the training split, {len(sphere)} views each", (asdict(recipe),)

@@ -115,9 +115,11 @@ split."""
 
 @dataclass(frozen=True)
 class MapRecipe:
-    """How a map network, LEM or LCM, is trained.
+    """How a map network is trained.
 
     Attributes:
+        measure: of views, whose map it predicts: one that the store holds (nextview measure), or "confidence", the
+            recogniser's where it is right, which takes predictions.
         input: what the network sees: the view as the recogniser does, geometry, through a ResNet; or the partial cloud,
             through a PointNet, as published.
         depth: of the ResNet.
@@ -143,6 +145,7 @@ class MapRecipe:
         patience: stop after so many epochs without a lower squared error on validation; 0 never stops early.
     """
 
+    measure: str = "depth_entropy"
     input: Literal["geometry", "cloud"] = "geometry"
     depth: Literal[18, 34, 50, 101, 152] = 18
     size: int = 56

@@ -1,1 +1,1 @@
-"""From views to the map networks, LEM and LCM."""
+"""From views to the networks that predict maps of a measure."""

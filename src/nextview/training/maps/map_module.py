@@ -182,8 +182,8 @@ def fit_map(
     if weights:
         if recipe.input == "cloud":
             raise ModelError(f"{weights}: a PointNet cannot start from a ResNet")
-        views, goes_on = next(iter(windows))[0].float() / 255, find_card(weights).kind != "recogniser"
-        load_exported(module.net.resnet, weights, views, last=goes_on, kinds=("recogniser", "lem", "lcm"))
+        views, start = next(iter(windows))[0].float() / 255, find_card(weights)
+        load_exported(module.net.resnet, weights, views, last=not start.is_recogniser, kinds=(start.kind,))
     score = "validation_mse"
     return fit(
         module, windows, validation_windows, recipe.epochs, out, score, "min", recipe.patience, hardware

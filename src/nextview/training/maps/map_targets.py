@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
-from nextview.errors import PredictionsError
+from nextview.errors import PredictionsError, UsageError
 from nextview.measures.confidence_map import confidence_maps
 from nextview.measures.depth_entropy import normalise_per_object
+from nextview.measures.map_names import CONFIDENCE
 
 
 @dataclass(frozen=True)
@@ -31,13 +32,32 @@ class Target:
         return objects[self.there[objects]]
 
 
-def entropy_target(store: ViewStore) -> Target:
-    """Depth-entropy, scaled to 0 .. 1 over each object's views: the LEM's."""
-    return Target(normalise_per_object(store.measure()), store.done)
+def target_of(measure: str, store: ViewStore, predictions: Predictions | None = None) -> Target:
+    """A measure of a store's views, scaled to 0 .. 1 over each object's; the confidence is that already.
+
+    Args:
+        measure: one that the store holds, or "confidence".
+        store: the views.
+        predictions: for the confidence, of the recogniser that is confident.
+
+    Raises:
+        DatasetError: the store lacks the measure.
+        PredictionsError: see ``confidence_target``.
+        UsageError: predictions for another measure, or none for the confidence.
+    """
+    if (measure == CONFIDENCE) != (predictions is not None):
+        raise UsageError(
+            "a map of the confidence is learned from predictions: give those of the recogniser"
+            if predictions is None
+            else f"a map of {measure} is learned from the store alone: predictions are for a map of the {CONFIDENCE}"
+        )
+    if predictions is not None:
+        return confidence_target(store, predictions)
+    return Target(normalise_per_object(store.measure(measure)), store.done)
 
 
 def confidence_target(store: ViewStore, predictions: Predictions) -> Target:
-    """The recogniser's confidence where it is right: the LCM's.
+    """The recogniser's confidence where it is right.
 
     A recogniser is too sure of what it was trained on, and another one prefers other views: validate on objects that
     the recogniser of use has not seen. Objects without predictions, and those right from no view, have no values.

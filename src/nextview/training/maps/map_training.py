@@ -1,8 +1,7 @@
-"""The stages from a view store to a trained map network, LEM or LCM."""
+"""The stage from a view store to a trained map network."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,91 +16,49 @@ from nextview.training.checkpoints import refuse_seen
 from nextview.training.hardware import Hardware
 from nextview.training.inputs import ready_inputs
 from nextview.training.maps.map_module import fit_map
-from nextview.training.maps.map_targets import Target, confidence_target, entropy_target
+from nextview.training.maps.map_targets import target_of
 from nextview.training.packed import PackedViews
 from nextview.training.recipes import MapRecipe
 from nextview.training.runs import begin, finish, is_done, training_commands
 
 
-def train_lem(
-    store: Path,
-    out: Path,
-    recipe: MapRecipe = MapRecipe(),
-    *,
-    weights: Path | None = None,
-    hardware: Hardware = Hardware(),
-    track: Track = silently,
-) -> Path:
-    """Train the LEM, the local map of the depth-entropy, on a store's training split; see ``train_map``."""
-    views = ViewStore.open(store)
-    command = command_line("train lem", store, out, weights=weights, recipe=recipe)
-    commands = training_commands(command, [views], weights)
-    target = entropy_target(views)
-    return train_map(store, target, out, recipe, weights=weights, hardware=hardware, commands=commands, track=track)
-
-
-def train_lcm(
-    store: Path,
-    predictions: Path,
-    out: Path,
-    recipe: MapRecipe = MapRecipe(),
-    *,
-    weights: Path | None = None,
-    hardware: Hardware = Hardware(),
-    track: Track = silently,
-) -> Path:
-    """Train the LCM, the local map of a recogniser's confidence, on a store's training split; see ``train_map``.
-
-    Args:
-        store: the view store.
-        predictions: of its training split, by the recogniser whose confidence is to be predicted.
-        out: see ``train_map``; so are the others.
-        recipe: how to train.
-        weights: to start from.
-        hardware: on what.
-        track: follows the preparation of the inputs.
-
-    Raises:
-        PredictionsError: the predictions are of other views.
-    """
-    views, predicted = ViewStore.open(store), Predictions.load(predictions)
-    command = command_line("train lcm", store, predictions, out, weights=weights, recipe=recipe)
-    commands = training_commands(command, [views, predicted], weights)
-    target = confidence_target(views, predicted)
-    return train_map(store, target, out, recipe, weights=weights, hardware=hardware, commands=commands, track=track)
-
-
 def train_map(
     store: Path,
-    target: Target,
     out: Path,
     recipe: MapRecipe = MapRecipe(),
     *,
+    predictions: Path | None = None,
     weights: Path | None = None,
     hardware: Hardware = Hardware(),
-    commands: Sequence[str] = (),
     track: Track = silently,
 ) -> Path:
-    """Train a network that predicts the local map of a target. A second call resumes what was cut off.
+    """Train a network that predicts the local map of a measure, on a store's training split.
+
+    A second call resumes what was cut off.
 
     Args:
-        store: the view store.
-        target: the value of every view.
+        store: the view store, with the recipe's measure in it.
         out: folder for checkpoints, logs and network.pt, the network of the epoch with the lowest squared error.
-        recipe: how to train.
+        recipe: of which measure, and how to train.
+        predictions: for the confidence: of the store's training split, by the recogniser whose confidence it is.
         weights: card (.json) of the same depth and input from which a ResNet starts, a recogniser's or a map network's.
         hardware: on what.
-        commands: that lead to this training, its own last; noted in the folder.
         track: follows the preparation of the inputs.
 
     Returns:
         ``out``.
 
     Raises:
-        DatasetError: the store cannot be used or has nothing to train on, or another process trains in the same folder.
+        DatasetError: the store cannot be used, lacks the measure or has nothing to train on, or another process trains
+            in the same folder.
+        PredictionsError: the predictions are of other views.
         ModelError: the weights cannot be used, or have seen what validates; or ``out`` holds another run.
     """
     views = ViewStore.open(store)
+    predicted = None if predictions is None else Predictions.load(predictions)
+    target = target_of(recipe.measure, views, predicted)
+    command = command_line("train map", store, out, predictions=predictions, weights=weights, recipe=recipe)
+    commands = training_commands(command, [views] if predicted is None else [views, predicted], weights)
     training, validation = (target.known(part) for part in split_training(views, recipe.validation, recipe.seed))
     check_any(views, training, validation, "" if target.there.all() else ": of the others no map is known")
     if weights:

@@ -1,0 +1,79 @@
+"""Maps that no model predicts: the true measures around every view, for oracles and for judging what is predicted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.predictions import Predictions
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, ResultsError
+from nextview.measures.confidence_map import confidence_maps
+from nextview.measures.depth_entropy import normalise_per_object
+from nextview.measures.map_names import map_name, measure_of
+
+TRUE = "true-"
+"""How the names of true maps begin."""
+
+
+def true_lem(p: Predictions) -> NDArray[np.float32]:
+    """Local windows of the true entropy map, (N, V, R, 3)."""
+    return normalise_per_object(p.depth_entropy)[:, p.sphere.windows]
+
+
+def true_lcm(p: Predictions) -> NDArray[np.float32]:
+    """Local windows of the recogniser's confidence, 0 where it is wrong (section 4.1.3), (N, V, R, 3)."""
+    return confidence_maps(p.logits, p.labels)[:, p.sphere.windows]
+
+
+IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {"lem": true_lem, "lcm": true_lcm}
+"""Maps whose truth the predictions themselves tell; that of others stands in the store that they were made from."""
+
+
+def true_map(p: Predictions, name: str) -> NDArray[np.float32]:
+    """Local windows of the true map of that name, (N, V, R, 3), 0 .. 1.
+
+    Raises:
+        ResultsError: neither the predictions nor their store tell it.
+    """
+    if name in IN_PREDICTIONS:
+        return IN_PREDICTIONS[name](p)
+    return normalise_per_object(true_measure(p, measure_of(name)))[:, p.sphere.windows]
+
+
+def known_maps(p: Predictions) -> tuple[str, ...]:
+    """Names of the maps whose truth can be told."""
+    return (*IN_PREDICTIONS, *(name for name in map(map_name, stored_measures(p.store)) if name not in IN_PREDICTIONS))
+
+
+def stored_measures(store: str) -> tuple[str, ...]:
+    """Names of the measures in a store; none where there is no store."""
+    try:
+        return tuple(ViewStore.open(store).measures) if store else ()
+    except DatasetError:
+        return ()
+
+
+def true_measure(p: Predictions, measure: str) -> NDArray[np.float32]:
+    """A measure of the views of some predictions, from the store that they were made from, (N, V) float32.
+
+    Raises:
+        ResultsError: the store is not there, not the same any more, or lacks the measure.
+    """
+    if measure == "depth_entropy":
+        return p.depth_entropy
+    if not p.store:
+        raise ResultsError(f"these predictions do not say from which store they were made, which holds {measure}")
+    try:
+        store = ViewStore.open(p.store)
+        row = {name: i for i, name in enumerate(store.names)}
+        if not set(p.names) <= row.keys():
+            raise ResultsError(f"{p.store}: holds other objects now than those of the predictions")
+        here = [row[name] for name in p.names]
+        if not np.array_equal(store.measure()[here], p.depth_entropy):
+            raise ResultsError(f"{p.store}: holds other views now than those of the predictions")
+        return store.measure(measure)[here]
+    except DatasetError as error:
+        raise ResultsError(str(error)) from None

@@ -1,0 +1,122 @@
+"""Mesh saliency: where a surface bends otherwise than around (Lee et al. 2005; thesis, section 3.4.4)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.measures.measured_view import MeasuredView
+from nextview.measures.surface import Surface
+
+EPSILON = 0.003
+"""Unit of the scales, diagonals of the bounding box."""
+SCALES = (2, 3, 4, 5, 6)
+"""Standard deviations of the finer of two averages, in units; the coarser one's is twice as large."""
+LONGEST = 0.05
+"""Edges are cut until none is longer, object radii: a large flat face has no vertices to average over."""
+CELL = 0.02
+"""Vertices in one cube of this side, object radii, are taken together where there are many."""
+MANY = 20_000
+
+
+def mesh_saliency(view: MeasuredView) -> float:
+    """Saliency of the visible surface, integrated over it.
+
+    Lee et al. 2005, Secord et al. 2011, Dutagaci et al. 2010; thesis, section 3.4.4. Lee sums over the visible
+    vertices; as meshes have many vertices here and few there, each counts by the area around it instead.
+
+    Returns:
+        Object radii; 0 on a sphere, or where nothing is seen.
+    """
+    return float((saliency_of(view.surface)[view.pixels[0]] * view.seen_area).sum())
+
+
+def saliency_of(surface: Surface) -> NDArray[np.float64]:
+    """Mean saliency of each face, (F,) float64; computed once a surface."""
+    if "saliency" not in surface.__dict__:
+        surface.__dict__["saliency"] = _saliency(surface)
+    return surface.__dict__["saliency"]
+
+
+def _saliency(surface: Surface) -> NDArray[np.float64]:
+    fine, parent = _cut(surface)
+    places = int(fine.corners.max()) + 1
+    around = np.bincount(fine.corners.ravel(), np.repeat(fine.areas, 3), places) / 3
+    # Half of each edge's curvature to each of its ends; each edge stands in two faces.
+    at_ends = (fine.lengths * fine.bends) / 8
+    bend = np.bincount(fine.corners.ravel(), (at_ends + np.roll(at_ends, 1, 1)).ravel(), places)
+    position = np.zeros((places, 3))
+    position[fine.corners.ravel()] = fine.vertices[fine.faces.ravel()]
+    group = _groups(position)
+    area = np.bincount(group, around)
+    middle = np.stack([np.bincount(group, around * position[:, k]) for k in range(3)], 1)
+    middle = np.where(area[:, None] > 0, middle / np.maximum(area, 1e-30)[:, None], 10 + np.arange(len(area))[:, None])
+    curvature = np.where(area > 0, np.bincount(group, bend) / np.maximum(area, 1e-30), 0)
+    salient = _salient(middle, area, curvature, EPSILON * float(np.linalg.norm(np.ptp(surface.vertices, axis=0))))
+    of_fine = salient[group][fine.corners].mean(1)
+    total = np.bincount(parent, fine.areas, len(surface.faces))
+    mean = np.bincount(parent, fine.areas * of_fine, len(surface.faces))
+    return np.divide(mean, total, out=np.zeros_like(mean), where=total > 0)
+
+
+def _salient(
+    points: NDArray[np.float64], area: NDArray[np.float64], curvature: NDArray[np.float64], unit: float
+) -> NDArray[np.float64]:
+    """Saliency of points, (n,): over all scales, how the averages of their curvature at two widths differ.
+
+    Lee scales each scale's map to a maximum of 1 first. Here it stays a curvature: the rounding of a sphere is none.
+    """
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(points).sparse_distance_matrix(
+        cKDTree(points), 4 * SCALES[-1] * unit, output_type="coo_matrix"
+    )  # the pairs of a point with itself are among them
+    i, j, square = pairs.row, pairs.col, pairs.data**2
+
+    def average(sigma: float) -> NDArray[np.float64]:
+        near = square <= (2 * sigma) ** 2
+        weight = np.exp(-square[near] / (2 * sigma**2)) * area[j[near]]
+        total = np.bincount(i[near], weight, len(points))
+        return np.divide(np.bincount(i[near], weight * curvature[j[near]], len(points)), total,
+                         out=np.zeros(len(points)), where=total > 0)  # fmt: skip
+
+    found = np.zeros(len(points))
+    for scale in SCALES:
+        salient = np.abs(average(scale * unit) - average(2 * scale * unit))
+        if salient.max() <= 0:
+            continue
+        near = square <= (2 * scale * unit) ** 2
+        highest = np.zeros(len(points))
+        np.maximum.at(highest, i[near], salient[j[near]])
+        peaks = salient[(salient >= highest) & (salient > 0)]
+        others = (peaks.sum() / salient.max() - 1) / max(len(peaks) - 1, 1)
+        found += salient * (1 - others) ** 2  # Lee's suppression of scales at which many peaks are alike
+    return found
+
+
+def _cut(surface: Surface) -> tuple[Surface, NDArray[np.int64]]:
+    """The surface with its edges cut in half until none is too long, and of which face each new one is a part.
+
+    Each face cuts its longest edge first. Two faces cut the edge between them at the same places, so the parts fit.
+    """
+    corners, parent = surface.vertices[surface.faces], np.arange(len(surface.faces))
+    done, done_parent = [], []
+    while len(corners):
+        square = ((np.roll(corners, -1, 1) - corners) ** 2).sum(2)
+        longest = square.argmax(1)
+        keep = square[np.arange(len(corners)), longest] <= LONGEST**2
+        done.append(corners[keep])
+        done_parent.append(parent[keep])
+        a, b, c = (corners[~keep, (longest[~keep] + k) % 3] for k in range(3))
+        half = (a + b) / 2
+        corners = np.concatenate([np.stack([a, half, c], 1), np.stack([half, b, c], 1)])
+        parent = np.tile(parent[~keep], 2)
+    vertices = np.concatenate(done)
+    return Surface(vertices.reshape(-1, 3), np.arange(3 * len(vertices)).reshape(-1, 3)), np.concatenate(done_parent)
+
+
+def _groups(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Which of some groups each point belongs to: one each, or where there are many those of its cube."""
+    if len(points) <= MANY:
+        return np.arange(len(points))
+    return np.unique(np.floor(points / CELL), axis=0, return_inverse=True)[1].reshape(-1)
