@@ -266,6 +266,19 @@ def test_a_recogniser_is_taught_by_one_command(boxes, capsys, monkeypatch):
     assert novelty_path(card.path).read_bytes() == first  # the same whatever the number of processes
 
 
+def test_what_is_known_through_sensors_is_known(boxes, capsys):
+    sensed, few, sphere = boxes / "sensed.zarr", boxes / "few.zarr", replace(ViewSphere.named("40"), azimuths=3)
+    list(render(boxes / "meshes", sensed, sphere, workers=0, sensor="mix"))
+    arguments = (boxes / "views.zarr", boxes / "meshes", boxes / "tiny.json", 20)
+    found = stages.fit_unknown(*arguments, sensed=(sensed, sensed), workers=0)
+    assert (found.objects, found.held_out) == (8, 4)
+    assert "clean and through sensors" in read_card(boxes / "tiny.json").fitted_to["novelty"]
+    assert f"--sensed {sensed} {sensed}" in read_card(boxes / "tiny.json").training.commands[-1]
+    list(render(boxes / "meshes", few, sphere, workers=0, sensor="mix", held_out=boxes / "tiny.json"))
+    with pytest.raises(nextview.DatasetError, match="lacks 8 of 8 objects"):
+        stages.fit_unknown(*arguments, sensed=(few, few), workers=0)
+
+
 def test_what_cannot_be_taught_is_said(boxes, tmp_path):
     card = make_recogniser(tmp_path, ["flat", "tall"])
     with pytest.raises(nextview.NextviewError, match=r"holds no object that .* was trained on, or none"):

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nextview.belief import PLAIN_SUM, Calibration
 from nextview.calibration.fitting_set import FittingSet, fitting_set, held_out_by, load_sensed
 from nextview.calibration.novelty_score import fit_novelty
-from nextview.calibration.novelty_views import features_of, known_features, made_up_features
+from nextview.calibration.novelty_views import Known, MadeUp, features_of, known_features, made_up_features
 from nextview.calibration.outliers import FAMILIES
 from nextview.calibration.policy_tables import fit_class_table, fit_ring, fit_sequence
 from nextview.calibration.size_density import densities, fit_weight
@@ -187,6 +188,7 @@ def fit_unknown(
     card: Path,
     made_up: int = 1700,
     seed: int = 0,
+    sensed: tuple[Path, Path] | None = None,
     workers: int | None = None,
     progress: Track = silently,
 ) -> FittedUnknown:
@@ -200,6 +202,8 @@ def fit_unknown(
         card: of the recogniser; is written anew, and NAME.novelty.safetensors beside it.
         made_up: so many objects.
         seed: of all that is drawn.
+        sensed: stores of the objects that it learned and of those that it holds out, seen through sensors: both count
+            as known as well, and every second made-up object is seen through the mix of sensors.
         workers: processes; one for each core by default.
         progress: of rendering and of running the recogniser.
 
@@ -222,29 +226,40 @@ def fit_unknown(
     if not entries:
         raise DatasetError(f"{meshes}: holds no mesh of which an object could be made up")
     rng, places = np.random.default_rng(seed), (str(store.absolute()), str(card.absolute()))
+    classes = np.array([model.classes.index(name) if name in model.classes else -1 for name in views.classes])
 
-    def drawn(n: int) -> tuple[int, ...]:
-        return tuple(rng.permutation(len(views.sphere))[:n].tolist())
+    def drawn(of: ViewStore, rows: NDArray[np.int64], wanted: int) -> list[Known]:
+        path, views = str(of.path.absolute()), len(of.sphere)
+        return [(path, places[1], int(i), tuple(rng.permutation(views).tolist()), wanted) for i in rows]
 
-    of_learned = [(*places, int(i), drawn(LEARNED_VIEWS)) for i in learned]
-    of_held_out = [(*places, int(i), drawn(HELD_OUT_VIEWS)) for i in held_out]
-    of_made_up = []
+    of_learned = drawn(views, learned, LEARNED_VIEWS)
+    of_held_out = drawn(views, held_out, HELD_OUT_VIEWS)
+    labels, held_out_labels = (classes[views.labels[rows]] for rows in (learned, held_out))
+    if sensed is not None:
+        seen = [
+            _rows(path, [views.names[i] for i in rows]) for path, rows in zip(sensed, (learned, held_out), strict=True)
+        ]
+        of_learned += drawn(*seen[0], LEARNED_VIEWS)
+        of_held_out += drawn(*seen[1], HELD_OUT_VIEWS)
+        labels, held_out_labels = np.tile(labels, 2), np.tile(held_out_labels, 2)
+    of_made_up: list[MadeUp] = []
     for k, at in enumerate(rng.integers(len(entries), size=(made_up, 2))):
         one, other = (str(entries[j].path.absolute()) for j in at)
-        of_made_up.append((*places, FAMILIES[k % len(FAMILIES)], one, other, drawn(MADE_UP_VIEWS), k + seed * made_up))
+        family, chosen = FAMILIES[k % len(FAMILIES)], tuple(rng.permutation(len(views.sphere))[:MADE_UP_VIEWS].tolist())
+        sensor = "mix" if sensed and (k // len(FAMILIES)) % 2 else None
+        of_made_up.append((*places, family, one, other, chosen, k + seed * made_up, sensor))
     strange = features_of(made_up_features, of_made_up, workers, progress, "made-up objects")
     if not any(map(len, strange)):
         raise DatasetError(f"{meshes}: no object could be made up of its meshes")
     ordinary = features_of(known_features, of_learned, workers, progress, "objects that it learned")
     calibrating = features_of(known_features, of_held_out, workers, progress, "held-out objects")
-    classes = np.array([model.classes.index(name) if name in model.classes else -1 for name in views.classes])
-    labels = classes[views.labels[learned]].repeat([len(rows) for rows in ordinary])
+    enough = [k for k, rows in enumerate(calibrating) if len(rows) == HELD_OUT_VIEWS]
     found = fit_novelty(
-        np.concatenate(ordinary),
-        labels,
+        np.concatenate([rows for rows in ordinary if len(rows)]),
+        labels.repeat([len(rows) for rows in ordinary]),
         np.concatenate([rows for rows in strange if len(rows)]),
-        np.stack(calibrating),
-        classes[views.labels[held_out]],
+        np.stack([calibrating[k] for k in enough]),
+        held_out_labels[enough],
         rng,
     )
     number = sum(len(rows) > 0 for rows in strange)
@@ -253,11 +268,26 @@ def fit_unknown(
     sha256 = found.save(novelty_path(model.path))
     about = (
         f"{len(learned)} objects of the training split and {number} made-up ones, calibrated on {len(held_out)} others"
+        + ", clean and through sensors" * (sensed is not None)
     )
     model = replace(model, novelty_sha256=sha256, fitted_to={**model.fitted_to, "novelty": about})
-    command = command_line("fit unknown", store, meshes, card, made_up=made_up, seed=seed)
+    command = command_line("fit unknown", store, meshes, card, made_up=made_up, seed=seed, sensed=sensed)
     write_card(card, model.made_by(*views.commands, command))
     return FittedUnknown(len(learned), number, len(held_out))
+
+
+def _rows(path: Path, names: list[str]) -> tuple[ViewStore, NDArray[np.int64]]:
+    """A store, and where it holds some objects.
+
+    Raises:
+        DatasetError: it lacks one.
+    """
+    store = ViewStore.open(path)
+    row = {name: i for i, name in enumerate(store.names) if store.done[i]}
+    missing = [name for name in names if name not in row]
+    if missing:
+        raise DatasetError(f"{path}: lacks {len(missing)} of {len(names)} objects, {missing[0]} among them")
+    return store, np.array([row[name] for name in names])
 
 
 @dataclass(frozen=True)
