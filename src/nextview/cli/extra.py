@@ -10,6 +10,8 @@ from nextview.errors import MissingExtraError
 EXTRAS = {
     "benchmark": ("jinja2", "pandas", "pyarrow"),
     "cluster": ("dask", "distributed"),
+    "explore": ("viser",),
+    "record": ("rerun",),
     "train": ("lightning", "numcodecs", "onnx", "onnxscript", "torch", "torchmetrics"),
 }
 """Packages by the optional part of the installation that brings them."""
