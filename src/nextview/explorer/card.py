@@ -7,12 +7,12 @@ from html import escape
 from io import BytesIO
 
 import numpy as np
-from matplotlib import colormaps
 from numpy.typing import NDArray
 from PIL import Image
 
 from nextview.explorer.exploration import Walk
 from nextview.observation import Observation
+from nextview.report.style import heat
 from nextview.session import View
 from nextview.viewsphere import ViewSphere
 
@@ -41,33 +41,20 @@ def walk_card(walk: Walk, milliseconds: float | None = None) -> str:
         walk: whose last view is shown.
         milliseconds: how long that view took, if it is to be told.
     """
-    title = f"<h3>{escape(walk.system.policy_name)}</h3>"
     if not walk.views:
-        asked = "" if walk.next_view is None else f" The policy begins at view {walk.next_view}."
-        return f'{STYLE}<div class="nv">{title}<p>No view was taken yet.{asked}</p></div>'
+        return f'{STYLE}<div class="nv"><p>No view was taken yet. The policy begins at view {walk.start}.</p></div>'
     view, classes = walk.views[-1], walk.session.models.classes
     best = int(view.belief.argmax())
-    believed = f"<b>{escape(classes[best])}</b> {view.belief[best]:.3f}" if view.observation.seen else "nothing is seen"
+    believed = f"{escape(classes[best])} {view.belief[best]:.3f}" if view.observation.seen else "nothing is seen"
     goes_on = "the rule would stop here" if walk.stopped else "the rule would look on"
     took = "" if milliseconds is None else f" · {milliseconds:.0f} ms"
-    parts = [title, f"<p>{believed} · {goes_on}{took}</p>", _figures(walk, view), _beliefs(walk), _steps(walk)]
+    parts = [f"<h3>{believed}</h3><p>{goes_on}{took}</p>", _figures(walk, view), _beliefs(walk), _steps(walk)]
     return f'{STYLE}<div class="nv">{"".join(parts)}</div>'
 
 
 def preview_card(observation: Observation) -> str:
     """What a camera that is being dragged would see."""
     return f'{STYLE}<div class="nv"><h3>from here</h3>{_image(observation.picture, 200)}</div>'
-
-
-def heat(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Values in the colours of viridis, lowest to highest, (...) to (..., 3); NaN is grey."""
-    known = np.isfinite(values)
-    if not known.any():
-        return np.full((*values.shape, 3), (201, 210, 218), np.uint8)
-    low, high = values[known].min(), values[known].max()
-    scaled = np.where(known, (values - low) / (high - low if high > low else 1.0), 0.0)
-    colours = (255 * colormaps["viridis"](scaled)[..., :3] + 0.5).astype(np.uint8)
-    return np.where(known[..., None], colours, np.array((201, 210, 218), np.uint8))
 
 
 def _image(pixels: NDArray[np.uint8], width: int) -> str:
@@ -93,10 +80,11 @@ def _beliefs(walk: Walk) -> str:
     """The classes believed most: belief now, what this view says alone, and the change."""
     view, classes = walk.views[-1], walk.session.models.classes
     before = walk.views[-2].belief if len(walk.views) > 1 else np.full(len(classes), 1 / len(classes))
+    highest = np.maximum(view.belief, before) if len(walk.views) > 1 else view.belief
     counted = sum(view.observation.seen for view in walk.views)
     threshold = 100 * float(walk.stopping.threshold_at(max(counted, 1)))
     rows = []
-    for c in np.argsort(-np.maximum(view.belief, before), kind="stable")[:SHOWN]:
+    for c in np.argsort(-highest, kind="stable")[:SHOWN]:
         bars = (
             f'<i style="top:0;height:8px;width:{100 * view.belief[c]:.1f}%;background:{ACCENT}"></i>'
             f'<i style="top:8px;height:5px;width:{100 * view.alone[c]:.1f}%;background:{FAINT}"></i>'
@@ -104,7 +92,8 @@ def _beliefs(walk: Walk) -> str:
         )
         rows.append(
             f'<tr><td>{escape(classes[c])}</td><td><div class="bar">{bars}</div></td>'
-            f'<td class="number">{view.belief[c]:.3f}</td><td class="number">{view.belief[c] - before[c]:+.3f}</td></tr>'
+            f'<td class="number">{view.belief[c]:.3f}</td>'
+            f'<td class="number">{view.belief[c] - before[c]:+.3f}</td></tr>'
         )
     legend = "belief · grey: this view alone · dotted: the threshold · last: change by this view"
     return f"<table>{''.join(rows)}</table><p><small>{legend}</small></p>"

@@ -202,7 +202,7 @@ class Page:
             panel.dock_below(self._panels[-1]) if self._panels else panel.dock_right()
             panel.set_width(330)
             self._panels.append(panel)
-        away = 9.0 + 4.0 * (n - 1)
+        away = 7.5 + 4.0 * (n - 1)
         self.server.initial_camera.position = (0.0, -away, 0.55 * away)
         self.server.initial_camera.look_at = (0.0, 0.0, 0.4)
         label = self.exploration.shown.label

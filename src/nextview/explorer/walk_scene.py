@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -11,9 +10,9 @@ import viser
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from nextview.explorer.card import heat
 from nextview.explorer.exploration import Walk
 from nextview.mesh import Mesh
+from nextview.report.style import heat
 
 Float = NDArray[np.float64]
 
@@ -72,7 +71,12 @@ class WalkScene:
         self._balls = []
         for view, position in enumerate(walk.sphere.poses[:, :3, 3]):
             ball = self._scene.add_icosphere(
-                f"{name}/views/{view}", BALL, position=position, cast_shadow=False, receive_shadow=False
+                f"{name}/views/{view}",
+                BALL,
+                subdivisions=2,
+                position=position,
+                cast_shadow=False,
+                receive_shadow=False,
             )
             ball.on_click(lambda event, view=view: self._look(view))
             self._balls.append(ball)
