@@ -12,8 +12,8 @@ import nextview
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.rendering import render
 from nextview.data.samples import sample_mesh
-from nextview.errors import DatasetError, PolicyError, UsageError
-from nextview.explorer.card import preview_card, walk_card
+from nextview.errors import DatasetError, MeshError, PolicyError, UsageError
+from nextview.explorer.card import gallery, preview_card, walk_card
 from nextview.explorer.exploration import Exploration
 from nextview.explorer.shown_object import ShownObject, StoredViews, shown_objects
 from nextview.report.style import heat
@@ -86,6 +86,19 @@ def test_a_preview_is_what_would_be_seen_and_takes_nothing(chair):
     expected = SimulatedCamera(sample_mesh("chair")).observe(chair.pose_towards(place))
     np.testing.assert_array_equal(seen.depth, expected.depth)
     assert not chair.walks[0].views
+
+
+def test_pictures_are_of_the_objects_that_can_be_opened(tmp_path):
+    shutil.copy(SAMPLES / "chair.off", tmp_path / "a.off")
+    (tmp_path / "b.off").write_text("OFF\n")
+    exploration = Exploration(shown_objects(tmp_path), threads=1)
+    pictures = exploration.pictures()
+    assert list(pictures) == ["a.off"]
+    assert (pictures["a.off"] > 0).mean() > 0.05
+    assert ">a.off<" in gallery(pictures)
+    with pytest.raises(MeshError):
+        exploration.show("b.off")
+    assert (exploration.shown.name, exploration.mesh.name) == ("a.off", str(tmp_path / "a.off"))
 
 
 def test_another_policy_takes_over_the_views(chair):

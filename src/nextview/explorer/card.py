@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64encode
+from collections.abc import Mapping
 from html import escape
 from io import BytesIO
 
@@ -17,14 +18,17 @@ from nextview.session import View
 from nextview.viewsphere import ViewSphere
 
 INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
+CELL = 11
+"""Side of a cell of a map, pixels."""
 SHOWN = 5
 """Classes of which the belief is shown."""
 STYLE = f"""<style>
 .nv {{ font: 13px sans-serif; color: {INK}; padding: 0.4em 0.8em 0.8em }}
 .nv h3 {{ margin: 0 0 0.2em; font-size: 15px }}
 .nv p {{ margin: 0.3em 0 }}
-.nv img {{ image-rendering: pixelated; vertical-align: top; margin: 0 6px 4px 0 }}
-.nv figure {{ display: inline-block; margin: 0 8px 0 0; font-size: 11px }}
+.nv img {{ image-rendering: pixelated; vertical-align: top; margin: 0 4px 4px 0 }}
+.nv figure {{ display: inline-block; margin: 0 4px 0 0; font-size: 11px; vertical-align: top }}
+.nv figcaption {{ width: 0; min-width: 100% }}
 .nv table {{ border-spacing: 0 3px; width: 100% }}
 .nv td {{ padding: 0 4px; white-space: nowrap }}
 .nv td.number {{ text-align: right; font-variant-numeric: tabular-nums }}
@@ -57,23 +61,38 @@ def preview_card(observation: Observation) -> str:
     return f'{STYLE}<div class="nv"><h3>from here</h3>{_image(observation.picture, 200)}</div>'
 
 
+def gallery(pictures: Mapping[str, NDArray[np.uint8]]) -> str:
+    """Small pictures in a row, with their names."""
+    width = 225 // max(len(pictures), 3)
+    images = (
+        f"<figure>{_image(image, width)}<figcaption>{escape(name)}</figcaption></figure>"
+        for name, image in pictures.items()
+    )
+    return f'{STYLE}<div class="nv">{"".join(images)}</div>'
+
+
 def _image(pixels: NDArray[np.uint8], width: int) -> str:
     file = BytesIO()
     Image.fromarray(pixels).save(file, "png")
     return f'<img width="{width}" src="data:image/png;base64,{b64encode(file.getvalue()).decode()}">'
 
 
+def _row(pictures: list[tuple[str, str]]) -> str:
+    """Pictures, as HTML, with what stands below each."""
+    return "".join(f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>" for below, image in pictures)
+
+
 def _figures(walk: Walk, view: View) -> str:
     """The image, local maps, and the value of each view where they lie on rings; the highest ring on top."""
     elevation, azimuth = view.angles
-    found = [(f"view {view.index}: {elevation:.0f}° up, {azimuth:.0f}° round", _image(view.observation.picture, 150))]
+    found = [(f"view {view.index}: {elevation:.0f}° up, {azimuth:.0f}° round", _image(view.observation.picture, 120))]
     for name, values in view.maps.items():
-        found.append((f"{escape(name)}, from here", _image(heat(values[::-1]), 14 * values.shape[1])))
+        found.append((f"{name}, from here", _image(heat(values[::-1]), CELL * values.shape[1])))
     if view.values is not None and isinstance(walk.sphere, ViewSphere):
         grid = view.values.reshape(walk.sphere.rings, walk.sphere.azimuths)
         order = np.argsort(walk.sphere.elevations)[::-1]
-        found.append(("value of each view", _image(heat(grid[order]), 14 * grid.shape[1])))
-    return "".join(f"<figure>{image}<figcaption>{caption}</figcaption></figure>" for caption, image in found)
+        found.append(("value of each view", _image(heat(grid[order]), CELL * grid.shape[1])))
+    return _row(found)
 
 
 def _beliefs(walk: Walk) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.belief import FixedLength, Stopping
-from nextview.errors import UsageError
+from nextview.errors import NextviewError, UsageError
 from nextview.explorer.shown_object import ShownObject
 from nextview.mesh import Mesh
 from nextview.observation import Camera, Observation
@@ -191,6 +192,16 @@ class Exploration:
         for walk in going:
             walk.step()
         return bool(going)
+
+    def pictures(self) -> dict[str, NDArray[np.uint8]]:
+        """Each object by name as seen from 20 degrees up, (H, W) uint8; without those that cannot be opened."""
+        found = {}
+        for name, shown in self.objects.items():
+            with suppress(NextviewError):  # it is said when the object is chosen
+                opened = shown.open()
+                camera = simulated(opened) if isinstance(opened, Mesh) else opened
+                found[name] = camera.observe(look_at_origin(np.radians(20), np.radians(40))).picture
+        return found
 
     def preview(self, where: Float) -> Observation:
         """What would be seen from a position, (3,), object radii, without noise; nothing is taken."""

@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 
 from nextview.cameras.sensors import SENSORS
 from nextview.errors import NextviewError
-from nextview.explorer.card import preview_card, walk_card
+from nextview.explorer.card import gallery, preview_card, walk_card
 from nextview.explorer.exploration import Exploration, Walk
 from nextview.explorer.walk_scene import WalkScene
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import POLICIES
 
 NOTHING = "nothing"
+GALLERY = 6
+"""As many objects are shown as pictures; more as a list."""
 APART = 8.5
 """Between two objects side by side, object radii."""
 PAUSE = 0.5
@@ -74,6 +76,11 @@ class Page:
         gui.main_panel.dock_left()
         gui.add_markdown(HELP)
         self._object = gui.add_dropdown("Object", list(exploration.objects), initial_value=exploration.shown.name)
+        if len(exploration.objects) <= GALLERY:
+            self._object.visible = False
+            gui.add_html(gallery(exploration.pictures()))
+            names = gui.add_button_group("Object", list(exploration.objects))
+            names.on_click(lambda event: setattr(self._object, "value", names.value))
         self._label = gui.add_markdown("")
         self._policy = gui.add_dropdown("Policy", policies, initial_value=exploration.policies[0])
         self._second = gui.add_dropdown("Compare with", [NOTHING, *policies], initial_value=second)
@@ -200,14 +207,22 @@ class Page:
             with panel.add_tab(walk.system.policy_name):
                 self._cards.append(self.server.gui.add_html(""))
             panel.dock_below(self._panels[-1]) if self._panels else panel.dock_right()
-            panel.set_width(330)
+            panel.set_width(400)
             self._panels.append(panel)
-        away = 7.5 + 4.0 * (n - 1)
-        self.server.initial_camera.position = (0.0, -away, 0.55 * away)
-        self.server.initial_camera.look_at = (0.0, 0.0, 0.4)
+        self._stand_back(n)
         label = self.exploration.shown.label
         self._label.content = "" if label is None else f"Its class is **{label}**; no policy knows."
         self._draw()
+
+    def _stand_back(self, walks: int) -> None:
+        """Let everyone see so many walks, if these are not as many as before."""
+        position, at = np.array([0.0, -1.0, 0.55]) * (7.5 + 4.5 * (walks - 1)), np.array([0.0, 0.0, 0.4])
+        first = self.server.initial_camera
+        if np.allclose(first.position, position):
+            return
+        first.position, first.look_at = position, at
+        for client in self.server.get_clients().values():
+            client.camera.position, client.camera.look_at = position, at
 
     def _draw(self) -> None:
         with self.server.atomic():
