@@ -35,10 +35,8 @@ def main() -> None:
             taken.append((time.perf_counter() - wall, time.process_time() - work))
         page.stop()
         (wall, work), slow = np.median(taken, 0), np.quantile(taken, 0.9, axis=0)
-        print(
-            f"sensor {sensor or 'none (clean)'}: median {1000 * wall:.0f} ms of wall clock (90 %: {1000 * slow[0]:.0f}),"
-            f" {1000 * work:.0f} ms of processor time (90 %: {1000 * slow[1]:.0f})"
-        )
+        clock = f"median {1000 * wall:.0f} ms of wall clock (90 %: {1000 * slow[0]:.0f})"
+        print(f"{sensor or 'clean'}: {clock}, {1000 * work:.0f} ms of processor time (90 %: {1000 * slow[1]:.0f})")
 
 
 if __name__ == "__main__":

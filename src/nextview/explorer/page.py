@@ -199,8 +199,8 @@ class Page:
         self._scenes, self._cards, self._panels = [], [], []
         for k, walk in enumerate(self._walks):
             place = ((k - (n - 1) / 2) * APART, 0.0, 0.0)
-            scene = WalkScene(self.server, f"/walk{k}", place, partial(self._look, k), partial(self._drag, k))
-            scene.show(walk, self.exploration.mesh)
+            look, drag = partial(self._look, k), partial(self._drag, k)
+            scene = WalkScene(self.server, f"/walk{k}", place, walk, self.exploration.mesh, look, drag)
             self._scenes.append(scene)
         for walk in self._walks:
             panel = self.server.gui.add_panel()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 
 import numpy as np
 import viser
@@ -33,6 +32,8 @@ class WalkScene:
         server: of the page.
         name: of the node.
         place: of the object's centre in the scene, (3,).
+        walk: what is drawn; another walk needs another scene.
+        mesh: the object; None if there are only pictures of it.
         look: called with the candidate view that is clicked.
         drag: called with the place to which the camera is dragged, (3,), object frame, and whether it was let go.
     """
@@ -42,35 +43,22 @@ class WalkScene:
         server: viser.ViserServer,
         name: str,
         place: tuple[float, float, float],
+        walk: Walk,
+        mesh: Mesh | None,
         look: Callable[[int], None],
         drag: Callable[[Float, bool], None],
     ) -> None:
-        self._scene, self._name, self._look, self._drag = server.scene, name, look, drag
+        self._scene, self._name, self._drag = server.scene, name, drag
         self._root = server.scene.add_frame(name, show_axes=False, position=place)
-        self._balls: list[viser.IcosphereHandle] = []
+        self._drawn = 0
         self._object: viser.MeshHandle | None = None
-
-    def remove(self) -> None:
-        """Take it out of the scene."""
-        self._root.remove()
-
-    def show(self, walk: Walk, mesh: Mesh | None) -> None:
-        """Another object, or another walk."""
-        name = self._name
-        if mesh is None:
-            if self._object is not None:
-                self._object.remove()
-            self._object = None
-        else:
+        if mesh is not None:
             vertices = mesh.vertices.astype(np.float32)
-            self._object = self._scene.add_mesh_simple(
+            self._object = server.scene.add_mesh_simple(
                 f"{name}/object", vertices, mesh.faces, color=(180, 187, 194), flat_shading=True, side="double"
             )
-        for ball in self._balls:
-            ball.remove()
-        self._balls = []
-        for view, position in enumerate(walk.sphere.poses[:, :3, 3]):
-            ball = self._scene.add_icosphere(
+        self._balls = [
+            server.scene.add_icosphere(
                 f"{name}/views/{view}",
                 BALL,
                 subdivisions=2,
@@ -78,13 +66,19 @@ class WalkScene:
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            ball.on_click(lambda event, view=view: self._look(view))
-            self._balls.append(ball)
-        first = walk.sphere.poses[walk.session.view]
-        self._handle = self._scene.add_transform_controls(
+            for view, position in enumerate(walk.sphere.poses[:, :3, 3])
+        ]
+        for view, ball in enumerate(self._balls):
+            ball.on_click(lambda event, view=view: look(view))
+        first = walk.sphere.poses[walk.start]
+        self._handle = server.scene.add_transform_controls(
             f"{name}/handle", 0.7, disable_rotations=True, position=first[:3, 3], depth_test=False
         )
         self._handle.on_update(self._dragged)
+
+    def remove(self) -> None:
+        """Take it out of the scene."""
+        self._root.remove()
 
     def _dragged(self, event: viser.TransformControlsEvent) -> None:
         if event.phase != "start":
@@ -103,12 +97,11 @@ class WalkScene:
         points, name = walk.points, self._name
         self._scene.add_point_cloud(f"{name}/seen", points, ACCENT, point_size=0.012, visible=len(points) > 0)
         self._draw_path(walk)
-        pose = walk.views[-1].observation.pose if walk.views else walk.sphere.poses[walk.session.view]
-        self._handle.position = tuple(pose[:3, 3])
         if not walk.views:
-            self._scene.remove_by_name(f"{name}/camera")
             return
         observation = walk.views[-1].observation
+        pose = observation.pose
+        self._handle.position = tuple(pose[:3, 3])
         height, width = observation.depth.shape
         self._scene.add_camera_frustum(
             f"{name}/camera",
@@ -129,17 +122,20 @@ class WalkScene:
         for view, (ball, colour) in enumerate(zip(self._balls, heat(values), strict=True)):
             visited, asked = view in walk.visited, view == walk.next_view
             ball.color = INK if visited else ACCENT if asked else tuple(int(c) for c in colour)
-            ball.scale = 0.5 if visited else 1.5 if asked else 1.0
+            scale = 0.5 if visited else 1.5 if asked else 1.0
+            if ball.scale != scale:
+                ball.scale = scale
 
     def _draw_path(self, walk: Walk) -> None:
-        """Great circles between the places where the camera stood, and their numbers."""
-        distance, path = walk.sphere.distance, f"{self._name}/path"
-        self._scene.remove_by_name(path)
-        self._scene.add_frame(path, show_axes=False)
-        places = [view.direction for view in walk.views]
-        for step, place in enumerate(places, 1):
-            self._scene.add_label(f"{path}/number{step}", str(step), position=1.1 * distance * place)
-        for step, (a, b) in enumerate(pairwise(places), 1):
-            line = a + np.linspace(0, 1, 25)[:, None] * (b - a)
-            line *= distance / np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
-            self._scene.add_line_segments(f"{path}/{step}", np.stack([line[:-1], line[1:]], 1), ACCENT, thickness=0.03)
+        """The places where the camera stood, numbered, and great circles between them; those that are new."""
+        distance, places = walk.sphere.distance, [view.direction for view in walk.views]
+        for step in range(self._drawn, len(places)):
+            name = f"{self._name}/path/{step + 1}"
+            self._scene.add_label(f"{name}/number", str(step + 1), position=1.1 * distance * places[step])
+            if step:
+                a, b = places[step - 1], places[step]
+                line = a + np.linspace(0, 1, 25)[:, None] * (b - a)
+                line *= distance / np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
+                segments = np.stack([line[:-1], line[1:]], 1)
+                self._scene.add_line_segments(f"{name}/way", segments, ACCENT, thickness=0.03)
+        self._drawn = len(places)
