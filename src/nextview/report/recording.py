@@ -151,5 +151,8 @@ def blueprint() -> rrb.Blueprint:
         rrb.Spatial3DView(origin="world", name="object frame"), rrb.TextLogView(origin="log"), row_shares=[4, 1]
     )
     return rrb.Blueprint(
-        rrb.Horizontal(scene, rrb.Vertical(pictures, bars, over_time)), rrb.TimePanel(timeline=TIMELINE)
+        rrb.Horizontal(scene, rrb.Vertical(pictures, bars, over_time)),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
     )
