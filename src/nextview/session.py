@@ -286,6 +286,8 @@ class Session:
         self._reachable: Reachable | None = None
         self._travel_cost: TravelCost | None = None
         self._here = np.eye(4)
+        self.observers: list[Callable[[Session], None]] = []
+        """Called, in order, after each view that was taken in, and when another next view was chosen."""
         self._episodes = self._begin(start)
 
     def _begin(self, start: int) -> Episodes:
@@ -414,6 +416,7 @@ class Session:
                 self.views[-1] = replace(
                     self.views[-1], next_view=None if to < 0 else to, values=self._values(step, to < 0)
                 )
+                self._tell_observers()
         elif self.object is None:  # with frames it begins where the camera is
             order = np.argsort(self.sphere.arc[self.view], kind="stable")
             there = ~self._failed[order]
@@ -479,7 +482,13 @@ class Session:
         if self.done:
             raise SessionError("this session has ended; begin another one")
         with _blas().limit(limits=1):
-            return self._update(seen)
+            view = self._update(seen)
+        self._tell_observers()
+        return view
+
+    def _tell_observers(self) -> None:
+        for observer in self.observers:
+            observer(self)
 
     def _update(self, seen: Observation | Frame) -> View:
         if isinstance(seen, Frame):

@@ -72,6 +72,7 @@ class System:
         seed: int = 0,
         object: ObservedObject | None = None,
         distance: float | None = None,
+        record: str | Path | None = None,
     ) -> Session:
         """One object under way, for whoever moves the camera. Those for a robot need no more than a distance.
 
@@ -82,14 +83,22 @@ class System:
             object: which object to find in the frames of a depth camera; the largest on the support plane by default.
             distance: how far from the object the camera shall stand, metres; 3 object radii by default. With an object
                 or a distance the session takes frames, else what it is given first.
+            record: write the session to this file as it goes on, for the Rerun viewer (.rrd), see
+                ``report.recording``; needs the extra "record".
 
         Raises:
-            UsageError: there is no such view or distance.
+            UsageError: there is no such view or distance, or the recording cannot be written.
         """
         rng = np.random.default_rng(seed)
         drawn = int(rng.integers(len(self.sphere)))
         first = drawn if start is None else start
-        return Session(self.models, self.policy, self.sphere, first, self.stopping, rng, object, distance, self.unknown)
+        options = (self.stopping, rng, object, distance, self.unknown)
+        session = Session(self.models, self.policy, self.sphere, first, *options)
+        if record is not None:
+            from nextview.report.recording import Recorder
+
+            session.observers.append(Recorder(record))
+        return session
 
     def session_with(self, camera: Camera | FrameCamera, start: int | None = None, seed: int = 0) -> Session:
         """A session for a camera that ``Session.run`` is to go on with: of one in the world, for its object."""

@@ -41,6 +41,7 @@ def recognise(
     seed: int = 0,
     sensor: str | None = None,
     figure: Path | None = None,
+    record: Path | None = None,
     json: bool = False,
     timing: bool = False,
 ) -> None:
@@ -79,6 +80,7 @@ def recognise(
         sensor: look at a mesh through a sensor with all its errors: kinect, stereo, setup, wrist or none, or
             NAME:STRENGTH (docs/your_camera.md); clean renders if not given.
         figure: write a picture of the episode to this file (PNG, PDF or SVG).
+        record: write the episode to this file (.rrd), for the Rerun viewer.
         json: print JSON instead of a table.
         timing: also print where the time went, from the start of the process.
     """
@@ -113,4 +115,4 @@ def recognise(
             return simulated(load_mesh(path, up, unit, max_faces), sensor, seed)
 
     name = path.name if sensor is None else f"{path.name} through {sensor}"
-    show(make, name, models, options, start, seed, figure, json, timing)
+    show(make, name, models, options, start, seed, figure, json, timing, record)

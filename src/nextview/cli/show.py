@@ -21,13 +21,17 @@ def show(
     figure: Path | None,
     json: bool = False,
     timing: bool = False,
+    record: Path | None = None,
 ) -> None:
     """Recognise what a camera sees and print the episode; ``options`` are those of ``nextview.load``."""
+    from contextlib import ExitStack
+
     from nextview import system
     from nextview.cli.episode_table import as_json, print_episode
     from nextview.cli.progress import console
     from nextview.cli.timing import Stopwatch
     from nextview.errors import ObservationError
+    from nextview.outputs import written_whole
 
     watch = Stopwatch()
     watch.lap("importing")
@@ -36,7 +40,14 @@ def show(
     opened = system.load(models, **options)
     session = opened.session_with(camera, start, seed)
     watch.lap("loading the models")
-    result = session.run(camera, watch.lap)
+    with ExitStack() as recorded:
+        if record is not None:
+            from nextview.report.recording import Recorder
+
+            recorder = Recorder(recorded.enter_context(written_whole(record)))
+            recorded.callback(recorder.close)
+            session.observers.append(recorder)
+        result = session.run(camera, watch.lap)
     if not result.seen:
         raise ObservationError(
             f"{name}: there is no answer, for nothing of it is seen from any of {len(result.views)} views; "

@@ -8,13 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, MaxNLocator
+from numpy.typing import NDArray
 
 INK, FAINT = "#1f2933", "#d5dbe1"
+UNKNOWN = 201, 210, 218
+"""The colour of what has no value."""
 STYLE = {
     "font.family": "sans-serif",
     "font.sans-serif": ["Helvetica Neue", "Arial", "Liberation Sans", "DejaVu Sans"],
@@ -66,6 +70,15 @@ def legend(axes: Axes, title: str | None = None) -> None:
     """A legend in two columns below the axes."""
     with matplotlib.rc_context(STYLE):
         axes.legend(loc="upper center", bbox_to_anchor=(0.45, -0.17), ncols=2, title=title, title_fontsize=8.5)
+
+
+def heat(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Values in the colours of viridis, lowest to highest, (...) to (..., 3); NaN is grey."""
+    known = np.isfinite(values)
+    low, high = (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)
+    scaled = np.where(known, values - low, 0.0) / (high - low if high > low else 1.0)
+    colours = (255 * matplotlib.colormaps["viridis"](scaled)[..., :3] + 0.5).astype(np.uint8)
+    return np.where(known[..., None], colours, np.array(UNKNOWN, np.uint8))
 
 
 def to_svg(figure: Figure) -> str:

@@ -1,0 +1,130 @@
+"""What the last view of a walk showed and changed, as a piece of HTML."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Mapping
+from html import escape
+from io import BytesIO
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from nextview.explorer.exploration import Walk
+from nextview.observation import Observation
+from nextview.report.style import heat
+from nextview.session import View
+from nextview.viewsphere import ViewSphere
+
+INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
+CELL = 11
+"""Side of a cell of a map, pixels."""
+SHOWN = 5
+"""Classes of which the belief is shown."""
+STYLE = f"""<style>
+.nv {{ font: 13px sans-serif; color: {INK}; padding: 0.4em 0.8em 0.8em }}
+.nv h3 {{ margin: 0 0 0.2em; font-size: 15px }}
+.nv p {{ margin: 0.3em 0 }}
+.nv img {{ image-rendering: pixelated; vertical-align: top; margin: 0 4px 4px 0 }}
+.nv figure {{ display: inline-block; margin: 0 4px 0 0; font-size: 11px; vertical-align: top }}
+.nv figcaption {{ width: 0; min-width: 100% }}
+.nv table {{ border-spacing: 0 3px; width: 100% }}
+.nv td {{ padding: 0 4px; white-space: nowrap }}
+.nv td.number {{ text-align: right; font-variant-numeric: tabular-nums }}
+.nv .bar {{ position: relative; height: 13px; width: 120px; background: #eef1f4 }}
+.nv .bar i {{ position: absolute; left: 0; display: block }}
+.nv .bar b {{ position: absolute; top: -2px; bottom: -2px; border-left: 2px dotted {INK} }}
+</style>"""
+
+
+def walk_card(walk: Walk, milliseconds: float | None = None) -> str:
+    """The walk so far: image, maps and values, belief before and after, and every view.
+
+    Args:
+        walk: whose last view is shown.
+        milliseconds: how long that view took, if it is to be told.
+    """
+    if not walk.views:
+        return f'{STYLE}<div class="nv"><p>No view was taken yet. The policy begins at view {walk.start}.</p></div>'
+    view, classes = walk.views[-1], walk.session.models.classes
+    best = int(view.belief.argmax())
+    believed = f"{escape(classes[best])} {view.belief[best]:.3f}" if view.observation.seen else "nothing is seen"
+    goes_on = "the rule would stop here" if walk.stopped else "the rule would look on"
+    took = "" if milliseconds is None else f" · {milliseconds:.0f} ms"
+    parts = [f"<h3>{believed}</h3><p>{goes_on}{took}</p>", _figures(walk, view), _beliefs(walk), _steps(walk)]
+    return f'{STYLE}<div class="nv">{"".join(parts)}</div>'
+
+
+def preview_card(observation: Observation) -> str:
+    """What a camera that is being dragged would see."""
+    return f'{STYLE}<div class="nv"><h3>from here</h3>{_image(observation.picture, 200)}</div>'
+
+
+def gallery(pictures: Mapping[str, NDArray[np.uint8]]) -> str:
+    """Small pictures in a row, with their names."""
+    width = 225 // max(len(pictures), 3)
+    images = (
+        f"<figure>{_image(image, width)}<figcaption>{escape(name)}</figcaption></figure>"
+        for name, image in pictures.items()
+    )
+    return f'{STYLE}<div class="nv">{"".join(images)}</div>'
+
+
+def _image(pixels: NDArray[np.uint8], width: int) -> str:
+    file = BytesIO()
+    Image.fromarray(pixels).save(file, "png")
+    return f'<img width="{width}" src="data:image/png;base64,{b64encode(file.getvalue()).decode()}">'
+
+
+def _row(pictures: list[tuple[str, str]]) -> str:
+    """Pictures, as HTML, with what stands below each."""
+    return "".join(f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>" for below, image in pictures)
+
+
+def _figures(walk: Walk, view: View) -> str:
+    """The image, local maps, and the value of each view where they lie on rings; the highest ring on top."""
+    elevation, azimuth = view.angles
+    found = [(f"view {view.index}: {elevation:.0f}° up, {azimuth:.0f}° round", _image(view.observation.picture, 120))]
+    for name, values in view.maps.items():
+        found.append((f"{name}, from here", _image(heat(values[::-1]), CELL * values.shape[1])))
+    if view.values is not None and isinstance(walk.sphere, ViewSphere):
+        grid = view.values.reshape(walk.sphere.rings, walk.sphere.azimuths)
+        order = np.argsort(walk.sphere.elevations)[::-1]
+        found.append(("value of each view", _image(heat(grid[order]), CELL * grid.shape[1])))
+    return _row(found)
+
+
+def _beliefs(walk: Walk) -> str:
+    """The classes believed most: belief now, what this view says alone, and the change."""
+    view, classes = walk.views[-1], walk.session.models.classes
+    before = walk.views[-2].belief if len(walk.views) > 1 else np.full(len(classes), 1 / len(classes))
+    highest = np.maximum(view.belief, before) if len(walk.views) > 1 else view.belief
+    counted = sum(view.observation.seen for view in walk.views)
+    threshold = 100 * float(walk.stopping.threshold_at(max(counted, 1)))
+    rows = []
+    for c in np.argsort(-highest, kind="stable")[:SHOWN]:
+        bars = (
+            f'<i style="top:0;height:8px;width:{100 * view.belief[c]:.1f}%;background:{ACCENT}"></i>'
+            f'<i style="top:8px;height:5px;width:{100 * view.alone[c]:.1f}%;background:{FAINT}"></i>'
+            f'<b style="left:{threshold:.1f}%"></b>'
+        )
+        rows.append(
+            f'<tr><td>{escape(classes[c])}</td><td><div class="bar">{bars}</div></td>'
+            f'<td class="number">{view.belief[c]:.3f}</td>'
+            f'<td class="number">{view.belief[c] - before[c]:+.3f}</td></tr>'
+        )
+    legend = "belief · grey: this view alone · dotted: the threshold · last: change by this view"
+    return f"<table>{''.join(rows)}</table><p><small>{legend}</small></p>"
+
+
+def _steps(walk: Walk) -> str:
+    classes, rows = walk.session.models.classes, []
+    for step, view in enumerate(walk.views, 1):
+        best, doubts = int(view.belief.argmax()), ", ".join(doubt.name for doubt in view.doubts)
+        rows.append(
+            f'<tr><td class="number">{step}</td><td>view {view.index}</td><td>{escape(classes[best])}</td>'
+            f'<td class="number">{view.belief[best]:.3f}</td><td class="number">{view.travel:.2f} cells</td>'
+            f"<td>{escape(doubts)}</td></tr>"
+        )
+    return f"<table>{''.join(rows)}</table>"

@@ -1,0 +1,188 @@
+"""A recording holds what the session held: read back by Rerun's own reader."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.scenes import INTRINSICS, box, cast, pose_at
+
+pytest.importorskip("rerun", reason="the extra 'record' is not installed")
+
+from rerun.chunk import RrdReader
+
+import nextview
+from nextview.cli.main import main
+from nextview.data.samples import sample_mesh
+from nextview.errors import ResultsError, UsageError
+from nextview.observation import Observation
+from nextview.report.recording import Recorder
+from nextview.sensing import Frame
+from nextview.system import simulated
+
+SAMPLE = Path(__file__).parent.parent / "samples" / "table.off"
+
+
+class Recording:
+    """The rows of a recording by entity, component and step; the last one that was written counts."""
+
+    def __init__(self, path):
+        self.rows = {}
+        chunks = sorted(RrdReader(path).stream().to_chunks(), key=lambda chunk: str(chunk.id))  # by time
+        for chunk in chunks:
+            if chunk.is_static:
+                continue
+            batch = chunk.to_record_batch().to_pydict()
+            for row, step in enumerate(batch["step"]):
+                for component, values in batch.items():
+                    if ":" in component:
+                        self.rows.setdefault((chunk.entity_path.strip("/"), component), {}).setdefault(step, [])
+                        self.rows[chunk.entity_path.strip("/"), component][step].append(values[row])
+
+    def at(self, entity, component, step):
+        return np.asarray(self.rows[entity, component][step][-1])
+
+    def steps(self, entity, component):
+        return sorted(self.rows[entity, component])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """An episode of several views, and its recording."""
+    path = tmp_path_factory.mktemp("recorded") / "episode.rrd"
+    session = nextview.load(threshold=0.9999, max_views=3, threads=1).session(start=3, record=path)
+    result = session.run(simulated(sample_mesh("table"), "kinect"))
+    assert len(result.views) > 1
+    return session, result, Recording(path)
+
+
+def test_belief_and_travel_over_the_steps(made):
+    session, result, recording = made
+    steps = list(range(1, len(result.views) + 1))
+    for step, view in zip(steps, result.views, strict=True):
+        for name, belief in zip(result.classes, view.belief, strict=True):
+            assert recording.at(f"belief/{name}", "Scalars:scalars", step) == [belief]
+        assert recording.at("travel/cells", "Scalars:scalars", step) == [view.travel]
+        assert recording.at("travel/radians", "Scalars:scalars", step) == [view.arc]
+        assert recording.at("threshold", "Scalars:scalars", step) == [session.stopping.threshold_at(step)]
+        for name, values in (("belief_now", view.belief), ("this_view_alone", view.alone)):
+            np.testing.assert_array_equal(recording.at(name, "BarChart:values", step)[0]["buffer"], values)
+    assert recording.steps("belief/chair", "Scalars:scalars") == steps
+
+
+def test_cameras_project_the_points_into_the_depth_image(made):
+    _, result, recording = made
+    for step, view in enumerate(result.views, 1):
+        rotation = recording.at("world/camera", "Transform3D:mat3x3", step).reshape(3, 3).T  # columns first
+        position = recording.at("world/camera", "Transform3D:translation", step).reshape(3)
+        pinhole = recording.at("world/camera", "Pinhole:image_from_camera", step).reshape(3, 3).T
+        size = recording.at("world/camera", "Pinhole:resolution", step).ravel().astype(int)
+        raw = np.array(recording.at("world/camera/depth", "DepthImage:buffer", step), np.uint8).tobytes()
+        depth = np.frombuffer(raw, np.float32).reshape(size[1], size[0])
+        points = np.array(recording.at(f"world/seen/{step}", "Points3D:positions", step).tolist())
+        np.testing.assert_array_equal(depth, view.observation.depth)
+        seen = (points - position) @ rotation
+        column, row, z = (seen @ pinhole.T).T
+        found = depth[(row / z).astype(int), (column / z).astype(int)]
+        np.testing.assert_allclose(found, z, atol=1e-4)
+
+
+def test_candidates_values_and_choices(made):
+    session, result, recording = made
+    poses = session.sphere.poses[:, :3, 3]
+    for step, view in enumerate(result.views, 1):
+        shown = np.array(recording.at("world/candidates", "Points3D:positions", step).tolist())
+        np.testing.assert_allclose(shown, poses, atol=1e-6)
+        chosen = np.array(recording.at("world/next", "Points3D:positions", step).tolist()).reshape(-1, 3)
+        np.testing.assert_allclose(chosen, poses[[] if view.next_view is None else [view.next_view]], atol=1e-6)
+        values = np.array(recording.at("values", "BarChart:values", step)[0]["buffer"])
+        if view.values is None:
+            assert len(values) == 0
+        else:
+            np.testing.assert_array_equal(values, view.values[np.isfinite(view.values)])
+        for name, expected in view.maps.items():
+            tensor = recording.at(f"maps/{name}", "Tensor:data", step)[0]
+            assert tensor["shape"] == list(expected.shape)
+            np.testing.assert_array_equal(np.array(tensor["buffer"]), expected.ravel())
+    (last,) = recording.at("log", "TextLog:text", len(result.views)).tolist()
+    assert last == f"done: {result!r}"
+
+
+def test_frames_that_move_the_object_are_written_anew(tmp_path):
+    path = tmp_path / "frames.rrd"
+    session = nextview.load(threshold=1.0, max_views=3, threads=1).session(distance=0.9, record=path)
+    thing = [box((0.2, 0.3, 0.2), (0, 0, 0.1)), box((2, 2, 0.02), (0, 0, -0.01))]
+    seen = []
+    for azimuth in (0, 60, 140):
+        pose = pose_at(40, azimuth, 0.9, (0, 0, 0.1))
+        depth, _ = cast(thing, pose)
+        session.update(Frame(depth, INTRINSICS, pose, pixel_centre=0.5))
+        seen.append([view.observation for view in session.views])
+    recording = Recording(path)
+    moved = [step for step in (2, 3) if seen[step - 1][0] is not seen[step - 2][0]]
+    assert moved  # else this tests nothing
+    assert recording.steps("world/seen/1", "Points3D:positions") == [1, *moved]
+    for step in moved:
+        points = np.array(recording.at("world/seen/1", "Points3D:positions", step).tolist())
+        np.testing.assert_allclose(points, seen[step - 1][0].points, atol=1e-6)
+
+
+def test_another_choice_is_written_too(tmp_path):
+    session = nextview.load(threshold=1.0, max_views=3, threads=1).session(start=3, record=tmp_path / "a.rrd")
+    camera = simulated(sample_mesh("table"))
+    session.update(camera.observe(session.pose))
+    first = session.view
+    session.failed()
+    assert session.view != first
+    session.reachable = np.zeros(40, bool)
+    assert session.done
+    recording = Recording(tmp_path / "a.rrd")
+    texts = [text[0] for text in recording.rows["log", "TextLog:text"][1]]
+    assert texts[0].endswith(f"next view {first}")
+    assert "next view" in texts[1]
+    assert texts[2].endswith("the end")
+    assert texts[1] != texts[0]
+    assert len(recording.rows["belief/chair", "Scalars:scalars"][1]) == 1  # nothing new was seen
+
+
+def test_a_recording_under_way_can_be_read_and_one_that_is_closed_is_complete(tmp_path):
+    path = tmp_path / "a.rrd"
+    session = nextview.load(max_views=2, threads=1).session(start=3, record=path)
+    seen = simulated(sample_mesh("table")).observe(session.pose)
+    session.update(Observation(np.zeros_like(seen.depth), seen.pose, seen.intrinsics))
+    with pytest.warns(Warning, match="no footer"):  # as long as it is not complete
+        recording = Recording(path)
+    assert len(recording.at("world/seen/1", "Points3D:positions", 1)) == 0  # nothing was seen
+    (recorder,) = session.observers
+    recorder.close()
+    size = path.stat().st_size
+    assert Recording(path).rows.keys() == recording.rows.keys()
+    session.update(seen)  # goes on, unrecorded
+    assert path.stat().st_size == size
+
+
+def test_the_command_writes_one_and_prints_the_same(tmp_path, capsys):
+    main(["recognise", str(SAMPLE), "--start", "3", "--json"])
+    plain = capsys.readouterr().out
+    main(["recognise", str(SAMPLE), "--start", "3", "--json", "--record", str(tmp_path / "new" / "episode.rrd")])
+    assert capsys.readouterr().out == plain
+    recording = Recording(tmp_path / "new" / "episode.rrd")
+    assert len(recording.steps("belief/table", "Scalars:scalars")) == len(json.loads(plain)["views"])
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["episode.rrd"]
+
+
+def test_a_command_that_fails_leaves_no_recording(tmp_path, capsys):
+    (tmp_path / "none.off").write_text("OFF\n")
+    with pytest.raises(SystemExit):
+        main(["recognise", str(tmp_path / "none.off"), "--record", str(tmp_path / "episode.rrd")])
+    with pytest.raises(SystemExit):
+        main(["recognise", str(SAMPLE), "--record", str(tmp_path / "episode.json")])
+    assert "is called .rrd" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["none.off"]
+
+
+def test_what_cannot_be_written_is_said_in_a_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "missing" / "a.rrd", tmp_path / "file" / "a.rrd"):
+        with pytest.raises((UsageError, ResultsError), match=r"a\.rrd"):
+            Recorder(path)
