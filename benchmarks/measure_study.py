@@ -9,8 +9,8 @@ recogniser gives the true class there, as the mean over objects, of all classes 
 the recogniser's best one, or next to it; and accuracy and travel of the policy that climbs its true map in the local
 window, after fixed numbers of views. That policy sees what no robot can, and so is an oracle by name; what it does not
 see is the class: it goes to the valley for those that it believes in at that moment and for which the valley gained on
-the validation objects. Intervals are 95 % bootstrap intervals over objects; p is McNemar's test against random choice in
-the window, over objects, corrected by Holm's method for all measures and numbers of views together.
+the validation objects. Intervals are 95 % bootstrap intervals over objects; p is McNemar's test against random choice
+in the window, over objects, corrected by Holm's method for all measures and numbers of views together.
 """
 
 from __future__ import annotations
@@ -236,6 +236,8 @@ def main(
         tables = [replace(p, store=str(store.resolve())) for p in tables]
     if set(tables[0].names) & set(tables[1].names):
         raise UsageError(f"{validation}: holds objects of {test}: peak or valley would be chosen on what is judged")
+    if tables[0].classes != tables[1].classes:
+        raise UsageError(f"{validation}: is of other classes than {test}")
     if not n_views or min(n_views) < 2:
         raise UsageError("policies are compared after two views or more")
     names = list(measures) or [*ViewStore.open(tables[0].store).measures, CONFIDENCE]
