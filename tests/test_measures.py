@@ -137,7 +137,7 @@ def test_entropy_of_shares():
 # The measure that no slant can raise
 
 
-def plane(slant, azimuth=0.0, size=224, depth=3.0, half=0.35):
+def plane(slant, azimuth=0.0, size=224, depth=3.0, half=0.9):
     """A square part of the image in which a plane is seen, turned away from the camera by an angle, degrees."""
     view = of_depth(np.zeros((size, size)))
     at = (np.arange(size) + 0.5 - size / 2) / view.intrinsics[0, 0]

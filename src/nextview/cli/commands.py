@@ -11,12 +11,9 @@ from nextview.cli.correspond import correspond
 from nextview.cli.demo import demo
 from nextview.cli.download import download
 from nextview.cli.evaluate import evaluate
-<<<<<<< HEAD
+from nextview.cli.explore import explore
 from nextview.cli.export import export_recogniser
 from nextview.cli.export_maps import export_lcm, export_lem, export_map
-=======
-from nextview.cli.explore import explore
->>>>>>> explore
 from nextview.cli.fit import fit_calibration, fit_size, fit_valleys
 from nextview.cli.fit_policies import fit_policies
 from nextview.cli.fit_unknown import fit_unknown

@@ -10,12 +10,9 @@ from nextview.errors import MissingExtraError
 EXTRAS = {
     "benchmark": ("jinja2", "pandas", "pyarrow"),
     "cluster": ("dask", "distributed"),
-<<<<<<< HEAD
     "measures": ("skimage",),
-=======
     "explore": ("viser",),
     "record": ("rerun",),
->>>>>>> explore
     "train": ("lightning", "numcodecs", "onnx", "onnxscript", "torch", "torchmetrics"),
 }
 """Packages by the optional part of the installation that brings them."""

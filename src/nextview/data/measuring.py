@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -91,30 +91,36 @@ def measure(
     names = names_of(names, meshes is not None)
     store = ViewStore.open(path)
     store.array("depth")  # says if it is missing, before anything is begun
-    files = {}
-    if any(find_measure(name).needs == "mesh" for name in names):
-        assert meshes is not None  # or names_of had said so
-        files = _files(store, meshes.absolute())
-    function = partial(_measure, names, files, max_faces)
+    if all(find_measure(name).needs == "depth" for name in names):
+        meshes = None
+    if meshes is not None:
+        meshes = meshes.absolute()
+        _check_meshes(store, meshes)
+    function = partial(_measure, names, meshes, max_faces)
     yield from keep(path, [f"measures/{name}" for name in names], function, workers, scheduler, cost)
 
 
-def _files(store: ViewStore, meshes: Path) -> dict[int, Path]:
-    """The mesh file of each rendered object.
+def _check_meshes(store: ViewStore, meshes: Path) -> None:
+    """Look for the mesh file of each rendered object.
 
     Raises:
         DatasetError: one is not there, or the store looked through a sensor.
     """
     if "sensor" in store.group.attrs:
         raise DatasetError(f"{store.path}: was rendered through a sensor, whose depth does not tell which face is seen")
-    found = {entry.name: entry.path for entry in list_dataset(meshes)}
-    lacking = [store.names[i] for i in np.flatnonzero(store.done) if store.names[i] not in found]
+    names, found = store.names, {entry.name for entry in list_dataset(meshes)}
+    lacking = [names[i] for i in np.flatnonzero(store.done) if names[i] not in found]
     if lacking:
         raise DatasetError(f"{meshes}: holds no mesh called {lacking[0]}, of which {store.path} has views")
-    return {int(i): found[store.names[i]] for i in np.flatnonzero(store.done)}
 
 
-def _measure(names: tuple[str, ...], files: dict[int, Path], max_faces: int, store: ViewStore, i: int) -> Made:
+@lru_cache(maxsize=1)  # once for each process
+def _files(meshes: Path, store: Path) -> dict[str, Path]:
+    """The mesh files of a dataset by name. The store is asked for nothing: for each one it is looked anew."""
+    return {entry.name: entry.path for entry in list_dataset(meshes)}
+
+
+def _measure(names: tuple[str, ...], meshes: Path | None, max_faces: int, store: ViewStore, i: int) -> Made:
     cost = Cost(views=len(store.sphere))
     began = time.process_time()
 
@@ -128,11 +134,12 @@ def _measure(names: tuple[str, ...], files: dict[int, Path], max_faces: int, sto
     depths = store.read("depth", i) * DEPTH_UNIT  # float64, as when it was rendered
     lap(READING)
     surface = camera = None
-    if files:
-        hashes = store.group.attrs.get("sha256")
-        if hashes and file_hash(files[i]) != hashes[i]:
-            raise DatasetError(f"{files[i]}: is not the mesh that {store.path} was rendered from")
-        mesh = deformed(store, load_mesh(files[i], max_faces=max_faces), store.names[i])
+    if meshes is not None:
+        name, hashes = store.names[i], store.group.attrs.get("sha256")
+        file = _files(meshes, store.path)[name]
+        if hashes and file_hash(file) != hashes[i]:
+            raise DatasetError(f"{file}: is not the mesh that {store.path} was rendered from")
+        mesh = deformed(store, load_mesh(file, max_faces=max_faces), name)
         surface = Surface(mesh.vertices, mesh.faces)
         camera = SimulatedCamera(mesh, depths.shape[-1], store.sphere.distance)
         lap(CASTING)
@@ -140,7 +147,7 @@ def _measure(names: tuple[str, ...], files: dict[int, Path], max_faces: int, sto
     for k, (depth, pose) in enumerate(zip(depths, store.sphere.poses, strict=True)):
         faces = None if camera is None else camera.face_ids(pose, depth > 0)
         view = MeasuredView(depth, pose, store.intrinsics, surface, faces)
-        lap(CASTING if files else READING)
+        lap(READING if camera is None else CASTING)
         for name, function in measures.items():
             try:
                 values[name][k] = function(view)

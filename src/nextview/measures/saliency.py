@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from nextview.measures.measured_view import MeasuredView
 from nextview.measures.surface import Surface
 
-EPSILON = 0.003
-"""Unit of the scales, diagonals of the bounding box."""
+UNIT = 0.006
+"""Of the scales, object radii: Lee's 0.003 diagonals of a bounding box whose corners the object's sphere goes through,
+but the same however the object lies in it."""
 SCALES = (2, 3, 4, 5, 6)
 """Standard deviations of the finer of two averages, in units; the coarser one's is twice as large."""
 LONGEST = 0.05
@@ -52,7 +53,7 @@ def _saliency(surface: Surface) -> NDArray[np.float64]:
     middle = np.stack([np.bincount(group, around * position[:, k]) for k in range(3)], 1)
     middle = np.where(area[:, None] > 0, middle / np.maximum(area, 1e-30)[:, None], 10 + np.arange(len(area))[:, None])
     curvature = np.where(area > 0, np.bincount(group, bend) / np.maximum(area, 1e-30), 0)
-    salient = _salient(middle, area, curvature, EPSILON * float(np.linalg.norm(np.ptp(surface.vertices, axis=0))))
+    salient = _salient(middle, area, curvature)
     of_fine = salient[group][fine.corners].mean(1)
     total = np.bincount(parent, fine.areas, len(surface.faces))
     mean = np.bincount(parent, fine.areas * of_fine, len(surface.faces))
@@ -60,7 +61,7 @@ def _saliency(surface: Surface) -> NDArray[np.float64]:
 
 
 def _salient(
-    points: NDArray[np.float64], area: NDArray[np.float64], curvature: NDArray[np.float64], unit: float
+    points: NDArray[np.float64], area: NDArray[np.float64], curvature: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Saliency of points, (n,): over all scales, how the averages of their curvature at two widths differ.
 
@@ -69,7 +70,7 @@ def _salient(
     from scipy.spatial import cKDTree
 
     pairs = cKDTree(points).sparse_distance_matrix(
-        cKDTree(points), 4 * SCALES[-1] * unit, output_type="coo_matrix"
+        cKDTree(points), 4 * SCALES[-1] * UNIT, output_type="coo_matrix"
     )  # the pairs of a point with itself are among them
     i, j, square = pairs.row, pairs.col, pairs.data**2
 
@@ -82,10 +83,10 @@ def _salient(
 
     found = np.zeros(len(points))
     for scale in SCALES:
-        salient = np.abs(average(scale * unit) - average(2 * scale * unit))
+        salient = np.abs(average(scale * UNIT) - average(2 * scale * UNIT))
         if salient.max() <= 0:
             continue
-        near = square <= (2 * scale * unit) ** 2
+        near = square <= (2 * scale * UNIT) ** 2
         highest = np.zeros(len(points))
         np.maximum.at(highest, i[near], salient[j[near]])
         peaks = salient[(salient >= highest) & (salient > 0)]
