@@ -33,6 +33,11 @@ Triangles = tuple[Float, NDArray[np.int32]]
 
 FASTEST = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])
 """Velocity limits of the seven joints, rad/s (Franka Control Interface, robot and interface specifications)."""
+RANGES = np.array([[-2.8973, 2.8973], [-1.7628, 1.7628], [-2.8973, 2.8973], [-3.0718, -0.0698], [-2.8973, 2.8973],
+                   [-0.0175, 3.7525], [-2.8973, 2.8973]])  # fmt: skip
+"""Limits of the joints, rad (the same source)."""
+OFFSETS = np.array([0, 0, 0, 0, 0, np.pi / 2, np.pi / 4])
+"""The model counts its last two joints from elsewhere: Franka's angles less the model's."""
 HOME = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 0.35, 0.0])
 """Joints at rest, rad: the elbow up, the camera over the table."""
 STARTS = HOME + np.array([[0, 0, 0, 0, 0, 0, 0], [0.9, 0.6, 0, 0.4, 0, 0, 0], [-0.9, 0.6, 0, 0.4, 0, 0, 0],
@@ -46,7 +51,7 @@ CLEARANCE = 0.01
 """Metres that the arm keeps from the table and from the object."""
 FINE = 0.05
 """Radians between the places of a motion that are looked at for collisions."""
-CAMERA = (0.07, 0.0, 0.147)
+CAMERA = np.array([0.055, 0.0, 0.147])
 """Where the camera sits beside the hand: metres from link 7, along the hand's axes."""
 OBJECT = np.array([0.5, 0.0])
 """Where on the table the object is put, or near it: metres from the arm's base."""
@@ -77,15 +82,16 @@ def _model(vertices: Float, faces: NDArray[np.int32]) -> Any:
     spec = mujoco.MjSpec.from_string(SCENE.format(assets=_assets(), clearance=CLEARANCE))
     for finger in "12":  # it holds nothing: the hand stays closed
         spec.delete(spec.joint(f"robot:panda0_finger_joint{finger}"))
+    for k, limits in enumerate(RANGES - OFFSETS[:, None]):
+        spec.joint(f"robot:panda0_joint{k + 1}").range = limits
     hand = np.array([[1.0, 1, 0], [-1, 1, 0], [0, 0, np.sqrt(2)]]) / np.sqrt(2)  # columns: its axes in those of link 7
     eye = np.zeros(4)
     mujoco.mju_mat2Quat(eye, np.stack([hand[:, 1], -hand[:, 0], hand[:, 2]], 1).ravel())  # x right, y down, z forward
     wrist = spec.body("panda0_link7")
     wrist.add_site(name="camera", pos=hand @ CAMERA, quat=eye)
-    wrist.add_geom(
-        name="camera", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.045, 0.0125, 0.012], pos=hand @ (CAMERA - np.eye(3)[2] * 0.013),
-        quat=eye, rgba=[0.15, 0.15, 0.18, 1], mass=0.07,
-    )  # fmt: skip
+    box, back = mujoco.mjtGeom.mjGEOM_BOX, CAMERA - [0, 0, 0.013]  # its lens is in the middle of its front
+    for name, size, pos in (("camera", [0.045, 0.0125, 0.012], back), ("mount", [0.015, 0.03, 0.006], back / [2, 1, 1])):
+        wrist.add_geom(name=name, type=box, size=size, pos=hand @ pos, quat=eye, rgba=[0.15, 0.15, 0.18, 1], mass=0.05)
     spec.add_mesh(
         name="object", uservert=vertices.ravel(), userface=faces.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     )  # fmt: skip
