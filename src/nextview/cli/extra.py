@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from nextview.errors import MissingExtraError
 
 EXTRAS = {
+    "arm": ("gymnasium_robotics", "mink", "mujoco"),
     "benchmark": ("jinja2", "pandas", "pyarrow"),
     "cluster": ("dask", "distributed"),
     "measures": ("skimage",),

@@ -1,0 +1,1 @@
+"""nextview as a ROS 2 node."""

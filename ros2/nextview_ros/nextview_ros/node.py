@@ -1,0 +1,206 @@
+"""The node: one action, two services, one topic. What is computed is in ``conversion`` and in nextview's session."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import message_filters
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from nextview_msgs.action import Recognise
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.time import Time
+from sensor_msgs.msg import CameraInfo, Image
+from std_srvs.srv import Trigger
+from tf2_ros import Buffer, TransformException, TransformListener
+
+import nextview
+from nextview.belief import Stopping
+from nextview.sensing import ObservedObject
+from nextview_ros.conversion import fill_pose, frame_of, seconds
+
+PARAMETERS = {
+    "models": "modelnet10",
+    "policy": "",
+    "threshold": 0.97,
+    "max_views": 5,
+    "world_frame": "base_link",
+    "rectified": True,
+    "axes": "opencv",
+    "life_size": False,
+    "patience": 2.0,  # seconds to wait for an image that was taken after a look was asked for
+}
+
+
+class RecogniseNode(Node):
+    """Offers the action recognise, and the services look and failed for whoever moves the camera."""
+
+    def __init__(self) -> None:
+        super().__init__("nextview")
+        for name, value in PARAMETERS.items():
+            self.declare_parameter(name, value)
+        self.system = nextview.load(
+            self.value("models"), self.value("policy") or None, self.value("threshold"), max_views=self.value("max_views")
+        )
+        self.session, self.goal, self.taken = None, None, False
+        self.busy, self.ended, self.arrived = threading.Lock(), threading.Event(), threading.Condition()
+        self.latest = None
+        group = ReentrantCallbackGroup()
+        self.tf = Buffer()
+        self.listener = TransformListener(self.tf, self)
+        subscribe = [
+            message_filters.Subscriber(self, kind, topic, qos_profile=qos_profile_sensor_data, callback_group=group)
+            for kind, topic in ((Image, "depth"), (CameraInfo, "camera_info"))
+        ]
+        self.pairs = message_filters.TimeSynchronizer(subscribe, 10)
+        self.pairs.registerCallback(self.keep)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.next_pose = self.create_publisher(PoseStamped, "next_pose", latched)
+        self.create_service(Trigger, "look", self.look, callback_group=group)
+        self.create_service(Trigger, "failed", self.failed, callback_group=group)
+        self.server = ActionServer(
+            self, Recognise, "recognise", self.execute, callback_group=group,
+            goal_callback=self.accept, cancel_callback=lambda goal: CancelResponse.ACCEPT,
+        )  # fmt: skip
+
+    def value(self, name: str):
+        """A parameter."""
+        return self.get_parameter(name).value
+
+    # Images
+
+    def keep(self, image: Image, info: CameraInfo) -> None:
+        """The latest image and its camera_info."""
+        with self.arrived:
+            self.latest = image, info
+            self.arrived.notify_all()
+
+    def frame(self):
+        """A frame that was taken from now on. Earlier ones may have been taken on the way."""
+        now = seconds(self.get_clock().now().to_msg())
+        with self.arrived:
+            fresh = self.arrived.wait_for(
+                lambda: self.latest is not None and seconds(self.latest[0].header.stamp) >= now, self.value("patience")
+            )
+            if not fresh:
+                raise nextview.ObservationError(f"no depth image came within {self.value('patience')} s")
+            image, info = self.latest
+        header = image.header
+        transform = self.tf.lookup_transform(
+            self.value("world_frame"), header.frame_id, Time.from_msg(header.stamp), Duration(seconds=1.0)
+        )
+        return frame_of(image, info, transform, self.value("rectified"), self.value("axes"))
+
+    # The action
+
+    def accept(self, request: Recognise.Goal) -> GoalResponse:
+        """One object at a time."""
+        if self.taken:
+            return GoalResponse.REJECT
+        self.taken = True
+        return GoalResponse.ACCEPT
+
+    def execute(self, goal) -> Recognise.Result:
+        """Begin a session, and wait until looks have ended it."""
+        self.ended.clear()
+        try:
+            session = self.begin(goal.request)
+            with self.busy:
+                self.session, self.goal = session, goal
+            while not self.ended.wait(0.1) and not goal.is_cancel_requested and rclpy.ok():
+                pass
+        except nextview.NextviewError as error:
+            self.get_logger().error(str(error))
+            goal.abort()
+            return Recognise.Result()
+        finally:
+            with self.busy:
+                self.session, self.goal, self.taken = None, None, False
+        if not session.done:
+            goal.canceled() if goal.is_cancel_requested else goal.abort()
+            return Recognise.Result()
+        goal.succeed()
+        found = session.result
+        return Recognise.Result(
+            answer=found.answer or "",
+            confidence=found.confidence,
+            confident=found.confident,
+            stranded=found.stranded,
+            classes=list(found.classes),
+            belief=found.views[-1].belief.tolist(),
+            views=len(found.views),
+        )
+
+    def begin(self, asked: Recognise.Goal) -> nextview.Session:
+        """A session for a goal; what it leaves at zero is the node's."""
+        threshold, max_views = asked.threshold or self.value("threshold"), asked.max_views or self.value("max_views")
+        stopping = Stopping.of(self.system.models.recogniser.calibration, threshold, max_views=max_views)
+        near = [[point.x, point.y, point.z] for point in asked.near]
+        thing = ObservedObject(point=near[0] if near else None, life_size=self.value("life_size"))
+        return replace(self.system, stopping=stopping).session(object=thing, distance=asked.distance or None)
+
+    # The services
+
+    def look(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """The camera stands where it was asked to be, or for the first view anywhere: take in what it sees."""
+        return self.answer(response, lambda session: session.update(self.frame()))
+
+    def failed(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """The camera cannot be brought to the pose that was asked for."""
+        return self.answer(response, lambda session: session.failed())
+
+    def answer(self, response: Trigger.Response, act) -> Trigger.Response:
+        """Do something with the session, and tell what follows."""
+        with self.busy:
+            if self.session is None or self.session.done:
+                response.success, response.message = False, "no goal is active"
+                return response
+            try:
+                act(self.session)
+            except (nextview.NextviewError, TransformException) as error:
+                response.success, response.message = False, str(error)
+                return response
+            response.success, response.message = True, self.tell()
+        return response
+
+    def tell(self) -> str:
+        """Publish the next pose and the feedback; what was said in words."""
+        session, feedback = self.session, Recognise.Feedback()
+        feedback.views, feedback.classes = len(session.views), list(session.models.classes)
+        if session.views:
+            feedback.belief = session.views[-1].belief.tolist()
+            feedback.doubts = [doubt.message for doubt in session.views[-1].doubts]
+        if not session.done:
+            target = feedback.next_pose
+            target.header.frame_id = self.value("world_frame")
+            target.header.stamp = self.get_clock().now().to_msg()
+            fill_pose(target.pose, session.target, self.value("axes"))
+            self.next_pose.publish(target)
+        self.goal.publish_feedback(feedback)
+        if session.done:
+            self.ended.set()
+            return str(session.result)
+        return f"view {len(session.views)} is taken in"
+
+
+def main() -> None:
+    """Run the node."""
+    rclpy.init()
+    node = RecogniseNode()
+    try:
+        rclpy.spin(node, MultiThreadedExecutor())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

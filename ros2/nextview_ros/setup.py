@@ -1,0 +1,17 @@
+"""The ROS 2 package around nextview; nextview itself comes from pip."""
+
+from setuptools import setup
+
+setup(
+    name="nextview_ros",
+    version="0.2.0",
+    packages=["nextview_ros"],
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/nextview_ros"]),
+        ("share/nextview_ros", ["package.xml"]),
+        ("share/nextview_ros/launch", ["launch/recognise.launch.py"]),
+    ],
+    install_requires=["setuptools", "nextview"],
+    entry_points={"console_scripts": ["recognise = nextview_ros.node:main"]},
+    license="Apache-2.0",
+)

@@ -1,0 +1,266 @@
+"""The ROS 2 package: what it makes of messages that a bag has recorded. ROS itself is not here; ``rosbags`` is."""
+
+import ast
+import os
+import sys
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image as Picture
+from rosbags.rosbag2 import Reader, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scenes import TABLE, box, cast, pose_at
+from scipy.spatial.transform import Rotation
+
+import nextview
+from nextview.cameras.captured import read_capture
+from nextview.data.samples import sample_mesh
+from nextview.errors import ObservationError
+from nextview.sensing import Frame, ObservedObject
+
+ROS = Path(__file__).parents[1] / "ros2"
+sys.path.insert(0, str(ROS / "nextview_ros"))
+from nextview_ros import conversion  # noqa: E402
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+KITCHEN = Path(os.environ.get("NEXTVIEW_DATA", "")) / "real_kinect"
+K = np.array([[260.0, 0, 79.5], [0, 265.0, 59.5], [0, 0, 1]])
+"""First pixel's centre at 0, as in ROS."""
+SHAPE = 120, 160
+
+
+def message(kind, **fields):
+    return STORE.types[kind](**fields)
+
+
+def header(frame, time=12.5):
+    stamp = message("builtin_interfaces/msg/Time", sec=int(time), nanosec=round(1e9 * (time % 1)))
+    return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def image_message(depth, encoding, big=False, padding=0, **more):
+    """A depth image; with rows that are longer than needed, and of either byte order."""
+    kind = np.dtype({"16UC1": "u2", "32FC1": "f4"}[encoding]).newbyteorder(">" if big else "<")
+    rows = np.ascontiguousarray(depth, kind).view(np.uint8)
+    rows = np.pad(rows.reshape(len(depth), -1), ((0, 0), (0, padding)), constant_values=7)
+    fields = {"height": depth.shape[0], "width": depth.shape[1], "encoding": encoding, "is_bigendian": int(big)}
+    fields |= {"header": header("optical"), "step": rows.shape[1], "data": rows.ravel()}
+    return message("sensor_msgs/msg/Image", **(fields | more))
+
+
+def info_message(k=K, shape=SHAPE, d=(), p=None, **more):
+    roi = message("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    p = np.hstack([k, np.zeros((3, 1))]) if p is None else p
+    fields = {"header": header("optical"), "height": shape[0], "width": shape[1], "distortion_model": "plumb_bob"}
+    fields |= {"d": np.array(d, float), "k": np.array(k, float).ravel(), "r": np.eye(3).ravel(), "p": p.ravel()}
+    return message("sensor_msgs/msg/CameraInfo", **(fields | {"binning_x": 0, "binning_y": 0, "roi": roi} | more))
+
+
+def transform_message(pose, child="optical", time=12.5):
+    x, y, z, w = map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
+    translation = message("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, pose[:3, 3]), strict=True)))
+    transform = message(
+        "geometry_msgs/msg/Transform",
+        translation=translation,
+        rotation=message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+    )
+    fields = {"header": header("world", time), "child_frame_id": child, "transform": transform}
+    return message("geometry_msgs/msg/TransformStamped", **fields)
+
+
+def recorded(folder, views):
+    """Messages by topic as they come out of a bag into which they were written: (image, info, transform) of each."""
+    topics = {"depth": "sensor_msgs/msg/Image", "camera_info": "sensor_msgs/msg/CameraInfo", "tf": "tf2_msgs/msg/TFMessage"}
+    with Writer(folder, version=9) as bag:
+        connections = {topic: bag.add_connection(topic, kind, typestore=STORE) for topic, kind in topics.items()}
+        for k, (image, info, transform) in enumerate(views):
+            for topic, what in (("depth", image), ("camera_info", info), ("tf", [transform])):
+                what = message("tf2_msgs/msg/TFMessage", transforms=what) if topic == "tf" else what
+                bag.write(connections[topic], k, STORE.serialize_cdr(what, topics[topic]))
+    found = {topic: [] for topic in topics}
+    with Reader(folder) as bag:
+        for connection, _, data in bag.messages():
+            found[connection.topic].append(STORE.deserialize_cdr(data, connection.msgtype))
+    return list(zip(found["depth"], found["camera_info"], [tf.transforms[0] for tf in found["tf"]], strict=True))
+
+
+@pytest.fixture(scope="module")
+def depth():
+    rng = np.random.default_rng(0)
+    return np.where(rng.random(SHAPE) < 0.1, 0, rng.uniform(0.4, 2.0, SHAPE)).astype(np.float32)
+
+
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("padding", [0, 12])
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_a_recorded_image_is_what_the_camera_saw(tmp_path, depth, encoding, padding, big):
+    pose = pose_at(40, 70, 0.7, (0.4, 0.1, 0.0), turn=(3, -2, 5))
+    given = np.rint(1000 * depth).astype(np.uint16) if encoding == "16UC1" else np.where(depth > 0, depth, np.nan)
+    written = image_message(given, encoding, big, padding), info_message(), transform_message(pose)
+    ((image, info, transform),) = recorded(tmp_path / "bag", [written])
+    frame = conversion.frame_of(image, info, transform)
+    np.testing.assert_allclose(frame.depth, depth, atol=6e-4 if encoding == "16UC1" else 0)
+    np.testing.assert_allclose(frame.pose, pose, atol=1e-9)
+    np.testing.assert_allclose(frame.intrinsics[:2, 2], [80, 60])  # the first pixel's centre is at 0.5 here
+
+
+def test_a_frame_of_body_axes_is_the_same_camera(depth):
+    """The body's axes in those of the optical frame, by hand: x is forward (z), y left (-x), z up (-y)."""
+    pose = pose_at(30, 10, 0.7)
+    body = pose.copy()
+    body[:3, :3] = np.stack([pose[:3, 2], -pose[:3, 0], -pose[:3, 1]], 1)
+    messages = image_message(depth, "32FC1"), info_message(), transform_message(body)
+    np.testing.assert_allclose(conversion.frame_of(*messages, axes="ros").pose, pose, atol=1e-9)
+    there = conversion.fill_pose(empty_pose(), pose, "ros")
+    sent = Rotation.from_quat([getattr(there.orientation, axis) for axis in "xyzw"]).as_matrix()
+    np.testing.assert_allclose(sent, body[:3, :3], atol=1e-9)
+
+
+def empty_pose():
+    position = message("geometry_msgs/msg/Point", x=0.0, y=0.0, z=0.0)
+    return message(
+        "geometry_msgs/msg/Pose",
+        position=position,
+        orientation=message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+
+
+def test_a_pose_survives_the_way_there_and_back():
+    pose = pose_at(-20, 200, 1.3, (5, -2, 1), turn=(10, 20, 30))
+    there = STORE.deserialize_cdr(
+        STORE.serialize_cdr(conversion.fill_pose(empty_pose(), pose), "geometry_msgs/msg/Pose"), "geometry_msgs/msg/Pose"
+    )
+    q, p = there.orientation, there.position
+    np.testing.assert_allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), pose[:3, :3], atol=1e-12)
+    np.testing.assert_allclose([p.x, p.y, p.z], pose[:3, 3])
+
+
+def test_rectified_images_have_the_intrinsics_of_p():
+    p = np.array([[250.0, 0, 81, -12.0], [0, 250, 61, 0], [0, 0, 1, 0]])
+    info = info_message(d=(0.1, -0.2, 0, 0, 0), p=p)
+    np.testing.assert_array_equal(conversion.intrinsics_of(info, rectified=True), p[:, :3])
+    with pytest.raises(ObservationError, match=r"distorts \(plumb_bob\): use rectified images"):
+        conversion.intrinsics_of(info)
+
+
+def roi(offset):
+    return message("sensor_msgs/msg/RegionOfInterest", x_offset=offset, y_offset=0, height=0, width=0, do_rectify=False)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "match"),
+    [
+        ({"image": {"encoding": "rgb8"}}, "not 'rgb8': a colour topic"),
+        ({"image": {"step": 100}}, "rows of 640 bytes or more"),
+        ({"image": {"data": np.zeros(40, np.uint8)}}, "this one has 40 bytes"),
+        ({"info": {"width": 320}}, "its camera_info 320 x 120"),
+        ({"info": {"binning_x": 2}}, "binned or cropped"),
+        ({"info": {"roi": roi(8)}}, "binned or cropped"),
+        ({"info": {"k": np.zeros(9)}}, "not calibrated: k of camera_info is zero"),
+        ({"info": {"header": header("depth_link")}}, "frames differ: 'optical' of the image, 'depth_link'"),
+        ({"info": {"header": header("optical", 12.6)}}, "0.100 s apart"),
+        ({"transform": {"child_frame_id": "base_link"}}, "'base_link' of the transform"),
+        ({"transform": {"header": header("world", 11.5)}}, "1.000 s apart"),
+    ],
+)
+def test_messages_that_cannot_be_used_are_refused(depth, wrong, match):
+    made = {"image": image_message(depth, "32FC1"), "info": info_message(), "transform": transform_message(np.eye(4))}
+    made |= {name: replace(made[name], **fields) for name, fields in wrong.items()}
+    with pytest.raises(ObservationError, match=match):
+        conversion.frame_of(**made)
+
+
+def test_a_transform_that_never_changes_has_no_time(depth):
+    conversion.frame_of(image_message(depth, "32FC1"), info_message(), transform_message(np.eye(4), time=0.0))
+
+
+def test_a_rotation_is_a_unit_quaternion():
+    transform = transform_message(np.eye(4))
+    broken = replace(transform.transform, rotation=message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=0.0))
+    with pytest.raises(ObservationError, match="quaternion of length 1"):
+        conversion.pose_of(replace(transform, transform=broken))
+
+
+def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
+    """Three views of a chair on a table, recorded and played back, end as the same frames without ROS do."""
+    mesh = sample_mesh("chair")
+    chair = box((0.1, 0.1, 0.1))
+    chair.vertices, chair.faces = 0.12 * mesh.vertices, mesh.faces
+    chair.apply_translation([0.3, -0.2, -chair.vertices[:, 2].min()])
+    k, shape = np.array([[520.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]]), (480, 640)
+    frames, messages = [], []
+    for azimuth in (20, 110, 250):
+        pose = pose_at(35, azimuth, 0.6, chair.bounds.mean(0))
+        depth, _ = cast((TABLE, chair), pose, k + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], shape)
+        depth = np.rint(1000 * depth).astype(np.uint16)
+        frames.append(Frame(depth, k, pose))
+        messages.append((image_message(depth, "16UC1"), info_message(k, shape), transform_message(pose)))
+    ends = []
+    for given in (frames, [conversion.frame_of(*each) for each in recorded(tmp_path / "bag", messages)]):
+        session = nextview.load(threshold=1.0, max_views=3).session(object=ObservedObject(life_size=False))
+        for frame in given:
+            session.update(frame)
+        ends.append(session)
+    assert ends[1].result.answer == "chair"
+    np.testing.assert_allclose(ends[1].views[-1].belief, ends[0].views[-1].belief, atol=1e-5)
+
+
+@pytest.mark.skipif(
+    "NEXTVIEW_DATA" not in os.environ or not KITCHEN.is_dir(), reason="NEXTVIEW_DATA names no folder with real_kinect"
+)
+def test_frames_of_a_real_kinect_survive_a_bag(tmp_path):
+    captured = read_capture(KITCHEN).frames[::10]
+    k = np.loadtxt(KITCHEN / "camera-intrinsics.txt")
+    depths = [np.array(Picture.open(KITCHEN / f"{frame.name}.depth.png")).astype(np.uint16) for frame in captured]
+    poses = [np.loadtxt(KITCHEN / f"{frame.name}.pose.txt") for frame in captured]
+    messages = [
+        (image_message(depth, "16UC1"), info_message(k, depth.shape), transform_message(pose))
+        for depth, pose in zip(depths, poses, strict=True)
+    ]
+    for each, depth, pose in zip(recorded(tmp_path / "bag", messages), depths, poses, strict=True):
+        frame, direct = conversion.frame_of(*each), Frame(depth, k, pose)
+        np.testing.assert_array_equal(frame.depth, direct.depth)
+        np.testing.assert_allclose(frame.intrinsics, direct.intrinsics)
+        np.testing.assert_allclose(frame.pose, direct.pose, atol=1e-6)
+
+
+# What cannot be run here is at least well formed
+
+
+@pytest.mark.parametrize("path", sorted(ROS.rglob("*.py")), ids=lambda path: path.name)
+def test_its_python_compiles_and_finds_what_it_takes_from_nextview(path):
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("nextview."):
+            module = __import__(node.module, fromlist=["_"])
+            assert all(hasattr(module, name.name) for name in node.names)
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "nextview":
+            assert hasattr(nextview, node.attr)
+
+
+def test_the_action_is_what_the_node_fills():
+    """Fields that the node gives to goal, result and feedback are those of the action file."""
+    text = (ROS / "nextview_msgs/action/Recognise.action").read_text()
+    parts = dict(zip(("Goal", "Result", "Feedback"), text.split("---\n"), strict=True))
+    fields = {}
+    for name, part in parts.items():
+        kinds = get_types_from_msg(part, f"nextview_msgs/msg/{name}")
+        fields[name] = {field[0] for field in kinds[f"nextview_msgs/msg/{name}"][1]}
+    tree = ast.parse((ROS / "nextview_ros/nextview_ros/node.py").read_text())
+    used = {"asked": set(), "feedback": set()}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in used:
+            used[node.value.id].add(node.attr)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "Recognise.Result" and node.keywords:
+            assert {word.arg for word in node.keywords} == fields["Result"]
+    assert used == {"asked": fields["Goal"], "feedback": fields["Feedback"]}
+
+
+@pytest.mark.parametrize("package", ["nextview_msgs", "nextview_ros"])
+def test_its_packages_are_of_this_version(package):
+    root = ET.parse(ROS / package / "package.xml").getroot()
+    assert root.findtext("name") == package
+    assert root.findtext("version") == nextview.__version__
