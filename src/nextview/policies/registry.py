@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from nextview.arguments import of_kind
 from nextview.errors import PolicyError
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
@@ -54,6 +55,10 @@ def make_policy(
     Raises:
         PolicyError: there is no such policy, or it cannot be made.
     """
+    of_kind(name, str, "a policy is a name", PolicyError)
+    of_kind(sphere, Viewpoints, "the viewpoints of a policy are a ViewSphere or Directions", PolicyError)
+    of_kind(valley_classes, Iterable, "classes are several", PolicyError)
+    of_kind(classes, Iterable | None, "classes are several", PolicyError)
     if name in POLICIES:
         if name not in ANYWHERE and not isinstance(sphere, ViewSphere):
             raise PolicyError(f"policy {name} needs viewpoints on rings")

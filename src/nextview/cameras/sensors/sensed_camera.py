@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from nextview.arguments import of_kind
 from nextview.cameras.sensors.depth_noise import uniform_field
 from nextview.cameras.sensors.sensor import Sensor, sensor_named
 from nextview.cameras.simulated import SimulatedCamera
@@ -49,6 +50,9 @@ class SensedCamera:
     """
 
     def __init__(self, mesh: Mesh, sensor: Sensor | str, rng: np.random.Generator, denoise: bool = True) -> None:
+        of_kind(mesh, Mesh, "what is looked at is a Mesh")
+        of_kind(sensor, str | Sensor, "a sensor is one, or its name")
+        of_kind(rng, np.random.Generator, "rng is a numpy.random.Generator")
         self.sensor = sensor_named(sensor) if isinstance(sensor, str) else sensor
         self.denoise, self._rng = denoise, rng
         self._camera = SimulatedCamera(mesh, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)

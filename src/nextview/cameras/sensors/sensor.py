@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import of_kind
 from nextview.cameras.sensors.depth_noise import kinect_axial, kinect_lateral, normal_field, uniform_field
 from nextview.cameras.sensors.projector_shadow import in_shadow
 from nextview.cameras.sensors.surface_angle import across_edges, incidence, inverse_depth, slopes
@@ -285,6 +286,7 @@ def sensor_named(text: str) -> Sensor:
     Raises:
         UsageError: there is no such sensor, or the strength is no number.
     """
+    of_kind(text, str, "a sensor is NAME or NAME:STRENGTH")
     name, given, strength = text.partition(":")
     if name not in SENSORS:
         raise UsageError(f"no sensor is called {name!r}; there are {', '.join(SENSORS)}")
