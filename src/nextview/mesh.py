@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.arguments import of_kind, whole
+from nextview.arguments import as_line, of_kind, whole
 from nextview.errors import MeshError
 from nextview.glb import read_glb
 from nextview.mesh_format import BYTES_PER_FACE, MAX_FACES, VERTICES_PER_FACE, check_faces
@@ -145,9 +145,9 @@ def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None, 
     path = Path(path)
     suffix = path.suffix.lower()
     if up is not None and (not isinstance(up, str) or up not in ("y", "z")):
-        raise MeshError(f"{path}: the up axis is y or z, not {up!r}")
+        raise MeshError(f"{path}: the up axis is y or z, not {as_line(up)}")
     if unit is not None and (not isinstance(unit, str) or unit not in UNITS):
-        raise MeshError(f"{path}: the unit is one of {', '.join(UNITS)}, not {unit!r}")
+        raise MeshError(f"{path}: the unit is one of {', '.join(UNITS)}, not {as_line(unit)}")
     whole(max_faces, "the largest number of faces", 1)
     data = _read(path, BYTES_PER_FACE * max_faces)
     if not data.strip():

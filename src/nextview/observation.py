@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.arguments import number
+from nextview.arguments import as_line, number
 from nextview.cloud import visible_points
 from nextview.depth import FARTHEST, object_depth
 from nextview.errors import ObservationError
@@ -70,7 +70,7 @@ class Observation:
         if self.radius is not None:
             if not (isinstance(self.radius, Real) and 0 < self.radius < LARGEST):
                 raise ObservationError(
-                    f"the object radius is a positive number of metres, or None, not {self.radius!r}"
+                    f"the object radius is a positive number of metres, or None, not {as_line(self.radius)}"
                 )
             object.__setattr__(self, "radius", float(self.radius))
 
@@ -247,7 +247,8 @@ def pinhole(size: int, distance: float) -> NDArray[np.float64]:
     Raises:
         ObservationError: the camera stands inside the sphere.
     """
-    if not number(distance, "the distance") > 1:
-        raise ObservationError(f"the camera has to stand more than one object radius from the centre, not {distance}")
+    distance = number(distance, "the distance")
+    if not 1 < distance < LARGEST:
+        raise ObservationError(f"the camera has to stand more than one object radius from the centre, not {distance:g}")
     focal = size / 2 * np.sqrt(distance**2 - 1)  # size/2 over the tangent of the half angle asin(1/distance)
     return np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])

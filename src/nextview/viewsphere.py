@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nextview.arguments import number, of_kind, whole
+from nextview.arguments import as_line, number, of_kind, whole
 from nextview.errors import UsageError
 
 Float = NDArray[np.float64]
@@ -235,7 +235,7 @@ class ViewSphere(Viewpoints):
     def named(cls, name: str) -> ViewSphere:
         """The thesis's layouts: "40" (5 rings of 8, section 4.1.1) and "12" (one ring at 45 degrees)."""
         if not isinstance(name, str) or name not in LAYOUTS:
-            raise UsageError(f"no view sphere is called {name!r}; there are {', '.join(LAYOUTS)}")
+            raise UsageError(f"no view sphere is called {as_line(name)}; there are {', '.join(LAYOUTS)}")
         return LAYOUTS[name]
 
     def __len__(self) -> int:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from nextview.arguments import of_kind
+import numpy as np
+
+from nextview.arguments import as_line, of_kind
 from nextview.errors import PolicyError
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
@@ -57,8 +59,8 @@ def make_policy(
     """
     of_kind(name, str, "a policy is a name", PolicyError)
     of_kind(sphere, Viewpoints, "the viewpoints of a policy are a ViewSphere or Directions", PolicyError)
-    of_kind(valley_classes, Iterable, "classes are several", PolicyError)
-    of_kind(classes, Iterable | None, "classes are several", PolicyError)
+    if not np.iterable(valley_classes) or not (classes is None or np.iterable(classes)):
+        raise PolicyError(f"classes are a list of them, not {as_line(valley_classes)} and {as_line(classes)}")
     if name in POLICIES:
         if name not in ANYWHERE and not isinstance(sphere, ViewSphere):
             raise PolicyError(f"policy {name} needs viewpoints on rings")
