@@ -156,6 +156,21 @@ def test_without_standard_error_a_refusal_keeps_its_status():
         assert (done.returncode, done.stdout) == (2, b"")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+def test_what_python_says_at_its_very_end_does_not_change_the_status():
+    """Where standard error is full, flushing it then would end with 120."""
+    code = (
+        "import sys; from nextview.cli.main import main\n"
+        "class Late:\n"
+        "    def __del__(self, out=sys.stderr):\n"
+        "        out.write('late')\n"
+        "sys.late = Late()\n"
+        "sys.stderr.write('early')\n"
+        "main(['recognise', 'none.off'])"
+    )
+    assert subprocess.run(["bash", "-c", '"$@" 2>/dev/full', "bash", sys.executable, "-c", code]).returncode == 2
+
+
 @pytest.mark.parametrize("columns", ["1", "5", "1000000000", "0", "-3", "wide"])
 def test_help_and_tables_in_any_width(columns):
     for arguments in (["recognise", "--help"], ["models"]):

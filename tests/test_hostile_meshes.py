@@ -269,6 +269,26 @@ def test_translation_rotation_and_scale_of_a_node(turn):
     np.testing.assert_allclose(vertices, expected, atol=1e-12)
 
 
+def test_a_mesh_that_is_there_a_great_many_times_is_read_soon():
+    """Turning the 200,000 matrices of such a file of 18 MB by NumPy took half a minute and more."""
+    count = 200_000
+    nodes = [{"mesh": 0, "translation": [k, 0, 0], "rotation": [0, 0, 1, 0], "scale": [1, 2, 1]} for k in range(count)]
+    file = glb(one_triangle(scenes=[{"nodes": list(range(count))}], nodes=nodes), TRIANGLE)
+    began = time.process_time()
+    vertices, faces = read_glb(file, count)
+    assert time.process_time() - began < 10  # 2 s
+    turned = np.array([[0, 0, 0], [-1, 0, 0], [0, -2, 1]])
+    np.testing.assert_allclose(
+        vertices[faces], turned + np.arange(count)[:, None, None] * np.array([1, 0, 0]), atol=1e-9
+    )
+
+
+def test_parts_of_no_end_are_refused():
+    part = {"attributes": {"POSITION": 0}, "indices": 1}
+    with pytest.raises(MeshError, match="more than 100,000 parts"):
+        read_glb(glb(one_triangle(meshes=[{"primitives": 100_001 * [part]}]), TRIANGLE), 10**6)
+
+
 def test_strips_fans_and_whole_numbers_in_a_glb():
     square = np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0], [2, 2, 0]], "<f4")
     for mode, order in ((5, (0, 1, 2, 3)), (6, (0, 1, 3, 2))):

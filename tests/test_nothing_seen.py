@@ -12,6 +12,7 @@ from hypothesis.extra import numpy as npst
 from scipy.special import softmax
 from tests.tiny_models import make_map_network, make_recogniser
 
+import nextview
 from nextview import SimulatedCamera, Stopping, ViewSphere, make_policy
 from nextview.belief import Calibration
 from nextview.cli.main import main
@@ -232,6 +233,15 @@ def test_any_finite_depth_is_refused_or_believed_in_no_more_than_all(tiny, depth
 def far_apart() -> trimesh.Trimesh:
     speck = trimesh.creation.box((1e-4, 1e-4, 1e-4))
     return trimesh.util.concatenate([speck.copy().apply_translation((x, x, x)) for x in (-1, 1)])
+
+
+@pytest.mark.parametrize("gap", [20, 30, 60, 300])
+def test_two_boxes_far_apart_are_nothing(gap):
+    """Most of their bounding sphere is empty; the networks would name what they see of it a table, confidently."""
+    boxes = [trimesh.creation.box((1, 1, 1)).apply_translation((x, 0, 0)) for x in (0, gap + 1)]
+    both = trimesh.util.concatenate(boxes)
+    found = nextview.recognise(make_mesh(both.vertices, both.faces), start=9)
+    assert (found.answer, found.confident) == (None, False)
 
 
 def test_a_mesh_without_area_is_refused():

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+import zarr
 from tiny_models import make_map_network, make_recogniser
 
 from nextview.cli.main import main
@@ -15,7 +16,7 @@ from nextview.data.checking import check
 from nextview.data.correspond import correspond
 from nextview.data.measuring import measure
 from nextview.data.rendering import render
-from nextview.data.store import PENDING, RENDERED, ViewStore
+from nextview.data.store import DIGEST, PENDING, RENDERED, ViewStore
 from nextview.errors import DatasetError
 from nextview.measures.registry import MEASURES
 from nextview.viewsphere import ViewSphere
@@ -185,6 +186,46 @@ def test_measure_makes_damaged_measures_anew(views):
     assert list(measure(views, workers=0)) == [(1, 3), (2, 3), (3, 3)]
     for name, values in before.items():
         np.testing.assert_array_equal(ViewStore.open(views).measure(name), values)
+
+
+def test_who_reads_a_store_while_it_is_rendered_is_told_nothing_of_lost_objects(views, monkeypatch, caplog):
+    """Looks at the store whenever a chunk of it is written."""
+    store = views.parent / "again.zarr"
+    seen, write = [], zarr.Array.__setitem__
+
+    def look(array, at, values):
+        write(array, at, values)
+        read = ViewStore.open(store)
+        assert read.lost == {}
+        seen.append((array.path, read.done.tolist()))
+
+    monkeypatch.setattr(zarr.Array, "__setitem__", look)
+    list(render(views.parent / "meshes", store, SPHERE, 48, workers=0))
+    assert {path for path, _ in seen} == {*RENDERED, DIGEST}
+    assert len({tuple(done) for _, done in seen}) == 4  # none, then one more each
+    assert caplog.messages == []
+
+
+def test_an_object_that_is_finished_while_others_are_read_is_not_missing(views, monkeypatch):
+    """Between what is looked for first, which chunks there are, and the statuses."""
+    away = views.parent / "away"
+    chunks = [chunk(views, name, 1) for name in (*RENDERED, DIGEST)]
+    for k, path in enumerate(chunks):
+        path.rename(away.with_suffix(f".{k}"))
+    scan = ViewStore.scan
+
+    def late(store, name, objects):
+        found = scan(store, name, objects)
+        for k, path in enumerate(chunks):
+            if not path.exists():
+                away.with_suffix(f".{k}").rename(path)
+        return found
+
+    read = ViewStore.open(views)
+    monkeypatch.setattr(ViewStore, "scan", late)
+    points = read.all_points()
+    monkeypatch.undo()
+    np.testing.assert_array_equal(points, read.all_points())
 
 
 @pytest.mark.parametrize("healer", ["check", "render"])

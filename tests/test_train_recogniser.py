@@ -168,8 +168,23 @@ def test_packed_views_are_read_like_an_array(tmp_path):
         assert (packed[at] == views[at]).all()
 
     file = tmp_path / "views/views.lz4"
-    file.write_bytes(file.read_bytes()[:-1])
+    sound = bytearray(file.read_bytes())
+    start, count = packed.places[1, 2]
+    for at in (start, start + count // 2, start + count - 1):
+        damaged = sound.copy()
+        damaged[at] ^= 4
+        file.write_bytes(damaged)
+        packed = load_packed(tmp_path / "views")
+        assert (packed[1, 1] == views[1, 1]).all()
+        for touched in ((1, 2), 1, (1, slice(2, 4))):
+            with pytest.raises(DatasetError, match="views: is damaged; delete it, and it is made again"):
+                packed[touched]
+    file.write_bytes(sound[:-1])
     with pytest.raises(ValueError, match="views: is damaged; delete it, and it is made again"):
+        load_packed(tmp_path / "views")
+    index = tmp_path / "views/index.npz"
+    index.write_bytes(index.read_bytes()[:-30])
+    with pytest.raises(DatasetError, match=r"index\.npz is damaged.* delete it, and it is made again"):
         load_packed(tmp_path / "views")
 
 
@@ -458,6 +473,17 @@ def test_the_grid_is_one_command(store, tmp_path, monkeypatch):
     (tmp_path / "grid.csv").unlink()
     main(command)  # nothing is trained or judged again
     assert list(csv.DictReader((tmp_path / "grid.csv").read_text().splitlines())) == rows
+
+
+@pytest.mark.parametrize("name", ["grid.csv", "grid.png", "manifest.json"])
+def test_the_grid_replaces_nothing_that_is_a_user_s(store, tmp_path, capsys, name):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(SystemExit) as ended:
+        main(["train", "grid", str(store), str(tmp_path), *FAST])
+    assert ended.value.code == 2
+    assert f"{name}: is there and is no" in capsys.readouterr().err
+    assert (tmp_path / name).read_text() == "mine"
+    assert not list(tmp_path.glob("resnet*"))  # before anything is trained
 
 
 def test_two_devices_train_one_network(store, tmp_path):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import number, whole
 from nextview.errors import ModelError, RiskError, UsageError
 from nextview.json_file import Fields
 
@@ -143,7 +144,7 @@ class RiskBounds:
         Raises:
             RiskError: none does, or so many views were not calibrated.
         """
-        if not 0 < risk < 1:
+        if not 0 < number(risk, "the risk") < 1:
             raise RiskError(f"the risk is an error rate between 0 and 1, not {risk}")
         if max_views > len(self.bounds):
             raise RiskError(f"error rates were calibrated for at most {len(self.bounds)} views, not {max_views}")
@@ -327,11 +328,11 @@ class Stopping:
     threshold_decay: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.threshold <= 1:
+        if not 0 <= number(self.threshold, "the threshold") <= 1:
             raise UsageError(f"the threshold is a probability between 0 and 1, not {self.threshold}")
-        if self.max_views < 1:
+        if whole(self.max_views, "the number of views") < 1:
             raise UsageError(f"at least one view has to be taken, not {self.max_views}")
-        if not 0 <= self.threshold_decay < np.inf:
+        if number(self.threshold_decay, "the threshold decay") < 0:
             raise UsageError(f"the threshold decay is a number from 0 on, not {self.threshold_decay}")
 
     @classmethod

@@ -7,6 +7,7 @@ any memory is taken for it.
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Iterator
 from typing import Any
@@ -20,10 +21,17 @@ from nextview.mesh_format import check_faces
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 COLUMNS = {"SCALAR": 1, "VEC3": 3}
 TRIANGLES, STRIP, FAN = 4, 5, 6
+MOVES = frozenset(("matrix", "rotation", "scale", "translation"))
+"""What a node may have that places it."""
 UNREAD = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing")
 """Extensions without which the shape would be another one."""
 MAX_JSON = 1 << 25
 """Bytes of JSON: as Python's objects it takes up to thirty times as much memory."""
+MAX_PARTS = 100_000
+"""Parts of meshes, each with arrays of its own: so many take some seconds."""
+
+Part = tuple[NDArray[np.float64], NDArray[np.integer]]
+"""Vertices (V, 3) and triangles (F, 3) of a part of a mesh, in the mesh's own frame."""
 
 
 def read_glb(data: bytes, max_faces: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -43,25 +51,44 @@ def read_glb(data: bytes, max_faces: int) -> tuple[NDArray[np.float64], NDArray[
         for name in gltf.get("extensionsRequired", ()):
             if name in UNREAD:
                 raise MeshError(f"it needs the extension {name}, which is not read here")
-        vertices, faces = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)]
-        vertex_count = face_count = 0
+        meshes: dict[int, list[Part]] = {}
+        places: dict[int, list[NDArray[np.float64]]] = {}
+        face_count = part_count = 0
         for index, matrix in _placed(gltf):
-            for primitive in _item(gltf["meshes"], index)["primitives"]:
-                corners = _corners(gltf, binary, primitive)
-                if not len(corners):
-                    continue
-                check_faces(face_count := face_count + len(corners), max_faces)
-                positions = _accessor(gltf, binary, primitive["attributes"]["POSITION"], "VEC3")
-                used, corners = np.unique(corners, return_inverse=True)  # parts often share one long list of positions
-                if used[-1] >= len(positions):
-                    raise MeshError(f"a face refers to vertex {used[-1]}, but there are only {len(positions)} vertices")
-                with np.errstate(all="ignore"):
-                    vertices.append(positions[used] @ matrix[:3, :3].T + matrix[:3, 3])
-                faces.append(corners.reshape(-1, 3) + vertex_count)
-                vertex_count += len(used)
+            if index not in meshes:  # read once, however often it is there
+                primitives = _item(gltf["meshes"], index)["primitives"]
+                if (part_count := part_count + len(primitives)) > MAX_PARTS:
+                    raise MeshError(f"its meshes have more than {MAX_PARTS:,} parts")
+                meshes[index] = [_part(gltf, binary, primitive, max_faces) for primitive in primitives]
+            check_faces(face_count := face_count + sum(len(corners) for _, corners in meshes[index]), max_faces)
+            places.setdefault(index, []).append(matrix)
     except (KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
         raise MeshError(f"its JSON is not that of a glTF scene ({type(error).__name__}: {error})") from None
+    vertices, faces = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)]
+    vertex_count = 0
+    for index, found in places.items():
+        matrices = np.array(found)
+        for positions, corners in meshes[index]:
+            with np.errstate(all="ignore"):
+                placed = positions @ matrices[:, :3, :3].swapaxes(1, 2) + matrices[:, None, :3, 3]
+            first = vertex_count + len(positions) * np.arange(len(found))
+            vertices.append(placed.reshape(-1, 3))
+            faces.append((corners + first[:, None, None]).reshape(-1, 3))
+            vertex_count += len(positions) * len(found)
     return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _part(gltf: dict[str, Any], binary: memoryview, primitive: dict[str, Any], max_faces: int) -> Part:
+    """The positions that a part of a mesh uses, and its triangles."""
+    corners = _corners(gltf, binary, primitive)
+    if not len(corners):
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    check_faces(len(corners), max_faces)
+    positions = _accessor(gltf, binary, primitive["attributes"]["POSITION"], "VEC3")
+    used, corners = np.unique(corners, return_inverse=True)  # parts often share one long list of positions
+    if used[-1] >= len(positions):
+        raise MeshError(f"a face refers to vertex {used[-1]}, but there are only {len(positions)} vertices")
+    return positions[used].astype(np.float64), corners.reshape(-1, 3)
 
 
 def _chunks(data: bytes) -> tuple[bytes, memoryview]:
@@ -102,28 +129,35 @@ def _placed(gltf: dict[str, Any]) -> Iterator[tuple[int, NDArray[np.float64]]]:
         if index in seen:
             raise MeshError(f"its node {index} is in the scene twice")
         seen.add(index)
-        with np.errstate(all="ignore"):  # what is not finite is noticed at the vertices
-            matrix = above @ _matrix(node)
+        matrix = above
+        if not MOVES.isdisjoint(node):
+            with np.errstate(all="ignore"):  # what is not finite is noticed at the vertices
+                matrix = above @ _matrix(node)
         if "mesh" in node:
-            yield node["mesh"], matrix
+            yield _natural(node["mesh"]), matrix
         waiting += [(child, matrix) for child in reversed(node.get("children", []))]
 
 
 def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
-    """From the frame of a node to that of the one above it, (4, 4)."""
+    """From the frame of a node to that of the one above it, (4, 4).
+
+    In Python's numbers until the end: a scene may have a great many nodes, and small arrays are slow.
+    """
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T  # written column by column
-    turn = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
-    x, y, z, w = turn / np.linalg.norm(turn)
-    rotation = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.array(rotation) * np.array(node.get("scale", (1, 1, 1)), np.float64)
-    matrix[:3, 3] = node.get("translation", (0, 0, 0))
-    return matrix
+    turn = [float(value) for value in node.get("rotation", (0, 0, 0, 1))]
+    length = math.hypot(*turn) or math.nan
+    x, y, z, w = (value / length for value in turn)
+    a, b, c = (float(value) for value in node.get("scale", (1, 1, 1)))
+    p, q, r = (float(value) for value in node.get("translation", (0, 0, 0)))
+    return np.array(
+        [
+            [a * (1 - 2 * (y * y + z * z)), b * 2 * (x * y - z * w), c * 2 * (x * z + y * w), p],
+            [a * 2 * (x * y + z * w), b * (1 - 2 * (x * x + z * z)), c * 2 * (y * z - x * w), q],
+            [a * 2 * (x * z - y * w), b * 2 * (y * z + x * w), c * (1 - 2 * (x * x + y * y)), r],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def _corners(gltf: dict[str, Any], binary: memoryview, primitive: dict[str, Any]) -> NDArray[np.integer]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import as_line, of_kind, whole
 from nextview.errors import MeshError
 from nextview.glb import read_glb
 from nextview.mesh_format import BYTES_PER_FACE, MAX_FACES, VERTICES_PER_FACE, check_faces
@@ -140,12 +141,14 @@ def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None, 
     Raises:
         MeshError: what is wrong with the file, in one sentence.
     """
+    of_kind(path, str | Path, "a mesh file is a path", MeshError)
     path = Path(path)
     suffix = path.suffix.lower()
-    if up not in (None, "y", "z"):
-        raise MeshError(f"{path}: the up axis is y or z, not {up!r}")
-    if unit is not None and unit not in UNITS:
-        raise MeshError(f"{path}: the unit is one of {', '.join(UNITS)}, not {unit!r}")
+    if up is not None and (not isinstance(up, str) or up not in ("y", "z")):
+        raise MeshError(f"{path}: the up axis is y or z, not {as_line(up)}")
+    if unit is not None and (not isinstance(unit, str) or unit not in UNITS):
+        raise MeshError(f"{path}: the unit is one of {', '.join(UNITS)}, not {as_line(unit)}")
+    whole(max_faces, "the largest number of faces", 1)
     data = _read(path, BYTES_PER_FACE * max_faces)
     if not data.strip():
         raise MeshError(f"{path}: the file is empty")
@@ -170,8 +173,8 @@ def _read(path: Path, most: int) -> bytes:
         found = path.stat()
     except FileNotFoundError:
         raise MeshError(f"{path}: there is no such file") from None
-    except OSError as error:
-        raise MeshError(f"{path}: cannot be read ({error.strerror})") from None
+    except (OSError, ValueError) as error:  # a zero byte in the name
+        raise MeshError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from None
     if stat.S_ISDIR(found.st_mode):
         raise MeshError(f"{path}: is a folder, not a mesh file")
     if path.suffix.lower() not in FORMATS:

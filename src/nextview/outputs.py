@@ -137,6 +137,21 @@ def check_folder(folder: Path, kind: str) -> None:
             raise ResultsError(f"{folder}: {name} has changed since nextview wrote it; move it or give another folder")
 
 
+def begin_folder(folder: Path, kind: str) -> None:
+    """Give a folder, made if it is not there, the manifest in which ``added_file`` notes what it adds.
+
+    Raises:
+        ResultsError: it cannot be written, or holds another manifest.json.
+    """
+    if _read_manifest(folder, kind) is None:
+        path = folder / MANIFEST
+        check_file(path)
+        if path.exists():
+            raise ResultsError(f"{path}: is there and is none of nextview's {kind} results; give another folder")
+        with written_whole(path) as part:
+            _write_manifest(part.parent, kind, {})
+
+
 @contextmanager
 def added_file(folder: Path, name: str, kind: str) -> Iterator[Path]:
     """A path to write one more file of a folder of results to, which is then put there and noted in the manifest.

@@ -6,13 +6,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import ThreadpoolController
 
+from nextview.arguments import as_line, number, of_kind, whole
 from nextview.belief import Stopping, fuse
 from nextview.episode import Episodes, Step
 from nextview.errors import NoViewLeftError, ObservationError, SessionError, UsageError
@@ -203,6 +205,20 @@ class Recognition:
         return figure
 
 
+def _array(given: ArrayLike, what: str) -> NDArray:
+    try:
+        return np.asarray(given)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{what} is an array or a callable ({error})") from None
+
+
+def _seconds(cost: Any) -> float:
+    """What a callable says that a way costs; infinity is a cost, too."""
+    if not isinstance(cost, Real):
+        raise UsageError(f"a travel cost is a number from 0 on, not {as_line(cost)}")
+    return float(cost)
+
+
 @lru_cache(maxsize=1)
 def _blas() -> ThreadpoolController:
     """The libraries below NumPy. Their threads wait for more work in a loop, and take the cores from the networks."""
@@ -258,7 +274,13 @@ class Session:
         distance: float | None = None,
         unknown: float = 0.0,
     ) -> None:
-        if not 0 <= unknown < 1:
+        of_kind(models, Models, "the models are Models")
+        of_kind(sphere, Viewpoints, "the viewpoints are a ViewSphere or Directions")
+        of_kind(stopping, Stopping | None, "when to stop is told by a Stopping")
+        of_kind(rng, np.random.Generator | None, "rng is a numpy.random.Generator")
+        if not (hasattr(policy, "needs") and hasattr(policy, "next_views")):
+            raise UsageError(f"a policy has needs and next_views, see nextview.Policy, not {as_line(policy)}")
+        if not 0 <= number(unknown, "the rate of known objects taken for unknown ones") < 1:
             raise UsageError(f"the rate of known objects taken for unknown ones lies from 0 to below 1, not {unknown}")
         if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:
             raise SessionError(
@@ -267,7 +289,7 @@ class Session:
         missing = [name for name in maps_among(policy.needs) if name.removesuffix("-sphere") not in models.maps]
         if missing:
             raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")
-        if distance is not None and not 0 < distance < np.inf:
+        if distance is not None and not number(distance, "the distance") > 0:
             raise UsageError(f"the distance is a positive number of metres, not {distance}")
         self.models, self.policy, self.sphere, self.distance = models, policy, sphere, distance
         self.views: list[View] = []
@@ -275,6 +297,8 @@ class Session:
             from nextview.sensing.observed_object import ObservedObject
 
             object = ObservedObject()
+        if object is not None and not hasattr(object, "sightings"):
+            raise UsageError(f"an object to find in frames is an ObservedObject, not {as_line(object)}")
         self.object = object
         self.stopping = stopping or Stopping.of(models.recogniser.calibration)
         self.unknown = unknown
@@ -291,6 +315,7 @@ class Session:
         self._episodes = self._begin(start)
 
     def _begin(self, start: int) -> Episodes:
+        start = whole(start, "the first view", 0, len(self.sphere) - 1)
         starts, calibration = np.array([start]), self.models.recogniser.calibration
         return Episodes(self.sphere, self._chooser, starts, self.stopping, self._rng, calibration)
 
@@ -349,7 +374,7 @@ class Session:
     @reachable.setter
     def reachable(self, given: ArrayLike | Callable[[Float], bool] | None) -> None:
         if given is not None and not callable(given):
-            given = np.asarray(given)
+            given = _array(given, "reachable")
             if given.shape != (len(self.sphere),) or given.dtype != bool:
                 raise UsageError(
                     f"reachable is a mask, ({len(self.sphere)},) bool, or a callable on poses, not {given.dtype} "
@@ -378,9 +403,10 @@ class Session:
     @travel_cost.setter
     def travel_cost(self, given: ArrayLike | Callable[[Float, Float], float] | None) -> None:
         if given is not None and not callable(given):
-            given, v = np.asarray(given, np.float64), len(self.sphere)
-            if given.shape != (v, v) or not (given >= 0).all():
+            given, v = _array(given, "a travel cost"), len(self.sphere)
+            if given.dtype.kind not in "fiu" or given.shape != (v, v) or not (given >= 0).all():
                 raise UsageError(f"a travel cost is a matrix, ({v}, {v}) of numbers from 0 on, or a callable on poses")
+            given = given.astype(np.float64)
         self._travel_cost = given
 
     def failed(self, view: int | None = None) -> None:
@@ -395,8 +421,7 @@ class Session:
         if self.done:
             raise SessionError("this session has ended; begin another one")
         view = self.view if view is None else view
-        if not 0 <= view < len(self.sphere):
-            raise UsageError(f"there is no view {view}, only 0 to {len(self.sphere) - 1}")
+        view = whole(view, "a view", 0, len(self.sphere) - 1)
         self._failed[view] = True
         self._choose_again()
 
@@ -445,7 +470,7 @@ class Session:
         if self._travel_cost is not None:
             if callable(self._travel_cost):
                 poses = self.poses
-                cost = np.array([self._travel_cost(self._here, poses[view]) for view in views], np.float64)
+                cost = np.array([_seconds(self._travel_cost(self._here, poses[view])) for view in views], np.float64)
                 if not (cost >= 0).all():
                     raise UsageError(f"a travel cost is a number from 0 on, not {cost[~(cost >= 0)][0]}")
             else:
@@ -481,6 +506,7 @@ class Session:
         """
         if self.done:
             raise SessionError("this session has ended; begin another one")
+        of_kind(seen, Observation | Frame, "what a camera gave is an Observation, or a Frame", ObservationError)
         with _blas().limit(limits=1):
             view = self._update(seen)
         self._tell_observers()
@@ -616,7 +642,10 @@ class Session:
 
         Raises:
             ObservationError: the camera gives what cannot be used, or has not a single view (``NoViewLeftError``).
+            UsageError: it is no camera.
         """
+        if not hasattr(camera, "observe"):
+            raise UsageError(f"a camera has observe(pose), and {as_line(camera)} has not")
         while not self.done:
             try:
                 seen = camera.observe(self.pose)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nextview.arguments import as_line, number, of_kind, whole
 from nextview.belief import Stopping
 from nextview.errors import MeshError, ModelError, OtherUseError, PolicyError, UsageError
 from nextview.mesh import Mesh, load_mesh
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from nextview.cameras.sensors import Sensor
     from nextview.sensing.observed_object import ObservedObject
 
+MOST_THREADS = 1024
 DEFAULT = "modelnet10"
 """The models that ship with the package."""
 
@@ -89,7 +91,7 @@ class System:
         Raises:
             UsageError: there is no such view or distance, or the recording cannot be written.
         """
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1))
         drawn = int(rng.integers(len(self.sphere)))
         first = drawn if start is None else start
         options = (self.stopping, rng, object, distance, self.unknown)
@@ -128,7 +130,7 @@ class System:
 
         Raises:
             MeshError: the file cannot be used.
-            UsageError: there is no such sensor, or it is asked for before a camera.
+            UsageError: there is no such sensor, or it is asked for before a camera; or ``what`` is nothing to look at.
             DatasetError: the folder, or an image in it, cannot be used.
             ObservationError: the object is found in none of the captured views.
         """
@@ -143,6 +145,9 @@ class System:
             what = simulated(what, sensor, seed)
         elif sensor is not None:
             raise UsageError("a sensor is for meshes: a camera has its own errors")
+        if not hasattr(what, "observe"):
+            wanted = "a mesh file, a Mesh, a folder of views, or a camera with observe(pose)"
+            raise UsageError(f"what is looked at is {wanted}, not {as_line(what)}")
         return self.session_with(what, start, seed).run(what)
 
     def __repr__(self) -> str:
@@ -161,7 +166,7 @@ def simulated(mesh: Mesh, sensor: str | Sensor | None = None, seed: int = 0) -> 
         return SimulatedCamera(mesh)
     from nextview.cameras.sensors import SensedCamera
 
-    return SensedCamera(mesh, sensor, np.random.default_rng(seed))
+    return SensedCamera(mesh, sensor, np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1)))
 
 
 def load(
@@ -200,6 +205,11 @@ def load(
         UsageError: a threshold, a rate or a number of views makes no sense.
     """
     given = {k: v for k, v in locals().items() if k != "models"} | {"models": str(models)}
+    of_kind(models, str | Path, "models are a name or a folder")
+    of_kind(policy, str | None, "the policy is a name")
+    whole(threads, "the number of threads", 0, MOST_THREADS)
+    if not 0 <= number(unknown, "the rate of known objects taken for unknown ones") < 1:
+        raise UsageError(f"the rate of known objects taken for unknown ones lies from 0 to below 1, not {unknown}")
     Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
     found = find_models(models)
     sphere = viewpoints_of(viewpoints)

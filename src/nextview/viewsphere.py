@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nextview.arguments import as_line, number, of_kind, whole
 from nextview.errors import UsageError
 
 Float = NDArray[np.float64]
@@ -24,6 +25,8 @@ DISTANCE = 3.0
 """Distance of the camera from the object's centre, in object radii."""
 CELL = np.radians((18.0, 45.0))
 """Elevation and azimuth of a cell of the 40 views: travel between directions that are on no grid is counted in it."""
+MOST = 99_999
+"""Viewpoints that there may be, and views on a ring."""
 SNAP = 1e-6
 """Radians within which a camera stands at a candidate. What is more is a place of its own."""
 
@@ -173,7 +176,10 @@ class Directions(Viewpoints):
     distance: float = DISTANCE
 
     def __post_init__(self) -> None:
-        given = np.asarray(self.directions)
+        try:
+            given = np.asarray(self.directions)
+        except ValueError as error:  # rows of different lengths
+            raise UsageError(f"directions are an array of numbers of the shape (V, 3) ({error})") from None
         if given.ndim != 2 or given.shape[1] != 3 or len(given) == 0 or given.dtype.kind not in "fiu":
             raise UsageError(f"directions are an array of numbers of the shape (V, 3), not {given.dtype} {given.shape}")
         length = np.linalg.norm(given, axis=1, keepdims=True)
@@ -185,7 +191,7 @@ class Directions(Viewpoints):
     @classmethod
     def fibonacci(cls, n: int) -> Directions:
         """n views spread evenly over the upper half (Fibonacci lattice; Swinbank and Purser, QJRMS 132, 2006)."""
-        if n < 1:
+        if whole(n, "the number of viewpoints", 0, MOST) < 1:
             raise UsageError(f"at least one viewpoint is needed, not {n}")
         height, azimuth = (np.arange(n) + 0.5) / n, np.arange(n) * np.pi * (3 - np.sqrt(5))
         flat = np.sqrt(1 - height**2)
@@ -193,7 +199,7 @@ class Directions(Viewpoints):
 
 
 def _check_distance(distance: float) -> None:
-    if not 0 < distance < np.inf:
+    if not number(distance, "the distance") > 0:
         raise UsageError(f"the distance must be a positive number of object radii, not {distance}")
 
 
@@ -218,17 +224,18 @@ class ViewSphere(Viewpoints):
     distance: float = DISTANCE
 
     def __post_init__(self) -> None:
-        if not self.elevations or self.azimuths < 3:
+        of_kind(self.elevations, tuple | list, "elevations are a tuple of degrees")
+        if not self.elevations or whole(self.azimuths, "the number of views on a ring", 0, MOST) < 3:
             raise UsageError("a view sphere needs at least one ring of at least three viewpoints")
-        if not all(-90 <= e <= 90 for e in self.elevations):
+        if not all(-90 <= number(e, "an elevation") <= 90 for e in self.elevations):
             raise UsageError(f"elevations must lie between -90 and 90 degrees, not {self.elevations}")
         _check_distance(self.distance)
 
     @classmethod
     def named(cls, name: str) -> ViewSphere:
         """The thesis's layouts: "40" (5 rings of 8, section 4.1.1) and "12" (one ring at 45 degrees)."""
-        if name not in LAYOUTS:
-            raise UsageError(f"no view sphere is called {name!r}; there are {', '.join(LAYOUTS)}")
+        if not isinstance(name, str) or name not in LAYOUTS:
+            raise UsageError(f"no view sphere is called {as_line(name)}; there are {', '.join(LAYOUTS)}")
         return LAYOUTS[name]
 
     def __len__(self) -> int:

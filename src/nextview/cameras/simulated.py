@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import as_line, of_kind, whole
+from nextview.errors import UsageError
 from nextview.mesh import Mesh
-from nextview.observation import Observation, checked_pose, pinhole
+from nextview.observation import Observation, checked_intrinsics, checked_pose, pinhole
 from nextview.shading import AMBIENT
 from nextview.viewsphere import DISTANCE
 
@@ -26,6 +28,10 @@ def _near(points: NDArray[np.float32], corners: NDArray[np.float32]) -> NDArray[
     return ((points > corners.min(1) - STRAY) & (points < corners.max(1) + STRAY)).all(1)
 
 
+LARGEST = 16_384
+"""Pixels that an image may be high or wide."""
+
+
 class SimulatedCamera:
     """Looks at one mesh from any pose.
 
@@ -38,6 +44,10 @@ class SimulatedCamera:
         distance: distance at which the unit sphere just fills the image, object radii.
         intrinsics: instead, a pinhole matrix, (3, 3), pixels, the first pixel's centre at 0.5.
         shape: height and width of the image that goes with it.
+
+    Raises:
+        UsageError: no mesh, or no size of an image.
+        ObservationError: the camera stands in the object, or a matrix that no pinhole has.
     """
 
     def __init__(
@@ -48,8 +58,12 @@ class SimulatedCamera:
         intrinsics: NDArray[np.float64] | None = None,
         shape: tuple[int, int] | None = None,
     ) -> None:
-        self.shape = shape or (size, size)
-        self.intrinsics = pinhole(size, distance) if intrinsics is None else intrinsics
+        of_kind(mesh, Mesh, "what is looked at is a Mesh")
+        if shape is not None and not (isinstance(shape, tuple | list) and len(shape) == 2):
+            raise UsageError(f"the shape of an image is its height and its width, not {as_line(shape)}")
+        height, width = shape or (size, size)
+        self.shape = whole(height, "the height of the image", 1, LARGEST), whole(width, "its width", 1, LARGEST)
+        self.intrinsics = pinhole(size, distance) if intrinsics is None else checked_intrinsics(intrinsics, self.shape)
         self.radius = mesh.metres
         vertices = mesh.vertices.astype(np.float32)
         self._corners = np.ascontiguousarray(vertices.T)

@@ -48,7 +48,7 @@ def correspond(
     of = views.done & (True if label is None else views.labels == views.classes.index(label))
     if not of.any():
         raise DatasetError(f"{store}: holds no rendered object" + (f" of the class {label!r}" if label else ""))
-    share = ViewStore.open(store).group[ARRAY][:][of]
+    share = ViewStore.open(store).rows(ARRAY)[of]
     maps = correspondence_maps(share).mean(0)
     arrays, picture = out.with_name(out.name + ".npz"), out.with_name(out.name + ".png")
     with written_whole(arrays) as part:

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import NoReturn
+from typing import TextIO
 
 from nextview.cli.columns import sensible_columns
 
@@ -32,9 +32,11 @@ def printable(text: str) -> str:
 
 
 def say(sentence: str) -> None:
-    """A sentence on standard error, where it is not closed."""
-    with suppress(OSError):
+    """A sentence on standard error, where that can be written."""
+    try:
         print(f"nextview: {printable(sentence)}", file=sys.stderr, flush=True)
+    except OSError:  # Python would try again at its end, fail again, and end with status 120 instead of ours
+        _forget(sys.stderr)
 
 
 @contextmanager
@@ -67,7 +69,8 @@ def orderly_end(advice: str) -> Iterator[None]:
             say(str(missing))
             sys.exit(2)
         except BrokenPipeError:  # whoever read this has gone, as head does
-            _forget_output(1)
+            _forget(sys.stdout)
+            sys.exit(1)
         except OSError as error:
             if error.filename is not None:
                 say(f"{error.filename}: {error.strerror}")
@@ -75,7 +78,8 @@ def orderly_end(advice: str) -> Iterator[None]:
             if error.errno not in FULL and sys.stdout.writable():
                 raise
             say(f"standard output or a file cannot be written ({error.strerror or 'it is closed'})")
-            _forget_output(1)
+            _forget(sys.stdout)
+            sys.exit(1)
         except (KeyboardInterrupt, SystemExit) as ended:
             # Lightning makes one of the other.
             interrupt = ended.__context__ if isinstance(ended, SystemExit) else ended
@@ -88,11 +92,10 @@ def orderly_end(advice: str) -> Iterator[None]:
             sys.exit(143 if isinstance(interrupt, Terminated) else 130)
 
 
-def _forget_output(status: int) -> NoReturn:
-    """End, and let what is still to be flushed go nowhere."""
+def _forget(stream: TextIO) -> None:
+    """Let what a standard file still holds, and all that comes, go nowhere."""
     with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    sys.exit(status)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _open_what_is_closed() -> None:

@@ -25,7 +25,7 @@ def train_grid(
 
     Args:
         store: view store made by nextview render.
-        out: folder for the runs, grid.csv and grid.png.
+        out: folder for the runs, grid.csv and grid.png; such files are replaced only if nextview wrote them.
         depths: train only networks of these depths.
         batches: train only networks with these batch sizes.
         recipe: how to train; network, depth and batch are those of the table.
@@ -33,6 +33,7 @@ def train_grid(
     """
     from nextview.cli.progress import track
     from nextview.cli.training_log import show_trained
+    from nextview.outputs import added_file
     from nextview.report.grid_figure import grid_figure
     from nextview.report.style import to_png
     from nextview.training.loop import is_first
@@ -41,4 +42,5 @@ def train_grid(
     table = stage.train_grid(store, out, recipe, depths=depths, batches=batches, hardware=hardware, track=track)
     show_trained(out.glob("resnet*-batch*"))
     if is_first():
-        to_png(grid_figure(stage.read_grid(table)), out / "grid.png")
+        with added_file(out, stage.FIGURE, stage.KIND) as part:
+            to_png(grid_figure(stage.read_grid(table)), part)

@@ -28,6 +28,7 @@ from nextview.data.store import (
     DIGEST,
     DONE,
     FAILED,
+    PENDING,
     POINT_UNIT,
     RENDERED,
     ViewStore,
@@ -368,6 +369,7 @@ def _render_entry(
     except MemoryError:
         return f"{entry.path}: too large for this machine's memory"
     rendered["radius"] = np.array(mesh.radius)
+    arrays["status"][i] = PENDING  # first: whoever reads the store meanwhile is not to take it for lost
     for name, values in rendered.items():
         arrays[name][i] = values
     arrays[DIGEST][i] = digest(entry.name, rendered)

@@ -45,6 +45,10 @@ class ChunkError(Exception):
     """What is wrong with one object's chunk of an array: it is missing, or cannot be read."""
 
 
+class MissingChunkError(ChunkError):
+    """There is none."""
+
+
 def digest(name: str, rows: Mapping[str, NDArray]) -> NDArray[np.uint8]:
     """SHA-256 of the name of an object and its rows of image, depth, points and radius, as stored, (32,)."""
     found = hashlib.sha256(name.encode())
@@ -238,7 +242,7 @@ class ViewStore:
             DatasetError: the array is missing.
         """
         array = self.array(name)
-        wrong = {i: ChunkError("is missing") for i in objects if not _chunk_exists(self.path, array, i)}
+        wrong = {i: MissingChunkError("is missing") for i in objects if not _chunk_exists(self.path, array, i)}
         try:
             return array[:], wrong
         except Exception:  # a damaged chunk raises whatever its codec makes of it; find out which it is
@@ -259,9 +263,9 @@ class ViewStore:
         values, wrong = self.scan(name, range(len(self)))
         if wrong:
             done = self.done
-            for i, error in sorted(wrong.items()):
+            for i in sorted(wrong):
                 if done[i]:
-                    raise DatasetError(self._damage(name, i, error))
+                    values[i] = self.read(name, i)  # a run that renders may have finished it since
         return values
 
     def _damage(self, name: str, i: int, error: ChunkError) -> str:
@@ -338,12 +342,15 @@ class ViewStore:
             self.group["status"][i] = status
 
     def _status(self) -> tuple[NDArray[np.uint8], dict[int, ChunkError]]:
-        """Of all objects; those for which nothing was ever written are PENDING."""
+        """Of all objects; those for which nothing was ever written are PENDING.
+
+        A run that renders writes the status of an object first, and the others may do so at any moment: what was begun
+        is found out before the statuses are read.
+        """
+        radius = self.array("radius") if self.sound("radius") else None
+        begun = [radius is not None and _chunk_exists(self.path, radius, i) for i in range(len(self))]
         status, wrong = self.scan("status", range(len(self)))
-        arrays = [self.array(name) for name in ("status", "radius") if self.sound(name)]
-        return status, {
-            i: error for i, error in wrong.items() if any(_chunk_exists(self.path, array, i) for array in arrays)
-        }
+        return status, {i: error for i, error in wrong.items() if begun[i] or not isinstance(error, MissingChunkError)}
 
     @property
     def failures(self) -> dict[str, str]:
@@ -416,7 +423,7 @@ def _chunk_exists(store: Path, array: zarr.Array, i: int) -> bool:
 
 def _chunk(store: Path, array: zarr.Array, i: int) -> NDArray:
     if not _chunk_exists(store, array, i):
-        raise ChunkError("is missing")
+        raise MissingChunkError("is missing")
     try:
         return array[i]
     except Exception as error:  # a damaged chunk raises whatever its codec makes of it

@@ -9,6 +9,7 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import of_kind
 from nextview.errors import ModelError, ObservationError
 from nextview.models.cloud_input import cloud_input
 from nextview.models.geometry_input import CHANNELS, geometry_input
@@ -77,6 +78,11 @@ def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> N
     Raises:
         ObservationError: they are not from one camera, or their image does not suit the network.
     """
+    of_kind(observations, Sequence, "views are a list of them", ObservationError)
+    for view in observations:
+        of_kind(view, Observation, "a view is an Observation", ObservationError)
+    if not observations:
+        raise ObservationError("there is no view to look at")
     first = observations[0]
     for other in observations[1:]:
         if other.depth.shape != first.depth.shape or not np.array_equal(other.intrinsics, first.intrinsics):

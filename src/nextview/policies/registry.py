@@ -9,6 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from nextview.arguments import as_line, of_kind
 from nextview.errors import PolicyError
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
@@ -60,6 +63,10 @@ def make_policy(
     Raises:
         PolicyError: there is no such policy, or it cannot be made.
     """
+    of_kind(name, str, "a policy is a name", PolicyError)
+    of_kind(sphere, Viewpoints, "the viewpoints of a policy are a ViewSphere or Directions", PolicyError)
+    if not np.iterable(valley_classes) or not (classes is None or np.iterable(classes)):
+        raise PolicyError(f"classes are a list of them, not {as_line(valley_classes)} and {as_line(classes)}")
     if name in POLICIES:
         if name not in ANYWHERE and not isinstance(sphere, ViewSphere):
             raise PolicyError(f"policy {name} needs viewpoints on rings")

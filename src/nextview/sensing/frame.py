@@ -7,6 +7,7 @@ from dataclasses import InitVar, dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nextview.arguments import as_line, number
 from nextview.errors import ObservationError
 from nextview.observation import LARGEST, array_of, numbers
 
@@ -64,11 +65,11 @@ class Frame:
     def __post_init__(self, axes: str, pixel_centre: float) -> None:
         depth = _metres(self.depth)
         intrinsics = _check_intrinsics(self.intrinsics, depth.shape)
-        intrinsics[:2, 2] += 0.5 - pixel_centre
+        intrinsics[:2, 2] += 0.5 - number(pixel_centre, "the coordinate of the first pixel's centre")
         object.__setattr__(self, "depth", depth)
         object.__setattr__(self, "intrinsics", intrinsics)
-        if axes not in AXES:
-            raise ObservationError(f"the axes of a pose are {', '.join(AXES)}, not {axes!r}")
+        if not isinstance(axes, str) or axes not in AXES:
+            raise ObservationError(f"the axes of a pose are {', '.join(AXES)}, not {as_line(axes)}")
         if self.pose is not None:
             pose = check_pose(self.pose)
             pose[:3, :3] = pose[:3, :3] @ AXES[axes]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nextview.arguments import as_line
 from nextview.errors import ObservationError, UsageError
 from nextview.observation import LARGEST, numbers
 
@@ -109,12 +110,6 @@ def three(values: Any) -> Float | None:
     except ObservationError:
         return None
     return array if array.shape == (3,) and bool((np.abs(array) < LARGEST).all()) else None
-
-
-def as_line(values: Any) -> str:
-    """What was handed in, for a sentence: in one line and not at length."""
-    text = " ".join(repr(values).split())
-    return text if len(text) <= 80 else text[:77] + "..."
 
 
 def _rotation(values: Any, what: str) -> Float:

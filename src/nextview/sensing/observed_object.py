@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from nextview.arguments import as_line, of_kind
 from nextview.errors import ObservationError, UsageError
 from nextview.observation import Observation, pinhole
 from nextview.sensing import segmentation
 from nextview.sensing.facets import Facets, fit_facets
 from nextview.sensing.frame import Frame
 from nextview.sensing.noise import ROWS, Noise, estimate_noise
-from nextview.sensing.object_frame import Box, ObjectFrame, as_line, enclose, three, upright_axes
+from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
 from nextview.sensing.plausibility import Doubt, check_observation, check_views
 from nextview.sensing.segmentation import Footprint
 from nextview.sensing.support_plane import Plane, Samples, find_plane, mistake_in_pose, refine_plane, sample
@@ -105,6 +106,11 @@ class ObservedObject:
         self.point = None if point is None else three(point)
         if point is not None and self.point is None:
             raise UsageError(f"a point is three numbers, world, metres, not {as_line(point)}")
+        of_kind(box, Box | None, "a box is a Box")
+        of_kind(known, ObjectFrame | None, "a known frame is an ObjectFrame")
+        of_kind(rng, np.random.Generator | None, "rng is a numpy.random.Generator")
+        if up is not None:
+            upright_axes(up)  # says what is wrong with it
         self.box, self.support, self.known = box, support, known if box is None else box.object_frame
         self.denoise, self.life_size = denoise, life_size
         self.sightings: tuple[Sighting, ...] = ()
@@ -153,6 +159,7 @@ class ObservedObject:
         Raises:
             ObservationError: the object is not found in it; the frame is then not taken in.
         """
+        of_kind(frame, Frame, "what a depth camera gave is a Frame", ObservationError)
         if self.sightings and (frame.pose is None or self.sightings[0].frame.pose is None):
             raise ObservationError("a second frame needs a pose, and the first one too: how else do they fit together?")
         few = slice(None, None, max(1, frame.shape[0] // ROWS))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,12 +33,17 @@ class PackedViews:
         packed: its bytes, memory-mapped.
         places: first byte and number of bytes of each view, (N, V, 2); none for views that are not there, which are 0.
         size: of a view, (C, H, W).
+        checksums: CRC-32 of each packed view, (N, V) uint32.
+
+    Raises:
+        DatasetError: when a view is read whose bytes have changed.
     """
 
     file: Path
     packed: NDArray[np.uint8]
     places: NDArray[np.int64]
     size: tuple[int, ...]
+    checksums: NDArray[np.uint32]
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -48,11 +54,16 @@ class PackedViews:
         return len(self.places)
 
     def __getitem__(self, at: int | tuple[int, int | slice]) -> NDArray[np.uint8]:
-        places = self.places[at]
+        places, checksums = self.places[at], self.checksums[at]
         views = np.zeros((*places.shape[:-1], *self.size), np.uint8)
-        for (start, count), view in zip(places.reshape(-1, 2), views.reshape(-1, *self.size), strict=True):
+        for (start, count), checksum, view in zip(
+            places.reshape(-1, 2), np.ravel(checksums), views.reshape(-1, *self.size), strict=True
+        ):
             if count:
-                PACKING.decode(self.packed[start : start + count], view)
+                packed = self.packed[start : start + count]
+                if zlib.crc32(packed) != checksum:
+                    raise DatasetError(f"{self.file.parent}: is damaged; delete it, and it is made again")
+                PACKING.decode(packed, view)
         return views
 
 
@@ -72,31 +83,37 @@ def save_packed(folder: Path, shape: tuple[int, ...], objects: Iterable[tuple[in
     Yields:
         Objects written so far.
     """
-    places = np.zeros((*shape[:2], 2), np.int64)
+    places, checksums = np.zeros((*shape[:2], 2), np.int64), np.zeros(shape[:2], np.uint32)
     with written_whole(folder) as part:
         part.mkdir()
         with open(part / "views.lz4", "wb") as file:
             for total, (i, packed) in enumerate(objects, 1):
                 counts = np.array([len(view) for view in packed])
                 places[i] = np.stack([file.tell() + np.cumsum(counts) - counts, counts], 1)
+                checksums[i] = [zlib.crc32(view) for view in packed]
                 file.writelines(packed)
                 yield total
-        np.savez(part / "index.npz", places=places, size=shape[2:])
+        np.savez(part / "index.npz", places=places, size=shape[2:], checksums=checksums)
 
 
 def load_packed(folder: Path) -> PackedViews:
     """Views that ``save_packed`` wrote.
 
     Raises:
-        DatasetError: the file of the views is not as long as it was.
+        DatasetError: the file of the views is not as long as it was, or its index cannot be read. Bytes that changed
+            are noticed when their view is read.
     """
-    with np.load(folder / "index.npz") as index:
-        places, size = index["places"], tuple(index["size"].tolist())
+    try:
+        with np.load(folder / "index.npz") as index:
+            places, checksums, size = index["places"], index["checksums"], tuple(index["size"].tolist())
+    except Exception as error:  # zip files and NumPy raise whatever a damaged file makes them raise
+        again = "is damaged, or of an earlier nextview; delete it, and it is made again"
+        raise DatasetError(f"{folder}: index.npz {again} ({error})") from None
     file, total = folder / "views.lz4", int(places[..., 1].sum())
     if file.stat().st_size != total:
         raise DatasetError(f"{folder}: is damaged; delete it, and it is made again")
     packed = np.memmap(file, np.uint8, "r") if total else np.zeros(0, np.uint8)
-    return PackedViews(file, packed, places, size)
+    return PackedViews(file, packed, places, size, checksums)
 
 
 def ask_for(views: NDArray | PackedViews, places: Iterable[tuple[int, ...]]) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from nextview.arguments import of_kind
 from nextview.cameras.sensors.boxes_around import boxes_around
 from nextview.cameras.sensors.depth_noise import uniform_field
 from nextview.cameras.sensors.sensor import Sensor
@@ -55,6 +56,9 @@ class SensedCamera:
     def __init__(
         self, mesh: Mesh, sensor: Sensor | SensorMix | str, rng: np.random.Generator, denoise: bool = True
     ) -> None:
+        of_kind(mesh, Mesh, "what is looked at is a Mesh")
+        of_kind(sensor, str | Sensor | SensorMix, "a sensor is one, or its name")
+        of_kind(rng, np.random.Generator, "rng is a numpy.random.Generator")
         known = sensor_named(sensor) if isinstance(sensor, str) else sensor
         self.sensor = known.draw(rng.spawn(1)[0]) if isinstance(known, SensorMix) else known
         self.denoise, self._rng = denoise, rng

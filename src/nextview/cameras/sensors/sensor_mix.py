@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from nextview.arguments import of_kind
 from nextview.cameras.sensors.known_sensors import SENSORS
 from nextview.cameras.sensors.sensor import Sensor
 from nextview.errors import UsageError
@@ -84,6 +85,7 @@ def sensor_named(text: str) -> Sensor | SensorMix:
     Raises:
         UsageError: there is no such sensor, or the strength is no number.
     """
+    of_kind(text, str, "a sensor is NAME or NAME:STRENGTH")
     name, given, strength = text.partition(":")
     if name not in (*SENSORS, "mix"):
         raise UsageError(f"no sensor is called {name!r}; there are {', '.join(SENSORS)} and mix")

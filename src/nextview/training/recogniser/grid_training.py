@@ -18,7 +18,7 @@ from nextview.benchmark.published import published_recognisers, read_rows
 from nextview.data.splits import test_objects
 from nextview.data.store import ViewStore
 from nextview.errors import UsageError
-from nextview.outputs import written_whole
+from nextview.outputs import added_file, begin_folder, check_added, written_whole
 from nextview.tracking import Track, silently
 from nextview.training.hardware import Hardware
 from nextview.training.inputs import load_inputs
@@ -27,6 +27,10 @@ from nextview.training.packed import PackedViews
 from nextview.training.recipes import THESIS_RECOGNISER, RecogniserRecipe
 from nextview.training.recogniser.members import run_network
 from nextview.training.recogniser.recogniser_training import train_recogniser
+
+KIND = "grid"
+"""Of results: the table, and a figure of it, lie beside the runs and are noted in a manifest."""
+TABLE, FIGURE = "grid.csv", "grid.png"
 
 
 def train_grid(
@@ -57,6 +61,7 @@ def train_grid(
         validation_class_accuracy and published, with a row for each published accuracy or one without.
 
     Raises:
+        ResultsError: ``out`` holds a table or a figure that nextview did not write, or that has changed since.
         UsageError: the table holds no network of these depths and batch sizes.
         DatasetError: see ``train_recogniser``.
         ModelError: see ``train_recogniser``.
@@ -69,6 +74,10 @@ def train_grid(
     }
     if not cells:
         raise UsageError("table 6 holds no network of these depths and batch sizes")
+    if is_first():
+        begin_folder(out, KIND)
+        for name in (TABLE, FIGURE):
+            check_added(out, name, KIND)
     recipes = {}
     for depth, batch in cells:
         changes: dict[str, Any] = {"network": "resnet", "depth": depth, "batch": batch}
@@ -80,11 +89,11 @@ def train_grid(
         for (run, own), published in zip(recipes.items(), cells.values(), strict=True):
             cell = {"depth": own.depth, "batch_size": own.batch} | _scores(run, store, views, own, track)
             rows += [cell | {"published": accuracy} for accuracy in (published or (None,))]
-        with written_whole(out / "grid.csv") as part, part.open("w", newline="") as file:
+        with added_file(out, TABLE, KIND) as part, part.open("w", newline="") as file:
             table = csv.DictWriter(file, list(rows[0]))
             table.writeheader()
             table.writerows(rows)
-    return out / "grid.csv"
+    return out / TABLE
 
 
 def read_grid(table: Path) -> list[dict[str, Any]]:
