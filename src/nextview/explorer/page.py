@@ -21,7 +21,7 @@ from nextview.explorer.walk_scene import WalkScene
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import POLICIES
 
-NOTHING = "nothing"
+NOTHING, CLEAN = "nothing", "clean renders"
 GALLERY = 6
 """As many objects are shown as pictures; more as a list."""
 APART = 8.5
@@ -85,8 +85,9 @@ class Page:
         self._policy = gui.add_dropdown("Policy", policies, initial_value=exploration.policies[0])
         self._second = gui.add_dropdown("Compare with", [NOTHING, *policies], initial_value=second)
         name, _, strength = (exploration.sensor or "").partition(":")
-        self._sensor = gui.add_dropdown("Sensor", [NOTHING, *SENSORS], initial_value=name or NOTHING)
-        self._strength = gui.add_slider("Noise strength", 0.0, 4.0, 0.25, initial_value=float(strength or 1))
+        self._sensor = gui.add_dropdown("Sensor", [CLEAN, *SENSORS], initial_value=name or CLEAN)
+        given = float(strength or 1)
+        self._strength = gui.add_slider("Noise strength", 0.0, max(4.0, given), 0.25, initial_value=given)
         self._hide = gui.add_checkbox("Hide what was not seen", initial_value=exploration.mesh is None)
         step = gui.add_button("Next view by the policy")
         walk = gui.add_button("Walk until it stops")
@@ -129,7 +130,7 @@ class Page:
     def _show_choices(self) -> None:
         """Let the page say what the exploration is at."""
         exploration = self.exploration
-        name, _, strength = (exploration.sensor or NOTHING).partition(":")
+        name, _, strength = (exploration.sensor or CLEAN).partition(":")
         self._object.value, self._sensor.value = exploration.shown.name, name
         self._strength.value = float(strength or self._strength.value)
         self._policy.value, *second = exploration.policies
@@ -140,7 +141,7 @@ class Page:
         self._changed(lambda: self.exploration.compare([self._policy.value, *second]))
 
     def _use_sensor(self) -> None:
-        named = None if self._sensor.value == NOTHING else f"{self._sensor.value}:{self._strength.value:g}"
+        named = None if self._sensor.value == CLEAN else f"{self._sensor.value}:{self._strength.value:g}"
         if named != self.exploration.sensor:
             self._changed(lambda: self.exploration.use_sensor(named))
 
