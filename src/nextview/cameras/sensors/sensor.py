@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.arguments import of_kind
 from nextview.cameras.sensors.depth_noise import kinect_axial, kinect_lateral, normal_field, uniform_field
 from nextview.cameras.sensors.projector_shadow import in_shadow
 from nextview.cameras.sensors.surface_angle import across_edges, incidence, inverse_depth, slopes
