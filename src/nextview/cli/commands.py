@@ -18,6 +18,7 @@ from nextview.cli.fit_unknown import fit_unknown
 from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
 from nextview.cli.models import models
+from nextview.cli.plan import plan
 from nextview.cli.predict import predict
 from nextview.cli.recognise import recognise
 from nextview.cli.render import render
@@ -36,6 +37,7 @@ COMMANDS: dict[str, Any] = {
     "render": render,
     "check": check,
     "measure": measure,
+    "plan": plan,
     "correspond": correspond,
     "inspect": inspect,
     "train": {

@@ -5,6 +5,9 @@ Only where the cameras stand counts: they are taken to have the whole region in 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,17 +39,25 @@ def new_volume(
     """
     grid, cells = occupancy.grid, occupancy.cells.reshape(-1)
     counts = (cells == UNSEEN) & (grid.ball if region is None else region).reshape(-1)
-    blockers, asked = grid.middles[:, cells >= OCCLUDER], grid.middles[:, counts]
-    return _shown(asked, blockers, positions, grid.pitch, grid.pitch) * grid.pitch**3
+    asked, blockers = grid.middles[:, counts], grid.middles[:, cells >= OCCLUDER]
+    found = np.zeros(len(positions))
+    for at, eye in enumerate(_eyes(asked, positions, grid.pitch)):
+        u, v, z = eye.project(asked)
+        corner, shape = _frame(u, v)
+        buffer = eye.z_buffer(blockers, corner, shape)
+        pixel = (v - corner[1]).astype(np.int32) * np.int32(shape[1]) + (u - corner[0]).astype(np.int32)
+        found[at] = np.count_nonzero(z <= buffer.take(pixel) + np.float32(grid.pitch))
+    return found * grid.pitch**3
 
 
 def new_surface(
     occupancy: Occupancy, positions: NDArray[np.floating], region: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float64]:
-    """Area of the border of unseen space that shows from each position: where new surface may come to light.
+    """Area of the picture in which the border of unseen space shows, where new surface may come to light.
 
     What is unseen is taken to be solid, the opposite of ``new_volume``: the object is at most what no view has seen
-    to be free. The border is that of this largest object, and its unseen part counts where nothing hides it.
+    to be free. Its border that is unseen counts where nothing hides it, as large as it appears: surface that is seen
+    at a low angle says less.
 
     Args:
         occupancy: what is known.
@@ -54,7 +65,7 @@ def new_surface(
         region: voxels where the object can be, (n, n, n) bool; by default those in the ball that the grid holds.
 
     Returns:
-        (V,) float64, squares of the grid's unit: a voxel of the border counts as one square of its side.
+        (V,) float64, squares of the grid's unit at the distance of the border's middle.
 
     Raises:
         UsageError: a camera stands within the region.
@@ -62,87 +73,95 @@ def new_surface(
     grid, cells = occupancy.grid, occupancy.cells
     solid = (cells != FREE) & (grid.ball if region is None else region) | (cells >= OCCLUDER)
     border = (solid & ~_enclosed(solid)).reshape(-1)
-    middles, unseen = grid.middles[:, border], cells.reshape(-1)[border] == UNSEEN
-    return _shown(middles[:, unseen], middles, positions, grid.pitch, 2 * grid.pitch) * grid.pitch**2
+    unseen = border & (cells.reshape(-1) == UNSEEN)
+    asked, blockers = grid.middles[:, unseen], grid.middles[:, border & ~unseen]
+    found = np.zeros(len(positions))
+    for at, eye in enumerate(_eyes(asked, positions, grid.pitch)):
+        corner, shape = _frame(*eye.project(asked)[:2])
+        nearest = eye.z_buffer(asked, corner, shape)
+        found[at] = np.count_nonzero(np.isfinite(nearest) & (nearest < eye.z_buffer(blockers, corner, shape)))
+    return found * grid.pitch**2
 
 
 def _enclosed(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Solid voxels all of whose six neighbours are solid; nothing is outside of the grid."""
-    padded = np.pad(solid, 1)
-    x, y, z = slice(1, -1), slice(1, -1), slice(1, -1)
-    sides = [padded[:-2, y, z], padded[2:, y, z], padded[x, :-2, z], padded[x, 2:, z], padded[x, y, :-2]]
-    return np.logical_and.reduce([*sides, padded[x, y, 2:]])
+    padded, inner = np.pad(solid, 1), slice(1, -1)
+    sides = [padded[:-2, inner, inner], padded[2:, inner, inner], padded[inner, :-2, inner], padded[inner, 2:, inner]]
+    return np.logical_and.reduce([*sides, padded[inner, inner, :-2], padded[inner, inner, 2:]])
 
 
-def _shown(
-    asked: Float, blockers: Float, positions: NDArray[np.floating], pitch: float, tolerance: float
-) -> NDArray[np.float64]:
-    """How many points no blocking voxel hides, from each position, (V,).
+@dataclass(frozen=True)
+class _Eye:
+    """A camera that looks at the middle of what it is asked about; there a pixel is as wide as a voxel.
 
-    Args:
-        asked: the points, (3, P).
-        blockers: middles of voxels, (3, Q).
-        positions: of the cameras, (V, 3).
+    Attributes:
+        position: (3,).
+        axes: right, down and ahead as rows, the first two in pixels, (3, 3).
+        distance: to that middle.
         pitch: side of a voxel.
-        tolerance: a point this little behind a blocker still shows.
     """
-    eyes = np.asarray(positions, np.float32)
+
+    position: Float
+    axes: Float
+    distance: float
+    pitch: float
+
+    def project(self, points: Float) -> tuple[Float, Float, Float]:
+        """Pixel coordinates and depth of points that lie ahead, (3, P), each (P,)."""
+        x, y, z = self.axes @ points - (self.axes @ self.position)[:, None]
+        if z.min(initial=np.inf) < self.pitch / 2:
+            raise UsageError("a camera stands among the voxels that it is asked about")
+        return x / z, y / z, z
+
+    def z_buffer(self, blockers: Float, corner: tuple[float, float], shape: tuple[int, int]) -> Float:
+        """Depth of the nearest voxel at each pixel, infinity for none.
+
+        Each is drawn over the four pixels around its middle, so that walls have no holes: the middles of the voxels of
+        a wall are at most sqrt(2) sides apart, and these are less than two pixels. Nearer ones, which are farther apart
+        in the picture, are drawn in pixels of twice the width, or four times, and so on.
+
+        Args:
+            blockers: middles of voxels, (3, Q); those that do not lie ahead are left out.
+            corner: pixel coordinates of the picture's corner.
+            shape: of the picture, rows and columns.
+        """
+        found = np.full(shape, np.inf, np.float32)
+        ahead = self.axes[2] @ blockers > self.axes[2] @ self.position + np.float32(self.pitch)
+        u, v, z = self.project(blockers[:, ahead])
+        level = np.ceil(np.log2(np.maximum(np.sqrt(0.5) * self.distance / z, 1))).astype(np.int64)
+        for coarse in range(int(level.max(initial=0)) + 1):
+            here, width = level == coarse, 2**coarse
+            rows, columns = (side // width + 3 for side in shape)
+            # Row i of ``nearest`` stands for the line between the pixels i - 1 and i.
+            i, j = ((c[here] - corner[k]) / width + np.float32(0.5) for k, c in ((1, v), (0, u)))
+            inside = (i >= 0) & (i < rows - 1) & (j >= 0) & (j < columns - 1)
+            nearest = np.full((rows, columns), np.inf, np.float32)
+            pixel = i[inside].astype(np.int32) * np.int32(columns) + j[inside].astype(np.int32)
+            np.minimum.at(nearest.reshape(-1), pixel, z[here][inside])
+            nearest = np.minimum(nearest[:-1], nearest[1:])
+            nearest = np.minimum(nearest[:, :-1], nearest[:, 1:])
+            if coarse:
+                nearest = nearest.repeat(width, 0).repeat(width, 1)
+            np.minimum(found, nearest[: shape[0], : shape[1]], out=found)
+        return found
+
+
+def _eyes(asked: Float, positions: NDArray[np.floating], pitch: float) -> Iterator[_Eye]:
+    """Cameras at some positions, (V, 3), that look at the middle of points, (3, P); none if there are no points."""
     if asked.size == 0:
-        return np.zeros(len(eyes))
+        return
+    eyes = np.asarray(positions, np.float32)
     towards = (asked.min(1) + asked.max(1)) / 2 - eyes
-    distances = np.linalg.norm(towards, axis=1)
-    counts = np.zeros(len(eyes))
-    for at, (eye, axes, distance) in enumerate(zip(eyes, _axes(towards), distances, strict=True)):
-        axes[:2] *= distance / np.float32(pitch)  # a pixel is as wide as a voxel at that distance
-        u, v, z = _project(asked, eye, axes, pitch)
-        low = u.min() - 1, v.min() - 1
-        width, height = int(u.max() - low[0]) + 2, int(v.max() - low[1]) + 2
-        ahead = blockers[:, axes[2] @ blockers > axes[2] @ eye + np.float32(pitch)]
-        buffer = _z_buffer(*_project(ahead, eye, axes, pitch), low, (height, width), float(distance))
-        pixel = (v - low[1]).astype(np.int32) * np.int32(width) + (u - low[0]).astype(np.int32)
-        counts[at] = np.count_nonzero(z <= buffer.take(pixel) + np.float32(tolerance))
-    return counts
+    distances = np.maximum(np.linalg.norm(towards, axis=1), np.float32(pitch))
+    ahead = towards / distances[:, None]
+    right = np.cross(ahead, np.eye(3, dtype=np.float32)[np.abs(ahead).argmin(1)])
+    right /= np.maximum(np.linalg.norm(right, axis=1, keepdims=True), np.float32(1e-9))
+    for eye, x, y, z, distance in zip(eyes, right, np.cross(ahead, right), ahead, distances, strict=True):
+        pixels = distance / np.float32(pitch)
+        yield _Eye(eye, np.stack([x * pixels, y * pixels, z]), float(distance), pitch)
 
 
-def _axes(towards: Float) -> Float:
-    """Two axes across each direction, (V, 3), and its own, as the rows of rotations, (V, 3, 3)."""
-    ahead = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
-    across = np.cross(ahead, np.eye(3, dtype=np.float32)[np.abs(ahead).argmin(1)])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    return np.stack([across, np.cross(ahead, across), ahead], 1)
-
-
-def _project(points: Float, eye: Float, axes: Float, nearest: float) -> tuple[Float, Float, Float]:
-    """Pixel coordinates and depth of points that lie ahead, (3, P), each (P,)."""
-    x, y, z = axes @ points - (axes @ eye)[:, None]
-    if z.min(initial=np.inf) < nearest / 2:
-        raise UsageError("a camera stands among the voxels that it is asked about")
-    return x / z, y / z, z
-
-
-def _z_buffer(
-    u: Float, v: Float, z: Float, low: tuple[float, float], shape: tuple[int, int], distance: float
-) -> Float:
-    """Depth of the nearest blocker at each pixel, infinity for none.
-
-    Each is drawn over the four pixels around it, so that walls have no holes: they are nowhere farther apart than two
-    pixels, as the middles of voxels of a wall are at most sqrt(2) sides apart. Nearer ones, which are farther apart in
-    the picture, are drawn in pixels of twice the width, or four times, and so on.
-    """
-    found = np.full(shape, np.inf, np.float32)
-    coarse = np.ceil(np.log2(np.maximum(np.sqrt(0.5) * distance / z, 1))).astype(np.int64)
-    for level in range(int(coarse.max(initial=0)) + 1):
-        wide, here = 2**level, coarse == level
-        rows, columns = (side // wide + 3 for side in shape)
-        i, j = ((c[here] - low[k]) / wide + np.float32(0.5) for k, c in ((1, v), (0, u)))  # one pixel of margin
-        inside = (i >= 0) & (i < rows - 1) & (j >= 0) & (j < columns - 1)
-        corner = np.full((rows, columns), np.inf, np.float32)
-        at = i[inside].astype(np.int32) * np.int32(columns) + j[inside].astype(np.int32)
-        np.minimum.at(corner.reshape(-1), at, z[here][inside])
-        # Margin 1: the corner at index k covers the pixels k - 1 and k.
-        filled = np.minimum(
-            np.minimum(corner[:-1, :-1], corner[1:, :-1]), np.minimum(corner[:-1, 1:], corner[1:, 1:])
-        )
-        large = filled.repeat(wide, 0).repeat(wide, 1) if level else filled
-        np.minimum(found, large[: shape[0], : shape[1]], out=found)
-    return found
+def _frame(u: Float, v: Float) -> tuple[tuple[float, float], tuple[int, int]]:
+    """Corner and shape of a picture that holds points at these pixel coordinates, and a pixel beside them."""
+    corner = u.min() - 1, v.min() - 1
+    return corner, (int(v.max() - corner[1]) + 2, int(u.max() - corner[0]) + 2)
