@@ -232,7 +232,9 @@ class Episodes:
         found: dict[int, list[Observation]] = {int(episode): [] for episode in episodes}
         for step in (*self.steps, last):
             if step.evidence.observations is None:
-                raise UsageError("this policy needs the depth that was seen, and only what the models say of it is known")
+                raise UsageError(
+                    "this policy needs the depth that was seen, and only what the models say of it is known"
+                )
             for episode, seen in zip(step.episodes, step.evidence.observations, strict=True):
                 if int(episode) in found:
                     found[int(episode)].append(seen)

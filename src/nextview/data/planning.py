@@ -73,8 +73,6 @@ def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> dict[str, NDArray
     found = {}
     for name in names:
         starts, length = np.arange(len(sphere)), FixedLength(max_views=PLANNED)
-        episodes = run_episodes(
-            observe, sphere, make_policy(name, sphere), starts, length, np.random.default_rng(0)
-        )
+        episodes = run_episodes(observe, sphere, make_policy(name, sphere), starts, length, np.random.default_rng(0))
         found[f"plans/{name}"] = episodes.outcome.views.astype(np.float32)
     return found

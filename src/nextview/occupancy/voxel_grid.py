@@ -124,7 +124,9 @@ class Occupancy:
         """
         depth = np.asarray(depth, np.float32)
         if depth.ndim != 2 or (object_mask is not None and np.shape(object_mask) != depth.shape):
-            raise ObservationError(f"depth and mask are images of one shape, not {depth.shape} and {np.shape(object_mask)}")
+            raise ObservationError(
+                f"depth and mask are images of one shape, not {depth.shape} and {np.shape(object_mask)}"
+            )
         grid, cells = self.grid, self.cells.copy().reshape(-1)
         unseen = np.flatnonzero(cells == UNSEEN)  # what was free before is so without being looked at again
         reach = np.where(depth > 0, depth, FARTHEST if background_free else 0).astype(np.float32)
