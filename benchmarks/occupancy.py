@@ -60,31 +60,35 @@ def latency(
     """Print how long each part takes."""
     camera, grid = SimulatedCamera(load_mesh(mesh)), VoxelGrid(n)
     print(f"{'':44}{'median':>9}{'fastest':>9}{'CPU':>9}  ms")
-
-    def line(what: str, run: Callable[[], Any]) -> None:
-        print(f"{what:44}" + "".join(f"{value:9.1f}" for value in milliseconds(run, rounds)))
-
     for name in views:
         sphere = nextview.viewsphere.viewpoints_of(name)
-        positions = sphere.poses[:, :3, 3]
         policy, seen = Volumetric(sphere, grid=grid), [camera.observe(sphere.poses[0])]
         visited = np.zeros((1, len(sphere)), bool)
         visited[0, 0] = True
         for k in range(1, 5):
-            known, last = occupancy_of(seen[:-1], grid), seen[-1]
-            now = occupancy_of(seen, grid)
-            state = EpisodeState(
-                np.array([0]), visited, np.ones((1, 2)) / 2, Evidence(np.zeros((1, 2))), k, observations=[seen]
-            )
-            of = f"{len(sphere)} candidates, after {k} view" + "s" * (k > 1)
-            line(f"{of}: update", lambda: known.seen(last.depth, last.pose, last.intrinsics))
-            line(f"{of}: new volume", lambda: new_volume(now, positions))
-            line(f"{of}: new surface", lambda: new_surface(now, positions))
-            line(f"{of}: visible share", lambda: visible_share(now, last.points[:256], positions))
-            line(f"{of}: decision", lambda: policy.next_views(state, np.random.default_rng(0)))
-            view = int(policy.next_views(state, np.random.default_rng(0))[0])
+            for what, run in parts(policy, seen, visited).items():
+                took = milliseconds(run, rounds)
+                of = f"{len(sphere)} candidates, after {k} view" + "s" * (k > 1)
+                print(f"{f'{of}: {what}':44}" + "".join(f"{value:9.1f}" for value in took))
+            view = int(run())  # the last part is the decision
             visited[0, view] = True
             seen = [*seen, camera.observe(sphere.poses[view])]
+
+
+def parts(policy: Volumetric, seen: list[nextview.Observation], visited: np.ndarray) -> dict[str, Callable[[], Any]]:
+    """What is timed, by name."""
+    grid, positions, last = policy.grid, policy.sphere.poses[:, :3, 3], seen[-1]
+    known, now = occupancy_of(seen[:-1], grid), occupancy_of(seen, grid)
+    flat = np.full((1, 2), 0.5)
+    current = np.array([policy.sphere.nearest(last.pose[:3, 3] / np.linalg.norm(last.pose[:3, 3]))[0]])
+    state = EpisodeState(current, visited, flat, Evidence(flat), len(seen), observations=[seen])
+    return {
+        "update": lambda: known.seen(last.depth, last.pose, last.intrinsics),
+        "new volume": lambda: new_volume(now, positions),
+        "new surface": lambda: new_surface(now, positions),
+        "visible share": lambda: visible_share(now, last.points[:256], positions),
+        "decision": lambda: policy.next_views(state, np.random.default_rng(0))[0],
+    }
 
 
 def picture(

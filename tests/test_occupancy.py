@@ -1,6 +1,7 @@
 """The occupancy grid against closed forms: what a ball, a wall and empty space hide from where."""
 
 import ast
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ def wall_depth(pose, x, half):
 
 
 def crossings(points, eye, radius):
-    """How far along the way from points (P, 3) to an eye a sphere round the origin is crossed, (P, 2); NaN for never."""
+    """How far along the way from points (P, 3) to an eye the sphere is crossed, (P, 2); NaN for never."""
     d = eye - points
     a, b, c = (d * d).sum(1), (points * d).sum(1), (points * points).sum(1) - radius**2
     with np.errstate(invalid="ignore"):
@@ -242,7 +243,7 @@ def test_more_views_never_make_seen_space_unseen_and_their_order_counts_for_noth
         return found
 
     steps = seen(frames)
-    for before, now in zip(steps, steps[1:], strict=False):
+    for before, now in pairwise(steps):
         assert not ((before.cells != UNSEEN) & (now.cells == UNSEEN)).any()
         assert (now.cells >= before.cells).all()
     shuffled = seen([frames[i] for i in order if i < len(frames)] + frames[:1])
@@ -283,7 +284,7 @@ def test_nothing_changes_if_all_moves_or_is_measured_in_another_unit(view, quart
 
 
 def test_grids_and_frames_that_cannot_be():
-    for bad in (dict(n=1), dict(half=0.0), dict(half=np.inf), dict(centre=(np.nan, 0, 0))):
+    for bad in ({"n": 1}, {"half": 0.0}, {"half": np.inf}, {"centre": (np.nan, 0, 0)}):
         with pytest.raises(UsageError, match="voxel grid"):
             VoxelGrid(**bad)
     with pytest.raises(ObservationError, match="one shape"):

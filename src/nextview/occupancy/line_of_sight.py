@@ -19,7 +19,7 @@ def visible_share(
 
     The object does not hide itself here: half of its points lie on its far side from anywhere. What is unseen lets a
     sight of length s through with probability exp(-density * s). So 0, which takes unseen space for free, gives the
-    largest share there can be, infinity, which takes it for solid, the least, and between them lies how uncertain it is.
+    largest share there can be, and infinity, which takes it for solid, the least: between them lies the truth.
 
     Args:
         occupancy: what is known, with occluders; what lies beyond its grid hides nothing.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from nextview.depth import FARTHEST
 from nextview.errors import ObservationError, UsageError
@@ -67,7 +67,7 @@ class VoxelGrid:
         return x[:, None, None] + y[:, None] + z <= radius**2
 
     def cell_of(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Index of the voxel of each point, (P, 3), into ``cells.ravel()``, and whether the cube holds it, each (P,)."""
+        """The voxel of each point, (P, 3), as an index into ``cells.ravel()``, and whether there is one, each (P,)."""
         at = np.floor((points - np.array(self.centre) + self.half) / self.pitch).astype(np.int64)
         inside = ((at >= 0) & (at < self.n)).all(1)
         at = np.where(inside[:, None], at, 0)

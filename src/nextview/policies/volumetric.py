@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
 from nextview.observation import Observation
-from nextview.occupancy import Occupancy, VoxelGrid, new_surface, new_volume
+from nextview.occupancy import Occupancy, VoxelGrid, new_volume
 from nextview.policies.base import EpisodeState, travel_from
 from nextview.viewsphere import Viewpoints
 
@@ -41,8 +41,8 @@ class Volumetric:
     (PlanSIG 2016). Simplified: the unseen space around the object stands in for McGreavy's known 3D model, and their
     environment analysis, which views are in reach, is ``EpisodeState.free``.
 
-    With ``new_surface`` (policy "coverage"), the aim of Mendoza et al., "Supervised learning of the next-best-view for 3D
-    object reconstruction" (Pattern Recognition Letters 133, 2020): the view that adds most surface. Simplified: they
+    With ``new_surface`` (policy "coverage"), the aim of Mendoza et al., "Supervised learning of the next-best-view for
+    3D object reconstruction" (Pattern Recognition Letters 133, 2020): the view that adds most surface. Simplified: they
     train a 3D-CNN on a probabilistic grid to name that view; here the border of unseen space on such a grid stands for
     the surface that is behind it, and the overlap that they need for registration is not asked for, as poses are known.
 
