@@ -63,9 +63,9 @@ class ViewStore:
     DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object frame; ``measures/depth_entropy``
     (N, V) float32, bits, and other measures alike; ``plans/NAME`` (N, V, PLANNED) float32, the views that a policy
     takes from each first view, see ``data.planning``; ``radius`` (N,) float64, of the object in the unit of its mesh
-    file; ``status`` (N,) uint8; ``digest`` (N, 32) uint8, of an object's name and arrays together, see ``digest``. Names,
-    labels, splits, the SHA-256 of the mesh files and their unit, what was rendered how, and why meshes were left out
-    are attributes. They and all chunks carry a checksum, so that damage is noticed when they are read. A chunk that is
+    file; ``status`` (N,) uint8; ``digest`` (N, 32) uint8, of an object's name and arrays together, see ``digest``.
+    Names, labels, splits, the SHA-256 of the mesh files and their unit, what was rendered how, and why meshes were left
+    out are attributes. They and all chunks carry a checksum, so that damage is noticed when they are read. A chunk that is
     gone is noticed too: zarr would read its fill value, so every read looks for the file first.
     """
 
