@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from nextview.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
 from nextview.errors import PolicyError, SessionError, UsageError
+from nextview.observation import Observation
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.off_grid import OffGrid
 from nextview.viewsphere import SNAP, Viewpoints, angle_between, turn_of
@@ -146,9 +147,11 @@ class Episodes:
         if n_views >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
         going = ~stopped
+        needs = self.policy.needs
         if going.any():
             azimuth_bins, places = None, None if sums.places is None else sums.places[going]
-            if "azimuth_bins" in self.policy.needs:
+            observations = self._observations(step, step.episodes[going]) if "observations" in needs else None
+            if "azimuth_bins" in needs:
                 classes, azimuth = evidence.logits.shape[1], sums.azimuth[going]
                 azimuth_bins = self.calibration.azimuth_bins(sums.total[going], weighed[going], classes, azimuth)
             state, next_views = self._move(
@@ -161,6 +164,7 @@ class Episodes:
                     step.episodes[going],
                     azimuth_bins,
                     places=places,
+                    observations=observations,
                 ),
                 constrain,
             )
@@ -222,6 +226,19 @@ class Episodes:
         going, nowhere = np.zeros(len(now), bool), np.full(len(now), -1)
         step = Step(now, views, evidence, belief, going, nowhere, total, counted)
         return step, _Sums(total, counted, visited, azimuth, places)
+
+    def _observations(self, last: Step, episodes: NDArray[np.int64]) -> list[list[Observation]]:
+        """All that was seen so far in some episodes, the last step included."""
+        found: dict[int, list[Observation]] = {int(episode): [] for episode in episodes}
+        for step in (*self.steps, last):
+            if step.evidence.observations is None:
+                raise UsageError(
+                    "this policy needs the depth that was seen, and only what the models say of it is known"
+                )
+            for episode, seen in zip(step.episodes, step.evidence.observations, strict=True):
+                if int(episode) in found:
+                    found[int(episode)].append(seen)
+        return list(found.values())
 
     def _keep(self, step: Step, sums: _Sums) -> None:
         if not self.steps:
@@ -350,7 +367,8 @@ def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
     azimuth_bins = None if evidence.azimuth_bins is None else kept(evidence.azimuth_bins)
     maps = {name: kept(values) for name, values in evidence.maps.items()}
     novelty = None if evidence.novelty is None else kept(evidence.novelty)
-    return Evidence(kept(evidence.logits), maps, azimuth_bins, seen, novelty), seen
+    logits = kept(evidence.logits)
+    return replace(evidence, logits=logits, maps=maps, azimuth_bins=azimuth_bins, novelty=novelty), seen
 
 
 def run_episodes(

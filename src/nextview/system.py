@@ -24,7 +24,7 @@ from nextview.models.collection import find_models
 from nextview.models.inference import MapNetwork, Models, Recogniser
 from nextview.observation import Camera
 from nextview.policies.base import Policy, maps_among
-from nextview.policies.maps import MapPeak
+from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.registry import make_policy_anywhere
 from nextview.session import FrameCamera, Recognition, Session
 from nextview.viewsphere import LAYOUTS, Viewpoints, ViewSphere, viewpoints_of
@@ -228,8 +228,8 @@ def load(
     opened = Models(recogniser, {name: MapNetwork(found.maps[name], threads) for name in names})
     if policy in names:  # a map's own policy goes to the valley for some classes, which the map's card names
         made = make_policy_anywhere(policy, sphere, opened.valley_classes(policy), recogniser.classes, found.maps)
-    if isinstance(made, MapPeak):
-        made = replace(made, sphere=_grid_of(opened.maps[made.map_name], made.sphere))
+    if isinstance(made, MapPeak | SpherePeak):
+        made = replace(made, sphere=_grid_of(opened.maps[made.map_name.removesuffix("-sphere")], made.sphere))
     stopping = Stopping.of(recogniser.calibration, threshold, risk, max_views)
     return System(opened, made, policy, sphere, stopping, unknown, given)
 

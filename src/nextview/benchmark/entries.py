@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_softmax
 
-from nextview.benchmark.true_maps import TRUE, known_maps
+from nextview.benchmark.stored import stored_rows
+from nextview.benchmark.true_maps import TRUE, known_maps, true_measure
 from nextview.data.predictions import Predictions
 from nextview.errors import EntryError, OtherUseError
 from nextview.policies.base import Policy, Scope
-from nextview.policies.fixed import orbit, ranked
+from nextview.policies.fixed import ViewList, orbit, ranked
 from nextview.policies.maps import MapPeak
-from nextview.policies.oracle import OracleGain, OracleValley
+from nextview.policies.oracle import OracleGain, OracleMeasure, OracleValley
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import POLICIES, make_policy
 
@@ -76,6 +77,14 @@ FIXED = {
     "orbit": "round the ring of the first view, then the next ring",
 }
 """Fixed views by name, to be followed by how many: "best-5", "orbit-8". They go on to the end whatever is believed."""
+TRUE_MEASURE = re.compile(r"true-([a-z0-9_]+)-all(-peak)?")
+"""Oracles by the true value of any measure in the view store, over all views: "true-NAME-all" goes to the highest unvisited
+view, "true-NAME-all-peak" to the peaks of its map first. "true-NAME-K" are fixed views: the K highest and no others."""
+
+
+def is_oracle(policy: str) -> bool:
+    """Whether a policy takes what a robot cannot know."""
+    return policy in ORACLES or policy.startswith(TRUE) or policy.endswith("-oracle-valley")
 
 
 def _gain(t: EpisodeSpecs, scope: Scope) -> Policy:
@@ -90,7 +99,7 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
     maps = [name for name in specs.predictions.maps if name not in POLICIES and not name.endswith("-sphere")]
     names = [*POLICIES, *(each for name in maps for each in (name, f"{name}-peak"))]
     names = [*names, *(name for name in bundled_policies() if _fits(name, specs)), *ORACLES]
-    names = [name for name in names if not _lacking(_make(name, specs), specs)]
+    names = [name for name in names if _ready(name, specs)]
     names += [f"{kind}-{min(5, v)}" for kind in FIXED if kind != "orbit"]
     return names + [f"orbit-{k}" for k in sorted({n, v})]
 
@@ -99,9 +108,12 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
     """The policy of that name.
 
     Raises:
-        EntryError: there is none, it cannot be made, or it needs a map that the predictions lack.
+        EntryError: there is none, it cannot be made, or it needs a map that the predictions lack, or a measure or a
+            plan that the view store lacks.
     """
     policy = _make(name, specs)
+    if "observations" in policy.needs:  # predictions hold no depth; where it leads to is planned
+        return ViewList(stored_rows(specs.predictions, f"plans/{name}")[specs.objects, specs.starts].astype(np.int64))
     lacking = _lacking(policy, specs)
     if lacking:
         what = (
@@ -116,13 +128,16 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
 def _make(name: str, specs: EpisodeSpecs) -> Policy:
     if name in ORACLES:
         return ORACLES[name](specs)
+    if true := TRUE_MEASURE.fullmatch(name):
+        values = true_measure(specs.predictions, true[1])[specs.objects].astype(np.float64)
+        return OracleMeasure(specs.predictions.sphere, values, true[2] == "-peak")
     card, p = name.partition("@")[0], specs.predictions
     by_map = None if name in POLICIES or card in bundled_policies() else _map_policy(name, specs)
     if by_map is not None:
         return by_map
     if name in POLICIES or card in bundled_policies() or card.endswith(".json") or ":" in name:
         return make_policy(name, p.sphere, specs.valley_classes(name.removesuffix("-peak")), p.classes)
-    names = [*POLICIES, *bundled_policies(), *ORACLES, *(f"{kind}-K" for kind in FIXED)]
+    names = [*POLICIES, *bundled_policies(), *ORACLES, "true-MEASURE-all", *(f"{kind}-K" for kind in FIXED)]
     raise EntryError(f"no policy is called {name!r}; there are {', '.join(names)}")
 
 
@@ -138,6 +153,15 @@ def _map_policy(name: str, specs: EpisodeSpecs) -> Policy | None:
     if how == "-oracle-valley":
         return OracleValley(p.sphere, specs.labels, specs.valley_classes(of), climbed)
     return MapPeak(p.sphere, climbed, () if how == "-peak" else specs.valley_classes(of))
+
+
+def _ready(name: str, specs: EpisodeSpecs) -> bool:
+    """Whether the predictions, and the view store behind them, hold what an entry needs."""
+    try:
+        entry_policy(name, specs)
+    except EntryError:
+        return False
+    return True
 
 
 def _fits(name: str, specs: EpisodeSpecs) -> bool:
@@ -161,7 +185,7 @@ def _lacking(policy: Policy, specs: EpisodeSpecs) -> list[str]:
 
 def fixed_views(name: str, specs: EpisodeSpecs, rng: np.random.Generator) -> NDArray[np.int64] | None:
     """The views of each episode in order, (E, k) int64; None if the name is not one of fixed views."""
-    match = re.fullmatch(rf"({'|'.join(FIXED)})-(\d+)", name)
+    match = re.fullmatch(rf"({'|'.join([*FIXED, 'true-[a-z0-9_]+'])})-(\d+)", name)
     if not match:
         return None
     p, objects, kind, k = specs.predictions, specs.objects, match[1], int(match[2])
@@ -171,6 +195,8 @@ def fixed_views(name: str, specs: EpisodeSpecs, rng: np.random.Generator) -> NDA
         return orbit(p.sphere, specs.starts, k)
     if kind == "random-fixed":
         return ranked(rng.random((len(objects), len(p.sphere))), k)
+    if kind.startswith("true-"):
+        return ranked(true_measure(p, kind.removeprefix(TRUE)).astype(np.float64), k)[objects]
     if kind in ("high-entropy", "low-entropy"):
         values = p.depth_entropy.astype(np.float64)
     else:

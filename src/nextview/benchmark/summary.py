@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nextview import metrics
 from nextview.benchmark import statistics as st
-from nextview.benchmark.entries import ORACLES
+from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.experiment import Grid
 from nextview.benchmark.published import published
 from nextview.benchmark.replay import Outcomes, truncate
@@ -233,7 +233,7 @@ def _risks(summary: pd.DataFrame, promised: Mapping[float, float]) -> pd.DataFra
         right, share = (at[at["measure"] == measure] for measure in ("confident_accuracy", "confident"))
         measured = right[["value", "high", "low"]].to_numpy(float)  # the upper end of accuracy is the lower of error
         for policy, (mean, high, low), stopped in zip(right["policy"], measured, share["value"], strict=True):
-            if policy not in ORACLES:
+            if not is_oracle(policy):
                 rows.append((policy, risk, threshold, 1 - mean, 1 - high, 1 - low, stopped))
     return _frame(rows, ["policy", "risk", "threshold", "error", "low", "high", "confident"])
 

@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.benchmark.stored import stored_rows
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, ResultsError
+from nextview.errors import DatasetError
 from nextview.measures.confidence_map import confidence_maps
 from nextview.measures.depth_entropy import normalise_per_object
 from nextview.measures.map_names import map_name, measure_of
@@ -36,7 +37,7 @@ def true_map(p: Predictions, name: str) -> NDArray[np.float32]:
     """Local windows of the true map of that name, (N, V, R, 3), 0 .. 1.
 
     Raises:
-        ResultsError: neither the predictions nor their store tell it.
+        EntryError: neither the predictions nor their store tell it.
     """
     if name in IN_PREDICTIONS:
         return IN_PREDICTIONS[name](p)
@@ -60,20 +61,6 @@ def true_measure(p: Predictions, measure: str) -> NDArray[np.float32]:
     """A measure of the views of some predictions, from the store that they were made from, (N, V) float32.
 
     Raises:
-        ResultsError: the store is not there, not the same any more, or lacks the measure.
+        EntryError: the store is not there, not the same any more, or lacks the measure.
     """
-    if measure == "depth_entropy":
-        return p.depth_entropy
-    if not p.store:
-        raise ResultsError(f"these predictions do not say from which store they were made, which holds {measure}")
-    try:
-        store = ViewStore.open(p.store)
-        row = {name: i for i, name in enumerate(store.names)}
-        if not set(p.names) <= row.keys():
-            raise ResultsError(f"{p.store}: holds other objects now than those of the predictions")
-        here = [row[name] for name in p.names]
-        if not np.array_equal(store.measure()[here], p.depth_entropy):
-            raise ResultsError(f"{p.store}: holds other views now than those of the predictions")
-        return store.measure(measure)[here]
-    except DatasetError as error:
-        raise ResultsError(str(error)) from None
+    return p.depth_entropy if measure == "depth_entropy" else stored_rows(p, f"measures/{measure}")

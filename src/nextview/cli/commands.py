@@ -21,6 +21,7 @@ from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
 from nextview.cli.measures import measures
 from nextview.cli.models import models
+from nextview.cli.plan import plan
 from nextview.cli.predict import predict
 from nextview.cli.recognise import recognise
 from nextview.cli.render import render
@@ -41,6 +42,7 @@ COMMANDS: dict[str, Any] = {
     "check": check,
     "measure": measure,
     "measures": measures,
+    "plan": plan,
     "correspond": correspond,
     "inspect": inspect,
     "train": {

@@ -33,6 +33,8 @@ DEPTH_UNIT = 1e-4
 POINT_UNIT = 1 / 32767
 """Points are stored as int16 in steps of this many object radii."""
 PENDING, DONE, FAILED = 0, 1, 2
+PLANNED = 5
+"""Views of a plan: the thesis's longest episode."""
 RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
 """The arrays that rendering makes; others are added later."""
 DIGEST = "digest"
@@ -63,10 +65,11 @@ class ViewStore:
 
     Arrays of the group, sharded by object (axis 0): ``image`` (N, V, S, S) uint8; ``depth`` (N, V, S, S) uint16 in
     DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object frame; ``measures/depth_entropy``
-    (N, V) float32, bits, and other measures alike; ``radius`` (N,) float64, of the object in the unit of its mesh file;
-    ``status`` (N,) uint8; ``digest`` (N, 32) uint8, of an object's name and arrays together, see ``digest``. Names,
-    labels, splits, the SHA-256 of the mesh files and their unit, what was rendered how, and why meshes were left out
-    are attributes. They and all chunks carry a checksum, so that damage is noticed when they are read. A chunk that is
+    (N, V) float32, bits, and other measures alike; ``plans/NAME`` (N, V, PLANNED) float32, the views that a policy
+    takes from each first view, see ``data.planning``; ``radius`` (N,) float64, of the object in the unit of its mesh
+    file; ``status`` (N,) uint8; ``digest`` (N, 32) uint8, of an object's name and arrays together, see ``digest``.
+    Names, labels, splits, the SHA-256 of the mesh files and their unit, what was rendered how, and why meshes were left
+    out are attributes. They and all chunks carry a checksum, so that damage is noticed when they are read. A chunk that is
     gone is noticed too: zarr would read its fill value, so every read looks for the file first.
     """
 
@@ -141,6 +144,8 @@ class ViewStore:
             DIGEST: ((32,), "uint8", 0),
             "correspondence": ((v, v), "float32", np.nan),
         }
+        if name.startswith("plans/"):
+            return (v, min(PLANNED, v)), "float32", np.nan
         return layouts.get(name, ((v,), "float32", np.nan))  # another measure
 
     @classmethod
@@ -171,9 +176,7 @@ class ViewStore:
         Raises:
             DatasetError: it is missing, damaged, or not of the store's objects and views.
         """
-        remedy = f"nextview check {self.path} --repair makes it, and nextview render fills it"
-        if name.startswith("measures/"):
-            remedy = f"nextview measure {self.path} --measures {name.removeprefix('measures/')} makes it"
+        remedy = self._maker(name) or f"nextview check {self.path} --repair makes it, and nextview render fills it"
         try:
             array = self.group[name]
         except KeyError:
@@ -185,6 +188,13 @@ class ViewStore:
         if not isinstance(array, zarr.Array) or (array.shape, array.chunks, str(array.dtype)) != wanted:
             raise DatasetError(f"{self.path}: the array {name} is not one of {wanted[0]} {dtype}; {remedy}")
         return array
+
+    def _maker(self, name: str) -> str | None:
+        """Which command makes an array, if it is not one of rendering."""
+        kind, _, rest = name.partition("/")
+        if kind == "measures":
+            return f"nextview measure {self.path} --measures {rest} makes it"
+        return f"nextview plan {self.path} {rest} makes it" if kind == "plans" else None
 
     def holds(self, name: str) -> bool:
         """Whether there is an array of that name, be it damaged."""
@@ -269,9 +279,8 @@ class ViewStore:
         return values
 
     def _damage(self, name: str, i: int, error: ChunkError) -> str:
-        remedy = f"nextview check {self.path} --repair takes the object out, and nextview render makes it anew"
-        if name.startswith("measures/"):
-            remedy = f"nextview measure {self.path} --measures {name.removeprefix('measures/')} makes it"
+        anew = f"nextview check {self.path} --repair takes the object out, and nextview render makes it anew"
+        remedy = self._maker(name) or anew
         return f"{self.path}: {name} of {self.names[i]} {error}; {remedy}"
 
     def __len__(self) -> int:

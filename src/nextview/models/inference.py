@@ -167,7 +167,7 @@ class Models:
     def evidence(self, observations: Sequence[Observation]) -> Evidence:
         """What the models say of views from one camera."""
         maps = {name: values for network in self.maps.values() for name, values in network(observations).items()}
-        return replace(self.recogniser(observations), maps=maps)
+        return replace(self.recogniser(observations), maps=maps, observations=observations)
 
 
 def load_models(maps: Sequence[str] = ("lem",), recogniser: str | Path = RECOGNISER, threads: int = 0) -> Models:

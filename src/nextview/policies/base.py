@@ -9,6 +9,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.observation import Observation
 from nextview.viewsphere import Viewpoints, ViewSphere
 
 Scope = Literal["global", "local"]
@@ -29,6 +30,7 @@ class Evidence:
         seen: whether anything was seen, (B,) bool; None if something was in all. A view without is no evidence: in
             episodes all the above counts as zero there.
         novelty: how strange each view is, (B,) float, see ``nextview.novelty``; None if the recogniser cannot tell.
+        observations: the views themselves, B of them; None where only what the models say of them is known.
     """
 
     logits: NDArray[np.floating]
@@ -36,13 +38,23 @@ class Evidence:
     azimuth_bins: NDArray[np.floating] | None = None
     seen: NDArray[np.bool_] | None = None
     novelty: NDArray[np.floating] | None = None
+    observations: Sequence[Observation] | None = None
 
     def of(self, rows: Any) -> Evidence:
         """That of some of the episodes, by index or mask."""
-        azimuth_bins = None if self.azimuth_bins is None else self.azimuth_bins[rows]
-        seen = None if self.seen is None else self.seen[rows]
-        novelty = None if self.novelty is None else self.novelty[rows]
-        return Evidence(self.logits[rows], {k: m[rows] for k, m in self.maps.items()}, azimuth_bins, seen, novelty)
+        return Evidence(
+            self.logits[rows],
+            {name: values[rows] for name, values in self.maps.items()},
+            None if self.azimuth_bins is None else self.azimuth_bins[rows],
+            None if self.seen is None else self.seen[rows],
+            None if self.novelty is None else self.novelty[rows],
+            _some(self.observations, rows),
+        )
+
+
+def _some(given: Sequence[Any] | None, rows: Any) -> list[Any] | None:
+    """Some items of a sequence, by index or mask."""
+    return None if given is None else [given[i] for i in np.arange(len(given))[rows]]
 
 
 @dataclass(frozen=True)
@@ -64,6 +76,8 @@ class EpisodeState:
             viewpoints, see ``travel_from``.
         places: unit vectors towards the places where the camera really stood, the last one here, (B, step, 3) float64;
             None where these are the views themselves. Then ``visited`` are the views nearest to them.
+        observations: all views taken so far in each episode, in order, B sequences; None if "observations" is not among
+            the policy's needs.
     """
 
     current: NDArray[np.int64]
@@ -76,6 +90,7 @@ class EpisodeState:
     reachable: NDArray[np.bool_] | None = None
     travel: NDArray[np.float64] | None = None
     places: NDArray[np.float64] | None = None
+    observations: Sequence[Sequence[Observation]] | None = None
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -99,6 +114,7 @@ class EpisodeState:
             part(self.reachable),
             part(self.travel),
             part(self.places),
+            _some(self.observations, rows),
         )
 
 
@@ -107,7 +123,9 @@ class Policy(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the maps it wants in the evidence; "azimuth_bins" for what the recogniser says of them."""
+        """Names of the maps it wants in the evidence; "azimuth_bins" for what the recogniser says of them; and
+        "observations" for the depth seen so far.
+        """
         ...
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -146,7 +164,7 @@ class ScoresViews(Protocol):
 
 def maps_among(needs: Sequence[str]) -> list[str]:
     """Those of a policy's needs that are maps."""
-    return [name for name in needs if name != "azimuth_bins"]
+    return [name for name in needs if name not in ("azimuth_bins", "observations")]
 
 
 def travel_from(sphere: Viewpoints, state: EpisodeState) -> NDArray[np.float64]:

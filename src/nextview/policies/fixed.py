@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import PolicyError
 from nextview.policies.base import EpisodeState
 from nextview.viewsphere import ViewSphere
 
@@ -53,4 +54,6 @@ class ViewList:
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
+        if state.step >= self.views.shape[1]:
+            raise PolicyError(f"only {self.views.shape[1]} views are listed")
         return self.views[state.episodes, state.step]

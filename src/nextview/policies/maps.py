@@ -27,6 +27,20 @@ def local_peaks(maps: NDArray[np.floating]) -> NDArray[np.bool_]:
     return np.asarray(maps) >= around.max((-2, -1))
 
 
+def sphere_peaks(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Scores of a map of the whole sphere that put every peak before every other view, each group by value.
+
+    Args:
+        values: (B, rings, azimuths); the last azimuth is next to the first.
+
+    Returns:
+        (B, rings, azimuths) float64.
+    """
+    values = np.asarray(values, np.float64)
+    round_once = np.concatenate([values[..., -1:], values, values[..., :1]], 2)
+    return values + (np.ptp(values, axis=(1, 2), keepdims=True) + 1) * local_peaks(round_once)[..., 1:-1]
+
+
 def peaks_first(maps: NDArray[np.floating]) -> NDArray[np.float64]:
     """Scores that put every local peak before every other cell, each group by value; same shape as the maps."""
     maps = np.asarray(maps, np.float64)
@@ -77,3 +91,46 @@ class MapPeak:
             )
         valley = np.isin(state.belief.argmax(1), self.valley_classes)
         return peaks_first(np.where(valley[:, None, None], -maps, maps))
+
+
+@dataclass(frozen=True)
+class SpherePeak:
+    """Go to the highest unvisited peak of a predicted entropy map of the whole sphere, then to the highest other view.
+
+    As in Parisotto, Mukherjee and Kasaei, "MORE: simultaneous multi-view 3D object recognition and pose estimation"
+    (Intelligent Service Robotics 16, 2023): a network predicts the depth-entropy of all views around the object from
+    one of them, and the map's local peaks are the views to take. Simplified: they settle the views after the first one,
+    on 60 viewpoints; here the map is predicted anew from each view, on the grid that the network was taught.
+
+    Attributes:
+        sphere: the viewpoints.
+        map_name: the map in the evidence, (B, rings, azimuths), columns once round from the view.
+    """
+
+    sphere: ViewSphere
+    map_name: str = "lem-sphere"
+    travel_weight = 0.0
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The map that is climbed."""
+        return (self.map_name,)
+
+    def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
+        """The predicted map where it lies on the sphere, (B, V)."""
+        return self._on_sphere(state, np.asarray(state.evidence.maps[self.map_name], np.float64))
+
+    def scores(self, state: EpisodeState) -> NDArray[np.float64]:
+        """Peaks before all else; see ``ScoresViews``."""
+        return self._on_sphere(state, sphere_peaks(state.evidence.maps[self.map_name]))
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See ``Policy.next_views``."""
+        return np.where(state.free, self.scores(state), -np.inf).argmax(1)
+
+    def _on_sphere(self, state: EpisodeState, maps: NDArray[np.float64]) -> NDArray[np.float64]:
+        n = self.sphere.azimuths
+        if maps.shape[1:] != (self.sphere.rings, n):
+            raise PolicyError(f"the map {self.map_name!r} is {maps.shape[1:]}, but the sphere {self.sphere.rings, n}")
+        columns = (np.arange(n) - self.sphere.azimuth_index[state.current][:, None]) % n
+        return np.take_along_axis(maps, columns[:, None], 2).reshape(len(maps), -1)

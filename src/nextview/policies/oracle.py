@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nextview.belief import PLAIN_SUM, Calibration, of_true_class
 from nextview.policies.base import EpisodeState, Scope, best_in_window
-from nextview.policies.maps import peaks_first
+from nextview.policies.maps import peaks_first, sphere_peaks
 from nextview.viewsphere import ViewSphere
 
 
@@ -39,6 +39,38 @@ class OracleValley:
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
         valley = np.isin(self.labels[state.episodes], self.valley_classes)
         return best_in_window(self.sphere, state, peaks_first(np.where(valley[:, None, None], -maps, maps)))
+
+
+@dataclass(frozen=True)
+class OracleMeasure:
+    """The unvisited view with the highest true value of a measure, or the highest peak of its map of the sphere.
+
+    It has seen every view beforehand. With viewpoint entropy this is the choice of Shui et al. (thesis, section 3.5),
+    who rank all views of an object and keep the best k; from a first view that is drawn, so that it can be paired with
+    other policies. With the fused descriptor it is that of Ding et al., without their regression, which only predicts
+    it. With peaks of the depth-entropy it is that of Parisotto et al. with a perfect map, see ``maps.SpherePeak``.
+
+    Attributes:
+        sphere: the viewpoints.
+        values: of each view in each episode, (E, V).
+        peaks: go to the peaks of the map first.
+    """
+
+    sphere: ViewSphere
+    values: NDArray[np.floating]
+    peaks: bool = False
+    needs: tuple[str, ...] = ()
+
+    def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
+        """The true values, (B, V)."""
+        return np.asarray(self.values[state.episodes], np.float64)
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See ``Policy.next_views``."""
+        values = self.view_values(state)
+        if self.peaks:
+            values = sphere_peaks(values.reshape(-1, self.sphere.rings, self.sphere.azimuths)).reshape(values.shape)
+        return np.where(state.free, values, -np.inf).argmax(1)
 
 
 @dataclass(frozen=True)

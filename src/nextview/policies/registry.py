@@ -13,12 +13,14 @@ import numpy as np
 
 from nextview.arguments import as_line, of_kind
 from nextview.errors import PolicyError
+from nextview.occupancy import new_surface, new_volume
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
 from nextview.policies.gain import Gain
-from nextview.policies.maps import MapPeak
+from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card
 from nextview.policies.spread import Spread
+from nextview.policies.volumetric import Volumetric
 from nextview.viewsphere import Viewpoints, ViewSphere
 
 POLICIES: dict[str, Callable[[Any, tuple[int, ...]], Policy]] = {
@@ -32,9 +34,12 @@ POLICIES: dict[str, Callable[[Any, tuple[int, ...]], Policy]] = {
     "lem-peak": lambda sphere, valleys: MapPeak(sphere, "lem"),
     "lcm": lambda sphere, valleys: MapPeak(sphere, "lcm", valleys),
     "lcm-peak": lambda sphere, valleys: MapPeak(sphere, "lcm"),
+    "lem-sphere-peak": lambda sphere, valleys: SpherePeak(sphere, "lem-sphere"),
+    "volumetric": lambda sphere, valleys: Volumetric(sphere, new_volume),
+    "coverage": lambda sphere, valleys: Volumetric(sphere, new_surface),
 }
 
-ANYWHERE = ("random-all", "spread")
+ANYWHERE = ("random-all", "spread", "volumetric", "coverage")
 """Those that ask for no grid."""
 
 DEFAULT = "gain"

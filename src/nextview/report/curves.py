@@ -8,7 +8,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold, is_oracle
+from nextview.benchmark.entries import is_oracle
+from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold
 from nextview.benchmark.results import Results
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import DEFAULT, POLICIES

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold, is_oracle, nothing_differs, too_few
+from nextview.benchmark.entries import is_oracle
+from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold, nothing_differs, too_few
 from nextview.benchmark.results import KIND, Results
 from nextview.errors import ResultsError
 from nextview.outputs import added_file, check_added, check_file, written_whole

@@ -1,0 +1,70 @@
+"""Policies that look where most is still unseen, by the voxels that the depth seen so far leaves unseen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import PolicyError
+from nextview.observation import Observation
+from nextview.occupancy import Occupancy, VoxelGrid, new_volume
+from nextview.policies.base import EpisodeState, travel_from
+from nextview.viewsphere import Viewpoints
+
+Gain = Callable[[Occupancy, NDArray[np.floating]], NDArray[np.float64]]
+"""What each of some positions, (V, 3), would bring into view, (V,)."""
+GRID = VoxelGrid(64)
+"""Around the object's unit sphere."""
+
+
+def occupancy_of(observations: Sequence[Observation], grid: VoxelGrid) -> Occupancy:
+    """What is known of the space around an object after some views of it, object frame, object radii.
+
+    Observations show the object alone: what is no object in them is taken to be free.
+    """
+    found = Occupancy.unseen(grid)
+    for seen in observations:
+        found = found.seen(seen.depth, seen.pose, seen.intrinsics)
+    return found
+
+
+@dataclass(frozen=True)
+class Volumetric:
+    """The free view from which most that is unseen comes into view; of equal ones that with the shortest travel.
+
+    With ``new_volume`` (policy "volumetric"), the volumetric information gain of active grasping (Breyer et al.,
+    "Closed-loop next-best-view planning for target-driven grasping", IROS 2022, the system active_grasp) and the model
+    analysis of McGreavy, Kunze and Hawes, "Next best view planning for object recognition in mobile robotics"
+    (PlanSIG 2016). Simplified: the unseen space around the object stands in for McGreavy's known 3D model, and their
+    environment analysis, which views are in reach, is ``EpisodeState.free``.
+
+    With ``new_surface`` (policy "coverage"), the aim of Mendoza et al., "Supervised learning of the next-best-view for
+    3D object reconstruction" (Pattern Recognition Letters 133, 2020): the view that adds most surface. Simplified: they
+    train a 3D-CNN on a probabilistic grid to name that view; here the border of unseen space on such a grid stands for
+    the surface that is behind it, and the overlap that they need for registration is not asked for, as poses are known.
+
+    Attributes:
+        sphere: the viewpoints.
+        gain: what counts, of an occupancy in the object frame and object radii.
+        grid: the voxels, which hold the object's unit sphere.
+    """
+
+    sphere: Viewpoints
+    gain: Gain = new_volume
+    grid: VoxelGrid = GRID
+    needs: tuple[str, ...] = ("observations",)
+
+    def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
+        """Unseen volume or surface that comes into view, cubes or squares of the object radius, (B, V)."""
+        if state.observations is None:
+            raise PolicyError("this policy needs the depth that was seen")
+        positions = self.sphere.poses[:, :3, 3]
+        return np.stack([self.gain(occupancy_of(views, self.grid), positions) for views in state.observations])
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See ``Policy.next_views``."""
+        values = self.view_values(state) - 1e-9 * travel_from(self.sphere, state)
+        return np.where(state.free, values, -np.inf).argmax(1)
