@@ -78,8 +78,8 @@ FIXED = {
 }
 """Fixed views by name, to be followed by how many: "best-5", "orbit-8". They go on to the end whatever is believed."""
 TRUE_MEASURE = re.compile(r"true-([a-z0-9_]+)-all(-peak)?")
-"""Oracles by the true value of any measure in the view store, over all views: "true-NAME-all" goes to the highest unvisited
-view, "true-NAME-all-peak" to the peaks of its map first. "true-NAME-K" are fixed views: the K highest and no others."""
+"""Oracles by the true value of any measure in the view store, over all views: "true-NAME-all" goes to the highest
+unvisited view, "true-NAME-all-peak" to the peaks of its map first. "true-NAME-K" are fixed views: the K highest."""
 
 
 def is_oracle(policy: str) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.belief import FixedLength
-from nextview.data.measuring import keep
+from nextview.data.measuring import Made, keep
 from nextview.data.store import PLANNED, ViewStore
 from nextview.episode import run_episodes
 from nextview.errors import DatasetError
@@ -61,7 +61,7 @@ def plan(
     yield from keep(path, [f"plans/{name}" for name in names], partial(_plan, names), workers, scheduler)
 
 
-def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> dict[str, NDArray[np.float32]]:
+def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> Made:
     sphere = store.sphere
     views = [
         Observation(depth, pose, store.intrinsics) for depth, pose in zip(store.depth(i), sphere.poses, strict=True)
@@ -75,4 +75,4 @@ def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> dict[str, NDArray
         starts, length = np.arange(len(sphere)), FixedLength(max_views=PLANNED)
         episodes = run_episodes(observe, sphere, make_policy(name, sphere), starts, length, np.random.default_rng(0))
         found[f"plans/{name}"] = episodes.outcome.views.astype(np.float32)
-    return found
+    return found, None

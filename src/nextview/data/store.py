@@ -69,8 +69,8 @@ class ViewStore:
     takes from each first view, see ``data.planning``; ``radius`` (N,) float64, of the object in the unit of its mesh
     file; ``status`` (N,) uint8; ``digest`` (N, 32) uint8, of an object's name and arrays together, see ``digest``.
     Names, labels, splits, the SHA-256 of the mesh files and their unit, what was rendered how, and why meshes were left
-    out are attributes. They and all chunks carry a checksum, so that damage is noticed when they are read. A chunk that is
-    gone is noticed too: zarr would read its fill value, so every read looks for the file first.
+    out are attributes. They and all chunks carry a checksum, so that damage is noticed when they are read. A chunk that
+    is gone is noticed too: zarr would read its fill value, so every read looks for the file first.
     """
 
     path: Path
@@ -252,7 +252,9 @@ class ViewStore:
             DatasetError: the array is missing.
         """
         array = self.array(name)
-        wrong = {i: MissingChunkError("is missing") for i in objects if not _chunk_exists(self.path, array, i)}
+        wrong: dict[int, ChunkError] = {
+            i: MissingChunkError("is missing") for i in objects if not _chunk_exists(self.path, array, i)
+        }
         try:
             return array[:], wrong
         except Exception:  # a damaged chunk raises whatever its codec makes of it; find out which it is
