@@ -200,20 +200,20 @@ def test_the_benchmark_goes_the_way_that_was_planned(stored):
 def test_true_measures_come_from_the_store(stored):
     store, predictions = stored
     specs = make_specs(predictions, 4, 0)
-    with pytest.raises(EntryError, match=r"nextview measure \S+ silhouette_area makes it"):
-        replay("true-silhouette_area-all", specs, 3, 0)
-    list(measure(store, ["silhouette_area"], workers=0))
-    area = ViewStore.open(store).rows("measures/silhouette_area")[specs.objects]
-    ways = replay("true-silhouette_area-all", specs, 3, 0).views
+    with pytest.raises(EntryError, match=r"nextview measure \S+ --measures view_area makes it"):
+        replay("true-view_area-all", specs, 3, 0)
+    list(measure(store, ["view_area"], workers=0))
+    area = ViewStore.open(store).rows("measures/view_area")[specs.objects]
+    ways = replay("true-view_area-all", specs, 3, 0).views
     for row, (start, way) in enumerate(zip(specs.starts, ways, strict=True)):
         left = np.delete(np.arange(6), start)
         assert sorted(area[row, way[1:]]) == pytest.approx(sorted(area[row, left])[-2:])
-    best = replay("true-silhouette_area-4", specs, 3, 0)
+    best = replay("true-view_area-4", specs, 3, 0)
     assert best.fixed
     np.testing.assert_allclose(area[np.arange(8)[:, None], best.views], -np.sort(-area, 1)[:, :4])
     entropy = replay("true-depth_entropy-4", specs, 3, 0).views
     np.testing.assert_array_equal(entropy, replay("high-entropy-4", specs, 3, 0).views)
-    assert is_oracle("true-silhouette_area-all")
+    assert is_oracle("true-view_area-all")
     assert is_oracle("true-depth_entropy-all-peak")
     assert not is_oracle("volumetric")
 
