@@ -220,6 +220,7 @@ def test_true_measures_come_from_the_store(stored):
 
 def test_what_the_store_behind_predictions_may_lack(stored):
     store, predictions = stored
+    list(measure(store, ["depth_distribution"], workers=0))
     for wrong, why in (
         (replace(predictions, store=""), "do not say which view store"),
         (replace(predictions, store=str(store) + "x"), "there is no view store"),
