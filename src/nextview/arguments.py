@@ -36,7 +36,11 @@ def number(value: Any, what: str) -> float:
     Raises:
         UsageError: ``what`` is none.
     """
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or abs(value) > 1e300 and abs(value) < np.inf:
+    if (
+        isinstance(value, bool | np.bool_)
+        or not isinstance(value, Real)
+        or (abs(value) > 1e300 and abs(value) < np.inf)
+    ):
         raise UsageError(f"{what} is a number, not {as_line(value)}")
     return float(value)
 
