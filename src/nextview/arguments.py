@@ -31,13 +31,17 @@ def whole(value: Any, what: str, least: int = 0, most: int | None = None) -> int
 
 
 def number(value: Any, what: str) -> float:
-    """A finite number; more about it is the caller's to ask.
+    """A number, perhaps NaN or infinite: its limits are the caller's.
 
     Raises:
         UsageError: ``what`` is none.
     """
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not -1e300 < value < 1e300:
-        raise UsageError(f"{what} is a finite number, not {as_line(value)}")
+    if (
+        isinstance(value, bool | np.bool_)
+        or not isinstance(value, Real)
+        or (abs(value) > 1e300 and abs(value) < np.inf)
+    ):
+        raise UsageError(f"{what} is a number, not {as_line(value)}")
     return float(value)
 
 

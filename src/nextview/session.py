@@ -289,7 +289,7 @@ class Session:
         missing = [name for name in maps_among(policy.needs) if name.removesuffix("-sphere") not in models.maps]
         if missing:
             raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")
-        if distance is not None and not number(distance, "the distance") > 0:
+        if distance is not None and not 0 < number(distance, "the distance") < np.inf:
             raise UsageError(f"the distance is a positive number of metres, not {distance}")
         self.models, self.policy, self.sphere, self.distance = models, policy, sphere, distance
         self.views: list[View] = []

@@ -191,7 +191,7 @@ class Directions(Viewpoints):
     @classmethod
     def fibonacci(cls, n: int) -> Directions:
         """n views spread evenly over the upper half (Fibonacci lattice; Swinbank and Purser, QJRMS 132, 2006)."""
-        if whole(n, "the number of viewpoints", 0, MOST) < 1:
+        if whole(n, "the number of viewpoints", -MOST, MOST) < 1:
             raise UsageError(f"at least one viewpoint is needed, not {n}")
         height, azimuth = (np.arange(n) + 0.5) / n, np.arange(n) * np.pi * (3 - np.sqrt(5))
         flat = np.sqrt(1 - height**2)
@@ -199,7 +199,7 @@ class Directions(Viewpoints):
 
 
 def _check_distance(distance: float) -> None:
-    if not number(distance, "the distance") > 0:
+    if not 0 < number(distance, "the distance") < np.inf:
         raise UsageError(f"the distance must be a positive number of object radii, not {distance}")
 
 
@@ -225,7 +225,7 @@ class ViewSphere(Viewpoints):
 
     def __post_init__(self) -> None:
         of_kind(self.elevations, tuple | list, "elevations are a tuple of degrees")
-        if not self.elevations or whole(self.azimuths, "the number of views on a ring", 0, MOST) < 3:
+        if not self.elevations or whole(self.azimuths, "the number of views on a ring", -MOST, MOST) < 3:
             raise UsageError("a view sphere needs at least one ring of at least three viewpoints")
         if not all(-90 <= number(e, "an elevation") <= 90 for e in self.elevations):
             raise UsageError(f"elevations must lie between -90 and 90 degrees, not {self.elevations}")

@@ -65,7 +65,9 @@ class Frame:
     def __post_init__(self, axes: str, pixel_centre: float) -> None:
         depth = _metres(self.depth)
         intrinsics = _check_intrinsics(self.intrinsics, depth.shape)
-        intrinsics[:2, 2] += 0.5 - number(pixel_centre, "the coordinate of the first pixel's centre")
+        if not abs(number(pixel_centre, "the coordinate of the first pixel's centre")) <= 1:
+            raise ObservationError(f"the first pixel's centre has the coordinate 0 or 0.5, not {as_line(pixel_centre)}")
+        intrinsics[:2, 2] += 0.5 - pixel_centre
         object.__setattr__(self, "depth", depth)
         object.__setattr__(self, "intrinsics", intrinsics)
         if not isinstance(axes, str) or axes not in AXES:
