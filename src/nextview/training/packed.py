@@ -104,16 +104,16 @@ def load_packed(folder: Path) -> PackedViews:
             are noticed when their view is read.
     """
     try:
-        with np.load(folder / "index.npz") as index:
+        with open(folder / "index.npz", "rb") as file, np.load(file) as index:
             places, checksums, size = index["places"], index["checksums"], tuple(index["size"].tolist())
     except Exception as error:  # zip files and NumPy raise whatever a damaged file makes them raise
         again = "is damaged, or of an earlier nextview; delete it, and it is made again"
         raise DatasetError(f"{folder}: index.npz {again} ({error})") from None
-    file, total = folder / "views.lz4", int(places[..., 1].sum())
-    if file.stat().st_size != total:
+    views, total = folder / "views.lz4", int(places[..., 1].sum())
+    if views.stat().st_size != total:
         raise DatasetError(f"{folder}: is damaged; delete it, and it is made again")
-    packed = np.memmap(file, np.uint8, "r") if total else np.zeros(0, np.uint8)
-    return PackedViews(file, packed, places, size, checksums)
+    packed = np.memmap(views, np.uint8, "r") if total else np.zeros(0, np.uint8)
+    return PackedViews(views, packed, places, size, checksums)
 
 
 def ask_for(views: NDArray | PackedViews, places: Iterable[tuple[int, ...]]) -> None:
