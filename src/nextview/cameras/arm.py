@@ -90,7 +90,10 @@ def _model(vertices: Float, faces: NDArray[np.int32]) -> Any:
     wrist = spec.body("panda0_link7")
     wrist.add_site(name="camera", pos=hand @ CAMERA, quat=eye)
     box, back = mujoco.mjtGeom.mjGEOM_BOX, CAMERA - [0, 0, 0.013]  # its lens is in the middle of its front
-    for name, size, pos in (("camera", [0.045, 0.0125, 0.012], back), ("mount", [0.015, 0.03, 0.006], back / [2, 1, 1])):
+    for name, size, pos in (
+        ("camera", [0.045, 0.0125, 0.012], back),
+        ("mount", [0.015, 0.03, 0.006], back / [2, 1, 1]),
+    ):
         wrist.add_geom(name=name, type=box, size=size, pos=hand @ pos, quat=eye, rgba=[0.15, 0.15, 0.18, 1], mass=0.05)
     spec.add_mesh(
         name="object", uservert=vertices.ravel(), userface=faces.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
@@ -140,7 +143,9 @@ class Arm:
         self._data = mujoco.MjData(self._model)
         self._site = self._model.site("camera").id
         # Turning the camera about its line of sight shows nothing new: that much the arm is free to choose.
-        self._aim = mink.FrameTask("camera", "site", position_cost=1.0, orientation_cost=[0.3, 0.3, 0.0], lm_damping=1e-4)
+        self._aim = mink.FrameTask(
+            "camera", "site", position_cost=1.0, orientation_cost=[0.3, 0.3, 0.0], lm_damping=1e-4
+        )
         self._rest = mink.PostureTask(self._model, cost=1e-3)
         self._rest.set_target(HOME)
         names = [self._model.joint(k).name for k in range(7)]
@@ -268,9 +273,7 @@ class Arm:
                 found.append(((placed, faces), model.geom_rgba[k, :3].astype(float)))
         return found
 
-    def run(
-        self, session: Session, looked: Callable[[], None] = lambda: None, costs: bool = True
-    ) -> Recognition:
+    def run(self, session: Session, looked: Callable[[], None] = lambda: None, costs: bool = True) -> Recognition:
         """Go on with a session to its end: look, and move to where it asks, if there is a way.
 
         Args:

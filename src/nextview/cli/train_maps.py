@@ -37,8 +37,8 @@ def train_map(
     from nextview.cli.training_log import show_trained
     from nextview.training.maps import map_training as stage
 
-    options = {"predictions": predictions, "weights": weights, "hardware": hardware, "track": track}
-    show_trained([stage.train_map(store, out, recipe, **options)])
+    made = stage.train_map(store, out, recipe, predictions=predictions, weights=weights, hardware=hardware, track=track)
+    show_trained([made])
 
 
 def train_lem(
