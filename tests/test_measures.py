@@ -256,8 +256,8 @@ REMESHED = {
     "mesh_saliency": 0.05,
     "base_avoidance": 0.01,
 }
-"""How much a measure may differ, as a share of its value, when each face of a chair is cut into four. A half hidden face
-has half of the curvature of its edges, and its parts more or less."""
+"""How much a measure may differ, as a share of its value, when each face of a chair is cut into four. A half hidden
+face has half of the curvature of its edges, and its parts more or less."""
 
 
 @pytest.mark.parametrize("name", REMESHED)

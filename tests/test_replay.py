@@ -11,9 +11,10 @@ from test_predictions import some_predictions
 from tiny_models import make_map_network, make_recogniser
 
 from nextview.belief import Calibration, Stopping
-from nextview.benchmark.entries import default_entries, true_lcm, true_lem
+from nextview.benchmark.entries import default_entries
 from nextview.benchmark.experiment import Grid, run_grid
 from nextview.benchmark.replay import make_specs, replay, truncate
+from nextview.benchmark.true_maps import true_lcm, true_lem
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions

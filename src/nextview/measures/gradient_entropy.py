@@ -50,6 +50,8 @@ def visible_normals(view: MeasuredView) -> NDArray[np.floating]:
     From the inverse depth's change to the neighbour at which it changes less, which lies on the same surface. Pixels
     without a neighbour to the side, or above and below, are left out.
     """
+    if len(view.depths) == 0:
+        return np.zeros((0, 3))
     inverse = np.divide(1, view.near, out=np.full(view.near.shape, np.nan), where=view.seen)
     a = _change(inverse) * view.intrinsics[0, 0]
     b = _change(inverse.T).T * view.intrinsics[1, 1]
