@@ -28,9 +28,9 @@ from nextview.viewsphere import Viewpoints
 
 require("arm")
 
-from nextview.cameras.arm import Arm, first_joints  # noqa: E402
-from nextview.data.folders import list_dataset  # noqa: E402
-from nextview.sensing import ObservedObject  # noqa: E402
+from nextview.cameras.arm import Arm, first_joints
+from nextview.data.folders import list_dataset
+from nextview.sensing import ObservedObject
 
 DISTANCE = 0.4
 """Of the camera from the object, metres."""
