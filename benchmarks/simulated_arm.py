@@ -35,7 +35,7 @@ from nextview.sensing import ObservedObject
 DISTANCE = 0.4
 """Of the camera from the object, metres."""
 HORIZON = 10.0
-"""Seconds of motion that an episode counts which does not end right; none moves longer."""
+"""Seconds of motion that an episode counts which does not end right; the longest one is printed with the table."""
 POLICIES = ("gain", "gain, in cells", "nearest", "random")
 
 
