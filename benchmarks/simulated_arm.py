@@ -28,14 +28,14 @@ from nextview.viewsphere import Viewpoints
 
 require("arm")
 
-from nextview.cameras.arm import Arm, first_joints  # noqa: E402
-from nextview.data.folders import list_dataset  # noqa: E402
-from nextview.sensing import ObservedObject  # noqa: E402
+from nextview.cameras.arm import Arm, first_joints
+from nextview.data.folders import list_dataset
+from nextview.sensing import ObservedObject
 
 DISTANCE = 0.4
 """Of the camera from the object, metres."""
 HORIZON = 10.0
-"""Seconds of motion that an episode counts which does not end right; none moves longer."""
+"""Seconds of motion that an episode counts which does not end right; the longest one is printed with the table."""
 POLICIES = ("gain", "gain, in cells", "nearest", "random")
 
 

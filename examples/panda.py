@@ -1,7 +1,7 @@
 """A simulated Panda looks at an object on a table until it is sure, and moves only as an arm can.
 
-    pip install 'nextview[arm]'
-    python examples/panda.py samples/chair.off [--seed 0] [--film episode.gif]
+pip install 'nextview[arm]'
+python examples/panda.py samples/chair.off [--seed 0] [--film episode.gif]
 """
 
 from pathlib import Path
@@ -22,7 +22,11 @@ def recognise(arm: Arm, looked=lambda session: None, threshold: float = 0.97) ->
 
 
 def main(
-    mesh: tyro.conf.Positional[Path], seed: int = 0, threshold: float = 0.97, azimuth: float = 215.0, film: Path | None = None
+    mesh: tyro.conf.Positional[Path],
+    seed: int = 0,
+    threshold: float = 0.97,
+    azimuth: float = 215.0,
+    film: Path | None = None,
 ) -> None:
     arm = Arm(nextview.load_mesh(mesh), np.random.default_rng(seed))
     start = first_joints(arm, np.radians(35), np.radians(azimuth), 0.4)

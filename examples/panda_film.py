@@ -10,7 +10,7 @@ from nextview.viewsphere import look_at_origin
 
 SIZE, SIDE = (440, 400), 200
 """Of the scene, and the width of what is shown beside it, pixels."""
-FINER = 2
+FINER = 1
 """Rays for a pixel, along each side."""
 SLOWER = 3
 """How many times slower than at the joints' velocity limits motions are shown."""

@@ -31,6 +31,7 @@ from nextview.data.samples import sample_mesh
 from nextview.sensing import ObservedObject
 from nextview.viewsphere import angle_between, look_at_origin
 
+
 def denavit_hartenberg(a, d, alpha, theta):
     """Craig's convention, as in Franka's documentation."""
     ca, sa, ct, st = np.cos(alpha), np.sin(alpha), np.cos(theta), np.sin(theta)
@@ -109,9 +110,10 @@ def test_it_touches_what_is_in_its_way(at_home):
     assert not at_home.touches(HOME)
     assert at_home.touches(np.array([0, 1.5, 0, -0.5, 0, 0, 0]))  # stretched down through the table
     assert at_home.touches(np.array([0, 0, 0, -3.0, 0, -1.6, 0]))  # folded into itself
-    over = looking(89.9, 0, 0.05)  # the object's own height above its foot: inside of it
-    found = at_home._descend(over, HOME)
-    assert found is None or at_home.touches(found)
+    inside, ((vertices, _), _) = looking(89.9, 0), at_home.things()[1]
+    inside[:3, 3] = (vertices.min(0) + vertices.max(0)) / 2  # between the legs of the chair: in its convex hull
+    assert at_home.touches(at_home._descend(inside, HOME))
+    assert at_home.solve(inside) is None
 
 
 def test_a_way_goes_round_what_blocks_it(at_home):

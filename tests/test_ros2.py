@@ -73,7 +73,11 @@ def transform_message(pose, child="optical", time=12.5):
 
 def recorded(folder, views):
     """Messages by topic as they come out of a bag into which they were written: (image, info, transform) of each."""
-    topics = {"depth": "sensor_msgs/msg/Image", "camera_info": "sensor_msgs/msg/CameraInfo", "tf": "tf2_msgs/msg/TFMessage"}
+    topics = {
+        "depth": "sensor_msgs/msg/Image",
+        "camera_info": "sensor_msgs/msg/CameraInfo",
+        "tf": "tf2_msgs/msg/TFMessage",
+    }
     with Writer(folder, version=9) as bag:
         connections = {topic: bag.add_connection(topic, kind, typestore=STORE) for topic, kind in topics.items()}
         for k, (image, info, transform) in enumerate(views):
@@ -131,7 +135,8 @@ def empty_pose():
 def test_a_pose_survives_the_way_there_and_back():
     pose = pose_at(-20, 200, 1.3, (5, -2, 1), turn=(10, 20, 30))
     there = STORE.deserialize_cdr(
-        STORE.serialize_cdr(conversion.fill_pose(empty_pose(), pose), "geometry_msgs/msg/Pose"), "geometry_msgs/msg/Pose"
+        STORE.serialize_cdr(conversion.fill_pose(empty_pose(), pose), "geometry_msgs/msg/Pose"),
+        "geometry_msgs/msg/Pose",
     )
     q, p = there.orientation, there.position
     np.testing.assert_allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), pose[:3, :3], atol=1e-12)
@@ -194,7 +199,7 @@ def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
     frames, messages = [], []
     for azimuth in (20, 110, 250):
         pose = pose_at(35, azimuth, 0.6, chair.bounds.mean(0))
-        depth, _ = cast((TABLE, chair), pose, k + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], shape)
+        depth, _ = cast((TABLE, chair), pose, k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), shape)
         depth = np.rint(1000 * depth).astype(np.uint16)
         frames.append(Frame(depth, k, pose))
         messages.append((image_message(depth, "16UC1"), info_message(k, shape), transform_message(pose)))

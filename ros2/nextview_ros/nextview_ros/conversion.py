@@ -36,8 +36,8 @@ def depth_of(image: Any) -> NDArray[Any]:
     data = np.frombuffer(bytes(image.data), np.uint8)
     if step < width * kind.itemsize or len(data) < step * height:
         raise ObservationError(
-            f"an image of {width} x {height} in {image.encoding} has rows of {width * kind.itemsize} bytes or more; this "
-            f"one has {len(data)} bytes in rows of {step}"
+            f"an image of {width} x {height} in {image.encoding} has rows of {width * kind.itemsize} bytes or more; "
+            f"this one has {len(data)} bytes in rows of {step}"
         )
     rows = data[: step * height].reshape(height, step)[:, : width * kind.itemsize]
     return np.ascontiguousarray(rows).view(kind).astype(kind.newbyteorder("="))
@@ -62,8 +62,8 @@ def intrinsics_of(info: Any, rectified: bool = False) -> Float:
         k = np.asarray(info.k, float).reshape(3, 3).copy()
         if np.any(np.asarray(info.d, float)):
             raise ObservationError(
-                f"the camera distorts ({info.distortion_model}): use rectified images (image_rect of image_proc), and say "
-                "that they are"
+                f"the camera distorts ({info.distortion_model}): use rectified images (image_rect of image_proc), and "
+                "say that they are"
             )
     if not k.any():
         raise ObservationError(f"the camera is not calibrated: {'p' if rectified else 'k'} of camera_info is zero")

@@ -46,7 +46,10 @@ class RecogniseNode(Node):
         for name, value in PARAMETERS.items():
             self.declare_parameter(name, value)
         self.system = nextview.load(
-            self.value("models"), self.value("policy") or None, self.value("threshold"), max_views=self.value("max_views")
+            self.value("models"),
+            self.value("policy") or None,
+            self.value("threshold"),
+            max_views=self.value("max_views"),
         )
         self.session, self.goal, self.taken = None, None, False
         self.busy, self.ended, self.arrived = threading.Lock(), threading.Event(), threading.Condition()

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,8 +41,16 @@ OFFSETS = np.array([0, 0, 0, 0, 0, np.pi / 2, np.pi / 4])
 """The model counts its last two joints from elsewhere: Franka's angles less the model's."""
 HOME = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 0.35, 0.0])
 """Joints at rest, rad: the elbow up, the camera over the table."""
-STARTS = HOME + np.array([[0, 0, 0, 0, 0, 0, 0], [0.9, 0.6, 0, 0.4, 0, 0, 0], [-0.9, 0.6, 0, 0.4, 0, 0, 0],
-                          [0.8, 0.9, -1.2, 0, 0, 0, 0], [-0.8, 0.9, 1.2, 0, 0, 0, 0], [0, 1.0, 0, 0.8, 0, -0.8, 0]])  # fmt: skip
+STARTS = HOME + np.array(
+    [
+        [0, 0, 0, 0, 0, 0, 0],
+        [0.9, 0.6, 0, 0.4, 0, 0, 0],
+        [-0.9, 0.6, 0, 0.4, 0, 0, 0],
+        [0.8, 0.9, -1.2, 0, 0, 0, 0],
+        [-0.8, 0.9, 1.2, 0, 0, 0, 0],
+        [0, 1.0, 0, 0.8, 0, -0.8, 0],
+    ]
+)
 """Where the search for joints begins if it finds none from where the arm is."""
 ITERATIONS, CLOSE, STRAIGHT = 20, 0.002, np.radians(0.5)
 """Steps of a search, and how near it has to come: metres and radians."""
@@ -95,9 +104,8 @@ def _model(vertices: Float, faces: NDArray[np.int32]) -> Any:
         ("mount", [0.015, 0.03, 0.006], back / [2, 1, 1]),
     ):
         wrist.add_geom(name=name, type=box, size=size, pos=hand @ pos, quat=eye, rgba=[0.15, 0.15, 0.18, 1], mass=0.05)
-    spec.add_mesh(
-        name="object", uservert=vertices.ravel(), userface=faces.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    )  # fmt: skip
+    shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # of meshes that enclose no volume, too
+    spec.add_mesh(name="object", uservert=vertices.ravel(), userface=faces.ravel(), inertia=shell)
     spec.worldbody.add_geom(
         name="object", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="object", margin=CLEARANCE, rgba=[0.25, 0.5, 0.75, 1]
     )
@@ -263,7 +271,7 @@ class Arm:
         return Frame(measured, k, pose, pixel_centre=0.5)
 
     def things(self) -> list[tuple[Triangles, Float]]:
-        """All that can be seen, with the arm as it is: vertices (N, 3), world, metres, faces (F, 3), and colour (3,)."""
+        """All that can be seen, with the arm as it is: vertices (N, 3), metres, faces (F, 3), and colour (3,)."""
         self._place(self.joints)
         model, data, found = self._model, self._data, []
         for k in range(model.ngeom):
@@ -308,20 +316,20 @@ def first_joints(arm: Arm, elevation: float, azimuth: float, distance: float) ->
 
 def seconds_of(way: Sequence[Float]) -> float:
     """How long a way in joint space takes at the joints' velocity limits: on each leg the slowest joint counts."""
-    return float(sum((np.abs(b - a) / FASTEST).max() for a, b in zip(way, way[1:], strict=False)))
+    return float(sum((np.abs(b - a) / FASTEST).max() for a, b in pairwise(way)))
 
 
 def along(way: Sequence[Float], step: float) -> list[Float]:
     """Joints along a way, no joint farther apart than a step, radians; with its first and its last."""
     found = [way[0]]
-    for a, b in zip(way, way[1:], strict=False):
+    for a, b in pairwise(way):
         n = max(1, int(np.ceil(np.abs(b - a).max() / step)))
         found += [a + (b - a) * k / n for k in range(1, n + 1)]
     return found
 
 
 def cast(things: Sequence[Triangles], origin: Float, rays: Float) -> Any:
-    """What rays, (N, 3), from a point, (3,), or from points, (N, 3), hit: Embree's arrays, "geomID" the thing's index."""
+    """What rays, (N, 3), from a point, (3,), or points, (N, 3), hit: Embree's arrays, "geomID" the thing's index."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
