@@ -24,7 +24,7 @@ def whole(value: Any, what: str, least: int = 0, most: int | None = None) -> int
         UsageError: ``what`` is none.
     """
     highest = 2**31 - 1 if most is None else most
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Integral) or not least <= value <= highest:
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Integral) or not least <= int(value) <= highest:
         reach = f"from {least} on" if most is None else f"from {least} to {most}"
         raise UsageError(f"{what} is a whole number {reach}, not {as_line(value)}")
     return int(value)
@@ -36,13 +36,14 @@ def number(value: Any, what: str) -> float:
     Raises:
         UsageError: ``what`` is none.
     """
-    if (
-        isinstance(value, bool | np.bool_)
-        or not isinstance(value, Real)
-        or (abs(value) > 1e300 and abs(value) < np.inf)
-    ):
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or _too_large(value):
         raise UsageError(f"{what} is a number, not {as_line(value)}")
     return float(value)
+
+
+def _too_large(value: Any) -> bool:
+    """Whether a number is finite, but hardly: what is computed with it would not be."""
+    return bool(1e300 < abs(value) < np.inf)
 
 
 def of_kind(value: Any, kinds: type | UnionType, what: str, error: type[NextviewError] = UsageError) -> None:

@@ -108,7 +108,7 @@ class MeasuredView:
         across = np.abs(a * x[column[n]] + b * y[row[n]] + c)
         focal = self.intrinsics[0, 0] * self.intrinsics[1, 1]
         patches = self.depths[n] ** 2 / (focal * np.maximum(across, GRAZING))
-        return np.bincount(at, patches, len(faces))
+        return np.asarray(np.bincount(at, patches, len(faces)), np.float64)
 
     @cached_property
     def seen_share(self) -> NDArray[np.float64]:

@@ -49,10 +49,10 @@ def _saliency(surface: Surface) -> NDArray[np.float64]:
     position = np.zeros((places, 3))
     position[fine.corners.ravel()] = fine.vertices[fine.faces.ravel()]
     group = _groups(position)
-    area = np.bincount(group, around)
+    area = np.asarray(np.bincount(group, around), np.float64)
     middle = np.stack([np.bincount(group, around * position[:, k]) for k in range(3)], 1)
     middle = np.where(area[:, None] > 0, middle / np.maximum(area, 1e-30)[:, None], 10 + np.arange(len(area))[:, None])
-    curvature = np.where(area > 0, np.bincount(group, bend) / np.maximum(area, 1e-30), 0)
+    curvature = np.asarray(np.where(area > 0, np.bincount(group, bend) / np.maximum(area, 1e-30), 0), np.float64)
     salient = _salient(middle, area, curvature)
     of_fine = salient[group][fine.corners].mean(1)
     total = np.bincount(parent, fine.areas, len(surface.faces))

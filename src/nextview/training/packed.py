@@ -61,7 +61,7 @@ class PackedViews:
         ):
             if count:
                 packed = self.packed[start : start + count]
-                if zlib.crc32(packed) != checksum:
+                if zlib.crc32(packed.data) != checksum:
                     raise DatasetError(f"{self.file.parent}: is damaged; delete it, and it is made again")
                 PACKING.decode(packed, view)
         return views
