@@ -1,0 +1,208 @@
+"""The pictures of the pages on concepts and of the gallery, from real runs.
+
+    python docs/site/pictures.py predictions.npz
+
+``predictions.npz`` is the test split's, from ``nextview predict``; without it the picture of calibration is left as it is.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+import nextview
+from nextview.belief import PLAIN_SUM
+from nextview.data.predictions import Predictions
+from nextview.data.samples import sample_mesh
+from nextview.measures.depth_entropy import depth_entropy
+from nextview.metrics import calibration_error, reliability
+from nextview.policies.maps import local_peaks
+from nextview.report.style import STYLE, PlainFigure
+from nextview.session import View
+from nextview.viewsphere import ViewSphere
+
+IMAGES = Path(__file__).parents[1] / "images"
+INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
+START = 33
+"""A view from above, in which a table could be a desk."""
+SPHERE = ViewSphere.named("40")
+
+
+def main(predictions: Path | None) -> None:
+    """Draw all of them."""
+    view = nextview.load().recognise(sample_mesh("table"), start=START).views[0]
+    figures = {
+        "concept_viewpoints": viewpoints(13),
+        "concept_belief": belief(),
+        "concept_maps": maps(view),
+        "concept_gain": gain(view),
+        "gallery_samples": samples((33, 17, 3, 22)),
+    }
+    if predictions is not None:
+        figures["concept_calibration"] = calibration(Predictions.load(predictions), np.random.default_rng(0))
+    for name, figure in figures.items():
+        figure.savefig(IMAGES / f"{name}.png", dpi=110, facecolor="white")
+    for name, start in {"chair": 36, "monitor": 14}.items():
+        nextview.load().recognise(sample_mesh(name), start=start).plot(IMAGES / f"gallery_{name}.png", name)
+
+
+def new(columns: int, height: float = 3.0, width: float = 9.6) -> tuple[Figure, list[Axes]]:
+    """A row of axes."""
+    figure = PlainFigure((width, height), layout="constrained")
+    return figure, list(figure.subplots(1, columns, squeeze=False)[0])
+
+
+def grid(axes: Axes, values: np.ndarray, title: str, **options: object) -> None:
+    """A map of the sphere: a row for each ring, the horizon below."""
+    axes.imshow(np.ma.masked_invalid(values.reshape(5, 8)), origin="lower", aspect="auto", **options)  # type: ignore[arg-type]
+    axes.set_facecolor("#eef1f4")
+    axes.set_xticks(range(0, 8, 2), [f"{45 * k}°" for k in range(0, 8, 2)])
+    axes.set_yticks(range(5), [f"{18 * k}°" for k in range(5)])
+    axes.set(xlabel="azimuth", ylabel="elevation")
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.grid(visible=False)
+
+
+def mark(axes: Axes, view: int, label: str, colour: str) -> None:
+    """Frame a cell of a map."""
+    ring, column = divmod(view, 8)
+    axes.add_patch(Rectangle((column - 0.46, ring - 0.46), 0.92, 0.92, fill=False, edgecolor=colour, linewidth=2.2))
+    axes.text(column, ring, label, ha="center", va="center", fontsize=7, color=colour, weight="bold")
+
+
+def picture(axes: Axes, view: int, mesh: nextview.Mesh, title: str) -> None:
+    """What the camera sees from a view."""
+    axes.imshow(nextview.SimulatedCamera(mesh).observe(SPHERE.poses[view]).picture, cmap="gray", vmin=0, vmax=255)
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.axis("off")
+
+
+def viewpoints(here: int) -> Figure:
+    """The 40 views in space and as a map, with the local window of one of them."""
+    figure = PlainFigure((9.6, 3.6), layout="constrained")
+    space = figure.add_subplot(1, 2, 1, projection="3d")
+    window = np.unique(SPHERE.windows[here])
+    colours = np.full(len(SPHERE), FAINT)
+    colours[window], colours[here] = "#7fa6c9", ACCENT
+    space.scatter(*SPHERE.directions.T, c=colours, s=34, depthshade=False)
+    vertices = sample_mesh("chair").vertices
+    space.scatter(*(vertices - vertices.mean(0)).T * 0.5 / np.abs(vertices - vertices.mean(0)).max(), s=2, color=INK)
+    space.set_box_aspect((1, 1, 0.6), zoom=1.25)
+    space.view_init(elev=18, azim=-100)
+    space.set_axis_off()
+    axes = figure.add_subplot(1, 2, 2)
+    shown = np.full(len(SPHERE), np.nan)
+    shown[window] = 0.35
+    grid(axes, shown, f"their numbers; view {here} and its window", cmap="Blues", vmin=0, vmax=1)
+    for view in range(len(SPHERE)):
+        if view != here:
+            axes.text(view % 8, view // 8, str(view), ha="center", va="center", fontsize=8, color=INK)
+    mark(axes, here, str(here), ACCENT)
+    return figure
+
+
+def belief() -> Figure:
+    """Belief in the likeliest classes after each of five views, against the threshold, which comes down."""
+    system = nextview.load(threshold=1.0, max_views=5)
+    result, usual = system.recognise(sample_mesh("table"), start=START), nextview.load().stopping
+    steps = np.arange(1, len(result.views) + 1)
+    beliefs = np.array([view.belief for view in result.views])
+    alone = np.array([view.alone for view in result.views])
+    figure, (left, right) = new(2, 3.2)
+    for axes, values, title in ((left, alone, "each view alone"), (right, beliefs, "fused over the views so far")):
+        for c in np.argsort(-beliefs.max(0))[:3]:
+            axes.plot(steps, values[:, c], marker="o", label=result.classes[c].replace("_", " "))
+        axes.set_title(title, fontsize=10, loc="left")
+        axes.set(ylim=(0, 1.03), xlabel="view", ylabel="belief", xticks=steps)
+    right.plot(steps, usual.threshold_at(steps), color=INK, linestyle=":", label="threshold")
+    right.legend()
+    return figure
+
+
+def maps(view: View) -> Figure:
+    """True depth entropy of all views with its highest and lowest, and what the network predicts of the window."""
+    mesh = sample_mesh("table")
+    camera = nextview.SimulatedCamera(mesh)
+    true = np.array([depth_entropy(camera.observe(pose).depth) for pose in SPHERE.poses])
+    session = nextview.load(policy="lem").session(START)
+    seen = session.update(camera.observe(session.pose))
+    values = np.full(len(SPHERE), np.nan)
+    values[SPHERE.windows[START].ravel()] = seen.maps["lem"].ravel()
+    figure, (low, high, whole, window) = new(4, 2.8, 11.5)
+    picture(low, int(true.argmin()), mesh, f"view {true.argmin()}: {true.min():.1f} bits")
+    picture(high, int(true.argmax()), mesh, f"view {true.argmax()}: {true.max():.1f} bits")
+    grid(whole, true, "depth entropy, bits", cmap="viridis")
+    figure.colorbar(whole.images[0], ax=whole)
+    mark(whole, int(true.argmin()), "low", "white")
+    mark(whole, int(true.argmax()), "high", ACCENT)
+    grid(window, values, f"predicted from view {START} (LEM)", cmap="viridis")
+    figure.colorbar(window.images[0], ax=window)
+    mark(window, START, "here", "white")
+    for ring, column in np.argwhere(local_peaks(seen.maps["lem"][None])[0]):
+        cell = int(SPHERE.windows[START][ring, column])
+        if cell != START:
+            mark(window, cell, "peak", ACCENT)
+    return figure
+
+
+def gain(view: View) -> Figure:
+    """What is seen, what it costs to go to each view, and what each is worth."""
+    assert view.values is not None
+    assert view.next_view is not None
+    figure, (seen, cost, value) = new(3, 3.0)
+    picture(seen, view.index, sample_mesh("table"), f"view {view.index}: a table, or a desk?")
+    grid(cost, SPHERE.travel[view.index], "travel from here, cells", cmap="Greys")
+    figure.colorbar(cost.images[0], ax=cost)
+    grid(value, view.values, "value of each view", cmap="viridis")
+    figure.colorbar(value.images[0], ax=value)
+    for axes in (cost, value):
+        mark(axes, view.index, "here", "#2f7ab9" if axes is cost else "white")
+        mark(axes, view.next_view, "next", ACCENT)
+    return figure
+
+
+def calibration(p: Predictions, rng: np.random.Generator) -> Figure:
+    """Reliability of the belief after one, two and five random views: plain sums of logits, and calibrated."""
+    figure, panels = new(3, 3.5)
+    for axes, n in zip(panels, (1, 2, 5), strict=True):
+        views = np.array([rng.permutation(len(p.sphere))[:n] for _ in range(len(p))])
+        # What is observed is noted for each azimuth bin; the plain sum knows of none.
+        logits = np.take_along_axis(p.logits, views[:, :, None], 1).sum(1)
+        evidence = np.take_along_axis(p.log_evidence, views[:, :, None], 1).sum(1)
+        beliefs = {
+            "plain sum": (PLAIN_SUM.belief(logits, n, len(p.classes)), FAINT),
+            "calibrated": (p.calibration.belief(evidence, n, len(p.classes)), ACCENT),
+        }
+        axes.plot([0, 1], [0, 1], color=INK, linewidth=0.8)
+        for name, (belief, colour) in beliefs.items():
+            sure, right = belief.max(1), belief.argmax(1) == p.labels
+            confidence, accuracy, count = reliability(sure, right, 10)
+            label = f"{name}: error {calibration_error(sure, right, 10):.3f}"
+            axes.plot(confidence[count > 0], accuracy[count > 0], color=colour, label=label)
+            axes.scatter(confidence[count > 0], accuracy[count > 0], s=6 + 200 * count[count > 0] / len(p), color=colour)
+        axes.set_title(f"{n} view{'s' if n > 1 else ''}", fontsize=10, loc="left")
+        axes.set(xlim=(0, 1.03), ylim=(0, 1.03), xlabel="belief in the answer", ylabel="share that was right")
+        axes.legend(loc="upper left", fontsize=7.5)
+    return figure
+
+
+def samples(views: tuple[int, ...]) -> Figure:
+    """The bundled sample objects from some views."""
+    figure = PlainFigure((9.6, 7.4), layout="constrained")
+    axes = figure.subplots(3, len(views))
+    for row, name in zip(axes, ("chair", "monitor", "table"), strict=True):
+        for each, view in zip(row, views, strict=True):
+            elevation, azimuth = SPHERE.angles(view)
+            picture(each, view, sample_mesh(name), f"{name}, {elevation:.0f}° up, {azimuth:.0f}° round")
+    return figure
+
+
+if __name__ == "__main__":
+    with matplotlib.rc_context(STYLE):
+        main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
