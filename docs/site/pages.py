@@ -27,7 +27,19 @@ REPOSITORY_PAGES = {
     "CHANGELOG.md": "changelog.md",
 } | {f"examples/{path.name}": f"examples/{path.stem}.md" for path in sorted(ROOT.glob("examples/*.py"))}
 """Files of the repository outside docs/, and the pages that show them."""
-MADE = {"Commands": command_pages, "Models": card_pages, "API": api_pages}
+
+
+def example_pages() -> dict[str, str]:
+    """Markdown of each example's page by its place in the site; the first lists them all."""
+    top, pages = "# Examples\n\n", {}
+    for path in sorted(ROOT.glob("examples/*.py")):
+        summary = _summary(path)
+        top += f"- [{path.name}](../../examples/{path.name}): {summary}\n"
+        pages[f"examples/{path.stem}.md"] = f"# {path.name}\n\n{summary}\n\n```python\n{path.read_text()}```\n"
+    return {"examples/index.md": top} | pages
+
+
+MADE = {"Examples": example_pages, "Commands": command_pages, "Models": card_pages, "API": api_pages}
 """What fills the sections of the navigation that mkdocs.yml leaves empty."""
 
 
@@ -45,9 +57,6 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are not files in docs/."""
     made = {uri: (ROOT / name).read_text() for name, uri in REPOSITORY_PAGES.items() if name.endswith(".md")}
-    examples = [ROOT / name for name in REPOSITORY_PAGES if name.endswith(".py")]
-    made["examples/index.md"] = "# Examples\n\n" + "".join(map(_example_line, examples))
-    made |= {f"examples/{path.stem}.md": _example(path) for path in examples}
     for pages in MADE.values():
         made |= pages()
     for uri, text in made.items():
@@ -85,10 +94,3 @@ def _leaves(nav: Any) -> Iterator[str]:
 def _summary(path: Path) -> str:
     return re.match(r'(?:#.*\n)*"""(.*?)(?:\n\n|""")', path.read_text(), re.S)[1].replace("\n", " ")  # type: ignore[index]
 
-
-def _example_line(path: Path) -> str:
-    return f"- [{path.name}](../../examples/{path.name}): {_summary(path)}\n"
-
-
-def _example(path: Path) -> str:
-    return f"# {path.name}\n\n{_summary(path)}\n\n```python\n{path.read_text()}```\n"
