@@ -1,7 +1,7 @@
 """The wheel: built, installed into an empty environment, and run with nothing but what it asks for.
 
-Always: what the wheel asks for is linked from the environment of the tests, so that nothing that is not asked for can be
-imported. With NEXTVIEW_WHEELS=all, pip installs the wheel and each extra from an index, as a user would.
+Always: what the wheel asks for is linked from the environment of the tests, so that nothing else can be imported.
+With NEXTVIEW_WHEELS=all, pip installs the wheel and each extra from an index, as a user would.
 """
 
 import os
@@ -23,9 +23,9 @@ ROOT = Path(__file__).parent.parent
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 EXAMPLES = {
     "": "import nextview; assert nextview.recognise('samples/chair.off', start=3).answer == 'chair'",
-    "benchmark": "from nextview.benchmark.run import run_benchmark; from nextview.report.html import report_page",
+    "benchmark": "from nextview.benchmark.run import run_benchmark; from nextview.report.html import write_report",
     "cluster": "from distributed import LocalCluster; import nextview.data.pool",
-    "train": "from nextview.training.architectures import resnet; print(sum(p.numel() for p in resnet(18, 10).parameters()))",
+    "train": "import lightning, torch; from nextview.training import export, loop, onnx_export",
     "workflow": "import snakemake",
     "docs": "import material, mkdocs, mkdocs_jupyter, mkdocstrings_handlers.python",
     "dev": "import hypothesis, mypy, pytest, ruff, skimage, trimesh",
@@ -60,7 +60,8 @@ def environment(folder):
     """An environment of its own without anything; its Python and where its packages go."""
     venv.create(folder, with_pip=False)
     base = {"base": str(folder), "platbase": str(folder)}
-    return Path(sysconfig.get_path("scripts", "venv", base)) / "python", Path(sysconfig.get_path("purelib", "venv", base))
+    python = Path(sysconfig.get_path("scripts", "venv", base)) / "python"
+    return python, Path(sysconfig.get_path("purelib", "venv", base))
 
 
 def asked_for(requirements, found=None):

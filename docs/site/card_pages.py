@@ -10,7 +10,7 @@ from nextview.models.model_card import ModelCard, bundled_cards
 from nextview.policies.policy_card import PolicyCard, bundled_policies, read_policy_card
 
 USE = {
-    "recogniser": "Names the object in the depth image of a view; the evidence of several views is fused into a belief.",
+    "recogniser": "Names the object in the depth image of a view; the evidence of several is fused into a belief.",
     "lem": "Predicts the depth entropy of the views around the current one (local-depth-entropy map).",
     "lcm": "Predicts the recogniser's confidence in the views around the current one (local confidence map).",
     "gain": "Values every candidate view by what it is expected to add to the belief, less its weighted travel.",
@@ -19,6 +19,12 @@ USE = {
     "class-table": "Values views by a table, by the class that is believed.",
 }
 """What a model or policy of each kind is for."""
+LIMITS = (
+    "It was trained on clean renders of ModelNet10's upright objects, one object a picture, seen from 40 places, from"
+    " the horizon to 72 degrees above it. An object of another class is given one of the ten names unless `--unknown`"
+    " is used. What noise, missing depth and views from elsewhere cost is measured in [the results](../results.md) and"
+    " in [your camera](../your_camera.md)."
+)
 
 
 @cache
@@ -50,7 +56,8 @@ def _model_page(card: ModelCard) -> str:
         facts |= {
             "classes": ", ".join(c.replace("_", " ") for c in card.classes),
             "azimuth bins": card.azimuth_bins,
-            "calibration": f"temperature {card.calibration.temperature:g}, correlation {card.calibration.correlation:g}",
+            "temperature of one view": f"{card.calibration.temperature:g}",
+            "correlation of two views": f"{card.calibration.correlation:g}",
         }
     else:
         facts |= {"output": card.output, "valley classes": ", ".join(card.valley_classes) or "none"}
@@ -60,14 +67,6 @@ def _model_page(card: ModelCard) -> str:
     for k, recipe in enumerate(card.training.recipes, 1):
         parts += [f"Recipe {k}:", _table(recipe, ("option", "value"))]
     return "\n\n".join(filter(None, parts)) + "\n"
-
-
-LIMITS = (
-    "It was trained on clean renders of ModelNet10's upright objects, one object a picture, seen from 40 places from the"
-    " horizon to 72 degrees above it. An object of another class is given one of the ten names unless"
-    " `--unknown` is used. What noise, missing depth and views from elsewhere cost is measured in"
-    " [the results](../results.md) and in [your camera](../your_camera.md). ModelNet's meshes are for academic use."
-)
 
 
 def _policy_page(name: str, card: PolicyCard) -> str:

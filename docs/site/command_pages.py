@@ -15,7 +15,8 @@ from nextview.cli.commands import COMMANDS, GROUPS
 from nextview.cli.main import main
 
 ROOT = Path(__file__).parents[2]
-SOURCES = ["README.md", *(f"docs/{name}.md" for name in ("your_camera", "dataset", "training", "add_a_policy", "results"))]
+GUIDES = ("your_camera", "dataset", "training", "add_a_policy", "results")
+SOURCES = ["README.md", *(f"docs/{name}.md" for name in GUIDES)]
 """Where examples are looked for, the best first; the research notes tell what was run once."""
 COLUMNS = "96"
 

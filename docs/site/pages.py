@@ -93,4 +93,3 @@ def _leaves(nav: Any) -> Iterator[str]:
 
 def _summary(path: Path) -> str:
     return re.match(r'(?:#.*\n)*"""(.*?)(?:\n\n|""")', path.read_text(), re.S)[1].replace("\n", " ")  # type: ignore[index]
-

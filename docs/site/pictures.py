@@ -1,13 +1,11 @@
-"""The pictures of the pages on concepts and of the gallery, from real runs.
+"""The pictures of the page on concepts, and the samples in the gallery, from real runs.
 
-    python docs/site/pictures.py predictions.npz
-
-``predictions.npz`` is the test split's, from ``nextview predict``; without it the picture of calibration is left as it is.
+python docs/site/pictures.py
 """
 
 from __future__ import annotations
 
-import sys
+import re
 from pathlib import Path
 
 import matplotlib
@@ -17,39 +15,34 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 import nextview
-from nextview.belief import PLAIN_SUM
-from nextview.data.predictions import Predictions
 from nextview.data.samples import sample_mesh
 from nextview.measures.depth_entropy import depth_entropy
-from nextview.metrics import calibration_error, reliability
 from nextview.policies.maps import local_peaks
 from nextview.report.style import STYLE, PlainFigure
 from nextview.session import View
 from nextview.viewsphere import ViewSphere
 
 IMAGES = Path(__file__).parents[1] / "images"
+RESULTS = Path(__file__).parents[1] / "results.md"
 INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
 START = 33
 """A view from above, in which a table could be a desk."""
 SPHERE = ViewSphere.named("40")
 
 
-def main(predictions: Path | None) -> None:
+def main() -> None:
     """Draw all of them."""
     view = nextview.load().recognise(sample_mesh("table"), start=START).views[0]
     figures = {
         "concept_viewpoints": viewpoints(13),
         "concept_belief": belief(),
-        "concept_maps": maps(view),
+        "concept_calibration": calibration(),
+        "concept_maps": maps(19),
         "concept_gain": gain(view),
         "gallery_samples": samples((33, 17, 3, 22)),
     }
-    if predictions is not None:
-        figures["concept_calibration"] = calibration(Predictions.load(predictions), np.random.default_rng(0))
     for name, figure in figures.items():
         figure.savefig(IMAGES / f"{name}.png", dpi=110, facecolor="white")
-    for name, start in {"chair": 36, "monitor": 14}.items():
-        nextview.load().recognise(sample_mesh(name), start=start).plot(IMAGES / f"gallery_{name}.png", name)
 
 
 def new(columns: int, height: float = 3.0, width: float = 9.6) -> tuple[Figure, list[Axes]]:
@@ -91,10 +84,12 @@ def viewpoints(here: int) -> Figure:
     colours = np.full(len(SPHERE), FAINT)
     colours[window], colours[here] = "#7fa6c9", ACCENT
     space.scatter(*SPHERE.directions.T, c=colours, s=34, depthshade=False)
-    vertices = sample_mesh("chair").vertices
-    space.scatter(*(vertices - vertices.mean(0)).T * 0.5 / np.abs(vertices - vertices.mean(0)).max(), s=2, color=INK)
-    space.set_box_aspect((1, 1, 0.6), zoom=1.25)
-    space.view_init(elev=18, azim=-100)
+    camera = nextview.SimulatedCamera(sample_mesh("chair"))
+    points = np.concatenate([camera.observe(SPHERE.poses[view]).points[::2] for view in (1, 3, 5, 7, 33, 37)])
+    space.scatter(*0.6 * points.T, s=0.6, color=INK)
+    space.set_box_aspect((1, 1, 0.6), zoom=1.35)
+    space.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-0.3, 0.9))
+    space.view_init(elev=20, azim=-112)
     space.set_axis_off()
     axes = figure.add_subplot(1, 2, 2)
     shown = np.full(len(SPHERE), np.nan)
@@ -125,15 +120,15 @@ def belief() -> Figure:
     return figure
 
 
-def maps(view: View) -> Figure:
+def maps(here: int) -> Figure:
     """True depth entropy of all views with its highest and lowest, and what the network predicts of the window."""
     mesh = sample_mesh("table")
     camera = nextview.SimulatedCamera(mesh)
     true = np.array([depth_entropy(camera.observe(pose).depth) for pose in SPHERE.poses])
-    session = nextview.load(policy="lem").session(START)
+    session = nextview.load(policy="lem").session(here)
     seen = session.update(camera.observe(session.pose))
     values = np.full(len(SPHERE), np.nan)
-    values[SPHERE.windows[START].ravel()] = seen.maps["lem"].ravel()
+    values[SPHERE.windows[here].ravel()] = seen.maps["lem"].ravel()
     figure, (low, high, whole, window) = new(4, 2.8, 11.5)
     picture(low, int(true.argmin()), mesh, f"view {true.argmin()}: {true.min():.1f} bits")
     picture(high, int(true.argmax()), mesh, f"view {true.argmax()}: {true.max():.1f} bits")
@@ -141,12 +136,12 @@ def maps(view: View) -> Figure:
     figure.colorbar(whole.images[0], ax=whole)
     mark(whole, int(true.argmin()), "low", "white")
     mark(whole, int(true.argmax()), "high", ACCENT)
-    grid(window, values, f"predicted from view {START} (LEM)", cmap="viridis")
+    grid(window, values, f"predicted from view {here} (LEM)", cmap="viridis")
     figure.colorbar(window.images[0], ax=window)
-    mark(window, START, "here", "white")
+    mark(window, here, "here", "white")
     for ring, column in np.argwhere(local_peaks(seen.maps["lem"][None])[0]):
-        cell = int(SPHERE.windows[START][ring, column])
-        if cell != START:
+        cell = int(SPHERE.windows[here][ring, column])
+        if cell != here:
             mark(window, cell, "peak", ACCENT)
     return figure
 
@@ -167,28 +162,20 @@ def gain(view: View) -> Figure:
     return figure
 
 
-def calibration(p: Predictions, rng: np.random.Generator) -> Figure:
-    """Reliability of the belief after one, two and five random views: plain sums of logits, and calibrated."""
-    figure, panels = new(3, 3.5)
-    for axes, n in zip(panels, (1, 2, 5), strict=True):
-        views = np.array([rng.permutation(len(p.sphere))[:n] for _ in range(len(p))])
-        # What is observed is noted for each azimuth bin; the plain sum knows of none.
-        logits = np.take_along_axis(p.logits, views[:, :, None], 1).sum(1)
-        evidence = np.take_along_axis(p.log_evidence, views[:, :, None], 1).sum(1)
-        beliefs = {
-            "plain sum": (PLAIN_SUM.belief(logits, n, len(p.classes)), FAINT),
-            "calibrated": (p.calibration.belief(evidence, n, len(p.classes)), ACCENT),
-        }
-        axes.plot([0, 1], [0, 1], color=INK, linewidth=0.8)
-        for name, (belief, colour) in beliefs.items():
-            sure, right = belief.max(1), belief.argmax(1) == p.labels
-            confidence, accuracy, count = reliability(sure, right, 10)
-            label = f"{name}: error {calibration_error(sure, right, 10):.3f}"
-            axes.plot(confidence[count > 0], accuracy[count > 0], color=colour, label=label)
-            axes.scatter(confidence[count > 0], accuracy[count > 0], s=6 + 200 * count[count > 0] / len(p), color=colour)
-        axes.set_title(f"{n} view{'s' if n > 1 else ''}", fontsize=10, loc="left")
-        axes.set(xlim=(0, 1.03), ylim=(0, 1.03), xlabel="belief in the answer", ylabel="share that was right")
-        axes.legend(loc="upper left", fontsize=7.5)
+def calibration() -> Figure:
+    """Mean belief in the answer and how often it is right, by views fused: the measurements of docs/results.md."""
+    part = RESULTS.read_text().split("\n## Calibration\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (\d+) \| ([\d.]+) \(([\d.]+)-([\d.]+)\) \| [\d.]+ \| ([\d.]+) \|", part, re.M)
+    n_views, accuracy, low, high, confidence = np.array(rows, float).T
+    figure, (axes,) = new(1, 3.4, 5.6)
+    axes.fill_between(n_views, low, high, color="#0b5fa5", alpha=0.15, linewidth=0)
+    axes.plot(n_views, accuracy, marker="o", color="#0b5fa5", label="how often it is right, 95 % interval")
+    axes.plot(n_views, confidence, marker="o", color=ACCENT, label="mean belief in the answer")
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(n_views, [f"{n:.0f}" for n in n_views])
+    axes.minorticks_off()
+    axes.set(xlabel="random views fused", ylim=(0.88, 1.0))
+    axes.legend(loc="upper left")
     return figure
 
 
@@ -205,4 +192,4 @@ def samples(views: tuple[int, ...]) -> Figure:
 
 if __name__ == "__main__":
     with matplotlib.rc_context(STYLE):
-        main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+        main()
