@@ -28,6 +28,9 @@ REPOSITORY_PAGES = {
 } | {f"examples/{path.name}": f"examples/{path.stem}.md" for path in sorted(ROOT.glob("examples/*.py"))}
 """Files of the repository outside docs/, and the pages that show them."""
 
+LINK = re.compile(r"(\[[^\[\]]*\])\((?![a-z]+:|/)([^)#\s]+)(#[^)\s]*)?\)")
+"""A relative link in Markdown: its label in brackets, the file, the anchor."""
+
 
 def example_pages() -> dict[str, str]:
     """Markdown of each example's page by its place in the site; the first lists them all."""
@@ -72,13 +75,15 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     source = next((name for name, shown in REPOSITORY_PAGES.items() if shown == uri), f"docs/{uri}")
 
     def mended(match: re.Match[str]) -> str:
-        target, anchor = match[1], match[2] or ""
+        label, target, anchor = match[1], match[2], match[3] or ""
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
+        if path not in REPOSITORY_PAGES and not path.startswith("docs/") and (ROOT / path).exists():
+            return label.strip("[]")  # a file of the repository that the site does not show
         found = REPOSITORY_PAGES.get(path, path.removeprefix("docs/"))
-        return f"]({posixpath.relpath(found, posixpath.dirname(uri) or '.')}{anchor})"
+        return f"{label}({posixpath.relpath(found, posixpath.dirname(uri) or '.')}{anchor})"
 
     texts = re.split(r"(^```.*?^```)", markdown, flags=re.M | re.S)  # every second one is code
-    texts[::2] = [re.sub(r"\]\((?![a-z]+:|/)([^)#\s]+)(#[^)\s]*)?\)", mended, text) for text in texts[::2]]
+    texts[::2] = [LINK.sub(mended, text) for text in texts[::2]]
     return "".join(texts)
 
 
