@@ -1,7 +1,7 @@
 # Two commands do everything on a machine with Python 3.11+, pip and make: `make demo` and `make test`.
 PYTHON ?= python3
 
-.PHONY: demo test lint reproduce reproduce-small clean
+.PHONY: demo test lint docs reproduce reproduce-small clean
 
 demo: .venv/installed  ## look at a sample object, with the base installation (no torch)
 	.venv/bin/nextview demo --figure nextview_demo.png
@@ -13,6 +13,9 @@ lint: .venv-test/installed  ## style and types
 	.venv-test/bin/ruff check .
 	.venv-test/bin/ruff format --check .
 	.venv-test/bin/mypy
+
+docs: .venv-test/installed  ## the documentation site, build/site/index.html; a broken link or notebook ends it
+	NO_MKDOCS_2_WARNING=1 .venv-test/bin/mkdocs build
 
 DATA ?= data/ModelNet10
 OUT ?= reproduction
@@ -32,7 +35,7 @@ reproduce-small: .venv-test/installed  ## the same on three meshes a class, or o
 
 .venv-test/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv-test
-	.venv-test/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,benchmark,cluster,explore,record,dev,workflow,arm]'
+	.venv-test/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,benchmark,cluster,explore,record,dev,workflow,arm,docs]'
 	touch $@
 
 clean:

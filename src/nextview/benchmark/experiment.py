@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -51,8 +51,15 @@ class Grid:
         return (answer == self.specs.labels).reshape(self.runs, -1)
 
 
-def run_grid(grid: Grid, names: Sequence[str]) -> Iterator[int]:
+def run_grid(
+    grid: Grid, names: Sequence[str], through: Callable[[Grid, str], object] = lambda grid, name: None
+) -> Iterator[int]:
     """Run the entries one after the other; one that fails leaves its sentence and takes nothing from the others.
+
+    Args:
+        grid: what is run, and takes in what comes of it.
+        names: of the entries.
+        through: is called with the grid and the name of each entry that has just been run.
 
     Yields:
         How many are through.
@@ -62,4 +69,5 @@ def run_grid(grid: Grid, names: Sequence[str]) -> Iterator[int]:
             grid.paths[name] = replay(name, grid.specs, grid.max_views, grid.seed)
         except NextviewError as error:
             grid.failures[name] = str(error)
+        through(grid, name)
         yield n

@@ -45,6 +45,7 @@ def run_benchmark(
     samples: int = 2000,
     seed: int = 0,
     track: Track = _unseen,
+    through: Callable[[Grid, str], object] = lambda grid, name: None,
 ) -> results.Results:
     """Run every policy under every threshold from the same first views, and write episodes, tables and tests.
 
@@ -68,6 +69,7 @@ def run_benchmark(
         samples: of the bootstrap.
         seed: decides first views, random policies and the bootstrap.
         track: shows how far it is; by default nothing is shown.
+        through: is called with all that was run and the name of each policy that has just come through.
 
     Raises:
         UsageError: settings that make no sense.
@@ -103,7 +105,7 @@ def run_benchmark(
     names = list(dict.fromkeys([*([reference] if policies else []), *wanted]))
     grid = Grid(specs, runs, tuple(sorted({*thresholds, *promised.values()})), max_views, seed, threshold_decay)
     with written_results(out, results.KIND) as part:
-        track(run_grid(grid, names), len(names), "replaying policies")
+        track(run_grid(grid, names, through), len(names), "replaying policies")
         if not grid.paths:
             raise EntryError("\n".join(grid.failures.values()))
         tables = summarise(grid, reference, samples, np.random.default_rng([seed, 1]), promised)

@@ -50,15 +50,18 @@ def benchmark(
         samples: of the bootstrap.
         seed: decides first views, random policies and the bootstrap.
     """
+    from functools import partial
+
     from nextview.benchmark.run import run_benchmark
     from nextview.cli.leaderboard_table import print_leaderboard
+    from nextview.cli.live_leaderboard import LiveLeaderboard
     from nextview.cli.progress import console, track
     from nextview.models.collection import find_models
 
-    own = find_models(models).policies
+    own, live = find_models(models).policies, LiveLeaderboard()
     results = run_benchmark(
         predictions, out, policies, own, thresholds, risks, threshold_decay, uncalibrated, split, runs, max_views,
-        reference, valley_classes, samples, seed, track,
+        reference, valley_classes, samples, seed, partial(track, above=live.table), live.add,
     )  # fmt: skip
     print_leaderboard(results)
     console.print(f"results in {out}", soft_wrap=True)

@@ -7,6 +7,7 @@ from typing import Any
 from nextview.cli.benchmark import benchmark
 from nextview.cli.capture import capture
 from nextview.cli.check import check
+from nextview.cli.completion import completion
 from nextview.cli.correspond import correspond
 from nextview.cli.demo import demo
 from nextview.cli.download import download
@@ -65,6 +66,7 @@ COMMANDS: dict[str, Any] = {
     "evaluate": evaluate,
     "benchmark": benchmark,
     "report": report,
+    "completion": completion,
 }
 GROUPS = {
     "train": "Train a network on a view store.",

@@ -41,8 +41,10 @@ def predict(
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler, to use its workers instead.
     """
-    from nextview.cli.progress import track
+    from nextview.cli.predictions_table import print_predictions
+    from nextview.cli.progress import console, track
     from nextview.data import predicting as job
+    from nextview.data.predictions import Predictions
     from nextview.data.store import ViewStore
     from nextview.models.collection import find_models
     from nextview.models.model_card import find_card
@@ -61,3 +63,5 @@ def predict(
     steps = job.predict(store, out, judges, cards, split, held_out, not by_shape, batch, workers, scheduler)
     before, total = next(steps)
     track((done for done, _ in steps), total, f"predicting {store.name}", before, len(ViewStore.open(store).sphere))
+    print_predictions(Predictions.load(out))
+    console.print(f"predictions in {out}; compare policies with: nextview benchmark {out}", soft_wrap=True)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
+from rich.console import Console, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -22,7 +23,14 @@ from nextview.cli.terminal import Terminal
 console = Terminal(stderr=True)
 
 
-def track(done: Iterable[int], total: int, what: str, before: int = 0, views: int = 0) -> None:
+def track(
+    done: Iterable[int],
+    total: int,
+    what: str,
+    before: int = 0,
+    views: int = 0,
+    above: Callable[[], RenderableType] | None = None,
+) -> None:
     """Exhaust an iterable that yields how much is done so far; show it, the time left and, at the end, the time taken.
 
     Args:
@@ -31,6 +39,7 @@ def track(done: Iterable[int], total: int, what: str, before: int = 0, views: in
         what: what is being done.
         before: how much an earlier run had done.
         views: if given, the speed is shown too, in objects of so many views.
+        above: if given, what it makes is shown above the bar while something is left to do; in a terminal only.
     """
     # All of it fits into 80 columns, at thousands of objects and views a second too.
     name = TextColumn(
@@ -38,10 +47,24 @@ def track(done: Iterable[int], total: int, what: str, before: int = 0, views: in
     )
     columns = [name, BarColumn(8), MofNCompleteColumn(), TimeRemainingColumn(elapsed_when_finished=True)]
     columns += [Speed(views)] if views else []
-    with Progress(*columns, console=console) as progress:
+    with _ProgressBelow(*columns, console=console, above=above if console.is_terminal else None) as progress:
         task = progress.add_task(printable(what), total=total, completed=before)
         for n in done:
             progress.update(task, completed=n)
+
+
+class _ProgressBelow(Progress):
+    """Progress bars below something else."""
+
+    def __init__(self, *columns: ProgressColumn, console: Console, above: Callable[[], RenderableType] | None) -> None:
+        self.above = above
+        super().__init__(*columns, console=console)
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """What stands above, until all is done, and the bars."""
+        if self.above is not None and not self.finished:
+            yield self.above()
+        yield from super().get_renderables()
 
 
 class Speed(ProgressColumn):

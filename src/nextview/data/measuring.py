@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -45,13 +45,14 @@ class Cost:
         peak: memory of the largest process, bytes.
     """
 
-    seconds: Counter[str] = field(default_factory=Counter)
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     views: int = 0
     peak: int = 0
 
     def add(self, other: Cost) -> None:
         """Count another one in."""
-        self.seconds.update(other.seconds)
+        for name, seconds in other.seconds.items():
+            self.seconds[name] += seconds
         self.views += other.views
         self.peak = max(self.peak, other.peak)
 

@@ -1,0 +1,80 @@
+"""One page for each command: its own help, and the lines of the documentation that use it."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Iterator
+from contextlib import redirect_stdout, suppress
+from functools import cache
+from pathlib import Path
+from unittest.mock import patch
+
+from nextview.cli.commands import COMMANDS, GROUPS
+from nextview.cli.main import main
+
+ROOT = Path(__file__).parents[2]
+GUIDES = ("your_camera", "dataset", "training", "add_a_policy", "results")
+SOURCES = ["README.md", *(f"docs/{name}.md" for name in GUIDES)]
+"""Where examples are looked for, the best first; the research notes tell what was run once."""
+COLUMNS = "96"
+
+
+@cache
+def command_pages() -> dict[str, str]:
+    """Markdown of each page by its place in the site; the first lists them all."""
+    examples, pages, rows = _examples(), {}, []
+    for words, command in _commands():
+        uri = f"commands/{words.replace(' ', '-')}.md"
+        rows.append(f"| [`nextview {words}`](../{uri}) | {_first_sentence(command.__doc__ or '')} |")
+        pages[uri] = f"# nextview {words}\n\n```text\n{help_of(words)}```\n\n{_used(examples.get(words, {}))}"
+    table = "\n".join(["| command | |", "|---|---|", *rows])
+    top = f"# Commands\n\nEach page is the command's own help. `nextview COMMAND --help` prints it.\n\n{table}\n"
+    return {"commands/index.md": top} | pages
+
+
+def _commands() -> Iterator[tuple[str, object]]:
+    for name, command in COMMANDS.items():
+        if name in GROUPS:
+            yield from ((f"{name} {each}", function) for each, function in command.items())
+        else:
+            yield name, command
+
+
+def help_of(words: str) -> str:
+    """What ``nextview WORDS --help`` prints, without trailing spaces."""
+    printed = io.StringIO()
+    plain = {"COLUMNS": COLUMNS, "NO_COLOR": "1"}
+    with patch.dict(os.environ, plain), redirect_stdout(printed), suppress(SystemExit):
+        main([*words.split(), "--help"])
+    return "\n".join(line.rstrip() for line in printed.getvalue().strip().splitlines()) + "\n"
+
+
+def _first_sentence(text: str) -> str:
+    return " ".join(text.split("\n\n")[0].split()).partition(". ")[0].rstrip(".") + "."
+
+
+def _examples() -> dict[str, dict[str, str]]:
+    """Of each command, the lines that use it and the page where each stands first."""
+    names = sorted((words for words, _ in _commands()), key=len, reverse=True)
+    found: dict[str, dict[str, str]] = {}
+    for source in SOURCES:
+        for line in re.findall(r"^ {0,4}(nextview [a-z].*?)\s*(?:  #.*)?$", (ROOT / source).read_text(), re.M):
+            words = next((name for name in names if f"{line} ".startswith(f"nextview {name} ")), None)
+            if words:
+                found.setdefault(words, {}).setdefault(line, source)
+    return found
+
+
+def _used(lines: dict[str, str]) -> str:
+    if not lines:
+        return ""
+    by_page: dict[str, list[str]] = {}
+    for line, source in lines.items():
+        by_page.setdefault(source, []).append(line)
+    parts = ["## In use\n"]
+    for source, each in by_page.items():
+        commands = "\n".join(each)
+        parts.append(f"In [{Path(source).stem.replace('_', ' ')}](../../{source}):\n\n```sh\n{commands}\n```\n")
+    return "\n".join(parts)

@@ -1,0 +1,146 @@
+"""The wheel: built, installed into an empty environment, and run with nothing but what it asks for.
+
+Always: what the wheel asks for is linked from the environment of the tests, so that nothing else can be imported.
+With NEXTVIEW_WHEELS=all, pip installs the wheel and each extra from an index, as a user would.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import venv
+import zipfile
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parent.parent
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+EXAMPLES = {
+    "": "import nextview; assert nextview.recognise('samples/chair.off', start=3).answer == 'chair'",
+    "benchmark": "from nextview.benchmark.run import run_benchmark; from nextview.report.html import write_report",
+    "cluster": "from distributed import LocalCluster; import nextview.data.pool",
+    "train": "import lightning, torch; from nextview.training import export, loop, onnx_export",
+    "workflow": "import snakemake",
+    "docs": "import material, mkdocs, mkdocs_jupyter, mkdocstrings_handlers.python",
+    "dev": "import hypothesis, mypy, pytest, ruff, skimage, trimesh",
+}
+"""One line for each extra, and for none."""
+EMPTY_ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_TARGET"))}
+
+
+def run(*command, cwd=ROOT, timeout=600):
+    done = subprocess.run(
+        list(map(str, command)), cwd=cwd, env=EMPTY_ENVIRONMENT, capture_output=True, text=True, timeout=timeout
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """Built from a copy, which setuptools may fill with what it makes; by the environment's own setuptools."""
+    folder = tmp_path_factory.mktemp("wheel")
+    for name in ("src", "samples"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("*.egg-info", "__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, folder)
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
+    run(*pip, "wheel", "--quiet", "--no-deps", "--no-index", "--no-build-isolation", "-w", folder / "dist", folder)
+    (built,) = (folder / "dist").glob("*.whl")
+    return built
+
+
+def environment(folder):
+    """An environment of its own without anything; its Python and where its packages go."""
+    venv.create(folder, with_pip=False)
+    base = {"base": str(folder), "platbase": str(folder)}
+    python = Path(sysconfig.get_path("scripts", "venv", base)) / "python"
+    return python, Path(sysconfig.get_path("purelib", "venv", base))
+
+
+def asked_for(requirements, found=None):
+    """The installed distributions that requirements need, by name, theirs included.
+
+    Raises:
+        PackageNotFoundError: one is not installed.
+    """
+    found = {} if found is None else found
+    for text, extra in requirements:
+        needed = Requirement(text)
+        if needed.marker and not needed.marker.evaluate({"extra": extra}):
+            continue
+        installed = distribution(needed.name)
+        for wanted in ("", *needed.extras):
+            if (needed.name.lower(), wanted) not in found:
+                found[needed.name.lower(), wanted] = installed
+                asked_for([(each, wanted) for each in installed.requires or ()], found)
+    return found
+
+
+def link(installed, packages):
+    """What a distribution has at the top of its packages' folder, linked into another one."""
+    home = Path(installed.locate_file(""))
+    for name in {file.parts[0] for file in installed.files or () if file.parts[0] not in ("..", "__pycache__")}:
+        place = packages / name
+        if place.is_dir() and not place.is_symlink():
+            for inner in (home / name).iterdir():
+                if not (place / inner.name).exists():
+                    (place / inner.name).symlink_to(inner)
+        elif not place.exists() and (home / name).exists():
+            if (home / name).is_dir() and not (home / name / "__init__.py").exists() and "-" not in name:
+                place.mkdir()  # several distributions may share a namespace
+                link(installed, packages)
+            else:
+                place.symlink_to(home / name)
+
+
+def test_every_extra_has_an_example():
+    assert set(EXAMPLES) == {"", *EXTRAS}
+
+
+@pytest.mark.parametrize("extra", EXAMPLES)
+def test_it_runs_with_what_it_asks_for(wheel, extra, tmp_path):
+    python, packages = environment(tmp_path / "venv")
+    zipfile.ZipFile(wheel).extractall(packages)
+    (own,) = packages.glob("nextview-*.dist-info")
+    try:
+        found = asked_for([(text, extra) for text in Distribution.at(own).requires])
+    except PackageNotFoundError as missing:
+        pytest.skip(f"the extra {extra} is not installed here: {missing.name} is missing")
+    for installed in found.values():
+        link(installed, packages)
+    run(python, "-c", EXAMPLES[extra], cwd=wheel.parents[1])
+    assert f"{packages}" in run(python, "-c", "import nextview; print(nextview.__file__)", cwd=tmp_path)
+
+
+def test_what_is_not_asked_for_is_not_there(wheel, tmp_path):
+    python, packages = environment(tmp_path / "venv")
+    zipfile.ZipFile(wheel).extractall(packages)
+    done = subprocess.run([python, "-c", "import numpy"], env=EMPTY_ENVIRONMENT, capture_output=True, text=True)
+    assert "No module named 'numpy'" in done.stderr
+
+
+def test_it_holds_the_package_and_nothing_else(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    tops = {name.split("/")[0] for name in names}
+    assert {re.sub(r"-.*\.dist-info", "", top) for top in tops} == {"nextview", "nextview_command.py"}
+    source = ROOT / "src/nextview"
+    data = [path for path in source.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")]
+    assert {f"nextview/{path.relative_to(source).as_posix()}" for path in data} <= set(names)
+
+
+@pytest.mark.skipif(os.environ.get("NEXTVIEW_WHEELS") != "all", reason="NEXTVIEW_WHEELS=all installs from an index")
+@pytest.mark.parametrize("extra", EXAMPLES)
+def test_pip_installs_it(wheel, extra, tmp_path):
+    run(sys.executable, "-m", "venv", tmp_path / "venv")
+    python = tmp_path / "venv/bin/python"
+    wanted = f"nextview[{extra}] @ {wheel.as_uri()}" if extra else wheel
+    run(python, "-m", "pip", "install", "--quiet", "-c", ROOT / "constraints.txt", wanted, timeout=3000)
+    run(python, "-c", EXAMPLES[extra], cwd=wheel.parents[1])
+    assert "nextview 0" in run(tmp_path / "venv/bin/nextview", "--version")
