@@ -116,14 +116,10 @@ def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng
     """Follow a policy through all episodes."""
     p, objects = specs.predictions, specs.objects
     maps = {name: TRUE_MAPS[name](p) if name in TRUE_MAPS else p.maps[name] for name in maps_among(policy.needs)}
+    p = replace(p, maps=maps)
 
     def observe(which: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
-        rows = objects[which]
-        return Evidence(
-            p.logits[rows, views],
-            {name: values[rows, views] for name, values in maps.items()},
-            azimuth_bins=None if p.azimuth_bins is None else p.azimuth_bins[rows, views],
-        )
+        return p.evidence(objects[which], views)
 
     try:
         done = run_episodes(observe, p.sphere, policy, specs.starts, stopping, rng, p.calibration)

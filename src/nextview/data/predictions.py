@@ -15,6 +15,7 @@ from nextview.belief import PLAIN_SUM, Calibration, log_evidence_of
 from nextview.data.splits import deduplicated
 from nextview.errors import PredictionsError
 from nextview.outputs import written_whole
+from nextview.policies.base import Evidence
 from nextview.viewsphere import ViewSphere
 
 FORMAT = 1
@@ -112,6 +113,14 @@ class Predictions:
     def log_evidence(self) -> NDArray[np.float32]:
         """What the recogniser says of each view, so that views can be summed, (N, V, D); see ``log_evidence_of``."""
         return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.turn)
+
+    def evidence(self, objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
+        """What the models say of objects (rows), (B,), each seen from one view, (B,)."""
+        return Evidence(
+            self.logits[objects, views],
+            {name: values[objects, views] for name, values in self.maps.items()},
+            azimuth_bins=None if self.azimuth_bins is None else self.azimuth_bins[objects, views],
+        )
 
     def of_split(self, split: str) -> Predictions:
         """The objects of one split.
