@@ -10,6 +10,9 @@ from nextview.errors import MissingExtraError
 EXTRAS = {
     "benchmark": ("jinja2", "pandas", "pyarrow"),
     "cluster": ("dask", "distributed"),
+    "envs": ("gymnasium",),
+    "ap-gym": ("ap_gym",),
+    "rl": ("stable_baselines3",),
     "train": ("lightning", "numcodecs", "onnx", "onnxscript", "torch", "torchmetrics"),
 }
 """Packages by the optional part of the installation that brings them."""

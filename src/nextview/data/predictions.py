@@ -132,14 +132,14 @@ class Predictions:
         if not kept.any():
             there = ", ".join(repr(str(name)) for name in np.unique(self.splits))
             raise PredictionsError(f"these predictions hold no objects of the split {split!r}, only of {there}")
-        return self._of(np.flatnonzero(kept))
+        return self.of_objects(np.flatnonzero(kept))
 
     def deduplicate(self) -> Predictions:
         """One object of each shape and label: without the copies that look the same from every view."""
-        return self._of(deduplicated(self.labels, self.depth_entropy))
+        return self.of_objects(deduplicated(self.labels, self.depth_entropy))
 
-    def _of(self, kept: NDArray[np.int64]) -> Predictions:
-        """Some of the objects."""
+    def of_objects(self, kept: NDArray[np.int64]) -> Predictions:
+        """Some of the objects, by their rows, (n,)."""
         arrays = {name: getattr(self, name)[kept] for name in ("logits", "depth_entropy", "labels", "splits")}
         maps = {name: values[kept] for name, values in self.maps.items()}
         optional = {
