@@ -13,14 +13,14 @@ from test_gain import some_state
 
 pytest.importorskip("stable_baselines3")
 
-from nextview.belief import Calibration  # noqa: E402
-from nextview.calibration.rollout import ReplayTable, judge, rollout  # noqa: E402
-from nextview.cli.main import main  # noqa: E402
-from nextview.data.predictions import Predictions  # noqa: E402
-from nextview.errors import PolicyError  # noqa: E402
-from nextview.policies.agent import Agent  # noqa: E402
-from nextview.policies.baselines import RandomAll  # noqa: E402
-from nextview.policies.registry import make_policy  # noqa: E402
+from nextview.belief import Calibration
+from nextview.calibration.rollout import ReplayTable, judge, rollout
+from nextview.cli.main import main
+from nextview.data.predictions import Predictions
+from nextview.errors import PolicyError
+from nextview.policies.agent import Agent
+from nextview.policies.baselines import RandomAll
+from nextview.policies.registry import make_policy
 
 QUICK = ["--steps", "64", "--envs", "8", "--rollout", "4", "--evaluations", "2", "--hidden", "8", "--batch", "8"]
 PLAIN = ["--inputs", "belief", "place", "--frame", "camera"]
@@ -60,7 +60,9 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("agent")
     learnable(30).save(folder / "p.npz")
     for name, preset in (("agent", "default"), ("mvselect", "mvselect")):
-        main(["train", "agent", str(folder / "p.npz"), str(folder / f"{name}.json"), "--preset", preset, *QUICK, *PLAIN])
+        main(
+            ["train", "agent", str(folder / "p.npz"), str(folder / f"{name}.json"), "--preset", preset, *QUICK, *PLAIN]
+        )
     return folder
 
 
@@ -112,7 +114,9 @@ print(*make_policy({str(trained / "agent.json")!r}, sphere).next_views(state, np
 def test_the_same_seed_gives_the_same_agent(trained, tmp_path):
     for seed in ("0", "1"):
         main(["train", "agent", str(trained / "p.npz"), str(tmp_path / f"{seed}.json"), *QUICK, *PLAIN, "--seed", seed])
-    first, again, other = (path.read_bytes() for path in (trained / "agent.onnx", tmp_path / "0.onnx", tmp_path / "1.onnx"))
+    first, again, other = (
+        path.read_bytes() for path in (trained / "agent.onnx", tmp_path / "0.onnx", tmp_path / "1.onnx")
+    )
     assert first == again
     assert first != other
 

@@ -27,7 +27,10 @@ def learnable(n: int = 12, seed: int = 0, split: str = "train") -> Predictions:
     p = some_predictions(n, seed)
     azimuth_bins = np.random.default_rng(seed + 9).normal(size=(n, 40, 3, 8)).astype(np.float32)
     return replace(
-        p, splits=np.array([split] * n), azimuth_bins=azimuth_bins, calibration=Calibration(1.5, 0.3, bin_correlation=0.2)
+        p,
+        splits=np.array([split] * n),
+        azimuth_bins=azimuth_bins,
+        calibration=Calibration(1.5, 0.3, bin_correlation=0.2),
     )
 
 
@@ -68,7 +71,9 @@ def played(env, seed: int, n: int = 60):
 
 def test_a_seed_decides_everything(file):
     def same(a, b):
-        return all(np.array_equal(x, y) for one, other in zip(a, b, strict=True) for x, y in zip(one, other, strict=True))
+        return all(
+            np.array_equal(x, y) for one, other in zip(a, b, strict=True) for x, y in zip(one, other, strict=True)
+        )
 
     options = {"predictions": str(file), "threshold": 0.7}
     first, again, other = (played(gymnasium.make(RECOGNISE, **options), seed) for seed in (3, 3, 4))
@@ -178,9 +183,9 @@ def test_training_and_test_objects_stay_apart(tmp_path):
         labels=np.concatenate([train.labels, test.labels]), splits=np.concatenate([train.splits, test.splits]),
         conflicting=np.zeros(15, bool), azimuth_bins=np.concatenate([train.azimuth_bins, test.azimuth_bins]),
     )  # fmt: skip
-    for split, names in (("train", train.names), ("test", names), (None, both.names)):
+    for split, expected in (("train", train.names), ("test", names), (None, both.names)):
         env = gymnasium.make(RECOGNISE, predictions=both, split=split).unwrapped
-        assert env.task.names == names
+        assert env.task.names == expected
     with pytest.raises(PredictionsError, match="no objects of the split 'test'"):
         gymnasium.make(RECOGNISE, predictions=train, split="test")
 
@@ -228,14 +233,14 @@ def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
     options = {"depth": True, "size": 64, "inputs": ("belief", "place", "lem-sphere")}
     env = gymnasium.make("nextview/RecogniseMesh-v0", **options)
     check_env(env.unwrapped, skip_render_check=True)
-    observation, info = env.reset(seed=1)
+    observation, _ = env.reset(seed=1)
     assert observation["depth"].shape == (64, 64)
     assert observation["depth"].max() > 2
     # The beliefs are those of a session that takes the same views.
     from nextview.data.samples import SAMPLES, sample_mesh
 
     plain = gymnasium.make("nextview/RecogniseMesh-v0", inputs=("belief",), max_views=2)
-    observation, info = plain.reset(options={"object": 0, "start": 3})
+    observation, _ = plain.reset(options={"object": 0, "start": 3})
     system = load(policy="spread", max_views=2)
     camera = simulated(sample_mesh(next(iter(SAMPLES))))
     session: Session = system.session(start=3)

@@ -1,10 +1,10 @@
 """``nextview/ActiveRecognise-v0``: the replay as an active classification environment of ap_gym.
 
 ap_gym (Schneider et al., "Active Perception Gym") asks an agent for an action and a prediction in every step:
-``{"action": view, "prediction": logits}``. The reward is the base reward, here the price of the view and of the way
-there with a minus, less the loss of the prediction, the cross-entropy over that of a guess. The truth stands in the info
-as ``info["prediction"]["target"]``. What the recogniser believes is in the observation; ``Rules.outcome`` counts for
-nothing.
+``{"action": view, "prediction": logits}``. The reward is a base reward less the loss of the prediction. The base reward
+is the price of the view and of the way there with a minus; the loss is ap_gym's, the cross-entropy over that of a
+guess. The truth stands in the info as ``info["prediction"]["target"]``. What the recogniser believes is in the
+observation, and ``Rules.outcome`` counts for nothing.
 """
 
 from __future__ import annotations

@@ -46,7 +46,8 @@ class TaskEnv(gymnasium.Env[Any, Any]):
             SessionError: no episode is under way.
         """
         seen = self._go(action)
-        return (*self._observed(seen)[:1], float((seen.change - seen.price)[0]), bool(seen.ended[0]), False, info_of(seen))
+        observation, info = self._observed(seen)
+        return observation, float((seen.change - seen.price)[0]), bool(seen.ended[0]), False, info
 
     def _go(self, action: Any) -> Seen:
         if self._cohort is None or len(self._cohort.running) == 0:

@@ -66,7 +66,9 @@ class Rules:
             if unknown or not given:
                 raise UsageError(f"{what} is of {', '.join(known)}, not {unknown[0] if unknown else 'nothing'!r}")
         if self.max_views < 2:
-            raise UsageError(f"an episode takes at least two views, of which the agent chooses one, not {self.max_views}")
+            raise UsageError(
+                f"an episode takes at least two views, of which the agent chooses one, not {self.max_views}"
+            )
         for name in ("view_price", "travel_price"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise UsageError(f"the {name} is a number from 0 on, not {getattr(self, name)}")
@@ -135,14 +137,9 @@ class Task:
     @property
     def observation_space(self) -> gymnasium.spaces.Box:
         """Of the numbers that ``policies.gain.features`` makes, (D,) float32; all but the maps from 0 to 1."""
-        high = np.ones(len(mirrored_features(self.sphere, len(self.classes), self.rules.inputs, self.rules.frame)))
-        alone = Rules(tuple(n for n in self.rules.inputs if n in MAPS) or ("view",), self.rules.frame)
-        if self.rules.maps:
-            width = len(mirrored_features(self.sphere, len(self.classes), alone.inputs, self.rules.frame))
-            tail = 0
-            if "azimuth_bin" in self.rules.inputs:
-                tail = len(mirrored_features(self.sphere, len(self.classes), ("azimuth_bin",), self.rules.frame))
-            high[len(high) - tail - width : len(high) - tail] = FAR
+        c, rules = len(self.classes), self.rules
+        widths = {name: len(mirrored_features(self.sphere, c, (name,), rules.frame)) for name in INPUTS}
+        high = np.concatenate([np.full(widths[n], FAR if n in MAPS else 1.0) for n in INPUTS if n in rules.inputs])
         return gymnasium.spaces.Box(np.where(high > 1, -FAR, 0).astype(np.float32), high.astype(np.float32))
 
     @property

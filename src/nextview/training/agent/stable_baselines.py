@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -95,10 +95,6 @@ def learn(model: BaseAlgorithm, recipe: AgentRecipe) -> Iterator[Layers]:
 def layers_of(model: BaseAlgorithm) -> Layers:
     """From observations to the logits of the actions (PPO's actor), or to their values (DQN)."""
     policy: Any = model.policy
-    parts: Sequence[nn.Module]
-    if isinstance(model, PPO):
-        parts = [*policy.mlp_extractor.policy_net, policy.action_net]
-    else:
-        parts = [*policy.q_net.q_net]
-    array: Callable[[Any], NDArray[np.float32]] = lambda tensor: tensor.detach().numpy().copy()  # noqa: E731
-    return tuple((array(part.weight).T, array(part.bias)) for part in parts if isinstance(part, nn.Linear))
+    parts = [*policy.mlp_extractor.policy_net, policy.action_net] if isinstance(model, PPO) else [*policy.q_net.q_net]
+    linear = [[p.detach().numpy().copy() for p in part.parameters()] for part in parts if isinstance(part, nn.Linear)]
+    return tuple((weights.T, bias) for weights, bias in linear)
