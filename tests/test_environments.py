@@ -1,7 +1,9 @@
 """The environments: what Gymnasium promises for them, and that they are the replay's own episodes."""
 
+import doctest
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -204,9 +206,9 @@ def test_every_class_is_drawn_equally_often_where_that_is_asked_for():
 @pytest.mark.parametrize(
     ("options", "error", "sentence"),
     [
-        ({"inputs": ("belief", "smell")}, UsageError, "not smell"),
+        ({"inputs": ("belief", "smell")}, UsageError, "not 'smell'"),
         ({"inputs": ()}, UsageError, "not nothing"),
-        ({"outcome": "joy"}, UsageError, "not joy"),
+        ({"outcome": "joy"}, UsageError, "not 'joy'"),
         ({"max_views": 1}, UsageError, "at least two views"),
         ({"max_views": 41}, UsageError, "40 views"),
         ({"travel_price": -1.0}, UsageError, "travel_price"),
@@ -287,3 +289,12 @@ def test_ap_gym_takes_it_for_one_of_its_own():
         np.testing.assert_array_equal(info["prediction"]["target"], targets[-1])
         targets.append(info["prediction_target"])
     assert rewards.shape == (5,)
+
+
+def test_the_page_does_what_it_says(tmp_path, monkeypatch):
+    learnable().save(tmp_path / "validation.npz")
+    monkeypatch.chdir(tmp_path)
+    page = Path(__file__).parents[1] / "docs/environments.md"
+    failed, tried = doctest.testfile(str(page), module_relative=False)
+    assert tried > 12
+    assert failed == 0

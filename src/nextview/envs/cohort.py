@@ -86,7 +86,7 @@ class Cohort:
             actions: (A,), see ``Task.action_space``.
         """
         sphere, running = self.task.sphere, self.running
-        before = self._episodes.current[running]
+        before = self._episodes.steps[-1].views[~self._episodes.steps[-1].stopped]  # ``current`` is what comes next
         self._asked.views[running] = self._reached[np.arange(len(running)), actions]
         self._episodes.choose_again()
         way = sphere.travel[before, self._episodes.current[running]]

@@ -64,7 +64,8 @@ class Rules:
         ):
             unknown = [name for name in given if name not in known]
             if unknown or not given:
-                raise UsageError(f"{what} is of {', '.join(known)}, not {unknown[0] if unknown else 'nothing'!r}")
+                other = repr(unknown[0]) if unknown else "nothing"
+                raise UsageError(f"{what} is of {', '.join(known)}, not {other}")
         if self.max_views < 2:
             raise UsageError(
                 f"an episode takes at least two views, of which the agent chooses one, not {self.max_views}"
