@@ -75,7 +75,7 @@ def learner(env: TaskVectorEnv, recipe: AgentRecipe) -> BaseAlgorithm:
     first, last = recipe.exploration
     model = DQN(
         "MlpPolicy", BatchedVecEnv(env), train_freq=recipe.rollout, gradient_steps=recipe.updates, tau=0.05,
-        target_update_interval=1, buffer_size=200_000, learning_starts=4 * recipe.batch, **shared,
+        target_update_interval=recipe.envs, buffer_size=200_000, learning_starts=4 * recipe.batch, **shared,
     )  # fmt: skip
     model.exploration_schedule = lambda _: float(
         np.interp(2 * model.num_timesteps, [0, recipe.steps], [first, last])
