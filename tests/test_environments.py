@@ -232,11 +232,11 @@ def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
     from nextview.session import Session
     from nextview.system import load, simulated
 
-    options = {"depth": True, "size": 64, "inputs": ("belief", "place", "lem-sphere")}
+    options = {"depth": True, "size": 112, "inputs": ("belief", "place", "lem-sphere")}
     env = gymnasium.make("nextview/RecogniseMesh-v0", **options)
     check_env(env.unwrapped, skip_render_check=True)
     observation, _ = env.reset(seed=1)
-    assert observation["depth"].shape == (64, 64)
+    assert observation["depth"].shape == (112, 112)
     assert observation["depth"].max() > 2
     # The beliefs are those of a session that takes the same views.
     from nextview.data.samples import SAMPLES, sample_mesh

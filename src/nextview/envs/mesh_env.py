@@ -39,7 +39,7 @@ class RecogniseMeshEnv(TaskEnv):
         viewpoints: a layout of ``ViewSphere.named``.
         depth: add the depth image: the observation is then {"state": (D,), "depth": (size, size) float32, object radii,
             0 where there is no object}.
-        size: side of the image, pixels.
+        size: side of the image, pixels; a multiple of what the networks take, 112 for the bundled ones.
         balanced: draw every class equally often.
         rules: options of ``Rules``, by name.
 

@@ -26,7 +26,7 @@ class BatchedVecEnv(VecEnv):
 
     def reset(self) -> NDArray[np.float32]:
         """First observations, (envs, D)."""
-        observation, self.reset_infos = self._env.reset(seed=self._seeds[0])[0], [{} for _ in range(self.num_envs)]
+        observation, _ = self._env.reset(seed=self._seeds[0])
         self._reset_seeds()
         return observation
 
