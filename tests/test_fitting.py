@@ -305,13 +305,13 @@ def test_a_calibration_that_knows_a_bad_sensor_trusts_views_less(training_predic
     clean = Recogniser(card).calibration
     order = np.random.default_rng(1).permutation(90)  # the same objects, in another order
     noise = np.random.default_rng(2).normal(0, 4, p.logits.shape)
-    sensed = replace(p, logits=(p.logits + noise).astype(np.float32)).of(order)
+    sensed = replace(p, logits=(p.logits + noise).astype(np.float32)).of_objects(order)
     sensed.save(tmp_path / "sensed.npz")
     main(["fit", "calibration", str(path), str(card), "--sensed", str(tmp_path / "sensed.npz")])
     assert Recogniser(card).calibration.temperature > 1.5 * clean.temperature
     assert "60 objects" in json.loads(card.read_text())["fitted_to"]["calibration"]
     assert "through sensors" in json.loads(card.read_text())["fitted_to"]["calibration"]
-    sensed.of(np.arange(50)).save(tmp_path / "few.npz")
+    sensed.of_objects(np.arange(50)).save(tmp_path / "few.npz")
     replace(sensed, models={**p.models, "lem": ("other", "f" * 64)}).save(tmp_path / "other.npz")
     capsys.readouterr()
     for arguments, sentence in [

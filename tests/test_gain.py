@@ -524,8 +524,8 @@ def test_it_learns_from_what_sensors_made_of_the_same_objects(unseen, tmp_path, 
     from nextview.data.predictions import Predictions
 
     p = Predictions.load(unseen)
-    replace(p, logits=p.logits[:, ::-1]).of(np.arange(90)[::-1]).save(tmp_path / "sensed.npz")
-    sensed = Predictions.load(tmp_path / "sensed.npz").of(np.arange(90)[::-1])
+    replace(p, logits=p.logits[:, ::-1]).of_objects(np.arange(90)[::-1]).save(tmp_path / "sensed.npz")
+    sensed = Predictions.load(tmp_path / "sensed.npz").of_objects(np.arange(90)[::-1])
     kept = np.array([3, 50, 7])
     table = ReplayTable.of(p, kept, np.random.default_rng(0), [sensed])
     np.testing.assert_array_equal(table.data.logits[3:], p.logits[kept][:, ::-1])

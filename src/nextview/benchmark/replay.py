@@ -19,7 +19,7 @@ from nextview.benchmark.entries import EpisodeSpecs, entry_policy, fixed_views
 from nextview.benchmark.true_maps import TRUE, true_map
 from nextview.data.predictions import Predictions
 from nextview.episode import run_episodes
-from nextview.errors import EntryError, PolicyError, ResultsError, UsageError
+from nextview.errors import EntryError, PolicyError, UsageError
 from nextview.policies.base import Evidence, Policy, maps_among
 from nextview.policies.fixed import ViewList
 from nextview.viewsphere import ViewSphere
@@ -110,21 +110,14 @@ PART = 4096
 def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng: np.random.Generator) -> Trajectories:
     """Follow a policy through all episodes."""
     p, objects = specs.predictions, specs.objects
-    try:
-        maps = {
-            name: true_map(p, name.removeprefix(TRUE)) if name.startswith(TRUE) else p.maps[name]
-            for name in maps_among(policy.needs)
-        }
-    except ResultsError as error:  # the store with the truth has gone, or holds something else now
-        raise EntryError(f"{name}: {error}") from error
+    maps = {
+        name: true_map(p, name.removeprefix(TRUE)) if name.startswith(TRUE) else p.maps[name]
+        for name in maps_among(policy.needs)
+    }
+    p = replace(p, maps=maps)
 
     def observe(which: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
-        rows = objects[which]
-        return Evidence(
-            p.logits[rows, views],
-            {name: values[rows, views] for name, values in maps.items()},
-            azimuth_bins=None if p.azimuth_bins is None else p.azimuth_bins[rows, views],
-        )
+        return p.evidence(objects[which], views)
 
     try:
         done = run_episodes(observe, p.sphere, policy, specs.starts, stopping, rng, p.calibration)

@@ -107,7 +107,7 @@ def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
             raise PredictionsError(f"{path}: lacks {len(missing)} of the {len(table)} objects, {missing[0]} among them")
         if (other.classes, other.sphere, other.models) != (table.classes, table.sphere, table.models):
             raise PredictionsError(f"{path}: is of other models, classes or viewpoints")
-        found.append(other.of(np.array([row[name] for name in table.names])))
+        found.append(other.of_objects(np.array([row[name] for name in table.names])))
     return found
 
 

@@ -55,7 +55,7 @@ class ReplayTable:
         """
         if len(kept) == 0:
             raise PredictionsError("no object is left to learn from")
-        parts = [part.of(kept) for part in (predictions, *sensed)]
+        parts = [part.of_objects(kept) for part in (predictions, *sensed)]
         data = FittingSet.joined([FittingSet.of_all(part) for part in parts])
         maps = {name: np.concatenate([part.maps[name] for part in parts]) for name in predictions.maps}
         known = predictions.calibration != PLAIN_SUM
@@ -125,9 +125,23 @@ def outcome(table: ReplayTable, total: Float, n_views: int, kind: str) -> Float:
         (N, ...) float64.
     """
     logs = table.calibration.log_belief(total, n_views, len(table.data.classes))
+    return outcome_of(logs, table.data.labels, kind)
+
+
+def outcome_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
+    """What beliefs are worth.
+
+    Args:
+        logs: of the belief in each class, up to a constant, (N, ..., C).
+        labels: the truth, (N,).
+        kind: one of OUTCOMES.
+
+    Returns:
+        (N, ...) float64.
+    """
     if kind == "right":
-        return np.equal(logs.argmax(-1).T, table.data.labels).T.astype(np.float64)
-    of_truth = of_true_class(logs, table.data.labels)
+        return np.equal(logs.argmax(-1).T, labels).T.astype(np.float64)
+    of_truth = of_true_class(logs, labels)
     return of_truth if kind == "log-belief" else np.exp(of_truth)
 
 

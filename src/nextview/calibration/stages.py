@@ -85,7 +85,7 @@ def fit_calibration(
         kept = held_out_by(model, table)
         if len(kept) == 0:
             raise PredictionsError(f"{predictions}: holds no object that {card} calls held out; see --validation")
-        table = table.of(kept)
+        table = table.of_objects(kept)
         data = FittingSet.joined([FittingSet.of_all(part) for part in (table, *load_sensed(sensed, table))])
     elif sensed:
         raise UsageError("predictions through sensors are of the objects that the card calls held out: no --validation")

@@ -27,6 +27,7 @@ from nextview.cli.predict import predict
 from nextview.cli.recognise import recognise
 from nextview.cli.render import render
 from nextview.cli.report import report
+from nextview.cli.train_agent import train_agent
 from nextview.cli.train_gain import train_gain
 from nextview.cli.train_grid import train_grid
 from nextview.cli.train_maps import train_lcm, train_lem, train_map
@@ -53,6 +54,7 @@ COMMANDS: dict[str, Any] = {
         "lem": train_lem,
         "lcm": train_lcm,
         "gain": train_gain,
+        "agent": train_agent,
     },
     "export": {"recogniser": export_recogniser, "map": export_map, "lem": export_lem, "lcm": export_lcm},
     "predict": predict,

@@ -14,6 +14,9 @@ EXTRAS = {
     "measures": ("skimage",),
     "explore": ("viser",),
     "record": ("rerun",),
+    "envs": ("gymnasium",),
+    "ap-gym": ("ap_gym",),
+    "rl": ("stable_baselines3",),
     "train": ("lightning", "numcodecs", "onnx", "onnxscript", "torch", "torchmetrics"),
 }
 """Packages by the optional part of the installation that brings them."""

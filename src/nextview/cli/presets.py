@@ -13,15 +13,17 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
+from nextview.cli.train_agent import train_agent
 from nextview.cli.train_maps import train_lcm, train_lem, train_map
 from nextview.cli.train_recogniser import train_recogniser
-from nextview.training.recipes import THESIS_MAP, THESIS_RECOGNISER, MapRecipe, RecogniserRecipe
+from nextview.training.recipes import MVSELECT, THESIS_MAP, THESIS_RECOGNISER, AgentRecipe, MapRecipe, RecogniserRecipe
 
 PRESETS: dict[Callable, dict[str, Any]] = {
     train_recogniser: {"default": RecogniserRecipe(), "thesis": THESIS_RECOGNISER},
     train_map: {"default": MapRecipe(), "thesis": THESIS_MAP},
     train_lem: {"default": MapRecipe(), "thesis": THESIS_MAP},
     train_lcm: {"default": MapRecipe(), "thesis": THESIS_MAP},
+    train_agent: {"default": AgentRecipe(), "mvselect": MVSELECT},
 }
 """The recipes of each command that has several."""
 

@@ -15,6 +15,7 @@ from nextview.belief import PLAIN_SUM, Calibration, log_evidence_of
 from nextview.data.splits import deduplicated
 from nextview.errors import PredictionsError
 from nextview.outputs import written_whole
+from nextview.policies.base import Evidence
 from nextview.viewsphere import ViewSphere
 
 FORMAT = 1
@@ -113,6 +114,14 @@ class Predictions:
         """What the recogniser says of each view, so that views can be summed, (N, V, D); see ``log_evidence_of``."""
         return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.turn)
 
+    def evidence(self, objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
+        """What the models say of objects (rows), (B,), each seen from one view, (B,)."""
+        return Evidence(
+            self.logits[objects, views],
+            {name: values[objects, views] for name, values in self.maps.items()},
+            azimuth_bins=None if self.azimuth_bins is None else self.azimuth_bins[objects, views],
+        )
+
     def of_split(self, split: str) -> Predictions:
         """The objects of one split.
 
@@ -123,14 +132,14 @@ class Predictions:
         if not kept.any():
             there = ", ".join(repr(str(name)) for name in np.unique(self.splits))
             raise PredictionsError(f"these predictions hold no objects of the split {split!r}, only of {there}")
-        return self.of(np.flatnonzero(kept))
+        return self.of_objects(np.flatnonzero(kept))
 
     def deduplicate(self) -> Predictions:
         """One object of each shape and label: without the copies that look the same from every view."""
-        return self.of(deduplicated(self.labels, self.depth_entropy))
+        return self.of_objects(deduplicated(self.labels, self.depth_entropy))
 
-    def of(self, kept: NDArray[np.int64]) -> Predictions:
-        """Some of the objects, by index, in this order."""
+    def of_objects(self, kept: NDArray[np.int64]) -> Predictions:
+        """Some of the objects, by their rows, (n,)."""
         arrays = {name: getattr(self, name)[kept] for name in ("logits", "depth_entropy", "labels", "splits")}
         maps = {name: values[kept] for name, values in self.maps.items()}
         optional = {

@@ -13,14 +13,18 @@ import numpy as np
 from nextview.errors import ModelError, OtherUseError, PolicyError
 from nextview.json_file import Fields, read_object
 from nextview.outputs import written_whole
+from nextview.policies.agent import Agent
 from nextview.policies.base import Policy, Scope
+from nextview.policies.gain import Gain
 from nextview.policies.gain.gain_file import read_gain
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence
 from nextview.viewsphere import Viewpoints, ViewSphere
 
 BUNDLED = Path(__file__).parent / "bundled"
 SCHEMA = 1
-KINDS = ("fixed-sequence", "fixed-ring", "class-table", "gain")
+KINDS = ("fixed-sequence", "fixed-ring", "class-table", "gain", "agent")
+NETWORKS: dict[str, type[Gain]] = {"gain": Gain, "agent": Agent}
+"""The kinds whose scores are an ONNX file."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,7 @@ class PolicyCard:
             () if pairs is None else tuple(map(tuple, pairs.tolist())),
             fields.mapping("settings", {}),
             fields.texts("commands", ()),
-            fields.sha256("sha256") if kind == "gain" else fields.sha256("sha256", ""),
+            fields.sha256("sha256") if kind in NETWORKS else fields.sha256("sha256", ""),
         )
         fields.end()
         return card
@@ -129,10 +133,10 @@ class PolicyCard:
         Raises:
             ModelError or PolicyError: the table makes no sense, or the file cannot be used.
         """
-        if self.kind == "gain":
+        if self.kind in NETWORKS:
             if self.table.get("classes") != len(self.classes):
                 raise ModelError(f"the table is of {self.table.get('classes')} classes, not {len(self.classes)}")
-            return read_gain(sphere, self.table, self.scope, weights, self.sha256)
+            return read_gain(sphere, self.table, self.scope, weights, self.sha256, NETWORKS[self.kind])
         fields = Fields(self.table, "the table")
         policy: Policy
         if self.kind == "fixed-ring":

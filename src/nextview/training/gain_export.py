@@ -1,4 +1,4 @@
-"""From the trained networks of the gain policy to one ONNX file that gives the same answers."""
+"""From the trained networks of the gain policy, or of an agent, to one ONNX file that gives the same answers."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ IR_VERSION = 8
 """That of the ONNX releases with this opset: older ONNX Runtimes read it too."""
 
 BOUND = 1e-5
-"""How far the file's answers may be from those of the networks in double precision. A fiftieth of the
-lowest travel weight that is tried."""
+"""How far the file's answers may be from those of the networks in double precision; of answers larger than 1, so large
+a part of the largest. For gains a fiftieth of the lowest travel weight that is tried."""
 
 
 def gain_graph(perceptrons: Perceptrons) -> onnx.ModelProto:
@@ -113,8 +113,9 @@ def write_gain(card: Path, policy: Gain, about: PolicyCard, features: NDArray[np
         onnx.save(gain_graph(policy.score), part)
         sha256 = file_hash(part)
         answers = open_onnx(part, sha256, threads=1).run(["cells"], {FEATURES_INPUT: features.astype(np.float32)})[0]
-        difference = float(np.abs(answers - policy.score(features.astype(np.float64))).max())
-        if not difference <= BOUND:
+        expected = policy.score(features.astype(np.float64))
+        difference = float(np.abs(answers - expected).max())
+        if not difference <= BOUND * max(1.0, float(np.abs(expected).max())):
             raise ModelError(
                 f"{weights}: ONNX Runtime's answers differ by {difference:.2g} from the networks'; not written"
             )

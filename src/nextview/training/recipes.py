@@ -238,3 +238,92 @@ class GainRecipe:
         _at_least(2, n_views=self.n_views)
         _at_least(1, hidden=self.hidden, networks=self.networks, epochs=self.epochs, walks=self.walks, batch=self.batch)
         _at_least(0, lr=self.lr, weight_decay=self.weight_decay, seed=self.seed)
+
+
+@dataclass(frozen=True)
+class AgentRecipe:
+    """How an agent learns by reinforcement, in the environment over predictions.
+
+    Attributes:
+        algorithm: of Stable-Baselines3: PPO (Schulman et al., 2017) or DQN (Mnih et al., Nature 518, 2015).
+        inputs: what the agent sees; see ``policies.gain.INPUTS``.
+        frame: from where the azimuths of actions and observations are counted, see ``GainRecipe``.
+        outcome: what is paid: the change of "right" (1 if the most believed class is the true one), of the "belief" in
+            the true class or of its "log-belief".
+        n_views: views of an episode, the first included.
+        view_price: taken from the reward for each view.
+        travel_price: taken from it for each grid cell of travel.
+        hidden: width of the two hidden layers.
+        steps: views that are chosen in training, in all episodes together.
+        envs: episodes side by side.
+        rollout: PPO: views in each of these between two updates. DQN: the same between two rounds of updates.
+        batch: decisions in a gradient step.
+        updates: PPO: passes over what was gathered. DQN: gradient steps a round.
+        lr: Adam's learning rate.
+        discount: of rewards to come.
+        entropy: PPO: weight of the entropy bonus.
+        exploration: DQN: share of random views, from the first number down to the second over the first half of the
+            steps.
+        evaluations: so often the agent is judged on objects held out, and the best one kept.
+        holdout: one of so many parts of the objects is held out for that.
+        seed: of everything random.
+    """
+
+    algorithm: Literal["ppo", "dqn"] = "ppo"
+    inputs: tuple[Literal["belief", "view", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "azimuth_bin"], ...] = (
+        "belief",
+        "view",
+        "place",
+        "lem-sphere",
+        "azimuth_bin",
+    )
+    frame: Literal["camera", "object"] = "object"
+    outcome: Literal["belief", "log-belief", "right"] = "log-belief"
+    n_views: int = 5
+    view_price: float = 0.0
+    travel_price: float = 0.0
+    hidden: int = 64
+    steps: int = 1_000_000
+    envs: int = 512
+    rollout: int = 8
+    batch: int = 1024
+    updates: int = 5
+    lr: float = 1e-3
+    discount: float = 1.0
+    entropy: float = 0.01
+    exploration: tuple[float, float] = (0.9, 0.05)
+    evaluations: int = 20
+    holdout: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.inputs:
+            raise UsageError("--inputs names at least one input of the network")
+        _at_least(2, n_views=self.n_views, holdout=self.holdout)
+        _at_least(1, hidden=self.hidden, steps=self.steps, envs=self.envs, rollout=self.rollout, batch=self.batch)
+        _at_least(1, updates=self.updates, evaluations=self.evaluations)
+        _at_least(0, lr=self.lr, entropy=self.entropy, view_price=self.view_price, travel_price=self.travel_price)
+        _at_least(0, seed=self.seed)
+        if not all(0 <= share <= 1 for share in (self.discount, *self.exploration)):
+            raise UsageError("--discount and --exploration are numbers from 0 to 1")
+
+
+MVSELECT = AgentRecipe(
+    algorithm="dqn",
+    inputs=("belief", "place"),
+    frame="camera",
+    outcome="right",
+    rollout=1,
+    updates=4,
+    discount=0.99,
+)
+"""After MVSelect (Hou, Gould and Zheng, "Learning to select camera views: efficient multiview understanding at few
+glances", arXiv 2303.06145, 2023; "Learning to select views for efficient multi-view understanding", CVPR 2024): deep
+Q-learning over what all views say together and which views these were, paid for the right answer; discount 0.99,
+exploration from 0.9 to 0.05 and a slowly moving target network as in the authors' code.
+
+What differs from it: the fused input is the belief over all views instead of the maximum of their 512 features, so the
+recogniser is not trained along with the agent. Views are counted from the camera, not by the number of a fixed camera.
+One perceptron of two layers stands for the sum of a feature branch and a camera branch. It learns from a replay memory
+instead of every first camera of every batch. The authors' published code pays the fall of the task's loss; being paid
+for the right answer is the other form that it holds. Episodes have five views, not two or three."""

@@ -20,7 +20,9 @@ FEATURES_INPUT = "told"
 """The name that the features have in the ONNX file."""
 
 
-def read_gain(sphere: ViewSphere, table: Any, scope: Scope, weights: Path, sha256: str) -> Gain:
+def read_gain(
+    sphere: ViewSphere, table: Any, scope: Scope, weights: Path, sha256: str, kind: type[Gain] = Gain
+) -> Gain:
     """The policy that a card describes.
 
     Args:
@@ -29,6 +31,7 @@ def read_gain(sphere: ViewSphere, table: Any, scope: Scope, weights: Path, sha25
         scope: where it may go.
         weights: the ONNX file, from "told" (B, D) to "cells" (B, V), both float32; see ``Gain.score``.
         sha256: of that file.
+        kind: the policy that its scores are for.
 
     Raises:
         ModelError: the card makes no sense, or the file cannot be used or is one for other inputs or viewpoints.
@@ -43,7 +46,7 @@ def read_gain(sphere: ViewSphere, table: Any, scope: Scope, weights: Path, sha25
     def score(features: NDArray[np.float32]) -> NDArray[np.float32]:
         return session.run(["cells"], {FEATURES_INPUT: features})[0]
 
-    policy = Gain(sphere, classes, score, inputs, travel_weight, scope, frame)  # type: ignore[arg-type]  # it checks them
+    policy = kind(sphere, classes, score, inputs, travel_weight, scope, frame)  # type: ignore[arg-type]  # it checks them
     width = len(mirrored_features(sphere, policy.classes, policy.inputs, policy.frame))
     ends = [*session.get_inputs(), *session.get_outputs()]
     if [end.name for end in ends] != [FEATURES_INPUT, "cells"]:

@@ -1,0 +1,39 @@
+"""A task over predictions: what the models said of every view is looked up, nothing is rendered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from nextview.data.predictions import Predictions
+from nextview.envs.task import Rules, Split, Task
+from nextview.errors import PredictionsError
+
+
+def replayed(
+    predictions: str | Path | Predictions, split: Split | None = "train", balanced: bool = False, rules: Rules = Rules()
+) -> Task:
+    """The task of recognising the objects of one split.
+
+    Args:
+        predictions: a file, or what it holds. To learn from, they have to be of objects that the recogniser itself was
+            not trained on (``nextview predict --held-out``): of others it is too sure, and an agent learns that one
+            view is enough.
+        split: "train" for objects to learn from, each shape once; "test" for those to judge by, which nothing may learn
+            from; None for all, where the dataset has no splits.
+        balanced: draw every class equally often.
+        rules: see ``Rules``.
+
+    Raises:
+        PredictionsError: there are no objects of that split, or no such map or azimuth bins.
+    """
+    p = predictions if isinstance(predictions, Predictions) else Predictions.load(predictions)
+    p = p if split is None else p.of_split(split)
+    p = p.deduplicate() if split == "train" else p
+    lacking = [name for name in rules.maps if name not in p.maps]
+    if lacking:
+        raise PredictionsError(f"these predictions hold no map {lacking[0]!r}; there are {', '.join(p.maps) or 'none'}")
+    if ("azimuth_bin" in rules.inputs or rules.frame == "object") and p.azimuth_bins is None:
+        raise PredictionsError("these predictions hold no azimuth bins, which the inputs or the frame need")
+    p = replace(p, maps={name: p.maps[name] for name in rules.maps})
+    return Task(p.names, p.labels, p.classes, p.sphere, p.calibration, p.evidence, rules, balanced)

@@ -1,0 +1,1 @@
+"""From predictions to a policy by reinforcement learning."""

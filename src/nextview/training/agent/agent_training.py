@@ -1,0 +1,138 @@
+"""The stage from predictions to an agent: its card, and its network as ONNX beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.calibration.fitting_set import FittingSet
+from nextview.calibration.rollout import ReplayTable, Value, judge, rollout
+from nextview.command_line import command_line
+from nextview.data.predictions import Predictions
+from nextview.envs.replayed import replayed
+from nextview.envs.task import Rules
+from nextview.envs.vector_env import TaskVectorEnv
+from nextview.errors import UsageError
+from nextview.models.model_card import file_hash
+from nextview.policies.agent import Agent
+from nextview.policies.gain import features
+from nextview.policies.policy_card import LearnedFrom, PolicyCard
+from nextview.tracking import Track, silently
+from nextview.training.agent.stable_baselines import learn, learner
+from nextview.training.folds import hold_out
+from nextview.training.gain.perceptrons import Layers, Perceptrons
+from nextview.training.gain_export import write_gain
+from nextview.training.recipes import AgentRecipe
+
+
+@dataclass(frozen=True)
+class TrainedAgent:
+    """An agent that was trained and written.
+
+    Attributes:
+        card: its card (.json); the network is the .onnx beside it.
+        objects: from how many it learned.
+        held_out: how many judged it.
+        value: the mean outcome after 2, 3, ... views on those, and the travel there.
+        steps: after which it was the best.
+    """
+
+    card: Path
+    objects: int
+    held_out: int
+    value: Value
+    steps: int
+
+
+def train_agent(
+    predictions: Path, card: Path, recipe: AgentRecipe = AgentRecipe(), *, track: Track = silently
+) -> TrainedAgent:
+    """Train an agent on predictions of objects that the recogniser was not trained on.
+
+    One part of the objects is held out; the agent is judged on these from time to time, as it will be used, and the one
+    with the best outcome less prices is kept.
+
+    Args:
+        predictions: of such objects of the training split.
+        card: the card to write (.json); the network is written beside it (.onnx).
+        recipe: how to train.
+        track: follows the training.
+
+    Raises:
+        UsageError: the card is not called NAME.json.
+        PredictionsError: the predictions lack what the recipe takes, or hold no objects of the training split.
+        DatasetError: the objects cannot be divided.
+        ModelError: the ONNX file does not answer as the network does; nothing is written then.
+    """
+    if card.suffix != ".json":
+        raise UsageError(f"{card}: the card of a policy is called NAME.json")
+    table = Predictions.load(predictions).of_split("train").deduplicate()
+    judging = hold_out(table.labels, table.depth_entropy, recipe.holdout, recipe.seed)[0]
+    learning = np.setdiff1d(np.arange(len(table)), judging)
+    rules = Rules(
+        recipe.inputs, recipe.frame, recipe.outcome, recipe.n_views,
+        view_price=recipe.view_price, travel_price=recipe.travel_price,
+    )  # fmt: skip
+    env = TaskVectorEnv(replayed(table.of_objects(learning), "train", True, rules), recipe.envs)
+    judges = ReplayTable(FittingSet.of_all(table).of(judging), _maps(table, judging), table.calibration)
+    steps, policy, value = _best(env, judges, recipe, track)
+    command = command_line("train agent", predictions, card, recipe=recipe)
+    about = PolicyCard(
+        "agent",
+        "global",
+        table.sphere.elevations,
+        table.sphere.azimuths,
+        table.classes,
+        {},
+        f"{len(learning)} objects of the training split, classes drawn evenly, by {recipe.algorithm.upper()}; "
+        f"{steps} steps chosen on {len(judging)} others",
+        (LearnedFrom(file_hash(predictions), table.models),),
+        ((table.calibration.temperature, table.calibration.correlation),),
+        asdict(recipe),
+        (*table.commands, command),
+    )
+    card.parent.mkdir(parents=True, exist_ok=True)
+    write_gain(card, policy, about, _states(judges, policy, recipe))
+    return TrainedAgent(card, len(learning), len(judging), value, steps)
+
+
+def _maps(table: Predictions, kept: NDArray[np.int64]) -> dict[str, NDArray[np.float32]]:
+    return {name: values[kept] for name, values in table.maps.items()}
+
+
+def _best(env: TaskVectorEnv, judges: ReplayTable, recipe: AgentRecipe, track: Track) -> tuple[int, Agent, Value]:
+    """The agent that was best on the objects held out, after how many steps, and what it reaches."""
+    found: list[tuple[float, int, Agent, Value]] = []
+    model = learner(env, recipe)
+
+    def parts() -> Iterator[int]:
+        for k, layers in enumerate(learn(model, recipe), 1):
+            agent = _agent(env, layers, recipe)
+            rng = np.random.default_rng([recipe.seed, 2])
+            value = judge(judges, agent, recipe.n_views, recipe.outcome, rng, rounds=4)
+            score = float(value.outcome.mean() - recipe.travel_price * value.travel[-1])
+            if not found or score > found[-1][0]:
+                found.append((score, model.num_timesteps, agent, value))
+            yield k
+
+    track(parts(), recipe.evaluations, "learning")
+    return found[-1][1:]
+
+
+def _agent(env: TaskVectorEnv, layers: Layers, recipe: AgentRecipe) -> Agent:
+    task = env.task
+    width, v = len(layers[0][0]), len(task.sphere)
+    # A mirror that leaves everything in its place: reinforcement has not learned what is alike.
+    score = Perceptrons((layers,), np.arange(width), np.arange(v))
+    return Agent(task.sphere, len(task.classes), score, recipe.inputs, frame=recipe.frame)
+
+
+def _states(judges: ReplayTable, agent: Agent, recipe: AgentRecipe) -> NDArray[np.float32]:
+    """States that the agent meets, to compare its file with."""
+    met = rollout(judges, agent, recipe.n_views - 1, np.random.default_rng([recipe.seed, 3]))
+    seen = [features(agent.sphere, moment.state, agent.inputs, agent.frame) for moment in met]
+    return np.concatenate(seen).astype(np.float32)

@@ -1,0 +1,100 @@
+"""Stable-Baselines3 on the vectorised environment, and the network that it has learned."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
+
+from nextview.envs.vector_env import TaskVectorEnv
+from nextview.training.gain.perceptrons import Layers
+from nextview.training.recipes import AgentRecipe
+
+
+class BatchedVecEnv(VecEnv):
+    """A ``TaskVectorEnv`` in the form that Stable-Baselines3 asks for."""
+
+    def __init__(self, env: TaskVectorEnv) -> None:
+        self._env, self._actions = env, np.zeros(0, np.int64)
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> NDArray[np.float32]:
+        """First observations, (envs, D)."""
+        observation, _ = self._env.reset(seed=self._seeds[0])
+        self._reset_seeds()
+        return observation
+
+    def step_async(self, actions: NDArray[np.int64]) -> None:
+        """Note the actions, (envs,)."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Observations, rewards, ends and infos."""
+        observation, reward, ended, _, info = self._env.step(self._actions)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for row in np.flatnonzero(ended):
+            infos[row] = {"terminal_observation": info["final_obs"][row], "TimeLimit.truncated": False}
+        return observation, reward.astype(np.float32), ended, infos
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of the environment, for each."""
+        return [getattr(self._env, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of the environment."""
+        setattr(self._env, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list[Any]:
+        """Call a method of the environment, for each."""
+        return [getattr(self._env, method_name)(*args, **options)] * len(list(self._get_indices(indices)))
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """It is not."""
+        return [False] * len(list(self._get_indices(indices)))
+
+
+def learner(env: TaskVectorEnv, recipe: AgentRecipe) -> BaseAlgorithm:
+    """The algorithm of a recipe before its first step."""
+    net = {"net_arch": [recipe.hidden, recipe.hidden], "activation_fn": nn.ReLU}
+    shared: dict[str, Any] = {"policy_kwargs": net, "seed": recipe.seed, "device": "cpu", "gamma": recipe.discount}
+    shared |= {"learning_rate": recipe.lr, "batch_size": recipe.batch}
+    if recipe.algorithm == "ppo":
+        return PPO(
+            "MlpPolicy", BatchedVecEnv(env), n_steps=recipe.rollout, n_epochs=recipe.updates, ent_coef=recipe.entropy,
+            **shared,
+        )  # fmt: skip
+    first, last = recipe.exploration
+    model = DQN(
+        "MlpPolicy", BatchedVecEnv(env), train_freq=recipe.rollout, gradient_steps=recipe.updates, tau=0.05,
+        target_update_interval=recipe.envs, buffer_size=200_000, learning_starts=4 * recipe.batch, **shared,
+    )  # fmt: skip
+    model.exploration_schedule = lambda _: float(
+        np.interp(2 * model.num_timesteps, [0, recipe.steps], [first, last])
+    )  # the algorithm's own begins anew with each call of ``learn``
+    return model
+
+
+def learn(model: BaseAlgorithm, recipe: AgentRecipe) -> Iterator[Layers]:
+    """Go on learning; after each of ``recipe.evaluations`` parts, the network as it then is."""
+    for k in range(1, recipe.evaluations + 1):
+        missing = recipe.steps * k // recipe.evaluations - model.num_timesteps
+        if missing > 0:
+            model.learn(missing, reset_num_timesteps=False)
+        yield layers_of(model)
+
+
+def layers_of(model: BaseAlgorithm) -> Layers:
+    """From observations to the logits of the actions (PPO's actor), or to their values (DQN)."""
+    policy: Any = model.policy
+    parts = [*policy.mlp_extractor.policy_net, policy.action_net] if isinstance(model, PPO) else [*policy.q_net.q_net]
+    linear = [[p.detach().numpy().copy() for p in part.parameters()] for part in parts if isinstance(part, nn.Linear)]
+    return tuple((weights.T, bias) for weights, bias in linear)
