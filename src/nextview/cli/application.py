@@ -27,10 +27,10 @@ def application(arguments: Sequence[str] = ()) -> SubcommandApp:
         if isinstance(command, dict):
             group = SubcommandApp()
             for each, function in command.items():
-                group.command(_laid_out(with_preset(function, arguments)), name=each)
+                group.command(name=each)(_laid_out(with_preset(function, arguments)))
             app.command(group, name=name, help=GROUPS[name])
         else:
-            app.command(_laid_out(command), name=name)
+            app.command(name=name)(_laid_out(command))
     return app
 
 

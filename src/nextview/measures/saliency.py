@@ -53,7 +53,7 @@ def _saliency(surface: Surface) -> NDArray[np.float64]:
     middle = np.stack([np.bincount(group, around * position[:, k]) for k in range(3)], 1)
     middle = np.where(area[:, None] > 0, middle / np.maximum(area, 1e-30)[:, None], 10 + np.arange(len(area))[:, None])
     curvature = np.asarray(np.where(area > 0, np.bincount(group, bend) / np.maximum(area, 1e-30), 0), np.float64)
-    salient = _salient(middle, area, curvature)
+    salient = _salient(np.asarray(middle, np.float64), area, curvature)
     of_fine = salient[group][fine.corners].mean(1)
     total = np.bincount(parent, fine.areas, len(surface.faces))
     mean = np.bincount(parent, fine.areas * of_fine, len(surface.faces))
