@@ -29,7 +29,7 @@ def test_the_bundled_cards_are_written_as_they_are_read(tmp_path):
             assert written == before | {"schema": 2} | own
             before = written
         assert written == before
-        assert ModelCard.from_dict(written, card.path) == card
+        assert ModelCard.from_dict(written, card.path).to_dict() == written
     for path in bundled_policies().values():
         write_policy_card(tmp_path / "card.json", read_policy_card(path))
         assert (tmp_path / "card.json").read_bytes() == path.read_bytes()

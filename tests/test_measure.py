@@ -10,7 +10,7 @@ from skimage.measure import perimeter_crofton
 from nextview.cli.main import main
 from nextview.data.checking import check
 from nextview.data.measuring import Cost, measure
-from nextview.data.rendering import Deform, render
+from nextview.data.rendering import Deform, deformed, render
 from nextview.data.store import DEPTH_UNIT, ViewStore
 from nextview.errors import DatasetError, MeasureError
 from nextview.measures.area import view_area
@@ -18,7 +18,7 @@ from nextview.measures.depth_spread import BIN, depth_distribution, max_depth
 from nextview.measures.measured_view import MeasuredView
 from nextview.measures.registry import MEASURES
 from nextview.measures.silhouette import silhouette_length
-from nextview.mesh import make_mesh
+from nextview.mesh import load_mesh, make_mesh
 from nextview.viewsphere import ViewSphere
 
 SPHERE = ViewSphere.named("12")
@@ -132,12 +132,18 @@ def test_all_measures_of_a_store_and_its_meshes(views):
 
 
 def test_a_deformed_store_is_measured_on_the_deformed_meshes(views):
-    """Faces would not lie where the depth is: three sides of a box are half of it whatever its proportions."""
     meshes = views.parent / "meshes"
     list(render(meshes, views.parent / "new.zarr", SPHERE, 64, 3, Deform(0.8, True), workers=0))
     list(measure(views.parent / "new.zarr", ["visible_area_ratio"], workers=0, meshes=meshes))
     store = ViewStore.open(views.parent / "new.zarr")
-    np.testing.assert_allclose(store.measure("visible_area_ratio")[store.names.index("box")], 0.5, atol=0.02)
+    row = store.names.index("box")
+    new = deformed(store, load_mesh(meshes / "box/box.off"), "box")
+    seen = [view_of(new, pose, 64) for pose in SPHERE.poses]
+    np.testing.assert_allclose(store.depth(row), [view.depth for view in seen], atol=1e-4)
+    own = [MEASURES["visible_area_ratio"](view) for view in seen]
+    np.testing.assert_allclose(store.measure("visible_area_ratio")[row], own, atol=1e-3)
+    before = [MEASURES["visible_area_ratio"](view_of(load_mesh(meshes / "box/box.off"), p, 64)) for p in SPHERE.poses]
+    assert np.abs(np.subtract(own, before)).max() > 0.02
 
 
 def test_meshes_that_are_not_those_of_the_store_are_refused(views):

@@ -112,8 +112,12 @@ def _cut(surface: Surface) -> tuple[Surface, NDArray[np.int64]]:
         half = (a + b) / 2
         corners = np.concatenate([np.stack([a, half, c], 1), np.stack([half, b, c], 1)])
         parent = np.tile(parent[~keep], 2)
-    vertices = np.concatenate(done)
-    return Surface(vertices.reshape(-1, 3), np.arange(3 * len(vertices)).reshape(-1, 3)), np.concatenate(done_parent)
+    vertices, parent = np.concatenate(done).reshape(-1, 3), np.concatenate(done_parent)
+    loose = Surface(vertices, np.arange(len(vertices)).reshape(-1, 3))
+    # Corners in one place are one, but not of parts that only touch: their cuts meet by chance.
+    key = loose.places.ravel() * (int(surface.parts.max()) + 1) + np.repeat(surface.parts[parent], 3)
+    _, first, index = np.unique(key, return_index=True, return_inverse=True)
+    return Surface(vertices[first], index.reshape(-1, 3)), parent
 
 
 def _groups(points: NDArray[np.float64]) -> NDArray[np.int64]:

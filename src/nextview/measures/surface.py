@@ -49,7 +49,7 @@ class Surface:
         return float(self.areas.sum())
 
     @cached_property
-    def _places(self) -> NDArray[np.int64]:
+    def places(self) -> NDArray[np.int64]:
         """The faces by places instead of vertices, (F, 3) int64: vertices in one place count as one."""
         cell = np.rint((self.vertices - self.vertices.min(0)) / SAME).astype(np.int64)
         width = cell.max(0) + 1  # 2e6 at most: one number holds a place, and numbers are sorted ten times as fast
@@ -65,7 +65,7 @@ class Surface:
         """
         left = np.flatnonzero(np.repeat(self.areas > 0, 3))
         found = []
-        for ends in (self.faces, self._places):
+        for ends in (self.faces, self.places):
             both = np.sort(np.stack([ends, np.roll(ends, -1, 1)], 2), 2).reshape(-1, 2)[left].astype(np.int64)
             _, edge, count = np.unique(both @ [int(ends.max()) + 1, 1], return_inverse=True, return_counts=True)
             two = count[edge] == 2
@@ -73,6 +73,17 @@ class Surface:
             left = left[~two]
         first, second = np.concatenate(found).T
         return first, second
+
+    @cached_property
+    def parts(self) -> NDArray[np.int64]:
+        """Which connected part of the surface each face belongs to, (F,) int64."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        first, second = self._pairs
+        n = len(self.faces)
+        graph = coo_array((np.ones(len(first), bool), (first // 3, second // 3)), (n, n))
+        return connected_components(graph, directed=False)[1].astype(np.int64)
 
     @cached_property
     def corners(self) -> NDArray[np.int64]:
@@ -84,7 +95,7 @@ class Surface:
         from scipy.sparse.csgraph import connected_components
 
         first, second = self._pairs
-        n, place = self.faces.size, self._places.ravel()
+        n, place = self.faces.size, self.places.ravel()
         begin, end = second, second - second % 3 + (second + 1) % 3
         same = place[first] == place[begin]  # the neighbour may run along the edge either way
         ahead = first - first % 3 + (first + 1) % 3
