@@ -65,8 +65,8 @@ class ViewStore:
     takes from each first view, see ``data.planning``; ``radius`` (N,) float64, of the object in the unit of its mesh
     file; ``status`` (N,) uint8; ``digest`` (N, 32) uint8, of an object's name and arrays together, see ``digest``.
     Names, labels, splits, the SHA-256 of the mesh files and their unit, what was rendered how, and why meshes were left
-    out are attributes. They and all chunks carry a checksum, so that damage is noticed when they are read. A chunk that is
-    gone is noticed too: zarr would read its fill value, so every read looks for the file first.
+    out are attributes. They and all chunks carry a checksum, so that damage is noticed when they are read. A chunk that
+    is gone is noticed too: zarr would read its fill value, so every read looks for the file first.
     """
 
     path: Path
