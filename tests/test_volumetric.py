@@ -220,6 +220,7 @@ def test_true_measures_come_from_the_store(stored):
 
 def test_what_the_store_behind_predictions_may_lack(stored):
     store, predictions = stored
+    list(measure(store, ["silhouette_area"], workers=0))
     for wrong, why in (
         (replace(predictions, store=""), "do not say which view store"),
         (replace(predictions, store=str(store) + "x"), "there is no view store"),
@@ -227,7 +228,7 @@ def test_what_the_store_behind_predictions_may_lack(stored):
         (replace(predictions, depth_entropy=predictions.depth_entropy + 1), "other views"),
     ):
         with pytest.raises(EntryError, match=why):
-            replay("true-depth_distribution", make_specs(wrong, 1, 0), 2, 0)
+            replay("true-silhouette_area", make_specs(wrong, 1, 0), 2, 0)
 
 
 def test_only_what_needs_depth_alone_is_planned(stored):
