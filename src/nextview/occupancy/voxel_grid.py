@@ -123,10 +123,9 @@ class Occupancy:
             ObservationError: depth and mask are no images of one shape.
         """
         depth = np.asarray(depth, np.float32)
-        if depth.ndim != 2 or (object_mask is not None and np.shape(object_mask) != depth.shape):
-            raise ObservationError(
-                f"depth and mask are images of one shape, not {depth.shape} and {np.shape(object_mask)}"
-            )
+        shape = depth.shape if object_mask is None else np.shape(object_mask)
+        if depth.ndim != 2 or shape != depth.shape:
+            raise ObservationError(f"depth and mask are images of one shape, not {depth.shape} and {shape}")
         grid, cells = self.grid, self.cells.copy().reshape(-1)
         unseen = np.flatnonzero(cells == UNSEEN)  # what was free before is so without being looked at again
         reach = np.where(depth > 0, depth, FARTHEST if background_free else 0).astype(np.float32)
