@@ -99,7 +99,7 @@ def picture(
     made = nextview.policies.registry.make_policy(policy, sphere)
     assert isinstance(made, Volumetric), f"{policy} is not volumetric"
     grid, view, path = made.grid, start, [start]
-    occupancy = Occupancy.unseen(grid)
+    occupancy = Occupancy.unseen(grid, grid.ball)
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
         figure = Figure((8.4, 7.2), layout="constrained")
         axes = figure.subplots(3, 3)
@@ -114,6 +114,7 @@ def picture(
                 at = sphere.directions[path]
                 axis.plot(1.12 * at[:, 0], 1.12 * at[:, "xyz".index(names[1])], "k^", ms=5, clip_on=False)
                 axis.set(xlabel=names[0], ylabel=names[1], xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+                axis.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2))
             left = (occupancy.cells[grid.ball] == UNSEEN).mean()
             row[0].set_title(f"after {len(path)}: middle from above", fontsize=9)
             row[1].set_title(f"from the side, {left:.0%} of the ball unseen", fontsize=9)

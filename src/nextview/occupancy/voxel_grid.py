@@ -93,9 +93,9 @@ class Occupancy:
     cells: NDArray[np.uint8]
 
     @classmethod
-    def unseen(cls, grid: VoxelGrid) -> Occupancy:
-        """Before the first frame."""
-        return cls(grid, np.full((grid.n,) * 3, UNSEEN))
+    def unseen(cls, grid: VoxelGrid, region: NDArray[np.bool_] | None = None) -> Occupancy:
+        """Before the first frame; outside of a region, (n, n, n) bool, if one is given, all is known to be free."""
+        return cls(grid, np.full((grid.n,) * 3, UNSEEN) if region is None else np.where(region, UNSEEN, FREE))
 
     def seen(
         self,

@@ -23,9 +23,9 @@ GRID = VoxelGrid(64)
 def occupancy_of(observations: Sequence[Observation], grid: VoxelGrid) -> Occupancy:
     """What is known of the space around an object after some views of it, object frame, object radii.
 
-    Observations show the object alone: what is no object in them is taken to be free.
+    Observations show the object alone: what is no object in them is taken to be free, as is all beyond its radius.
     """
-    found = Occupancy.unseen(grid)
+    found = Occupancy.unseen(grid, grid.ball)
     for seen in observations:
         found = found.seen(seen.depth, seen.pose, seen.intrinsics)
     return found
