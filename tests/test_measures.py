@@ -63,7 +63,7 @@ def test_a_ball():
     assert MEASURES["curvature_entropy"](view) < 0.1
     assert MEASURES["silhouette_entropy"](view) < 0.4  # of the pixels of a circle
     # Its facets are as large as the finest scales.
-    assert measured("mesh_saliency", BALL) < 0.15 * measured("mesh_saliency", CUBE)
+    assert measured("mesh_saliency", BALL) < 0.2 * measured("mesh_saliency", CUBE)
     assert MEASURES["base_avoidance"](view) == 1
 
 
@@ -254,7 +254,7 @@ REMESHED = {
     "surface_visibility": 0.2,
     "mean_curvature": 0.1,
     "gaussian_curvature": 0.2,
-    "mesh_saliency": 0.05,
+    "mesh_saliency": 0.15,
     "base_avoidance": 0.01,
 }
 """How much a measure may differ, as a share of its value, when each face of a chair is cut into four. A half hidden

@@ -13,11 +13,11 @@ UNIT = 0.006
 but the same however the object lies in it."""
 SCALES = (2, 3, 4, 5, 6)
 """Standard deviations of the finer of two averages, in units; the coarser one's is twice as large."""
-LONGEST = 0.05
+LONGEST = 0.07
 """Edges are cut until none is longer, object radii: a large flat face has no vertices to average over."""
 CELL = 0.02
 """Vertices in one cube of this side, object radii, are taken together where there are many."""
-MANY = 20_000
+MANY = 30_000
 
 
 def mesh_saliency(view: MeasuredView) -> float:
