@@ -89,7 +89,7 @@ def _salient(
         near = square <= (2 * scale * UNIT) ** 2
         highest = np.zeros(len(points))
         np.maximum.at(highest, i[near], salient[j[near]])
-        peaks = salient[(salient >= highest) & (salient > 0)]
+        peaks = salient[(salient >= (1 - 1e-6) * highest) & (salient > 0)]  # no tie is broken by rounding
         others = (peaks.sum() / salient.max() - 1) / max(len(peaks) - 1, 1)
         found += salient * (1 - others) ** 2  # Lee's suppression of scales at which many peaks are alike
     return found
