@@ -13,11 +13,11 @@ UNIT = 0.006
 but the same however the object lies in it."""
 SCALES = (2, 3, 4, 5, 6)
 """Standard deviations of the finer of two averages, in units; the coarser one's is twice as large."""
-LONGEST = 0.05
+LONGEST = 0.07
 """Edges are cut until none is longer, object radii: a large flat face has no vertices to average over."""
 CELL = 0.02
 """Vertices in one cube of this side, object radii, are taken together where there are many."""
-MANY = 20_000
+MANY = 30_000
 
 
 def mesh_saliency(view: MeasuredView) -> float:
@@ -89,7 +89,7 @@ def _salient(
         near = square <= (2 * scale * UNIT) ** 2
         highest = np.zeros(len(points))
         np.maximum.at(highest, i[near], salient[j[near]])
-        peaks = salient[(salient >= highest) & (salient > 0)]
+        peaks = salient[(salient >= (1 - 1e-6) * highest) & (salient > 0)]  # no tie is broken by rounding
         others = (peaks.sum() / salient.max() - 1) / max(len(peaks) - 1, 1)
         found += salient * (1 - others) ** 2  # Lee's suppression of scales at which many peaks are alike
     return found
