@@ -24,6 +24,7 @@ def render(
     turn: bool = False,
     unit: Unit | None = None,
     sensor: str | None = None,
+    meshes: Path | None = None,
     max_faces: int = MAX_FACES,
     seed: int = 0,
     workers: int | None = None,
@@ -31,8 +32,10 @@ def render(
 ) -> None:
     """Render a dataset folder (CLASS/train|test/MESH or CLASS/MESH) into a view store. Resumes where it was.
 
+    A folder of worlds (nextview worlds) makes a store too: of what shows of each target, and of the scene around it.
+
     Args:
-        dataset: folder of meshes.
+        dataset: folder of meshes, or of worlds.
         store: the store to make or to complete.
         sphere: viewpoints.
         azimuths: views on each ring, if not the sphere's own.
@@ -44,6 +47,7 @@ def render(
             known by default; a store that was made without can be told later.
         sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist, none, or a mix of all that is
             drawn anew for each object; or NAME:STRENGTH (docs/your_camera.md). Clean renders if not given.
+        meshes: of worlds: the folder of the meshes that they are made of.
         max_faces: leave out a mesh of more triangles, or a file of more than 60 bytes for each of these.
         seed: decides the stretch and the turn of each mesh, and the errors of a sensor.
         workers: processes; one for each core by default.
@@ -52,8 +56,7 @@ def render(
     from dataclasses import replace
 
     from nextview.cli.progress import console, track
-    from nextview.data.folders import list_dataset
-    from nextview.data.rendering import Deform
+    from nextview.data.rendering import Deform, list_entries
     from nextview.data.rendering import render as render_dataset
     from nextview.data.store import ViewStore
     from nextview.viewsphere import ViewSphere
@@ -61,13 +64,15 @@ def render(
     views = ViewSphere.named(sphere)
     if azimuths is not None:
         views = replace(views, azimuths=azimuths)
-    total = sum(split in (None, entry.split) for entry in list_dataset(dataset))
+    total = sum(split in (None, entry.split) for entry in list_entries(dataset, meshes))
     try:
         before = int(ViewStore.open(store).done.sum())
     except DatasetError:
         before = 0  # there is none yet, or rendering mends it or says what is wrong
     new = Deform(stretch, turn)
-    jobs = render_dataset(dataset, store, views, size, seed, new, split, unit, workers, scheduler, max_faces, sensor)
+    jobs = render_dataset(
+        dataset, store, views, size, seed, new, split, unit, workers, scheduler, max_faces, sensor, meshes
+    )
     track((before + n for n, _ in enumerate(jobs, 1)), total, f"rendering {store.name}", before, len(views))
 
     made = ViewStore.open(store)
