@@ -116,7 +116,7 @@ def render(
     sensor: str | None = None,
     meshes: Path | None = None,
 ) -> Iterator[tuple[str, str | None]]:
-    """Render every mesh, or the target of every world, that the store does not hold yet; one that failed before is tried again.
+    """Render every mesh, or the target of every world, that the store lacks; one that failed before is tried again.
 
     The run may end at any moment, even by a kill or a full disk; the next one goes on with what is missing.
 

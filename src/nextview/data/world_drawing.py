@@ -66,18 +66,16 @@ def draw_worlds(
         (name, None) for each world that is there, (name, reason) for one that cannot be drawn.
 
     Raises:
-        DatasetError: the dataset is unusable, another run is writing, the folder cannot be written, or a world in it was
-            drawn with another seed.
+        DatasetError: the dataset is unusable, another run is writing, the folder cannot be written, or worlds in it
+            were drawn with another seed.
         UsageError: a level, a number or a seed that makes no sense.
     """
-    todo = []
-    for task in tasks(dataset, out, levels, worlds, seed, split):
-        if not task.path.exists():
-            todo.append(task)
-            continue
-        if World.load(task.path).seed != seed:
-            raise DatasetError(f"{task.path}: was drawn with another seed; give another folder or the same seed")
-        yield task.name, None
+    wanted = tasks(dataset, out, levels, worlds, seed, split)
+    there = next(out.rglob(f"*@*{SUFFIX}"), None)
+    if there is not None and World.load(there).seed != seed:
+        raise DatasetError(f"{there}: was drawn with another seed; give another folder or the same seed")
+    todo = [task for task in wanted if not task.path.exists()]
+    yield from ((task.name, None) for task in wanted if task not in todo)
     files: dict[str, list[str]] = {}
     for entry in list_dataset(dataset):
         files.setdefault(entry.split, []).append(_relative(entry, dataset))
@@ -101,8 +99,8 @@ def tasks(
         raise UsageError(f"the level of a world is {', '.join(LEVELS)}, not {unknown[0] if unknown else 'none'}")
     if worlds is not None and worlds < 1:
         raise UsageError(f"there cannot be {worlds} worlds")
-    if not 0 <= seed < 2**63:
-        raise UsageError(f"a seed is from 0 to {2**63 - 1}, not {seed}")
+    if not 0 <= seed < 2**31:
+        raise UsageError(f"a seed is from 0 to {2**31 - 1}, not {seed}")
     found: list[Task] = []
     entries = [entry for entry in list_dataset(dataset) if split in (None, entry.split)]
     if not entries:

@@ -30,7 +30,7 @@ def scene_intrinsics(distance: float, side: int = SIDE) -> NDArray[np.float64]:
 
 
 def render_scene(scene: Scene, sphere: ViewSphere) -> dict[str, NDArray]:
-    """All that is kept of one world beside its target's views, by the names of the arrays. Without errors of a sensor."""
+    """All that is kept of a world beside its target's views, without errors of a sensor, by the names of the arrays."""
     camera = SceneCamera(scene, scene_intrinsics(sphere.distance), (SIDE, SIDE))
     looks = [camera.look(pose) for pose in sphere.poses]
     positions = sphere.poses[:, :3, 3]

@@ -36,7 +36,7 @@ class RayCaster:
             rays: (N, 3), of any length.
 
         Returns:
-            How many times its length each ray is long, (N,), infinity if it ends nowhere; and on which mesh, -1 for none.
+            How many times its length each ray goes, (N,), infinity if it ends nowhere; and on which mesh, -1 for none.
         """
         origins = np.ascontiguousarray(np.broadcast_to(np.asarray(origins, np.float32), rays.shape))
         hits = self._scene.run(origins, np.ascontiguousarray(rays, np.float32), output=1)

@@ -106,7 +106,7 @@ class Scene:
         return free
 
 
-def build_scene(world: World, meshes: Path, max_faces: int = MAX_FACES) -> Scene:
+def build_scene(world: World, meshes: str | Path, max_faces: int = MAX_FACES) -> Scene:
     """Everything in a world as geometry.
 
     Args:
@@ -118,7 +118,7 @@ def build_scene(world: World, meshes: Path, max_faces: int = MAX_FACES) -> Scene
         DatasetError: a mesh file is not the one that the world was made with.
         MeshError: it cannot be used.
     """
-    target, *others = (_load(meshes, placed, max_faces) for placed in (world.target, *world.objects))
+    target, *others = (_load(Path(meshes), placed, max_faces) for placed in (world.target, *world.objects))
     floor = float(target.vertices[:, 2].min())
     placed = [place(mesh, at, floor) for mesh, at in zip(others, world.objects, strict=True)]
     return Scene(target, (*placed, *(block_item(block, floor) for block in world.blocks)))

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nextview.errors import DatasetError, ModelError
 from nextview.json_file import Fields, read_object
 from nextview.outputs import written_whole
@@ -106,24 +108,26 @@ class World:
             fields = Fields(values, what)
             fields.schema(SCHEMA)
             fields.take("visible_share", None)
+            lists = {name: fields.take(name, []) for name in ("objects", "blocks")}
+            for name, found in lists.items():
+                if not isinstance(found, list):
+                    raise fields.wrong(name, "a list")
             target = Fields(fields.mapping("target"), f"the target of {what}")
-            found = cls(
+            world = cls(
                 fields.text("name"),
                 fields.text("level"),
-                fields.take("seed"),
+                fields.whole("seed"),
                 Placement(target.text("mesh"), target.sha256("sha256")),
-                tuple(_placement(each, what) for each in fields.take("objects", [])),
-                tuple(_block(each, what) for each in fields.take("blocks", [])),
-                tuple(fields.numbers("visible", 1, []) if values.get("visible") else ()),
-                tuple(int(v) for v in (fields.numbers("unreachable", 1, []) if values.get("unreachable") else ())),
+                tuple(_placement(each, what) for each in lists["objects"]),
+                tuple(_block(each, what) for each in lists["blocks"]),
+                tuple(fields.numbers("visible", 1, np.zeros(0)).tolist()),
+                tuple(fields.numbers("unreachable", 1, np.zeros(0)).astype(int).tolist()),
             )
-            for empty in ("visible", "unreachable"):
-                fields.take(empty, None)
             target.end()
             fields.end()
-        except (ModelError, TypeError) as error:
+        except ModelError as error:
             raise DatasetError(str(error)) from None
-        return found
+        return world
 
     def save(self, path: Path) -> None:
         """Write its file, whole or not at all. The same world makes the same bytes."""
