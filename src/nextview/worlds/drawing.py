@@ -29,20 +29,28 @@ SIZE, COARSE = 112, 48
 """Sides of the pictures, pixels, in which the target's share that shows is measured: in the end, and while drawing."""
 SPREAD, TOLERANCE = 0.04, 0.02
 """The share that a world is to have lies within the first of its level's, and is met to the second."""
-FEWEST, MOST = 3, 16
+FEWEST, MOST = 3, 20
 """Things around a target."""
-TRIES, LAYOUTS_TRIED = 60, 12
+TRIES, LAYOUTS_TRIED = 200, 20
 """Things that are tried for one layout, and layouts for one world."""
 GAP = 0.04
 """Between things, at least, object radii."""
-AWAY = (0.5, 2.6)
+AWAY = {"light": (0.5, 2.6), "medium": (0.5, 2.3), "heavy": (0.5, 2.1)}
 """How far from the target's middle that of a thing stands, object radii."""
-OBJECT_RADIUS = (0.6, 1.2)
-OBJECTS = 0.6
+OBJECT_RADIUS = (0.5, 1.1)
+FEWEST_OBJECTS = 2
+"""Of things that are no boxes or walls, if there are any meshes for them."""
+OBJECTS = {"light": 0.7, "medium": 0.6, "heavy": 0.4}
 """Share of objects among the things that are no walls; the others are boxes."""
+BOX_HEIGHT = {"light": HEIGHT, "medium": HEIGHT, "heavy": (1.4, 2.9)}
+"""Object radii: what is low hides nothing from above."""
+LEAST = {"light": 0.0, "medium": 0.0, "heavy": 0.008}
+"""What a thing takes off the share that shows, at least: the table is soon full."""
 WALLS = {"light": (0.8, 0.2, 0.0), "medium": (0.5, 0.4, 0.1), "heavy": (0.3, 0.4, 0.3)}
 """Chances of no wall, one, and two."""
 WALL_AWAY, WALL_WIDTH, WALL_DEPTH, WALL_HEIGHT = (1.2, 1.9), (2.0, 3.5), 0.1, (1.0, 2.6)
+POOL = 8
+"""Meshes that are tried in one world, at several places each: reading them takes longest."""
 LARGEST = 100_000
 """Triangles of an object around the target: larger ones are passed over, for the sake of time."""
 
@@ -77,6 +85,7 @@ def draw_world(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
     rng = np.random.default_rng([seed, *name.encode()])
     mesh = cached_mesh(meshes.folder / target)
     others = [file for file in meshes.files if file != target]
+    others = [others[i] for i in rng.permutation(len(others))[:POOL]]
     hiding = _Hiding(mesh)
     for _ in range(LAYOUTS_TRIED):
         goal = LEVELS[level] + rng.uniform(-SPREAD, SPREAD)
@@ -141,32 +150,34 @@ def _layout(
     free = np.ones(len(hiding.views), bool)
     for _ in range(TRIES):
         share = hiding.share(free)
-        if len(placed) >= FEWEST and share <= goal + TOLERANCE:
+        if len(placed) >= FEWEST + walls and share <= goal + TOLERANCE:
             return placed
         if len(placed) == MOST:
             return None
-        thing = _wall(rng) if len(placed) < walls else _thing(others, folder, rng)
+        objects = sum(isinstance(thing, Placement) for thing, _ in placed)
+        short = bool(others) and objects < FEWEST_OBJECTS
+        thing = _wall(rng) if len(placed) < walls else _thing(others, folder, level, short, rng)
         item = _stood(thing, folder, floor)
         if item is None or np.abs(item.footprint).max() > TABLE:
             continue
         if min(separation(item.footprint, other) for other in [middle, *(i.footprint for _, i in placed)]) < GAP:
             continue
         left = free & ~hiding.by(item, free)
-        if hiding.share(left) >= goal - TOLERANCE:
+        if goal - TOLERANCE <= hiding.share(left) <= share - LEAST[level] * (not short):
             placed.append((thing, item))
             free = left
     return None
 
 
-def _thing(others: Sequence[str], folder: Path, rng: np.random.Generator) -> Placement | Block:
-    """An object or a box, anywhere around."""
-    away, towards, turn = rng.uniform(*AWAY), rng.uniform(0, 2 * np.pi), _round(rng.uniform(0, 2 * np.pi))
+def _thing(others: Sequence[str], folder: Path, level: str, short: bool, rng: np.random.Generator) -> Placement | Block:
+    """An object or a box, anywhere around; an object where there are too few."""
+    away, towards, turn = rng.uniform(*AWAY[level]), rng.uniform(0, 2 * np.pi), _round(rng.uniform(0, 2 * np.pi))
     x, y = _round(away * np.cos(towards)), _round(away * np.sin(towards))
-    if others and rng.random() < OBJECTS:
+    if short or (others and rng.random() < OBJECTS[level]):
         file = others[int(rng.integers(len(others)))]
         return Placement(file, mesh_hash(folder / file), x, y, turn, _round(rng.uniform(*OBJECT_RADIUS)))
     width, depth = rng.uniform(*FOOTPRINT, 2)
-    return Block(x, y, turn, _round(width), _round(depth), _round(rng.uniform(*HEIGHT)))
+    return Block(x, y, turn, _round(width), _round(depth), _round(rng.uniform(*BOX_HEIGHT[level])))
 
 
 def _wall(rng: np.random.Generator) -> Block:
