@@ -32,6 +32,7 @@ from nextview.cli.train_gain import train_gain
 from nextview.cli.train_grid import train_grid
 from nextview.cli.train_maps import train_lcm, train_lem, train_map
 from nextview.cli.train_recogniser import train_recogniser
+from nextview.cli.worlds import worlds
 
 COMMANDS: dict[str, Any] = {
     "recognise": recognise,
@@ -40,6 +41,7 @@ COMMANDS: dict[str, Any] = {
     "capture": capture,
     "models": models,
     "download": download,
+    "worlds": worlds,
     "render": render,
     "check": check,
     "measure": measure,

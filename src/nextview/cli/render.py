@@ -25,6 +25,7 @@ def render(
     unit: Unit | None = None,
     sensor: str | None = None,
     held_out: Path | None = None,
+    meshes: Path | None = None,
     max_faces: int = MAX_FACES,
     seed: int = 0,
     workers: int | None = None,
@@ -32,8 +33,10 @@ def render(
 ) -> None:
     """Render a dataset folder (CLASS/train|test/MESH or CLASS/MESH) into a view store. Resumes where it was.
 
+    A folder of worlds (nextview worlds) makes a store too: of what shows of each target, and of the scene around it.
+
     Args:
-        dataset: folder of meshes.
+        dataset: folder of meshes, or of worlds.
         store: the store to make or to complete.
         sphere: viewpoints.
         azimuths: views on each ring, if not the sphere's own.
@@ -46,6 +49,7 @@ def render(
         sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist, none, or a mix of all that is
             drawn anew for each object; or NAME:STRENGTH (docs/your_camera.md). Clean renders if not given.
         held_out: only the objects that the model of this card (NAME.json) calls held out of its training.
+        meshes: of worlds: the folder of the meshes that they are made of.
         max_faces: leave out a mesh of more triangles, or a file of more than 60 bytes for each of these.
         seed: decides the stretch and the turn of each mesh, and the errors of a sensor.
         workers: processes; one for each core by default.
@@ -62,14 +66,14 @@ def render(
     views = ViewSphere.named(sphere)
     if azimuths is not None:
         views = replace(views, azimuths=azimuths)
-    total = len(entries_of(dataset, split, held_out))
+    total = len(entries_of(dataset, split, held_out, meshes))
     try:
         before = int(ViewStore.open(store).done.sum())
     except DatasetError:
         before = 0  # there is none yet, or rendering mends it or says what is wrong
     new = Deform(stretch, turn)
     jobs = render_dataset(
-        dataset, store, views, size, seed, new, split, unit, workers, scheduler, max_faces, sensor, held_out
+        dataset, store, views, size, seed, new, split, unit, workers, scheduler, max_faces, sensor, held_out, meshes
     )
     track((before + n for n, _ in enumerate(jobs, 1)), total, f"rendering {store.name}", before, len(views))
 

@@ -30,7 +30,7 @@ def validate(attributes: Mapping[str, Any]) -> None:
     """Make sure that the attributes of a store are what the rest of nextview takes them for.
 
     Stores of earlier versions may lack those that came later: failures, seed, stretch, turn, sha256, unit,
-    dataset, commands, checksum. Only those rendered through a sensor have one.
+    dataset, commands, checksum. Only those rendered through a sensor have one, only those of worlds a scene.
 
     Raises:
         DatasetError: which of them is missing, or is not what it has to be; or they do not have their checksum.
@@ -136,6 +136,7 @@ RULES = {
     "stretch": Rule(lambda v: _number(v, 0, LARGEST), "a finite number from 0", False),
     "turn": Rule(lambda v: isinstance(v, bool), "true or false", False),
     "sensor": Rule(lambda v: isinstance(v, dict) and isinstance(v.get("name"), str), "a sensor", False),
+    "scene": Rule(lambda v: _whole(v, 1, WIDEST), f"a whole number from 1 to {WIDEST}", False),
     "sha256": Rule(_texts, "a list of hashes", False),
     "unit": Rule(lambda v: v is None or (isinstance(v, str) and v in UNITS), f"one of {', '.join(UNITS)}", False),
     "dataset": Rule(lambda v: isinstance(v, str), "the name of the mesh folder", False),

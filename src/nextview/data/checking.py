@@ -13,7 +13,7 @@ from nextview.cloud import POINTS, visible_points
 from nextview.data.correspond import ARRAY, correspondence
 from nextview.data.lock import only_one, writing
 from nextview.data.pool import each
-from nextview.data.store import DEPTH_UNIT, DIGEST, PENDING, POINT_UNIT, RENDERED, ChunkError, ViewStore, digest
+from nextview.data.store import DEPTH_UNIT, DIGEST, PENDING, POINT_UNIT, ChunkError, ViewStore, digest
 from nextview.errors import DatasetError
 from nextview.measures.measured_view import MeasuredView
 from nextview.measures.registry import MEASURES
@@ -46,7 +46,7 @@ def check(
     if repair:
         mend(path)
     store = ViewStore.open(path)
-    for name in RENDERED:
+    for name in store.rendered:
         store.array(name)  # says what is wrong
         if not store.sound(name):
             raise DatasetError(f"{path}: the group of {name} cannot be opened; nextview check {path} --repair makes it")
@@ -70,8 +70,8 @@ def mend(path: Path) -> None:
     """
     store = ViewStore.open(path)
     with only_one(path), writing(path):
-        for name in (*RENDERED, DIGEST):
-            if not store.sound(name) and (name in RENDERED or store.holds(name)):
+        for name in (*store.rendered, DIGEST):
+            if not store.sound(name) and (name != DIGEST or store.holds(name)):
                 store.add(name)
 
 
@@ -79,8 +79,8 @@ def _check_object(path: Path, i: int) -> str | None:
     store = ViewStore.open(path)
     arrays = {}
     measures = [name for name in MEASURES if name in store.measures]
-    added = [*(f"measures/{name}" for name in measures if f"measures/{name}" not in RENDERED), ARRAY, DIGEST]
-    for name in (*RENDERED, *added):
+    added = [*(f"measures/{name}" for name in measures if f"measures/{name}" not in store.rendered), ARRAY, DIGEST]
+    for name in (*store.rendered, *added):
         if name in added and not (store.holds(name) and store.has(name, i)):
             continue  # not made yet
         try:

@@ -22,8 +22,8 @@ class Entry:
     split: str
 
 
-def list_dataset(root: str | Path) -> list[Entry]:
-    """All meshes of a dataset folder, sorted by class, split and name.
+def list_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> list[Entry]:
+    """All meshes of a dataset folder, or other files in its layout, sorted by class, split and name.
 
     Raises:
         DatasetError: the folder is missing or holds no class folders with meshes, one whose name cannot be printed, or
@@ -34,7 +34,7 @@ def list_dataset(root: str | Path) -> list[Entry]:
         raise DatasetError(f"{root}: there is no such folder")
     entries = []
     for path in sorted(root.rglob("*")):
-        if path.suffix.lower() not in FORMATS or not path.is_file():
+        if path.suffix.lower() not in suffixes or not path.is_file():
             continue
         parts = path.relative_to(root).parts
         if len(parts) == 3 and parts[1] in SPLITS:
@@ -42,7 +42,8 @@ def list_dataset(root: str | Path) -> list[Entry]:
         elif len(parts) == 2:
             entries.append(Entry(path, path.stem, parts[0], ""))
     if not entries:
-        raise DatasetError(f"{root}: no meshes in CLASS/MESH or CLASS/train|test/MESH below it")
+        what, name = ("meshes", "MESH") if suffixes == FORMATS else ("worlds", "WORLD")
+        raise DatasetError(f"{root}: no {what} in CLASS/{name} or CLASS/train|test/{name} below it")
     for entry in entries:
         if not (entry.label + entry.name).isprintable():
             raise DatasetError(f"{entry.path}: its name holds what cannot be printed; rename it")

@@ -25,6 +25,7 @@ from nextview.errors import DatasetError, PredictionsError
 from nextview.models.inference import MAPS, MapNetwork, Recogniser
 from nextview.models.model_card import BUNDLED, ModelCard
 from nextview.models.network_input import from_store
+from nextview.observation import LEAST_PIXELS, LEAST_SHARE
 from nextview.outputs import check_file, written_whole
 from nextview.viewsphere import ViewSphere
 
@@ -308,7 +309,10 @@ def _open(
 def _predict_object(
     path: Path, recognisers: tuple[Path, ...], maps: tuple[tuple[str, Path], ...], batch: int, item: tuple[int, int]
 ) -> dict[str, NDArray[np.float32]]:
-    """Maps, azimuth bins and logits of all views of one object, by the names of their files; the logits last."""
+    """Maps, azimuth bins and logits of all views of one object, by the names of their files; the logits last.
+
+    A view in which nothing is seen is no evidence: its logits are all the same.
+    """
     i, judge = item
     store, names_it, networks = _open(path, recognisers, maps)
     recogniser = names_it[judge]
@@ -325,4 +329,15 @@ def _predict_object(
     answers = [recogniser.from_inputs(inputs[recogniser.card.input][p]) for p in parts]
     if all(found_evidence.azimuth_bins is not None for found_evidence in answers):
         found["azimuth_bins"] = np.concatenate([found_evidence.azimuth_bins for found_evidence in answers])
-    return {**found, "logits": np.concatenate([found_evidence.logits for found_evidence in answers])}
+    found["logits"] = np.concatenate([found_evidence.logits for found_evidence in answers])
+    nothing = ~_seen(store, i)
+    for name in ("azimuth_bins", "logits"):
+        if name in found:
+            found[name][nothing] = 0
+    return found
+
+
+def _seen(store: ViewStore, i: int) -> NDArray[np.bool_]:
+    """In which views of an object enough of it shows to be evidence, (V,), as ``Observation.seen`` has it."""
+    visible = np.count_nonzero(store.read("depth", i), axis=(1, 2))
+    return visible >= max(LEAST_PIXELS, LEAST_SHARE * store.group.attrs["size"] ** 2)

@@ -30,11 +30,11 @@ from nextview.data.store import (
     FAILED,
     PENDING,
     POINT_UNIT,
-    RENDERED,
     ViewStore,
     digest,
     refuse_without_root,
 )
+from nextview.data.world_views import SIDE, render_scene
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.mesh import Mesh, load_mesh, make_mesh
@@ -43,6 +43,8 @@ from nextview.models.model_card import read_card
 from nextview.observation import Camera
 from nextview.sensing.observed_object import SIZE
 from nextview.viewsphere import DISTANCE, LAYOUTS, ViewSphere
+from nextview.worlds import OccludedCamera, Scene, World, build_scene, sensed_camera
+from nextview.worlds.world import SUFFIX
 
 LARGEST_CHUNK = 2**31 - 2**20
 """Bytes that may be compressed at once, the compressor's own included."""
@@ -115,13 +117,14 @@ def render(
     max_faces: int = MAX_FACES,
     sensor: str | None = None,
     held_out: Path | None = None,
+    meshes: Path | None = None,
 ) -> Iterator[tuple[str, str | None]]:
-    """Render every mesh that the store does not hold yet; one that failed before is tried again.
+    """Render every mesh, or the target of every world, that the store lacks; one that failed before is tried again.
 
     The run may end at any moment, even by a kill or a full disk; the next one goes on with what is missing.
 
     Args:
-        dataset: folder of meshes.
+        dataset: folder of meshes, or of worlds.
         path: the store.
         sphere: the viewpoints.
         size: side of the images, pixels.
@@ -135,6 +138,7 @@ def render(
         max_faces: leave out larger meshes, see ``load_mesh``.
         sensor: look through this sensor, see ``sensor_named``; clean renders if None.
         held_out: only the objects that the model of this card calls held out of its training.
+        meshes: folder of the meshes that the worlds of the dataset are made of; None if it holds meshes itself.
 
     Yields:
         (name, None) for each object done, (name, reason) for one that cannot be rendered.
@@ -144,7 +148,7 @@ def render(
             with other settings or lacks an array, another run is writing it, or it cannot be written.
         UsageError: a size, a seed, a sensor or a number of workers that makes no sense.
     """
-    entries = entries_of(dataset.absolute(), split, held_out)
+    entries = entries_of(dataset.absolute(), split, held_out, meshes)
     if not (size > 0 and 2 * len(sphere) * size**2 < LARGEST_CHUNK):
         most = int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere)))
         raise UsageError(f"the size of {len(sphere)} views is from 1 to {most} pixels, not {size}")
@@ -152,6 +156,8 @@ def render(
     if not 0 <= seed < 2**63:
         raise UsageError(f"a seed is from 0 to {2**63 - 1}, not {seed}")
     deform = deform or Deform()
+    if meshes is not None and deform != Deform():
+        raise UsageError("worlds are rendered as they are: objects in them are neither stretched nor turned")
     through = None if sensor is None else sensor_named(sensor)
     if through is not None and (size, sphere.distance) != (SIZE, DISTANCE):
         raise UsageError(
@@ -165,14 +171,16 @@ def render(
             f"{farthest - 1:.2f} at most, not {sphere.distance:g}"
         )
     with only_one(path), writing(path):
-        store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit, dataset.absolute().name, through)
-        command = _command(dataset, path, sphere, size, seed, deform, split, unit, sensor, held_out)
+        name = dataset.absolute().name
+        store = _begin(path.absolute(), entries, sphere, size, seed, deform, unit, name, through, meshes)
+        command = _command(dataset, path, sphere, size, seed, deform, split, unit, sensor, held_out, meshes)
         if command not in store.commands:
             store.note(commands=[*store.commands, command])
         todo = [int(i) for i in np.flatnonzero(~store.done)]
         # Largest files first, so that no worker is left with a long one at the end.
         todo.sort(key=lambda i: -entries[i].path.stat().st_size)
-        task = partial(_render_entry, store.path, uuid4().hex, sphere, size, seed, deform, max_faces, through)
+        within = None if meshes is None else meshes.absolute()
+        task = partial(_render_entry, store.path, uuid4().hex, sphere, size, seed, deform, max_faces, through, within)
         for (i, entry), reason in each(task, [(i, entries[i]) for i in todo], workers, scheduler):
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is done.
@@ -183,23 +191,35 @@ def render(
             yield entry.name, None if reason is None else f"{reason}"
 
 
-def entries_of(dataset: Path, split: str | None = None, held_out: Path | None = None) -> list[Entry]:
-    """The meshes of a dataset folder that are asked for; see ``render``.
+def entries_of(
+    dataset: Path, split: str | None = None, held_out: Path | None = None, meshes: Path | None = None
+) -> list[Entry]:
+    """The meshes, or the worlds, of a dataset folder that are asked for; see ``render``.
 
     Raises:
-        DatasetError: there are none, or there is no such folder.
+        DatasetError: there are none, there is no such folder, or it holds the other of both.
         ModelError: the card is none.
     """
-    entries = [e for e in list_dataset(dataset) if split in (None, e.split)]
+    entries = [e for e in _listed(dataset, meshes) if split in (None, e.split)]
     if not entries:
-        raise DatasetError(f"{dataset}: no meshes in CLASS/{split}/MESH below it")
+        raise DatasetError(f"{dataset}: nothing in CLASS/{split}/NAME below it")
     if held_out is None:
         return entries
     kept = set(read_card(held_out).held_out)
-    entries = [e for e in entries if e.name in kept]
+    entries = [e for e in entries if e.name.partition("@")[0] in kept]
     if not entries:
         raise DatasetError(f"{dataset}: holds no object that {held_out} calls held out")
     return entries
+
+
+def _listed(dataset: Path, meshes: Path | None) -> list[Entry]:
+    """The meshes of a dataset; or its worlds, if their meshes are elsewhere."""
+    try:
+        return list_dataset(dataset) if meshes is None else list_dataset(dataset, (SUFFIX,))
+    except DatasetError:
+        if meshes is None and any(dataset.glob(f"*/**/*@*{SUFFIX}")):
+            raise DatasetError(f"{dataset}: holds worlds; say with --meshes where the meshes are in them") from None
+        raise
 
 
 def _command(
@@ -213,6 +233,7 @@ def _command(
     unit: str | None,
     sensor: str | None,
     held_out: Path | None,
+    meshes: Path | None,
 ) -> str:
     """The command that renders so; of a sphere that has no name, the part that the command line can say."""
     names = [name for name in LAYOUTS if LAYOUTS[name].elevations == sphere.elevations]
@@ -230,6 +251,7 @@ def _command(
         unit=unit,
         sensor=sensor,
         held_out=held_out,
+        meshes=meshes,
         seed=seed,
     )
 
@@ -258,6 +280,7 @@ def _begin(
     unit: str | None,
     dataset: str,
     sensor: Sensor | SensorMix | None,
+    meshes: Path | None,
 ) -> ViewStore:
     """The store as an earlier run left it, if that had the same meshes and settings, or a new one."""
     with ThreadPoolExecutor() as pool:
@@ -265,6 +288,8 @@ def _begin(
     recipe = {"seed": seed, "stretch": deform.stretch, "turn": deform.turn, "sha256": hashes}
     if sensor is not None:
         recipe["sensor"] = sensor.to_dict()
+    if meshes is not None:
+        recipe["scene"] = SIDE
     if not path.exists():
         return ViewStore.create(path, entries, sphere, size, recipe | {"unit": unit, "dataset": dataset})
     if not (path / "zarr.json").exists():
@@ -300,7 +325,7 @@ def _begin(
         if known is not None:
             raise DatasetError(f"{path}: its meshes are measured in {known}, not {unit}")
         store.note(unit=unit)
-    for name in RENDERED:
+    for name in store.rendered:
         store.array(name)  # says what is missing
     if not store.sound(DIGEST):
         store.add(DIGEST)
@@ -338,7 +363,7 @@ def _arrays(path: Path, run: str) -> dict[str, zarr.Array]:
     # Finding out whether a chunk is worth writing costs more than writing it.
     with zarr.config.set({"array.write_empty_chunks": True}):
         store = ViewStore.open(path)
-        return {name: store.array(name) for name in (*RENDERED, DIGEST)}
+        return {name: store.array(name) for name in (*store.rendered, DIGEST)}
 
 
 def _render_entry(
@@ -350,21 +375,28 @@ def _render_entry(
     deform: Deform,
     max_faces: int,
     sensor: Sensor | SensorMix | None,
+    meshes: Path | None,
     item: tuple[int, Entry],
 ) -> str | None:
-    """Render one object into the store; the reason if its mesh cannot be used."""
+    """Render one object, or the target of one world, into the store; the reason if its mesh cannot be used."""
     i, entry = item
     arrays = _arrays(path, run)
+    rng = np.random.default_rng([seed, SENSING, *entry.name.encode()])
     try:
-        mesh = load_mesh(entry.path, max_faces=max_faces)
-        if deform != Deform():
-            mesh = deform(mesh, seed, entry.name)
-        if sensor is None:
-            camera: Camera = SimulatedCamera(mesh, size, sphere.distance)
+        if meshes is None:
+            mesh = load_mesh(entry.path, max_faces=max_faces)
+            if deform != Deform():
+                mesh = deform(mesh, seed, entry.name)
+            camera: Camera = (
+                SimulatedCamera(mesh, size, sphere.distance) if sensor is None else SensedCamera(mesh, sensor, rng)
+            )
+            rendered = render_object(camera, sphere, size)
         else:
-            camera = SensedCamera(mesh, sensor, np.random.default_rng([seed, SENSING, *entry.name.encode()]))
-        rendered = render_object(camera, sphere, size)
-    except MeshError as error:
+            scene = build_scene(World.load(entry.path), meshes, max_faces)
+            mesh = scene.target
+            rendered = render_object(_camera_in(scene, sphere, size, sensor, rng), sphere, size)
+            rendered |= render_scene(scene, sphere)
+    except (MeshError, DatasetError) as error:
         return str(error)
     except MemoryError:
         return f"{entry.path}: too large for this machine's memory"
@@ -375,3 +407,9 @@ def _render_entry(
     arrays[DIGEST][i] = digest(entry.name, rendered)
     arrays["status"][i] = DONE  # last, so that an object counts only when it is whole
     return None
+
+
+def _camera_in(
+    scene: Scene, sphere: ViewSphere, size: int, sensor: Sensor | SensorMix | None, rng: np.random.Generator
+) -> Camera:
+    return OccludedCamera(scene, size, sphere.distance) if sensor is None else sensed_camera(scene, sensor, rng)

@@ -37,6 +37,10 @@ PLANNED = 5
 """Views of a plan: the thesis's longest episode."""
 RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
 """The arrays that rendering makes; others are added later."""
+SCENE = (
+    "scene/depth", "scene/owner", "scene/reachable", "measures/visible_share", "measures/clearance",
+)  # fmt: skip
+"""The arrays that rendering makes of worlds beside these, see ``data.world_views``."""
 DIGEST = "digest"
 """The array of what ``digest`` gives of each object; stores that were begun before there was one have none."""
 RESTORE = "nextview render restores it, with the meshes and the settings that the store was made with"
@@ -106,8 +110,13 @@ class ViewStore:
             failures={},
             **recipe,
         )
-        for name in (*RENDERED, DIGEST):
+        for name in (*store.rendered, DIGEST):
             store.add(name)
+
+    @property
+    def rendered(self) -> tuple[str, ...]:
+        """Names of the arrays that rendering makes: more where the objects stand in worlds."""
+        return (*RENDERED, *SCENE) if "scene" in self.group.attrs else RENDERED
 
     def note(self, **changes: Any) -> None:
         """Change attributes, and with them their checksum."""
@@ -133,7 +142,7 @@ class ViewStore:
 
     def _layout(self, name: str) -> tuple[tuple[int, ...], str, float]:
         """Shape for one object, type and fill value of an array."""
-        v, size = len(self.sphere), self.group.attrs["size"]
+        v, size, scene = len(self.sphere), self.group.attrs["size"], self.group.attrs.get("scene", 0)
         layouts = {
             "image": ((v, size, size), "uint8", 0),
             "depth": ((v, size, size), "uint16", 0),
@@ -143,6 +152,9 @@ class ViewStore:
             "status": ((), "uint8", PENDING),
             DIGEST: ((32,), "uint8", 0),
             "correspondence": ((v, v), "float32", np.nan),
+            "scene/depth": ((v, scene, scene), "uint16", 0),
+            "scene/owner": ((v, scene, scene), "uint8", 0),
+            "scene/reachable": ((v,), "bool", False),
         }
         if name.startswith("plans/"):
             return (v, min(PLANNED, v)), "float32", np.nan

@@ -35,10 +35,26 @@ def boxes_around(vertices: NDArray[np.float64], count: int, rng: np.random.Gener
     size = np.concatenate([rng.uniform(*FOOTPRINT, (count, 2)), rng.uniform(*HEIGHT, (count, 1))], 1)
     turn, towards = rng.uniform(0, 2 * np.pi, (2, count))
     away = reach + np.hypot(size[:, 0], size[:, 1]) / 2 + rng.uniform(*GAP, count)
+    at = away[:, None] * np.stack([np.cos(towards), np.sin(towards)], 1)
+    return upright_boxes(size, turn, at, float(floor))
+
+
+def upright_boxes(size: NDArray[np.float64], turn: NDArray[np.float64], at: NDArray[np.float64], floor: float) -> Mesh:
+    """Boxes that stand on the ground.
+
+    Args:
+        size: width, depth and height of each, (N, 3).
+        turn: of each about the vertical, radians, (N,).
+        at: where its middle stands, (N, 2).
+        floor: height of the ground.
+
+    Returns:
+        All of them as one mesh, not normalised: 8 vertices and 12 faces each, in order.
+    """
     corners = _CORNERS * size[:, None]
     c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
-    x = c * corners[..., 0] - s * corners[..., 1] + (away * np.cos(towards))[:, None]
-    y = s * corners[..., 0] + c * corners[..., 1] + (away * np.sin(towards))[:, None]
+    x = c * corners[..., 0] - s * corners[..., 1] + at[:, :1]
+    y = s * corners[..., 0] + c * corners[..., 1] + at[:, 1:]
     places = np.stack([x, y, corners[..., 2] + floor], -1).reshape(-1, 3)
-    faces = (_FACES + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
+    faces = (_FACES + 8 * np.arange(len(size))[:, None, None]).reshape(-1, 3)
     return Mesh(places, faces.astype(np.int32), np.zeros(3), 1.0, "boxes")

@@ -26,7 +26,7 @@ from nextview.viewsphere import DISTANCE
 Float = NDArray[np.float64]
 
 TABLE = 1.5
-"""Radius of the table that the object stands on, object radii."""
+"""Radius of the table that the object stands on, if nothing else is said, object radii."""
 REACH = 1.3
 """What is taken for the object lies in a sphere so many radii large: with a wrong pose it sticks out of its own."""
 LEFTOVER = 4.0
@@ -48,13 +48,22 @@ class SensedCamera:
         sensor: a sensor, or the name of one, see ``sensor_named``. Of a mix, one is drawn now.
         rng: for all errors; those of the object's frame, and the boxes, are drawn now, once for the object.
         denoise: as in ``ObservedObject``; if not, every pixel keeps the depth that was measured.
+        around: what stands around the object and hides parts of it, object frame, object radii; instead of the boxes
+            of the sensor's setup.
+        table: radius of the table, object radii.
 
     Raises:
         UsageError: there is no such sensor.
     """
 
     def __init__(
-        self, mesh: Mesh, sensor: Sensor | SensorMix | str, rng: np.random.Generator, denoise: bool = True
+        self,
+        mesh: Mesh,
+        sensor: Sensor | SensorMix | str,
+        rng: np.random.Generator,
+        denoise: bool = True,
+        around: Mesh | None = None,
+        table: float = TABLE,
     ) -> None:
         of_kind(mesh, Mesh, "what is looked at is a Mesh")
         of_kind(sensor, str | Sensor | SensorMix, "a sensor is one, or its name")
@@ -67,11 +76,14 @@ class SensedCamera:
         self._metres = mesh.metres
         self._truth = ObjectFrame(np.zeros(3), self.sensor.radius, np.eye(3))
         self.object_frame = self._wrong_frame()
-        self._boxes: SimulatedCamera | None = None
-        count, around = 0, rng.spawn(1)[0] if self.sensor.boxes else None
-        if around is not None and (count := int(around.poisson(self.sensor.boxes))):
-            boxes = boxes_around(mesh.vertices, count, around)
-            self._boxes = SimulatedCamera(boxes, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)
+        self._reach = table
+        if around is None and self.sensor.boxes:
+            draws = rng.spawn(1)[0]
+            if count := int(draws.poisson(self.sensor.boxes)):
+                around = boxes_around(mesh.vertices, count, draws)
+        self._around: SimulatedCamera | None = None
+        if around is not None:
+            self._around = SimulatedCamera(around, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)
 
     def observe(self, pose: Float) -> Observation:
         """Look from the direction of a pose, (4, 4), object frame, at the sensor's own distance.
@@ -122,9 +134,9 @@ class SensedCamera:
         """How much of the object's picture from a pose, (4, 4), object frame, no box hides; 0 if there is none."""
         pose = self._truth.pose_in_object(self._truth.pose_in_world(pose, self.sensor.distance))
         alone = self._camera.observe(pose).depth
-        if self._boxes is None or not alone.any():
+        if self._around is None or not alone.any():
             return float(alone.any())
-        before = self._boxes.observe(pose).depth
+        before = self._around.observe(pose).depth
         return float(((before == 0) | (before > alone))[alone > 0].mean())
 
     def _scene(self, pose: Float) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -135,8 +147,8 @@ class SensedCamera:
         table, part = self._table(inside)
         shown = np.isfinite(table) & (depth[part] == 0)
         depth[part][shown], whose[part][shown] = table[shown], TABLE_TOP
-        if self._boxes is not None:
-            boxes = self._boxes.observe(inside).depth
+        if self._around is not None:
+            boxes = self._around.observe(inside).depth
             nearer = (boxes > 0) & ((depth == 0) | (boxes < depth))
             depth, whose = np.where(nearer, boxes, depth), np.where(nearer, np.uint8(BOX), whose)
         return depth * np.float32(self.sensor.radius), whose
@@ -148,7 +160,8 @@ class SensedCamera:
         y = (np.arange(self.sensor.height) + 0.5 - self.sensor.height / 2) / self.sensor.focal
         if height <= 0:
             return np.zeros((0, 0)), (slice(0), slice(0))
-        corners = np.array([[a, b, self._floor] for a in (-TABLE, TABLE) for b in (-TABLE, TABLE)])
+        ends = (-self._reach, self._reach)
+        corners = np.array([[a, b, self._floor] for a in ends for b in ends])
         right, down, forward = ((corners - pose[:3, 3]) @ pose[:3, :3]).T
         rows, columns = slice(None), slice(None)
         if forward.min() > 0:  # else its border is beside the camera, and it may be anywhere in the picture
@@ -159,7 +172,7 @@ class SensedCamera:
         along = np.where(falls < 0, -height / np.where(falls < 0, falls, -1), np.inf)
         with np.errstate(invalid="ignore"):
             across = [pose[i, 3] + along * (x * pose[i, 0] + y * pose[i, 1] + pose[i, 2]) for i in (0, 1)]
-            return np.where(across[0] ** 2 + across[1] ** 2 < TABLE**2, along, np.inf), (rows, columns)
+            return np.where(across[0] ** 2 + across[1] ** 2 < self._reach**2, along, np.inf), (rows, columns)
 
     def _shaken(self, pose: Float, rng: np.random.Generator) -> Float:
         """Where the camera really is."""

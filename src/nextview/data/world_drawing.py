@@ -1,0 +1,130 @@
+"""Draw a folder of worlds around the objects of a dataset, on all cores, resumable."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from nextview.data.folders import Entry, list_dataset
+from nextview.data.lock import only_one, writing
+from nextview.data.pool import each
+from nextview.errors import DatasetError, MeshError, UsageError
+from nextview.worlds.drawing import Meshes, draw_world
+from nextview.worlds.world import LEVELS, SUFFIX, World
+
+
+@dataclass(frozen=True)
+class Task:
+    """One world to draw.
+
+    Attributes:
+        target: the mesh file, relative to the dataset.
+        split: of the dataset, to which everything in the world belongs.
+        level: of clutter.
+        name: of the world.
+        path: of its file.
+    """
+
+    target: str
+    split: str
+    level: str
+    name: str
+    path: Path
+
+
+def draw_worlds(
+    dataset: Path,
+    out: Path,
+    levels: Sequence[str] = tuple(LEVELS),
+    worlds: int | None = None,
+    seed: int = 0,
+    split: str | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Iterator[tuple[str, str | None]]:
+    """Draw the worlds that are not in the folder yet. Which they are depends on the seed alone.
+
+    The objects of each split are taken in an order that the seed draws, each once before any is taken again, the same
+    at all levels. What stands around an object is of its own split. Files are CLASS/SPLIT/NAME@LEVEL-NUMBER.json, or
+    CLASS/NAME@LEVEL-NUMBER.json where the dataset has no splits.
+
+    Args:
+        dataset: folder of meshes.
+        out: folder of worlds.
+        levels: of LEVELS.
+        worlds: how many at each level, of each split; each object once by default.
+        seed: decides everything.
+        split: only this one.
+        workers: processes; one for each core by default; 0 to work in this one.
+        scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
+
+    Yields:
+        (name, None) for each world that is there, (name, reason) for one that cannot be drawn.
+
+    Raises:
+        DatasetError: the dataset is unusable, another run is writing, the folder cannot be written, or worlds in it
+            were drawn with another seed.
+        UsageError: a level, a number or a seed that makes no sense.
+    """
+    wanted = tasks(dataset, out, levels, worlds, seed, split)
+    there = next(out.rglob(f"*@*{SUFFIX}"), None)
+    if there is not None and World.load(there).seed != seed:
+        raise DatasetError(f"{there}: was drawn with another seed; give another folder or the same seed")
+    todo = [task for task in wanted if not task.path.exists()]
+    yield from ((task.name, None) for task in wanted if task not in todo)
+    files: dict[str, list[str]] = {}
+    for entry in list_dataset(dataset):
+        files.setdefault(entry.split, []).append(_relative(entry, dataset))
+    meshes = {name: Meshes(dataset.absolute(), tuple(sorted(found))) for name, found in files.items()}
+    with only_one(out), writing(out):
+        for task, reason in each(partial(_draw, meshes, seed), todo, workers, scheduler):
+            yield task.name, None if reason is None else f"{reason}"
+
+
+def tasks(
+    dataset: Path,
+    out: Path,
+    levels: Sequence[str],
+    worlds: int | None,
+    seed: int,
+    split: str | None,
+) -> list[Task]:
+    """All worlds that are asked for, see ``draw_worlds``."""
+    unknown = [level for level in levels if level not in LEVELS]
+    if unknown or not levels:
+        raise UsageError(f"the level of a world is {', '.join(LEVELS)}, not {unknown[0] if unknown else 'none'}")
+    if worlds is not None and worlds < 1:
+        raise UsageError(f"there cannot be {worlds} worlds")
+    if not 0 <= seed < 2**31:
+        raise UsageError(f"a seed is from 0 to {2**31 - 1}, not {seed}")
+    found: list[Task] = []
+    entries = [entry for entry in list_dataset(dataset) if split in (None, entry.split)]
+    if not entries:
+        raise DatasetError(f"{dataset}: no meshes in CLASS/{split}/MESH below it")
+    for one in dict.fromkeys(entry.split for entry in entries):
+        mine = [entry for entry in entries if entry.split == one]
+        order = np.random.default_rng([seed, *one.encode()]).permutation(len(mine))
+        for number in range(len(mine) if worlds is None else worlds):
+            entry = mine[order[number % len(mine)]]
+            for level in levels:
+                name = f"{entry.name}@{level}-{number // len(mine)}"
+                path = out.absolute() / entry.label / one / f"{name}{SUFFIX}"
+                found.append(Task(_relative(entry, dataset), one, level, name, path))
+    return found
+
+
+def _relative(entry: Entry, dataset: Path) -> str:
+    return entry.path.relative_to(dataset).as_posix()
+
+
+def _draw(meshes: dict[str, Meshes], seed: int, task: Task) -> str | None:
+    """Draw one world into its file; the reason if that cannot be."""
+    try:
+        draw_world(task.target, meshes[task.split], task.level, seed, task.name).save(task.path)
+    except (MeshError, DatasetError) as error:
+        return str(error)
+    return None
