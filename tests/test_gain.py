@@ -302,7 +302,7 @@ def test_the_file_chooses_as_the_networks_do(scope, inputs, tmp_path):
 
 def test_networks_that_single_precision_cannot_hold_are_not_written(tmp_path):
     policy = some_gain()
-    networks = [[(1e4 * weights, bias) for weights, bias in layers] for layers in policy.score.networks]
+    networks = [[(1e20 * weights, bias) for weights, bias in layers] for layers in policy.score.networks]
     huge = replace(policy, score=replace(policy.score, networks=tuple(tuple(layers) for layers in networks)))
     with pytest.raises(ValueError, match=r"differ by .* from the networks'"):
         write_card(tmp_path / "mine.json", huge)

@@ -15,7 +15,7 @@ from nextview.data.measuring import measure
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import render
 from nextview.data.store import ViewStore
-from nextview.errors import ResultsError, UsageError
+from nextview.errors import EntryError, UsageError
 from nextview.viewsphere import ViewSphere
 
 STUDY = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "measure_study.py"))
@@ -52,8 +52,8 @@ def made(tmp_path_factory):
         models={},
         store=str(folder / "views.zarr"),
     )
-    p._of(np.flatnonzero(np.arange(2 * N) % 4 < 2)).save(folder / "test.npz")
-    p._of(np.flatnonzero(np.arange(2 * N) % 4 >= 2)).save(folder / "validation.npz")
+    p.of_objects(np.flatnonzero(np.arange(2 * N) % 4 < 2)).save(folder / "test.npz")
+    p.of_objects(np.flatnonzero(np.arange(2 * N) % 4 >= 2)).save(folder / "validation.npz")
     STUDY["main"](folder / "test.npz", folder / "validation.npz", folder / "out", runs=4, samples=50)
     return folder
 
@@ -114,5 +114,5 @@ def test_what_makes_no_sense_is_refused(made):
         STUDY["main"](made / "test.npz", made / "test.npz", made / "no")
     with pytest.raises(UsageError, match="two views or more"):
         STUDY["main"](made / "test.npz", made / "validation.npz", made / "no", n_views=(1, 2))
-    with pytest.raises(ResultsError, match="mesh_saliency"):
+    with pytest.raises(EntryError, match="mesh_saliency"):
         STUDY["main"](made / "test.npz", made / "validation.npz", made / "no", measures=("mesh_saliency",), runs=1)

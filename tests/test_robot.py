@@ -120,18 +120,19 @@ def test_a_better_object_frame_changes_what_the_earlier_views_say(tiny):
 def test_only_what_changed_goes_through_the_networks_again(tiny):
     counted = []
 
-    class Counting:
-        recogniser, maps, classes = tiny.recogniser, tiny.maps, tiny.classes
-
+    class Counting(Models):
         def evidence(self, observations):
             counted.append(len(observations))
             return tiny.evidence(observations)
 
     known = ObjectFrame([0, 0, 0.09], 0.14, np.eye(3))
-    run(begin(Counting(), object=ObservedObject(known=known)), pose_at(40, 10, 0.7, (0, 0, 0.08)))
+    run(
+        begin(Counting(tiny.recogniser, tiny.maps), object=ObservedObject(known=known)),
+        pose_at(40, 10, 0.7, (0, 0, 0.08)),
+    )
     assert counted == [1, 1, 1, 1]
     counted.clear()
-    session = run(begin(Counting()), pose_at(10, 10, 0.7, (0, 0, 0.08)))
+    session = run(begin(Counting(tiny.recogniser, tiny.maps)), pose_at(10, 10, 0.7, (0, 0, 0.08)))
     assert counted[0] == 1
     assert sum(counted) > len(session.views)
 

@@ -27,6 +27,13 @@ EXAMPLES = {
     "cluster": "from distributed import LocalCluster; import nextview.data.pool",
     "train": "import lightning, torch; from nextview.training import export, loop, onnx_export",
     "workflow": "import snakemake",
+    "arm": "import gymnasium_robotics, mink, mujoco; import nextview.cameras.arm",
+    "explore": "import viser; from nextview.explorer.exploration import Exploration",
+    "record": "import rerun; from nextview.report.recording import Recorder",
+    "measures": "import skimage; from nextview.measures.registry import MEASURES; assert len(MEASURES) == 17",
+    "envs": "import gymnasium, nextview.envs; gymnasium.spec('nextview/Recognise-v0')",
+    "ap-gym": "import ap_gym, nextview.envs",
+    "rl": "import stable_baselines3; from nextview.training.agent import agent_training",
     "docs": "import material, mkdocs, mkdocs_jupyter, mkdocstrings_handlers.python",
     "dev": "import hypothesis, mypy, pytest, ruff, skimage, trimesh",
 }

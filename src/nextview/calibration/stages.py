@@ -82,6 +82,7 @@ def fit_calibration(
     if validation != 1 and table.models["recogniser"][1] != model.sha256:
         raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
     if validation is None:
+        FittingSet.of_all(table)  # refuses the test split
         kept = held_out_by(model, table)
         if len(kept) == 0:
             raise PredictionsError(f"{predictions}: holds no object that {card} calls held out; see --validation")

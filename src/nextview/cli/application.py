@@ -25,12 +25,17 @@ def application(arguments: Sequence[str] = ()) -> SubcommandApp:
     app = SubcommandApp()
     for name, command in COMMANDS.items():
         if isinstance(command, dict):
-            group = SubcommandApp()
-            for each, function in command.items():
-                group.command(name=each)(_laid_out(with_preset(function, arguments)))
-            app.command(group, name=name, help=GROUPS[name])
+            app.command(group(name, arguments), name=name, help=GROUPS[name])
         else:
             app.command(name=name)(_laid_out(command))
+    return app
+
+
+def group(name: str, arguments: Sequence[str] = ()) -> SubcommandApp:
+    """The commands of one group; see ``application``."""
+    app = SubcommandApp()
+    for each, function in COMMANDS[name].items():
+        app.command(name=each)(_laid_out(with_preset(function, arguments)))
     return app
 
 

@@ -6,8 +6,8 @@ import sys
 from typing import Any
 
 from nextview import __version__
-from nextview.cli.application import CONFIG, application
-from nextview.cli.commands import COMMANDS
+from nextview.cli.application import CONFIG, application, group
+from nextview.cli.commands import COMMANDS, GROUPS
 from nextview.cli.ending import orderly_end
 
 
@@ -22,8 +22,12 @@ def _run(arguments: list[str]) -> None:
     if arguments == ["--version"]:
         print(f"nextview {__version__}")
         return
-    description = "Active 3D object recognition: what it is, and where to look next."
-    application(arguments).cli(prog="nextview", description=description, args=arguments, config=CONFIG)
+    prog, description = "nextview", "Active 3D object recognition: what it is, and where to look next."
+    app = application(arguments)
+    if arguments and isinstance(COMMANDS.get(arguments[0]), dict):  # by itself, for shorter messages
+        name, *arguments = arguments
+        prog, description, app = f"{prog} {name}", GROUPS[name], group(name, arguments)
+    app.cli(prog=prog, description=description, args=arguments, config=CONFIG)
 
 
 def _advice(arguments: list[str]) -> str:

@@ -50,7 +50,7 @@ def track(
     with _ProgressBelow(*columns, console=console, above=above if console.is_terminal else None) as progress:
         task = progress.add_task(printable(what), total=total, completed=before)
         for n in done:
-            progress.update(task, completed=n)
+            progress.update(task, completed=n, refresh=above is not None)
 
 
 class _ProgressBelow(Progress):

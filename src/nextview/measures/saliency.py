@@ -66,6 +66,8 @@ def _salient(
     """Saliency of points, (n,): over all scales, how the averages of their curvature at two widths differ.
 
     Lee scales each scale's map to a maximum of 1 first. Here it stays a curvature: the rounding of a sphere is none.
+    Lee suppresses scales at which much is as salient as the maximum by the mean of the local maxima; here it is the
+    mean over the surface, for how many maxima there are depends on how the faces are cut.
     """
     from scipy.spatial import cKDTree
 
@@ -76,7 +78,8 @@ def _salient(
 
     def average(sigma: float) -> NDArray[np.float64]:
         near = square <= (2 * sigma) ** 2
-        weight = np.exp(-square[near] / (2 * sigma**2)) * area[j[near]]
+        # Down to 0 at its end, so that no rounding decides about whole rows of points that lie just there.
+        weight = (np.exp(-square[near] / (2 * sigma**2)) - np.exp(-2)) * area[j[near]]
         total = np.bincount(i[near], weight, len(points))
         return np.divide(np.bincount(i[near], weight * curvature[j[near]], len(points)), total,
                          out=np.zeros(len(points)), where=total > 0)  # fmt: skip
@@ -86,12 +89,8 @@ def _salient(
         salient = np.abs(average(scale * UNIT) - average(2 * scale * UNIT))
         if salient.max() <= 0:
             continue
-        near = square <= (2 * scale * UNIT) ** 2
-        highest = np.zeros(len(points))
-        np.maximum.at(highest, i[near], salient[j[near]])
-        peaks = salient[(salient >= (1 - 1e-6) * highest) & (salient > 0)]  # no tie is broken by rounding
-        others = (peaks.sum() / salient.max() - 1) / max(len(peaks) - 1, 1)
-        found += salient * (1 - others) ** 2  # Lee's suppression of scales at which many peaks are alike
+        others = (salient * area).sum() / area.sum() / salient.max()
+        found += salient * (1 - others) ** 2
     return found
 
 

@@ -51,7 +51,9 @@ class OccludedCamera:
     def _hidden(self, seen: Observation) -> NDArray[np.bool_]:
         """Pixels of the target alone before which something stands, (H, W)."""
         there = seen.depth > 0
-        depth, _ = self._others.cast(seen.pose[:3, 3], self._rays[there] @ seen.pose[:3, :3].T.astype(np.float32))
+        depth, _ = self._others.cast(
+            seen.pose[:3, 3].astype(np.float32), self._rays[there] @ seen.pose[:3, :3].T.astype(np.float32)
+        )
         hidden = np.zeros(there.shape, bool)
         hidden[there] = depth < seen.depth[there] - NEARER
         return hidden
@@ -79,7 +81,7 @@ class SceneCamera:
             TABLE_TOP for each pixel, (H, W) uint8.
         """
         rays = self._rays.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32)
-        depth, which = self._caster.cast(pose[:3, 3], rays)
+        depth, which = self._caster.cast(pose[:3, 3].astype(np.float32), rays)
         shape = self._rays.shape[:2]
         return np.where(which < 0, np.float32(0), depth).reshape(shape), self._owners[which].reshape(shape)
 
