@@ -219,8 +219,8 @@ def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
 def test_frames_of_a_real_kinect_survive_a_bag(tmp_path):
     captured = read_capture(KITCHEN).frames[::10]
     k = np.loadtxt(KITCHEN / "camera-intrinsics.txt")
-    depths = [np.array(Picture.open(KITCHEN / f"{frame.name}.depth.png")).astype(np.uint16) for frame in captured]
-    poses = [np.loadtxt(KITCHEN / f"{frame.name}.pose.txt") for frame in captured]
+    depths = [np.array(Picture.open(KITCHEN / f"frame-{frame.name}.depth.png")).astype(np.uint16) for frame in captured]
+    poses = [np.loadtxt(KITCHEN / f"frame-{frame.name}.pose.txt") for frame in captured]
     messages = [
         (image_message(depth, "16UC1"), info_message(k, depth.shape), transform_message(pose))
         for depth, pose in zip(depths, poses, strict=True)
