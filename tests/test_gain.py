@@ -532,7 +532,18 @@ def test_it_learns_from_what_sensors_made_of_the_same_objects(unseen, tmp_path, 
     np.testing.assert_array_equal(table.data.labels, np.tile(p.labels[kept], 2))
     np.testing.assert_array_equal(table.maps["lem-sphere"], np.tile(p.maps["lem-sphere"][kept], (2, 1, 1, 1)))
     card = tmp_path / "mine.json"
-    start = ["train", "gain", str(unseen), str(card), "--sensed", str(tmp_path / "sensed.npz"), "--epochs", "1"]
+    start = [
+        "train",
+        "gain",
+        str(unseen),
+        str(card),
+        "--sensed",
+        str(tmp_path / "sensed.npz"),
+        "--epochs",
+        "1",
+        "--folds",
+        "2",
+    ]
     main(start)
     assert "90 objects of the training split, clean and through sensors" in json.loads(card.read_text())["learned_from"]
     assert isinstance(make_policy(str(card), SPHERE, classes=("ball", "box", "pillar")), Gain)
