@@ -29,6 +29,7 @@ EXAMPLES = {
     "workflow": "import snakemake",
     "arm": "import gymnasium_robotics, mink, mujoco; import nextview.cameras.arm",
     "explore": "import viser; from nextview.explorer.exploration import Exploration",
+    "browser": "import playwright",
     "record": "import rerun; from nextview.report.recording import Recorder",
     "measures": "import skimage; from nextview.measures.registry import MEASURES; assert len(MEASURES) == 17",
     "envs": "import gymnasium, nextview.envs; gymnasium.spec('nextview/Recognise-v0')",
