@@ -7,7 +7,7 @@ demo: .venv/installed  ## look at a sample object, with the base installation (n
 	.venv/bin/nextview demo --figure nextview_demo.png
 
 test: .venv-test/installed  ## run all tests
-	OMP_NUM_THREADS=1 .venv-test/bin/python -m pytest -n 2 --dist loadfile  # one file is run by one process, of one thread
+	OMP_NUM_THREADS=1 .venv-test/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # one file is run by one process, of one thread
 
 lint: .venv-test/installed  ## style and types
 	.venv-test/bin/ruff check .
