@@ -16,11 +16,16 @@ import nextview
 from nextview import SimulatedCamera, Stopping, ViewSphere, make_policy
 from nextview.belief import Calibration
 from nextview.cli.main import main
+from nextview.data.predicting import predict
+from nextview.data.predictions import Predictions
+from nextview.data.rendering import render
 from nextview.data.samples import sample_mesh
+from nextview.data.store import ViewStore
 from nextview.episode import Episodes
 from nextview.errors import MeshError, ObservationError
 from nextview.mesh import make_mesh
 from nextview.models.inference import MapNetwork, Models, Recogniser, load_models
+from nextview.models.model_card import read_card
 from nextview.observation import Observation, pinhole
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Unidirectional
@@ -242,6 +247,25 @@ def test_two_boxes_far_apart_are_nothing(gap):
     both = trimesh.util.concatenate(boxes)
     found = nextview.recognise(make_mesh(both.vertices, both.faces), start=9)
     assert (found.answer, found.confident) == (None, False)
+
+
+def test_predictions_and_cameras_have_one_idea_of_nothing(tmp_path):
+    """Four balls far apart fill enough of the picture together, but no one of them does."""
+    balls = [trimesh.creation.icosphere(2, 0.09).apply_translation((x, y, 0)) for x in (-1, 1) for y in (-1, 1)]
+    file = tmp_path / "meshes/ball/test/balls.off"
+    file.parent.mkdir(parents=True)
+    trimesh.util.concatenate(balls).export(file)
+    list(render(tmp_path / "meshes", tmp_path / "store.zarr", SPHERE, 112, workers=1))
+    store = ViewStore.open(tmp_path / "store.zarr")
+    looks = [
+        Observation(depth, pose, store.intrinsics) for depth, pose in zip(store.depth(0), SPHERE.poses, strict=True)
+    ]
+    assert min(look.visible for look in looks) > 0.006 * 112**2
+    make_recogniser(tmp_path, CLASSES)
+    list(predict(tmp_path / "store.zarr", tmp_path / "said.npz", [read_card(tmp_path / "tiny.json")], {}, workers=1))
+    said = Predictions.load(tmp_path / "said.npz").logits[0].any(1)
+    np.testing.assert_array_equal(said, [look.seen for look in looks])
+    assert not said.all()
 
 
 def test_a_mesh_without_area_is_refused():

@@ -179,7 +179,11 @@ def test_messages_that_cannot_be_used_are_refused(depth, wrong, match):
 
 
 def test_a_transform_that_never_changes_has_no_time(depth):
-    conversion.frame_of(image_message(depth, "32FC1"), info_message(), transform_message(np.eye(4), time=0.0))
+    image, info = image_message(depth, "32FC1"), info_message()
+    still = conversion.frame_of(image, info, transform_message(np.eye(4), time=0.0))
+    stamped = conversion.frame_of(image, info, transform_message(np.eye(4)))
+    np.testing.assert_array_equal(still.depth, stamped.depth)
+    np.testing.assert_array_equal(still.pose, stamped.pose)
 
 
 def test_a_rotation_is_a_unit_quaternion():

@@ -82,13 +82,7 @@ class Observation:
     @cached_property
     def seen(self) -> bool:
         """Whether enough of the object is visible to say anything of it. A view without it is no evidence."""
-        least = max(LEAST_PIXELS, LEAST_SHARE * self.depth.size)
-        if not least <= self.visible < SPECKS * least:
-            return self.visible >= least
-        from scipy.ndimage import label  # only where little is seen: importing it takes time
-
-        parts, _ = label(self.depth > 0, np.ones((3, 3)))
-        return bool(np.bincount(parts.ravel())[1:].max() >= least)
+        return enough_shows(self.depth > 0)
 
     @cached_property
     def points(self) -> NDArray[np.float32]:
@@ -99,6 +93,20 @@ class Observation:
     def picture(self) -> NDArray[np.uint8]:
         """The image; where the camera has none, the depth as a headlight would show it. (H, W) uint8."""
         return headlight(self.depth, self.intrinsics) if self.image is None else self.image
+
+
+def enough_shows(mask: NDArray[np.bool_]) -> bool:
+    """Whether the pixels that show the object, (H, W) bool, are enough to say anything of it.
+
+    They are if one connected part of them fills ``LEAST_SHARE`` of the image, or all together ``SPECKS`` times as much.
+    """
+    least, n = max(LEAST_PIXELS, LEAST_SHARE * mask.size), np.count_nonzero(mask)
+    if not least <= n < SPECKS * least:
+        return bool(n >= least)
+    from scipy.ndimage import label  # only where little is seen: importing it takes time
+
+    parts, _ = label(mask, np.ones((3, 3)))
+    return bool(np.bincount(parts.ravel())[1:].max() >= least)
 
 
 class Camera(Protocol):

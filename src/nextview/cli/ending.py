@@ -59,14 +59,11 @@ def orderly_end(advice: str) -> Iterator[None]:
                 yield
             finally:
                 sys.stdout.flush()  # here and not at the interpreter's end, also after --help, which exits by itself
-        except NextviewError as error:
-            say(str(error))
-            sys.exit(2)
-        except ModuleNotFoundError as error:
-            missing = missing_extra(error)
-            if missing is None:
+        except (NextviewError, ModuleNotFoundError) as error:
+            sentence = missing_extra(error) if isinstance(error, ModuleNotFoundError) else error
+            if sentence is None:
                 raise
-            say(str(missing))
+            say(str(sentence))
             sys.exit(2)
         except BrokenPipeError:  # whoever read this has gone, as head does
             _forget(sys.stdout)

@@ -25,7 +25,7 @@ from nextview.errors import DatasetError, PredictionsError
 from nextview.models.inference import MAPS, MapNetwork, Recogniser
 from nextview.models.model_card import BUNDLED, ModelCard
 from nextview.models.network_input import from_store
-from nextview.observation import LEAST_PIXELS, LEAST_SHARE
+from nextview.observation import enough_shows
 from nextview.outputs import check_file, written_whole
 from nextview.viewsphere import ViewSphere
 
@@ -330,14 +330,8 @@ def _predict_object(
     if all(found_evidence.azimuth_bins is not None for found_evidence in answers):
         found["azimuth_bins"] = np.concatenate([found_evidence.azimuth_bins for found_evidence in answers])
     found["logits"] = np.concatenate([found_evidence.logits for found_evidence in answers])
-    nothing = ~_seen(store, i)
+    nothing = np.array([not enough_shows(depth > 0) for depth in store.read("depth", i)])
     for name in ("azimuth_bins", "logits"):
         if name in found:
             found[name][nothing] = 0
     return found
-
-
-def _seen(store: ViewStore, i: int) -> NDArray[np.bool_]:
-    """In which views of an object enough of it shows to be evidence, (V,), as ``Observation.seen`` has it."""
-    visible = np.count_nonzero(store.read("depth", i), axis=(1, 2))
-    return visible >= max(LEAST_PIXELS, LEAST_SHARE * store.group.attrs["size"] ** 2)

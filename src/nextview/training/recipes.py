@@ -10,6 +10,11 @@ from typing import Literal
 
 from nextview.errors import UsageError
 
+PolicyInput = Literal["belief", "view", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "azimuth_bin"]
+"""What the network of a policy can be told; see ``policies.gain.INPUTS``."""
+POLICY_INPUTS: tuple[PolicyInput, ...] = ("belief", "view", "place", "lem-sphere", "azimuth_bin")
+"""By default."""
+
 
 def _at_least(least: int, **options: float) -> None:
     for name, value in options.items():
@@ -213,13 +218,7 @@ class GainRecipe:
         seed: of everything random.
     """
 
-    inputs: tuple[Literal["belief", "view", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "azimuth_bin"], ...] = (
-        "belief",
-        "view",
-        "place",
-        "lem-sphere",
-        "azimuth_bin",
-    )
+    inputs: tuple[PolicyInput, ...] = POLICY_INPUTS
     frame: Literal["camera", "object"] = "object"
     outcome: Literal["belief", "log-belief", "right"] = "log-belief"
     n_views: int = 5
@@ -270,13 +269,7 @@ class AgentRecipe:
     """
 
     algorithm: Literal["ppo", "dqn"] = "ppo"
-    inputs: tuple[Literal["belief", "view", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "azimuth_bin"], ...] = (
-        "belief",
-        "view",
-        "place",
-        "lem-sphere",
-        "azimuth_bin",
-    )
+    inputs: tuple[PolicyInput, ...] = POLICY_INPUTS
     frame: Literal["camera", "object"] = "object"
     outcome: Literal["belief", "log-belief", "right"] = "log-belief"
     n_views: int = 5
