@@ -122,6 +122,18 @@ def test_deformed_twins_may_have_fewer_views_and_each_gets_its_share():
     assert np.bincount(found) / len(found) == pytest.approx([0.5, 0.25, 0.25], abs=0.03)
 
 
+def test_objects_without_a_deformed_twin_are_seen_as_they_are():
+    own, twins = (np.full((2, 40, 1, 1, 1), k, np.uint8) for k in (0, 1))
+    recipe = RecogniserRecipe(views=2000, batch=50, deformed_share=0.5, balanced=False)
+    sources = [Source(own, np.arange(2)), Source(twins, np.array([-1, 0]))]
+    views = Views(sources, np.arange(2), np.arange(2), recipe)
+    images, labels = (
+        np.concatenate(part).ravel() for part in zip(*([x.numpy() for x in drawn] for drawn in views), strict=True)
+    )
+    assert not images[labels == 0].any()
+    assert 0 < images[labels == 1].mean() < 1
+
+
 @pytest.mark.parametrize("balanced", [True, False])
 def test_devices_share_every_batch(balanced):
     recipe = replace(THESIS_RECOGNISER, batch=6, balanced=balanced, views=V)

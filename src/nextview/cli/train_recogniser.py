@@ -25,8 +25,8 @@ def train_recogniser(
     Args:
         store: view store made by nextview render.
         out: folder for checkpoints, logs, curves.png and network.pt, that of the epoch with the best class mean.
-        deformed: stores of the same objects, stretched and turned (nextview render --stretch .25 --turn --seed 1 and so
-            on); their views may be others.
+        deformed: stores of the same objects or some of them, stretched and turned (nextview render --stretch .25 --turn
+            --seed 1 and so on) or through sensors (--sensor mix); their views may be others.
         weights: start from a published checkpoint, torchvision's of the same depth or EfficientNet-Lite0's, or go on
             from an exported recogniser (its card, NAME.json) on other data or for longer.
         folds: train so many recognisers instead, OUT/fold0 and so on, each without its share of the training objects,

@@ -30,7 +30,7 @@ class Source:
 
     Attributes:
         inputs: (rows, V, C, S, S) uint8.
-        row: of each object in them, (N,).
+        row: of each object in them, (N,), -1 for none.
         azimuth_bins: that each view sees of its object, (rows, V), see ``azimuth_bins.azimuth_bins``; None if they are
             not to be learned.
     """
@@ -46,7 +46,7 @@ class Views(IterableDataset):
     Balanced, objects are drawn with weight 1/sqrt(objects of their class), so that rare classes are seen more often,
     and views at random. Otherwise every view comes at most once an epoch, and once exactly if ``recipe.views`` takes
     all of them. The views of an object come from its own store or, with chance ``recipe.deformed_share``, from one of
-    its deformed copies, which may have other views.
+    its deformed copies, which may have other views; always its own where it is not among those that are drawn from.
     """
 
     def __init__(
@@ -78,7 +78,9 @@ class Views(IterableDataset):
             objects, turn = self.objects[objects], (views + 0.5) / v
         deformed = (rng.random(n) < self.recipe.deformed_share) & (len(self.sources) > 1)
         source = np.where(deformed, rng.integers(1, max(2, len(self.sources)), n), 0)
-        row = np.stack([own.row for own in self.sources])[source, objects]
+        rows = np.stack([own.row for own in self.sources])
+        source[rows[source, objects] < 0] = 0
+        row = rows[source, objects]
         view = (turn * np.array([own.inputs.shape[1] for own in self.sources])[source]).astype(int)
         batches = np.arange(n).reshape(-1, self.batch)[:, self.share]
         for step, batch in enumerate(batches):

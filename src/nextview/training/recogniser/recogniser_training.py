@@ -43,7 +43,7 @@ def train_recogniser(
         store: the view store.
         out: folder for checkpoints, logs and network.pt, the network of the epoch with the best class mean.
         recipe: how to train.
-        deformed: stores of the same objects, deformed; their views may be others.
+        deformed: stores of the same objects or some of them, deformed; their views may be others.
         weights: a published checkpoint, or the card (.json) of an exported recogniser, to start from.
         folds: train so many recognisers instead, in OUT/fold0 and so on, each without its share of the training
             objects; 0 trains one on all of them.
@@ -112,8 +112,7 @@ def _source(
     store = ViewStore.open(path)
     row = {name: i for i, name in enumerate(store.names)}
     rows = np.array([row.get(name, -1) for name in views.names])
-    missing = [views.names[i] for i in needed if rows[i] < 0]
-    if missing:
-        raise DatasetError(f"{path}: lacks {len(missing)} of the training objects, {missing[0]} among them")
+    if (rows[needed] < 0).all():
+        raise DatasetError(f"{path}: holds none of the training objects")
     inputs = ready_inputs(path, recipe.size, recipe.input, track)
     return Source(inputs, rows, None if planes is None else azimuth_bins(store, views.sphere.azimuths, planes))
