@@ -1,6 +1,7 @@
 """Which measure of a view serves recognition? Every measure that a store holds, against what a recogniser says.
 
     python benchmarks/measure_study.py test.npz validation.npz --out measures [--store views.zarr] [--runs 10]
+        [--policies random-all volumetric mvselect.json gain]
 
 Writes measures.md (the table), measures.csv (every number in a row of its own) and measures.png into the folder.
 
@@ -9,8 +10,9 @@ recogniser gives the true class there, as the mean over objects, of all classes 
 the recogniser's best one, or next to it; and accuracy and travel of the policy that climbs its true map in the local
 window, after fixed numbers of views. That policy sees what no robot can, and so is an oracle by name; what it does not
 see is the class: it goes to the valley for those that it believes in at that moment and for which the valley gained on
-the validation objects. Intervals are 95 % bootstrap intervals over objects; p is McNemar's test against random choice
-in the window, over objects, corrected by Holm's method for all measures and numbers of views together.
+the validation objects. Other policies can stand beside, under the names that nextview benchmark has for them. Intervals
+are 95 % bootstrap intervals over objects; p is McNemar's test against random choice in the window, over objects,
+corrected by Holm's method for all measures, policies and numbers of views together.
 """
 
 from __future__ import annotations
@@ -85,8 +87,8 @@ def valleys_of(validation: Predictions, measure: str) -> tuple[int, ...]:
 
 
 def study(
-    test: Predictions, validation: Predictions, measures: list[str], n_views: tuple[int, ...], runs: int, samples: int,
-    seed: int, rows: list[tuple],
+    test: Predictions, validation: Predictions, measures: list[str], policies: tuple[str, ...],
+    n_views: tuple[int, ...], runs: int, samples: int, seed: int, rows: list[tuple],
 ) -> Iterator[int]:  # fmt: skip
     """Compute everything; yields how many entries are done.
 
@@ -94,6 +96,7 @@ def study(
         test: predictions to judge by.
         validation: predictions of other objects, by which peak or valley is chosen.
         measures: names.
+        policies: entries of the benchmark, beside them.
         n_views: after which policies are compared.
         runs: first views of each object.
         samples: of the bootstrap.
@@ -113,9 +116,9 @@ def study(
             for i, quantity in enumerate(quantities):
                 rows.append((name, label, quantity, top[here, i].mean(), low[i], high[i], np.nan))
 
-    for done, name in enumerate([RANDOM, *measures], 1):
-        if name == RANDOM:
-            entry, valleys = RANDOM, ()
+    for done, name in enumerate([RANDOM, *measures, *policies], 1):
+        if name not in measures:
+            entry, valleys = name, None
         else:
             values = true_measure(test, name) if name != CONFIDENCE else np.exp(reference)
             note(name, {"correlation": correlations(values, reference)}, labels=True)
@@ -137,24 +140,24 @@ def study(
 def markdown(table: pd.DataFrame, n_views: tuple[int, ...]) -> str:
     """The table as text, the highest correlation first."""
     found = {(r.measure, r.quantity): r for r in table.itertuples() if not r.label or r.quantity == "valleys"}
-    names = ordered(table)[::-1]
+    names = [*ordered(table)[::-1], *others(table)]
     at = ", ".join(map(str, n_views))
     head = ["measure", "correlation", *AGREEMENT.values(), f"accuracy at {at} views", f"points over random at {at}",
             f"travel at {at}", "valley for"]  # fmt: skip
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for name in [RANDOM, *names]:
-        cells = [name.replace("_", " ")]
-        if name == RANDOM:
+        r = found.get((name, "correlation"))
+        cells = [name.replace("_", " ") if r else Path(name).stem if name.endswith(".json") else name]
+        if r is None:
             cells += [""] * 3
         else:
-            r = found[name, "correlation"]
             cells.append(f"{r.value:.2f} ({r.low:.2f} to {r.high:.2f})")
             cells += [f"{100 * found[name, quantity].value:.0f} %" for quantity in AGREEMENT]
         cells.append(", ".join(f"{found[name, f'accuracy_{k}'].value:.3f}" for k in n_views))
         over = [found[name, f"over_random_{k}"] for k in n_views] if name != RANDOM else []
         cells.append(", ".join(f"{round(100 * r.value, 1) + 0.0:+.1f}{'*' * (r.p_holm < 0.05)}" for r in over))
         cells.append(", ".join(f"{found[name, f'travel_{k}'].value:.2f}" for k in n_views))
-        cells.append("" if name == RANDOM else found[name, "valleys"].label or "none")
+        cells.append("" if r is None else found[name, "valleys"].label or "none")
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join([*lines, "", "\\* p < 0.05 after Holm's correction."]) + "\n"
 
@@ -163,6 +166,11 @@ def ordered(table: pd.DataFrame) -> list[str]:
     """The measures by their correlation, the lowest first."""
     overall = table[(table["quantity"] == "correlation") & (table["label"] == "")]
     return overall.sort_values("value", kind="stable")["measure"].tolist()
+
+
+def others(table: pd.DataFrame) -> list[str]:
+    """The policies that are beside the measures, as they were named."""
+    return [name for name in table["measure"].unique() if name != RANDOM and name not in ordered(table)]
 
 
 def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
@@ -213,6 +221,7 @@ def main(
     out: Path = Path("measures"),
     store: Path | None = None,
     measures: tuple[str, ...] = (),
+    policies: tuple[str, ...] = (),
     n_views: tuple[int, ...] = (2, 3, 5),
     runs: int = 10,
     samples: int = 1000,
@@ -226,6 +235,7 @@ def main(
         out: folder of the results.
         store: the view store, if it is not where the predictions say, with its measures (nextview measure).
         measures: names; by default all that the store holds, and the confidence.
+        policies: others in the same table, as nextview benchmark names them.
         n_views: after which policies are compared.
         runs: random first views of each object.
         samples: of the bootstrap.
@@ -242,7 +252,8 @@ def main(
         raise UsageError("policies are compared after two views or more")
     names = list(measures) or [*ViewStore.open(tables[0].store).measures, CONFIDENCE]
     rows: list[tuple] = []
-    track(study(*tables, names, n_views, runs, samples, seed, rows), len(names) + 1, "comparing measures")
+    comparing = study(*tables, names, policies, n_views, runs, samples, seed, rows)
+    track(comparing, 1 + len(names) + len(policies), "comparing measures")
     table = pd.DataFrame(rows, columns=["measure", "label", "quantity", "value", "low", "high", "p"])
     table["p_holm"] = holm(table["p"].to_numpy())
     text = markdown(table, n_views)

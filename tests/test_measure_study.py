@@ -54,7 +54,14 @@ def made(tmp_path_factory):
     )
     p.of_objects(np.flatnonzero(np.arange(2 * N) % 4 < 2)).save(folder / "test.npz")
     p.of_objects(np.flatnonzero(np.arange(2 * N) % 4 >= 2)).save(folder / "validation.npz")
-    STUDY["main"](folder / "test.npz", folder / "validation.npz", folder / "out", runs=4, samples=50)
+    STUDY["main"](
+        folder / "test.npz",
+        folder / "validation.npz",
+        folder / "out",
+        policies=("unidirectional", "true-view_area-5"),
+        runs=4,
+        samples=50,
+    )
     return folder
 
 
@@ -84,6 +91,18 @@ def test_the_valley_is_chosen_for_the_class_that_wants_it(made):
     assert float(over.p_holm) >= float(over.p)
 
 
+def test_policies_stand_beside_the_measures_under_one_correction(made):
+    """The best views by the true area are those of one class and the worst of the other, from the first one on."""
+    best = found(made, "true-view_area-5", "over_random_2")
+    chance = float(found(made, "random", "accuracy_2").value)
+    assert float(best.value) == pytest.approx(float(found(made, "true-view_area-5", "accuracy_2").value) - chance)
+    assert float(found(made, "unidirectional", "travel_3").value) == pytest.approx(2)
+    table = pd.read_csv(made / "out" / "measures.csv")
+    tested = table[table["p"].notna()]
+    assert set(tested["measure"]) == {*table["measure"]} - {"random"}
+    assert (tested["p_holm"] >= tested["p"]).all()
+
+
 def test_the_confidence_agrees_with_itself():
     p = some_predictions(5)
     sure = STUDY["of_true_class"](p)
@@ -106,6 +125,7 @@ def test_table_and_figure_are_there(made):
     text = (made / "out" / "measures.md").read_text()
     assert "| view area |" in text
     assert "| random |" in text
+    assert "| true-view_area-5 |" in text
     assert (made / "out" / "measures.png").stat().st_size > 10_000
 
 
