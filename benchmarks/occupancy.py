@@ -106,7 +106,7 @@ def picture(
         for row in axes:
             seen = camera.observe(sphere.poses[view])
             occupancy = occupancy.seen(seen.depth, seen.pose, seen.intrinsics)
-            gains = made.gain(occupancy, sphere.poses[:, :3, 3])
+            gains = made.gain(occupancy, sphere.poses[:, :3, 3], grid.ball)
             middle = grid.n // 2
             cuts = (occupancy.cells[:, :, middle].T, occupancy.cells[:, middle].T)
             for axis, cut, names in zip(row, cuts, ("xy", "xz"), strict=False):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from nextview.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
 from nextview.errors import PolicyError, SessionError, UsageError
 from nextview.observation import Observation
+from nextview.occupancy import SeenScene, expected_visibility
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.off_grid import OffGrid
 from nextview.viewsphere import SNAP, Viewpoints, angle_between, turn_of
@@ -80,6 +81,10 @@ class _Sums:
     places: NDArray[np.float64] | None
 
 
+Visible = Callable[[EpisodeState], NDArray[np.float64]]
+"""Share of the object that is expected to show from each view in the episodes of a state, (B, V)."""
+
+
 def unconstrained(state: EpisodeState) -> EpisodeState:
     """Every view can be reached, and travel costs what it is."""
     return state
@@ -95,6 +100,8 @@ class Episodes:
         stopping: when an episode ends; a sphere with fewer views than ``max_views`` ends it too.
         rng: for policies that draw.
         calibration: how far to trust the sum of the logits; fully by default.
+        visibility: what is expected to show from each view, for policies that need it, (B, V) of a state that lacks
+            it; by default what the scenes in the observations of the evidence tell, see ``SeenScene``.
     """
 
     def __init__(
@@ -105,9 +112,10 @@ class Episodes:
         stopping: Stopping,
         rng: np.random.Generator,
         calibration: Calibration = PLAIN_SUM,
+        visibility: Visible | None = None,
     ) -> None:
         self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
-        self.calibration = calibration
+        self.calibration, self.visibility = calibration, visibility
         self.running = np.arange(len(starts))
         self.current = np.array(starts, np.int64)
         if ((self.current < 0) | (self.current >= len(sphere))).any():
@@ -154,20 +162,20 @@ class Episodes:
             if "azimuth_bins" in needs:
                 classes, azimuth = evidence.logits.shape[1], sums.azimuth[going]
                 azimuth_bins = self.calibration.azimuth_bins(sums.total[going], weighed[going], classes, azimuth)
-            state, next_views = self._move(
-                EpisodeState(
-                    step.views[going],
-                    sums.visited[going],
-                    step.belief[going],
-                    step.evidence.of(going),
-                    n_views,
-                    step.episodes[going],
-                    azimuth_bins,
-                    places=places,
-                    observations=observations,
-                ),
-                constrain,
+            state = EpisodeState(
+                step.views[going],
+                sums.visited[going],
+                step.belief[going],
+                step.evidence.of(going),
+                n_views,
+                step.episodes[going],
+                azimuth_bins,
+                places=places,
+                observations=observations,
             )
+            if "visibility" in needs:
+                state = replace(state, visibility=self._visibility(step, state))
+            state, next_views = self._move(state, constrain)
             step.next_views[going] = next_views
             step = replace(step, state=state)
         self._keep(replace(step, stopped=step.next_views < 0), sums)
@@ -226,6 +234,20 @@ class Episodes:
         going, nowhere = np.zeros(len(now), bool), np.full(len(now), -1)
         step = Step(now, views, evidence, belief, going, nowhere, total, counted)
         return step, _Sums(total, counted, visited, azimuth, places)
+
+    def _visibility(self, last: Step, state: EpisodeState) -> NDArray[np.float64]:
+        """What is expected to show from each view in the episodes of a state."""
+        if self.visibility is not None:
+            return self.visibility(state)
+        if any(step.evidence.observations is None for step in (*self.steps, last)):
+            return np.ones(state.visited.shape)
+        positions = self.sphere.poses[:, :3, 3]
+        return np.stack(
+            [
+                expected_visibility(SeenScene.of([seen.scene for seen in views if seen.scene]), positions).expected
+                for views in self._observations(last, state.episodes)
+            ]
+        )
 
     def _observations(self, last: Step, episodes: NDArray[np.int64]) -> list[list[Observation]]:
         """All that was seen so far in some episodes, the last step included."""
@@ -379,6 +401,8 @@ def run_episodes(
     stopping: Stopping,
     rng: np.random.Generator,
     calibration: Calibration = PLAIN_SUM,
+    constrain: Callable[[EpisodeState], EpisodeState] = unconstrained,
+    visibility: Visible | None = None,
 ) -> Episodes:
     """Run episodes to their end.
 
@@ -390,8 +414,10 @@ def run_episodes(
         stopping: when an episode ends.
         rng: for policies that draw.
         calibration: how far to trust the sum of the logits; fully by default.
+        constrain: see ``Episodes.update``.
+        visibility: see ``Episodes``.
     """
-    episodes = Episodes(sphere, policy, starts, stopping, rng, calibration)
+    episodes = Episodes(sphere, policy, starts, stopping, rng, calibration, visibility)
     while len(episodes.running):
-        episodes.update(observe(episodes.running, episodes.current[episodes.running]))
+        episodes.update(observe(episodes.running, episodes.current[episodes.running]), constrain=constrain)
     return episodes
