@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nextview.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
 from nextview.errors import PolicyError, SessionError, UsageError
-from nextview.observation import Observation
+from nextview.observation import Observation, SceneView
 from nextview.occupancy import SeenScene, expected_visibility
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.off_grid import OffGrid
@@ -125,6 +125,7 @@ class Episodes:
         self._total: NDArray[np.float64] = np.zeros((len(starts), 0))
         self._seen = np.zeros(len(starts), np.int64)
         self._places: NDArray[np.float64] | None = None
+        self._scenes: dict[int, tuple[list[SceneView], SeenScene]] = {}
 
     def update(
         self,
@@ -241,13 +242,21 @@ class Episodes:
             return self.visibility(state)
         if any(step.evidence.observations is None for step in (*self.steps, last)):
             return np.ones(state.visited.shape)
-        positions = self.sphere.poses[:, :3, 3]
-        return np.stack(
-            [
-                expected_visibility(SeenScene.of([seen.scene for seen in views if seen.scene]), positions).expected
-                for views in self._observations(last, state.episodes)
-            ]
-        )
+        positions, found = self.sphere.poses[:, :3, 3], []
+        for episode, views in zip(state.episodes, self._observations(last, state.episodes), strict=True):
+            scenes = [seen.scene for seen in views if seen.scene is not None]
+            found.append(expected_visibility(self._seen_scene(int(episode), scenes), positions).expected)
+        return np.stack(found)
+
+    def _seen_scene(self, episode: int, scenes: list[SceneView]) -> SeenScene:
+        """What the frames of an episode say together: that of all but the last ones is kept."""
+        known, seen = self._scenes.get(episode, ([], SeenScene.unseen()))
+        if any(old is not new for old, new in zip(known, scenes, strict=False)):
+            known, seen = [], SeenScene.unseen()
+        for scene in scenes[len(known) :]:
+            seen = seen.seen(scene)
+        self._scenes[episode] = scenes, seen
+        return seen
 
     def _observations(self, last: Step, episodes: NDArray[np.int64]) -> list[list[Observation]]:
         """All that was seen so far in some episodes, the last step included."""

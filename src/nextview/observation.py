@@ -41,6 +41,8 @@ class SceneView:
         target: pixels that show the object, (H, W) bool.
         pose: camera-to-world, (4, 4) float64, OpenCV axes; the world is the object frame.
         intrinsics: pinhole matrix, (3, 3) float64, pixels; the first pixel's centre is at 0.5.
+        background_free: whether nothing is there where nothing was measured, as in renders. A sensor may measure nothing
+            on what is black or shiny.
 
     Raises:
         ObservationError: depth and target are no images of one shape.
@@ -50,6 +52,7 @@ class SceneView:
     target: NDArray[np.bool_]
     pose: NDArray[np.float64]
     intrinsics: NDArray[np.float64]
+    background_free: bool = False
 
     def __post_init__(self) -> None:
         if self.depth.ndim != 2 or self.target.shape != self.depth.shape:

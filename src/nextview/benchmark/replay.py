@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from nextview.belief import FixedLength, Stopping
 from nextview.benchmark.entries import EpisodeSpecs, entry_policy, fixed_views
-from nextview.benchmark.stored import worlds_of
 from nextview.benchmark.true_maps import TRUE, true_map
 from nextview.data.predictions import Predictions
-from nextview.data.world_sight import sight_of
+from nextview.data.world_sight import sight_of, worlds_of
 from nextview.episode import run_episodes
 from nextview.errors import EntryError, PolicyError, UsageError
 from nextview.policies.base import Evidence, Policy, maps_among

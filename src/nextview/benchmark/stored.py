@@ -7,26 +7,7 @@ from numpy.typing import NDArray
 
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
-from nextview.data.world_sight import WorldSight
 from nextview.errors import DatasetError, EntryError
-
-
-def worlds_of(p: Predictions) -> WorldSight | None:
-    """The worlds that predictions are of; None if they are of single objects, or their store is not there.
-
-    Raises:
-        EntryError: the store lacks one of them.
-    """
-    if not p.store:
-        return None
-    try:
-        store = ViewStore.open(p.store)
-    except DatasetError:
-        return None
-    try:
-        return WorldSight.of(store, p.names)
-    except DatasetError as error:
-        raise EntryError(str(error)) from error
 
 
 def stored_rows(p: Predictions, name: str) -> NDArray:

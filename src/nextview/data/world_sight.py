@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
 from nextview.data.world_views import WorldViews, world_views
 from nextview.episode import Visible, unconstrained
@@ -38,6 +39,21 @@ def sight_of(worlds: WorldSight | None, objects: NDArray[np.int64]) -> tuple[Con
         lambda state: replace(state, reachable=worlds.reachable[objects[state.episodes]]),
         lambda state: worlds.visibility(objects[state.episodes], state.visited),
     )
+
+
+def worlds_of(p: Predictions) -> WorldSight | None:
+    """The worlds that predictions are of; None if they are of single objects, or their store is not there.
+
+    Raises:
+        DatasetError: the store lacks one of them, or is damaged.
+    """
+    if not p.store:
+        return None
+    try:
+        store = ViewStore.open(p.store)
+    except DatasetError:
+        return None
+    return WorldSight.of(store, p.names)
 
 
 @dataclass(frozen=True)

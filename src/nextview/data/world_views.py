@@ -69,7 +69,7 @@ class WorldViews:
 
     def scene_view(self, view: int) -> SceneView:
         """What a camera sees from there: things and table alike are no target."""
-        return SceneView(self.depth[view], self.owner[view] == TARGET, self.poses[view], self.intrinsics)
+        return SceneView(self.depth[view], self.owner[view] == TARGET, self.poses[view], self.intrinsics, True)
 
 
 def world_views(store: ViewStore, i: int) -> WorldViews:

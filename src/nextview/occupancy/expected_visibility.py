@@ -57,7 +57,7 @@ class SeenScene:
 
     def seen(self, view: SceneView) -> Self:
         """With what one more frame says."""
-        occupancy = self.occupancy.seen(view.depth, view.pose, view.intrinsics, view.target)
+        occupancy = self.occupancy.seen(view.depth, view.pose, view.intrinsics, view.target, view.background_free)
         return type(self)(occupancy, min(self.floor, _lowest(view)))
 
     def and_also(self, other: SeenScene) -> Self:

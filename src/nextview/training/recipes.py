@@ -193,12 +193,18 @@ THESIS_MAP = MapRecipe(
 16, every view once an epoch. The text does not say for how many epochs."""
 
 
+GainInput = Literal[
+    "belief", "view", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "azimuth_bin", "visibility"
+]  # fmt: skip
+
+
 @dataclass(frozen=True)
 class GainRecipe:
     """How the gain policy is trained.
 
     Attributes:
-        inputs: of the networks; see ``policies.gain.INPUTS``.
+        inputs: of the networks; see ``policies.gain.INPUTS``; in worlds "visibility" too, the share of the object that
+            is expected to show from each view.
         frame: from where azimuths are counted: from the camera's, or from the one at which the object is believed to
             show its azimuth bin 0, which takes a recogniser that was taught the azimuth bins.
         outcome: the value of a view: belief in the true class after it, its logarithm, or whether the answer is right.
@@ -213,13 +219,7 @@ class GainRecipe:
         seed: of everything random.
     """
 
-    inputs: tuple[Literal["belief", "view", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "azimuth_bin"], ...] = (
-        "belief",
-        "view",
-        "place",
-        "lem-sphere",
-        "azimuth_bin",
-    )
+    inputs: tuple[GainInput, ...] = ("belief", "view", "place", "lem-sphere", "azimuth_bin")
     frame: Literal["camera", "object"] = "object"
     outcome: Literal["belief", "log-belief", "right"] = "log-belief"
     n_views: int = 5
