@@ -41,8 +41,8 @@ class SceneView:
         target: pixels that show the object, (H, W) bool.
         pose: camera-to-world, (4, 4) float64, OpenCV axes; the world is the object frame.
         intrinsics: pinhole matrix, (3, 3) float64, pixels; the first pixel's centre is at 0.5.
-        background_free: whether nothing is there where nothing was measured, as in renders. A sensor may measure nothing
-            on what is black or shiny.
+        background_free: whether nothing is there where nothing was measured, as in renders. A sensor may measure
+            nothing on what is black or shiny.
 
     Raises:
         ObservationError: depth and target are no images of one shape.
