@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,6 +34,7 @@ from nextview.policies.gain import INPUTS, VISIBILITY, Gain, features, mirrored,
 from nextview.policies.registry import make_policy
 from nextview.policies.visibility import VisibleGain
 from nextview.policies.volumetric import Volumetric
+from nextview.sensing import Frame, ObservedObject
 from nextview.session import Session
 from nextview.viewsphere import Directions
 from nextview.worlds import TARGET, Block, OccludedCamera, SceneCamera, WorldCamera
@@ -74,8 +74,8 @@ def test_before_anything_is_seen_everything_may_show():
     found = expected_visibility(SeenScene.unseen(), POSITIONS)
     assert (found.least <= found.expected).all()
     assert (found.expected <= found.most).all()
-    np.testing.assert_allclose(found.most, 1)
-    assert found.least.max() == 0  # all may be hidden, too
+    np.testing.assert_array_equal(found.most, 1)
+    np.testing.assert_array_equal(found.least, 1)
 
 
 def test_alone_on_its_table_all_of_it_shows_once_the_space_around_was_seen():
@@ -161,7 +161,7 @@ def test_policies_by_what_shows_want_to_be_told_and_to_be_named_right():
         make_policy("visible-class-table", GRID)
     with pytest.raises(PolicyError, match="does not weigh travel"):
         make_policy("random@1", GRID)
-    with pytest.raises(PolicyError, match="not negative"):
+    with pytest.raises(PolicyError, match="at least 0"):
         make_policy("visibility@-1", GRID)
     with pytest.raises(PolicyError, match="at least 0"):
         make_policy("visible-gain@much", GRID)
@@ -180,8 +180,9 @@ def test_the_volume_behind_a_thing_does_not_come_into_view():
     alone = policy.view_values(
         replace(state_of(np.ones(40)), observations=[[replace(view, scene=None) for view in seen]])
     )[0]
-    assert alone[0] > 0.8 * alone.max()
-    assert among[0] < 0.5 * among[16:].max()
+    beside = [1, 7, 9, 15]  # there the box, of which only the edges were seen, hides what is unseen of the ball
+    assert (among[beside] < 0.75 * alone[beside]).all()
+    np.testing.assert_allclose(among[32:], alone[32:], rtol=0.1)
 
 
 # Learned
@@ -322,7 +323,7 @@ def test_a_robot_sees_around_a_box(named):
         session.update(camera.observe(session.pose))
     first = session.views[0]
     assert first.observation.scene is not None
-    assert np.corrcoef(first.values, truth)[0, 1] > 0.3
+    assert first.values[0] < 0.75 * first.values.max()
     assert truth[[view.index for view in session.views[1:]]].min() > 0.9
 
 
@@ -339,14 +340,12 @@ def test_where_no_scene_is_known_everything_shows():
     np.testing.assert_array_equal(episodes.steps[-1].state.visibility, 1)
 
 
-def test_a_finer_sensor_says_the_same_of_a_scene(tmp_path: Path):
+def test_a_finer_sensor_says_the_same_of_a_scene():
     """Depth of a sensor is thinned out: its pixels keep their places."""
-    from nextview.sensing.observed_object import ObservedObject
-
     scene = scene_of(BEFORE)
     k = np.array([[900.0, 0, 360], [0, 900, 360], [0, 0, 1]])
     depth, owner = SceneCamera(scene, k, (720, 720)).look(GRID.poses[3])
-    frame = nextview.Frame(0.2 * depth, k, _metres(GRID.poses[3]), owner == TARGET, pixel_centre=0.5)
+    frame = Frame(0.2 * depth, k, _metres(GRID.poses[3]), owner == TARGET, pixel_centre=0.5)
     seen = ObservedObject(denoise=False).add(frame)
     there = seen.scene
     assert there.depth.shape[0] < 240
