@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ from nextview.observation import SceneView
 from nextview.occupancy import SeenScene, expected_visibility
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.gain import INPUTS, VISIBILITY, Gain, features, mirrored, mirrored_features
-from nextview.policies.registry import make_policy
+from nextview.policies.registry import make_policy, with_cards
 from nextview.policies.visibility import VisibleGain
 from nextview.policies.volumetric import Volumetric
 from nextview.sensing import Frame, ObservedObject
@@ -167,6 +168,13 @@ def test_policies_by_what_shows_want_to_be_told_and_to_be_named_right():
         make_policy("visible-gain@much", GRID)
     with pytest.raises(PolicyError, match="not negative"):
         VisibleGain(make_policy("gain", GRID), np.nan)
+
+
+def test_a_name_may_be_that_of_a_card_of_ones_own():
+    cards = {"gain": Path("mine/gain.json")}
+    found = [with_cards(name, cards) for name in ("gain", "gain@1", "visible-gain", "visible-gain@1", "spread")]
+    mine = "mine/gain.json"
+    assert found == [mine, f"{mine}@1", f"visible-{mine}", f"visible-{mine}@1", "spread"]
 
 
 def test_the_volume_behind_a_thing_does_not_come_into_view():

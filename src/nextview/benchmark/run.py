@@ -18,7 +18,7 @@ from nextview.data.predictions import Predictions
 from nextview.errors import EntryError, UsageError
 from nextview.models.model_card import file_hash
 from nextview.outputs import check_folder, written_results
-from nextview.policies.registry import VISIBLE
+from nextview.policies.registry import with_cards
 
 Track = Callable[[Iterable[int], int, str], object]
 """Exhausts counts of what is done, given the last count and what is being done."""
@@ -27,13 +27,6 @@ Track = Callable[[Iterable[int], int, str], object]
 def _unseen(done: Iterable[int], total: int, what: str) -> None:
     for _ in done:
         pass
-
-
-def _own(name: str, own: Mapping[str, Path]) -> str:
-    """The card that a name means, where it is one of a user's own, also after "visible-"."""
-    kind = VISIBLE if name.startswith(VISIBLE) else ""
-    card = own.get(name.removeprefix(VISIBLE))
-    return name if card is None else f"{kind}{card}"
 
 
 def run_benchmark(
@@ -109,7 +102,7 @@ def run_benchmark(
     valleys = None if valley_classes is None else tuple(map(table.classes.index, valley_classes))
     specs = make_specs(table, runs, seed, valleys)
     own = own or {}
-    wanted = [_own(name, own) for name in policies] or [*default_entries(specs), *map(str, own.values())]
+    wanted = [with_cards(name, own) for name in policies] or [*default_entries(specs), *map(str, own.values())]
     names = list(dict.fromkeys([*([reference] if policies else []), *wanted]))
     grid = Grid(specs, runs, tuple(sorted({*thresholds, *promised.values()})), max_views, seed, threshold_decay)
     with written_results(out, results.KIND) as part:

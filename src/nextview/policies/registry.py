@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,15 @@ def make_policy(
         return _import_policy(name, sphere)
     known = [*POLICIES, *maps, *learned, f"{VISIBLE}{DEFAULT}"]
     raise PolicyError(f"no policy is called {name!r}; there are {', '.join(known)}")
+
+
+def with_cards(name: str, cards: Mapping[str, Path]) -> str:
+    """The name, or what it means where it is that of one of these cards: also after "visible-" and before "@WEIGHT"."""
+    policy, weighted, travel_weight = name.partition("@")
+    if policy in cards:
+        return f"{cards[policy]}{weighted}{travel_weight}"
+    card = cards.get(policy.removeprefix(VISIBLE)) if policy.startswith(VISIBLE) else None
+    return name if card is None else f"{VISIBLE}{card}{weighted}{travel_weight}"
 
 
 def make_policy_anywhere(
