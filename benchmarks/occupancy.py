@@ -6,9 +6,9 @@
 
 ``latency``: milliseconds of an update with one frame, of the expected gain of all candidate views, of the visible share
 of 256 points from all of them, and of a whole decision of the policy after one, two, three and four views; of an update
-with one frame of a scene, a box before the object, and of what is expected to show from all views: median and fastest by
-the clock, and of processor time. ``picture``: the grid from above and from the side after one, two and three
-views that the policy chose, and the expected gain of each candidate. ``accuracy``: sessions of fixed length with the
+with one frame of a scene, a box before the object, and of what is expected to show from all views: median and fastest
+by the clock, and of processor time. ``picture``: the grid from above and from the side after one, two and three views
+that the policy chose, and the expected gain of each candidate. ``accuracy``: sessions of fixed length with the
 simulated camera on test objects, the same first views for every policy; accuracy and travel after each view, with 95 %
 bootstrap intervals over objects.
 """
