@@ -26,7 +26,7 @@ from nextview.data.world_drawing import tasks
 from nextview.data.world_sight import WorldSight
 from nextview.data.world_views import scene_intrinsics, world_views
 from nextview.episode import Episodes
-from nextview.errors import DatasetError, EntryError, ObservationError, PolicyError
+from nextview.errors import DatasetError, EntryError, ObservationError, PolicyError, PredictionsError
 from nextview.mesh import make_mesh
 from nextview.observation import SceneView
 from nextview.occupancy import SeenScene, expected_visibility
@@ -305,6 +305,25 @@ def test_levels_are_compared_after_a_number_of_views(predictions):
     assert (table["p"].isna() == ((table["policy"] == "random") | (table["n_views"] == 1))).all()
     both = table.dropna(subset="p")
     assert (both["p_holm"] >= both["p"]).all()
+
+
+def test_gain_learns_in_worlds_what_to_make_of_what_shows(predictions, tmp_path):
+    from nextview.training.gain.gain_training import train_gain
+    from nextview.training.recipes import GainRecipe
+
+    train = np.array(["train"] * len(predictions))
+    replace(predictions, splits=train).save(tmp_path / "p.npz")
+    recipe = GainRecipe(("belief", "place", "visibility"), "camera", epochs=1, walks=1, networks=1)
+    made = train_gain(tmp_path / "p.npz", tmp_path / "in-worlds.json", recipe, folds=2, travel_weight=0.01)
+    assert made.objects == len(predictions)
+    policy = make_policy(str(made.card), GRID, classes=predictions.classes)
+    assert policy.needs == ("visibility",)
+    specs = make_specs(predictions, 1, 0)
+    views = replay(str(made.card), specs, 4, 0).views
+    assert specs.worlds.reachable[specs.objects[:, None], views].all()
+    replace(some_predictions(), splits=train).save(tmp_path / "alone.npz")
+    with pytest.raises(PredictionsError, match="of no worlds"):
+        train_gain(tmp_path / "alone.npz", tmp_path / "alone.json", recipe, folds=2)
 
 
 def test_worlds_for_learning_are_drawn_around_what_was_held_out(meshes, tmp_path):  # noqa: F811
