@@ -13,11 +13,12 @@ from test_worlds import BALL, GRID, meshes, scene_of, store, worlds  # noqa: F40
 from tiny_models import make_recogniser
 
 import nextview
-from nextview.belief import FixedLength, Stopping
+from nextview.belief import Calibration, FixedLength, Stopping
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.experiment import Grid, run_grid
 from nextview.benchmark.levels import by_level, levels_of
 from nextview.benchmark.replay import make_specs, replay
+from nextview.calibration.stages import fit_visibility
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.planning import plan
 from nextview.data.predictions import Predictions
@@ -26,10 +27,11 @@ from nextview.data.world_drawing import tasks
 from nextview.data.world_sight import WorldSight
 from nextview.data.world_views import scene_intrinsics, world_views
 from nextview.episode import Episodes
-from nextview.errors import DatasetError, EntryError, ObservationError, PolicyError, PredictionsError
+from nextview.errors import DatasetError, EntryError, ModelError, ObservationError, PolicyError, PredictionsError
 from nextview.mesh import make_mesh
+from nextview.models.model_card import read_card
 from nextview.observation import SceneView
-from nextview.occupancy import SeenScene, expected_visibility
+from nextview.occupancy import SeenScene, expected_visibility, shown_share
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.gain import INPUTS, VISIBILITY, Gain, features, mirrored, mirrored_features
 from nextview.policies.registry import make_policy, with_cards
@@ -331,6 +333,56 @@ def test_worlds_for_learning_are_drawn_around_what_was_held_out(meshes, tmp_path
     card.write_text(json.dumps(json.loads(card.read_text()) | {"held_out": ["jar_0", "crate_3"]}))
     found = tasks(meshes, tmp_path / "w", ["light"], None, 0, None, card)
     assert sorted(task.name for task in found) == ["crate_3@light-0", "jar_0@light-0"]
+
+
+# What a view counts
+
+
+def test_a_frame_tells_how_much_of_the_object_it_shows():
+    half = Block(1.6, 1.5, 0.0, 0.1, 3.0, 3.0)
+    for scene, share in ((scene_of(), 1.0), (scene_of(half), 0.5), (scene_of(BEFORE), 0.0)):
+        assert shown_share(looks(scene, 0)[0]) == pytest.approx(share, abs=0.13)
+
+
+def test_a_view_counts_as_much_as_it_shows():
+    """Two views of the same logits, of which one shows a quarter: as much as one and a half of them."""
+    calibration, logits = Calibration(0.8, 0.5, visibility=0.5), np.array([[1.0, 0.2, -0.5]])
+    spread, rule = make_policy("spread", GRID), FixedLength(max_views=2)
+    episodes = Episodes(GRID, spread, np.array([0]), rule, np.random.default_rng(0), calibration)
+    episodes.update(Evidence(logits, shown=np.array([1.0])))
+    step = episodes.update(Evidence(logits, shown=np.array([0.25])))
+    np.testing.assert_allclose(step.seen, 1.5)
+    expected = calibration.log_belief(1.5 * logits, 1.5, 3)
+    np.testing.assert_allclose(np.log(step.belief), expected - np.log(np.exp(expected).sum()))
+    plain = replace(calibration, visibility=None)
+    assert (plain.weights(np.array([0.2])), calibration.weights(None)) == (1.0, 1.0)
+    assert Calibration.from_dict(calibration.to_dict()) == calibration
+    with pytest.raises(ModelError, match="no calibration"):
+        Calibration(visibility=-1.0)
+
+
+def test_the_power_is_fitted_to_what_hidden_views_are_worth(predictions, tmp_path):
+    """Logits as clear as the share that shows to the power of one, and noise: full trust in all views is worse."""
+    share = ViewStore.open(predictions.store).measure("visible_share")
+    rng = np.random.default_rng(0)
+    truth = np.eye(3)[predictions.labels][:, None]
+    logits = (4 * share[..., None] * truth + rng.normal(size=predictions.logits.shape) * 2).astype(np.float32)
+    names = [name.partition("@")[0] for name in predictions.names]
+    card = make_recogniser(tmp_path, list(predictions.classes))
+    card.write_text(json.dumps(json.loads(card.read_text()) | {"held_out": names}))
+    models = {"recogniser": ("tiny", read_card(card).sha256)}
+    table = replace(predictions, logits=logits, splits=np.array(["train"] * len(names)), models=models)
+    table.save(tmp_path / "p.npz")
+    found = fit_visibility(tmp_path / "p.npz", card)
+    assert found.worlds == len(names)
+    assert found.power > 0
+    assert found.losses[found.power] < found.losses[0.0]
+    assert read_card(card).calibration.visibility == found.power
+    counted = replace(table, calibration=Calibration(visibility=1.0), splits=predictions.splits)
+    assert replay("random-all", make_specs(counted, 1, 0), 3, 0).confidences.max() <= 1
+    with pytest.raises(PredictionsError, match="test split"):
+        replace(table, splits=predictions.splits).save(tmp_path / "p.npz")
+        fit_visibility(tmp_path / "p.npz", card)
 
 
 # Live

@@ -32,7 +32,8 @@ class Step:
         stopped: whether the episode ended here, (A,) bool.
         next_views: where it goes next, (A,) int64; -1 where it ended.
         total: sum of the log-evidence in it and before, (A, D), see ``belief.log_evidence_of``.
-        seen: views so far in which anything was seen, (A,) int64.
+        seen: views so far in which anything was seen, each as much as it counts, (A,) float64; see
+            ``Calibration.weights``.
         state: what the policy was shown of the episodes that go on; None where all ended.
     """
 
@@ -43,7 +44,7 @@ class Step:
     stopped: NDArray[np.bool_]
     next_views: NDArray[np.int64]
     total: NDArray[np.float64]
-    seen: NDArray[np.int64]
+    seen: NDArray[np.float64]
     state: EpisodeState | None = None
 
 
@@ -75,7 +76,7 @@ class _Sums:
     """What A episodes have taken in: see ``Step`` and ``EpisodeState``."""
 
     total: NDArray[np.float64]
-    seen: NDArray[np.int64]
+    seen: NDArray[np.float64]
     visited: NDArray[np.bool_]
     azimuth: NDArray[np.float64]
     places: NDArray[np.float64] | None
@@ -123,7 +124,7 @@ class Episodes:
         self.steps: list[Step] = []
         self._visited = np.zeros((len(starts), len(sphere)), bool)
         self._total: NDArray[np.float64] = np.zeros((len(starts), 0))
-        self._seen = np.zeros(len(starts), np.int64)
+        self._seen = np.zeros(len(starts))
         self._places: NDArray[np.float64] | None = None
         self._scenes: dict[int, tuple[list[SceneView], SeenScene]] = {}
 
@@ -228,8 +229,9 @@ class Episodes:
             visited |= arc <= VISITED
         visited[np.arange(len(now)), views] = True
         before = self._total[now] if self.steps else 0.0
-        total = before + np.asarray(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64)
-        counted = self._seen[now] + seen
+        weights = seen * np.asarray(self.calibration.weights(evidence.shown))
+        said = np.asarray(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64)
+        total, counted = before + weights[:, None] * said, self._seen[now] + weights
         # Before anything is seen the total is zero, whatever it is divided by.
         belief = self.calibration.belief(total, np.maximum(counted, 1), evidence.logits.shape[1])
         going, nowhere = np.zeros(len(now), bool), np.full(len(now), -1)

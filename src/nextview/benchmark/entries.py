@@ -91,8 +91,10 @@ def is_oracle(policy: str) -> bool:
 
 
 def _gain(t: EpisodeSpecs, scope: Scope) -> Policy:
-    p = t.predictions
-    return OracleGain(p.sphere, p.log_evidence, len(p.classes), p.labels, t.objects, scope, p.calibration)
+    p, said = t.predictions, t.predictions.log_evidence
+    if t.worlds is not None and p.calibration.visibility is not None:
+        said = said * np.asarray(p.calibration.weights(t.worlds.all_shown()))[..., None]
+    return OracleGain(p.sphere, said, len(p.classes), p.labels, t.objects, scope, p.calibration)
 
 
 IN_WORLDS = ("visibility", f"{VISIBLE}{DEFAULT}", "true-visible_share-all")

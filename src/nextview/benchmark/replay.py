@@ -123,7 +123,10 @@ def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng
     p = replace(p, maps=maps)
 
     def observe(which: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
-        return p.evidence(objects[which], views)
+        evidence = p.evidence(objects[which], views)
+        if specs.worlds is None or p.calibration.visibility is None:
+            return evidence
+        return replace(evidence, shown=specs.worlds.shown(objects[which], views))
 
     sight = sight_of(specs.worlds, objects)
     try:

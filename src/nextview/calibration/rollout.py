@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,12 @@ class ReplayTable:
     calibration: Calibration
     worlds: WorldSight | None = None
 
+    @cached_property
+    def weights(self) -> Float:
+        """As how much of a view each counts, (N, V); 0 where nothing is seen."""
+        shown = None if self.worlds is None or self.calibration.visibility is None else self.worlds.all_shown()
+        return self.data.seen * np.asarray(self.calibration.weights(shown))
+
     @classmethod
     def of(
         cls, predictions: Predictions, kept: NDArray, rng: np.random.Generator, sensed: Sequence[Predictions] = ()
@@ -75,13 +82,13 @@ class DecisionState:
         state: what the policy is shown.
         total: sum of the log-evidence so far, (N, D) float64, see ``log_evidence_of``.
         travel: so far, grid cells, (N,) float64.
-        seen: views so far in which anything was seen, (N,) int64.
+        seen: views so far in which anything was seen, each as much as it counts, (N,) float64.
     """
 
     state: EpisodeState
     total: Float
     travel: Float
-    seen: NDArray[np.int64]
+    seen: Float
 
 
 def rollout(
@@ -104,6 +111,7 @@ def rollout(
     if table.worlds is not None:
         starts = np.where(table.worlds.reachable, rng.random(table.worlds.reachable.shape), -1).argmax(1)
     constrain, visible = sight_of(table.worlds, everything)
+    weigh = None if table.calibration.visibility is None else table.worlds
 
     def observe(objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
         return Evidence(
@@ -111,6 +119,7 @@ def rollout(
             {name: values[objects, views] for name, values in table.maps.items()},
             azimuth_bins=None if data.azimuth_bins is None else data.azimuth_bins[objects, views],
             seen=data.seen[objects, views],
+            shown=None if weigh is None else weigh.shown(objects, views),
         )
 
     length = FixedLength(max_views=n_views)
@@ -127,7 +136,7 @@ def rollout(
             travel = travel + sphere.travel[step.views, step.next_views]
 
 
-def outcome(table: ReplayTable, total: Float, n_views: NDArray[np.int64] | int, kind: str) -> Float:
+def outcome(table: ReplayTable, total: Float, n_views: NDArray | int, kind: str) -> Float:
     """What sums of the log-evidence of each object are worth.
 
     Args:
@@ -162,8 +171,9 @@ def outcome_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
 
 def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Float:
     """The outcome of looking from every view next, (N, V) float64."""
-    n_views = np.maximum(moment.seen[:, None] + table.data.seen, 1)
-    return outcome(table, moment.total[:, None] + table.data.log_evidence, n_views, kind)
+    n_views = np.maximum(moment.seen[:, None] + table.weights, 1)
+    said = table.weights[..., None] * table.data.log_evidence
+    return outcome(table, moment.total[:, None] + said, n_views, kind)
 
 
 @dataclass(frozen=True)

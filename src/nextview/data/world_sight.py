@@ -15,7 +15,7 @@ from nextview.data.world_views import WorldViews, world_views
 from nextview.episode import Visible, unconstrained
 from nextview.errors import DatasetError
 from nextview.occupancy import Occupancy, SeenScene, expected_visibility
-from nextview.occupancy.expected_visibility import GRID
+from nextview.occupancy.expected_visibility import GRID, shown_in
 from nextview.policies.base import EpisodeState
 
 Constrain = Callable[[EpisodeState], EpisodeState]
@@ -71,6 +71,7 @@ class WorldSight:
     reachable: NDArray[np.bool_]
     _found: dict[tuple[int, bytes], NDArray[np.float32]] = field(default_factory=dict, repr=False, compare=False)
     _frames: dict[tuple[int, int], tuple[bytes, float]] = field(default_factory=dict, repr=False, compare=False)
+    _shown: dict[tuple[int, int], float] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def of(cls, store: ViewStore, names: Sequence[str]) -> WorldSight | None:
@@ -113,6 +114,21 @@ class WorldSight:
                 scene = scene.and_also(self._frame(key[0], int(view), views))
             self._found[key] = expected_visibility(scene, self.store.sphere.poses[:, :3, 3]).expected.astype(np.float32)
         return np.stack([self._found[key] for key in keys]).astype(np.float64)
+
+    def shown(self, worlds: NDArray[np.int64], views: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Share of the target that shows in some views of worlds, as far as each frame alone can tell, (B,) each."""
+        keys = [(int(self.rows[world]), int(view)) for world, view in zip(worlds, views, strict=True)]
+        read: tuple[int, WorldViews] | None = None
+        for row, view in sorted({*keys} - {*self._shown}):
+            if (row, view) not in self._frames and (read is None or read[0] != row):
+                read = row, world_views(self.store, row)
+            self._shown[row, view] = shown_in(self._frame(row, view, read), self.store.sphere.poses[view, :3, 3])
+        return np.array([self._shown[key] for key in keys])
+
+    def all_shown(self) -> NDArray[np.float64]:
+        """The same of all views of all worlds, (N, V)."""
+        n, v = self.reachable.shape
+        return self.shown(np.repeat(np.arange(n), v), np.tile(np.arange(v), n)).reshape(n, v)
 
     def _frame(self, row: int, view: int, views: tuple[int, WorldViews] | None) -> SeenScene:
         """What the frame from one view says alone; kept packed, a tenth of its size or less."""

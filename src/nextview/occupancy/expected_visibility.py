@@ -23,6 +23,8 @@ DENSITY = 0.2
 """How often unseen space is filled, per object radius: between the two bounds."""
 SOLID = 1e3
 """A density, per voxel, through which nothing is seen."""
+TOGETHER = 400
+"""Lines that are drawn at once."""
 LOWEST = 0.02
 """Share of a frame's points that may lie below the height of the table: noise."""
 
@@ -113,6 +115,17 @@ def expected_visibility(
     return lines.visibility(seen, density, unseen_part)
 
 
+def shown_share(view: SceneView) -> float:
+    """Share of the object that shows in a frame, as far as that frame alone can tell."""
+    return shown_in(SeenScene.unseen().seen(view), view.pose[:3, 3])
+
+
+def shown_in(seen: SeenScene, position: NDArray[np.floating]) -> float:
+    """The same, of what the frame says, and of where its camera stood, (3,)."""
+    lines = SightLines(seen.occupancy.grid, np.asarray(position, np.float64)[None])
+    return float(lines.visibility(seen, DENSITY, UNSEEN_PART).expected[0])
+
+
 @lru_cache(maxsize=16)
 def sight_lines(grid: VoxelGrid, positions: bytes) -> SightLines:
     """Those from positions, the bytes of (V, 3) float64: the same ones are asked for again and again."""
@@ -152,13 +165,14 @@ class SightLines:
         length = np.linalg.norm(towards, axis=2)
         along = np.arange(0.5, np.sqrt(3) * grid.n)[:, None]
         found = np.full((len(start), len(along), len(eyes)), grid.n**3, np.int32)
-        for part in range(len(start)):
-            at = np.floor(start[part] + along[:, :, None] * (towards[part] / length[part, :, None]))
-            inside = (along < length[part]) & ((at >= 0) & (at < grid.n)).all(2)
-            x, y, z = at[inside].astype(np.int64).T
-            found[part][inside] = (x * grid.n + y) * grid.n + z
-        used = (found < grid.n**3).any((0, 2))
-        return np.ascontiguousarray(found[:, : used.nonzero()[0].max(initial=-1) + 1])
+        for some in np.array_split(np.arange(len(start)), -(-len(start) * len(eyes) // TOGETHER)):
+            ahead = towards[some] / length[some, :, None]
+            at = np.floor(start[some, None, None] + along[:, :, None] * ahead[:, None])
+            inside = (along < length[some, None]) & ((at >= 0) & (at < grid.n)).all(3)
+            x, y, z = np.where(inside[..., None], at, 0).astype(np.int64).transpose(3, 0, 1, 2)
+            found[some] = np.where(inside, (x * grid.n + y) * grid.n + z, grid.n**3)
+        longest = int(np.flatnonzero((found < grid.n**3).any(axis=(0, 2))).max(initial=-1)) + 1
+        return np.ascontiguousarray(found[:, :longest, :])
 
     def visibility(self, seen: SeenScene, density: float, unseen_part: float) -> Visibility:
         """See ``expected_visibility``."""

@@ -32,6 +32,8 @@ class Evidence:
             episodes all the above counts as zero there.
         novelty: how strange each view is, (B,) float, see ``nextview.novelty``; None if the recogniser cannot tell.
         observations: the views themselves, B of them; None where only what the models say of them is known.
+        shown: share of the object that shows in each view, as far as it can tell, (B,) float; None where nothing is
+            known to hide any, or that does not matter. See ``Calibration.weights``.
     """
 
     logits: NDArray[np.floating]
@@ -40,6 +42,7 @@ class Evidence:
     seen: NDArray[np.bool_] | None = None
     novelty: NDArray[np.floating] | None = None
     observations: Sequence[Observation] | None = None
+    shown: NDArray[np.floating] | None = None
 
     def of(self, rows: Any) -> Evidence:
         """That of some of the episodes, by index or mask."""
@@ -50,6 +53,7 @@ class Evidence:
             None if self.seen is None else self.seen[rows],
             None if self.novelty is None else self.novelty[rows],
             _some(self.observations, rows),
+            None if self.shown is None else self.shown[rows],
         )
 
 
