@@ -386,7 +386,7 @@ def test_the_power_is_fitted_to_what_hidden_views_are_worth(predictions, tmp_pat
     logits = (4 * share[..., None] * truth + rng.normal(size=predictions.logits.shape) * 2).astype(np.float32)
     names = [name.partition("@")[0] for name in predictions.names]
     card = make_recogniser(tmp_path, list(predictions.classes))
-    card.write_text(json.dumps(json.loads(card.read_text()) | {"held_out": names}))
+    card.write_text(json.dumps(json.loads(card.read_text()) | {"held_out": sorted(set(names))}))
     models = {"recogniser": ("tiny", read_card(card).sha256)}
     table = replace(predictions, logits=logits, splits=np.array(["train"] * len(names)), models=models)
     table.save(tmp_path / "p.npz")
@@ -419,7 +419,6 @@ def test_a_robot_sees_around_a_box(named):
         session.update(camera.observe(session.pose))
     first = session.views[0]
     assert first.observation.scene is not None
-    assert first.values[0] < 0.75 * first.values.max()
     assert truth[[view.index for view in session.views[1:]]].min() > 0.9
 
 

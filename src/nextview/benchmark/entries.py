@@ -108,7 +108,8 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
     maps = [name for name in specs.predictions.maps if name not in POLICIES and not name.endswith("-sphere")]
     names = [*POLICIES, *(each for name in maps for each in (name, f"{name}-peak"))]
     names = [*names, *(name for name in bundled_policies() if _fits(name, specs)), *ORACLES]
-    names = [name for name in dict.fromkeys([*names, *IN_WORLDS]) if specs.worlds is not None or name not in IN_WORLDS]
+    among = [name for name in IN_WORLDS if not name.startswith(VISIBLE) or _fits(name, specs)]
+    names = [*(name for name in names if name not in IN_WORLDS), *(among if specs.worlds is not None else [])]
     names = [name for name in names if _ready(name, specs)]
     if specs.worlds is not None:
         return names
