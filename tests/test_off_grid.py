@@ -23,6 +23,7 @@ LAYOUTS = ("40", "12", "rings:0,30,60x12", "fibonacci:60", "fibonacci:7")
 NAMES = (
     *(name for name in POLICIES if name not in plannable()),
     "gain",
+    "visible-gain",
     "fixed-sequence",
     "fixed-ring",
     "class-table",
@@ -117,11 +118,12 @@ def state_at(sphere, place, rng, visited=(), reachable=None) -> EpisodeState:
     e, bins = evidence(rng), rng.dirichlet(np.ones(8), (1, CLASSES))
     belief = rng.dirichlet(np.ones(CLASSES))[None]
     return EpisodeState(
-        np.array([view]), seen, belief, e, 1, np.zeros(1, int), bins, reachable, None, place[None, None]
-    )
+        np.array([view]), seen, belief, e, 1, np.zeros(1, int), bins, reachable, None, place[None, None],
+        visibility=rng.random(seen.shape),
+    )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["gain", "lem-peak", "class-table", "class-table-local"])
+@pytest.mark.parametrize("name", ["gain", "visible-gain", "lem-peak", "class-table", "class-table-local"])
 def test_on_views_that_happen_to_be_the_grid_the_interpolation_is_the_policy(name):
     """The 40 views as a mere list of directions: the same decisions and values as on the grid itself."""
     policy, rng = make_policy(name, SPHERE), np.random.default_rng(0)
@@ -129,7 +131,7 @@ def test_on_views_that_happen_to_be_the_grid_the_interpolation_is_the_policy(nam
     for k in range(40):
         state = state_at(SPHERE, SPHERE.directions[k], rng, rng.integers(0, 40, 6), rng.random((1, 40)) < 0.7)
         assert off.next_views(state, rng) == policy.next_views(state, rng)
-        if name in ("gain", "lem-peak"):
+        if name in ("gain", "visible-gain", "lem-peak"):
             np.testing.assert_allclose(off.view_values(state), policy.view_values(state), atol=1e-9)
         assert anywhere(policy, SPHERE).next_views(state, rng) == policy.next_views(state, rng)
 

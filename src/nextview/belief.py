@@ -189,29 +189,38 @@ class Calibration:
         correlation: of the evidence of two views, 0 .. 1.
         risk: for stopping with a promise; None if not known.
         bin_correlation: of what two views say of the side, 0 .. 1; None where that shall not count for the class.
+        visibility: a view in which only a share of the object shows counts as that share to this power of a view, see
+            ``weights``; None where each counts as one.
 
     Raises:
-        ModelError: a temperature that is not positive, or a negative correlation.
+        ModelError: a temperature that is not positive, or a negative correlation or power.
     """
 
     temperature: float = 1.0
     correlation: float = 0.0
     risk: RiskBounds | None = None
     bin_correlation: float | None = None
+    visibility: float | None = None
 
     def __post_init__(self) -> None:
-        numbers = (self.correlation, self.bin_correlation or 0.0)
+        numbers = (self.correlation, self.bin_correlation or 0.0, self.visibility or 0.0)
         if not 0 < self.temperature < np.inf or not all(0 <= x < np.inf for x in numbers):
             raise ModelError(
                 f"no calibration: temperature {self.temperature}, correlation {self.correlation}, of azimuth bins "
-                f"{self.bin_correlation}"
+                f"{self.bin_correlation}, visibility {self.visibility}"
             )
+
+    def weights(self, shown: NDArray[np.floating] | None) -> NDArray[np.floating] | float:
+        """As how much of a view each counts in the sum, by the share of the object that shows in it; 1 if not told."""
+        if self.visibility is None or shown is None:
+            return 1.0
+        return np.clip(np.asarray(shown, np.float64), LEAST_SHOWN, 1) ** self.visibility
 
     def temperature_after(self, n_views: int) -> float:
         """What the sum of the logits of so many views is divided by."""
         return self.temperature * (1 + self.correlation * (n_views - 1))
 
-    def log_belief(self, total: NDArray[np.floating], n_views: NDArray[np.int64] | int, classes: int) -> Float:
+    def log_belief(self, total: NDArray[np.floating], n_views: NDArray | int, classes: int) -> Float:
         """Logarithm of the belief in each class, up to a constant for all classes.
 
         Args:
@@ -238,12 +247,12 @@ class Calibration:
         pointing -= top[..., None, :]
         return logs + top + np.log(np.exp(pointing, out=pointing).sum(-2))
 
-    def belief(self, total: NDArray[np.floating], n_views: NDArray[np.int64] | int, classes: int) -> Float:
+    def belief(self, total: NDArray[np.floating], n_views: NDArray | int, classes: int) -> Float:
         """Belief in each class, (..., classes) float64, sums to 1; arguments as for ``log_belief``."""
         return _softmax(self.log_belief(total, n_views, classes))
 
     def azimuth_bins(
-        self, total: NDArray[np.floating], n_views: NDArray[np.int64] | int, classes: int, azimuth: NDArray[np.floating]
+        self, total: NDArray[np.floating], n_views: NDArray | int, classes: int, azimuth: NDArray[np.floating]
     ) -> Float | None:
         """Belief in the azimuth bin that is seen from an azimuth, if the object is of each class.
 
@@ -287,6 +296,7 @@ class Calibration:
             fields.number("correlation"),
             None if risk is None else RiskBounds.from_dict(risk),
             fields.number("bin_correlation", None),
+            fields.number("visibility", None),
         )
         fields.end()
         return found
@@ -296,11 +306,15 @@ class Calibration:
         values: dict[str, Any] = {"temperature": self.temperature, "correlation": self.correlation}
         if self.bin_correlation is not None:
             values["bin_correlation"] = self.bin_correlation
+        if self.visibility is not None:
+            values["visibility"] = self.visibility
         if self.risk is not None:
             values["risk"] = self.risk.to_dict()
         return values
 
 
+LEAST_SHOWN = 0.02
+"""Shares of an object below this are taken for it."""
 PLAIN_SUM = Calibration()
 """Trusts the sum of the logits as it stands, as the thesis did."""
 
@@ -355,7 +369,7 @@ class Stopping:
             return cls(calibration.threshold(risk, max_views), max_views)
         return cls(threshold, max_views, calibration.correlation)
 
-    def threshold_at(self, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
+    def threshold_at(self, n_views: NDArray | int) -> NDArray[np.float64]:
         """The belief at which to stop after so many views, same shape."""
         if self.threshold_decay == 0 or self.threshold in (0, 1):
             return np.full(np.shape(n_views), float(self.threshold))
@@ -375,7 +389,7 @@ class Stopping:
 class FixedLength(Stopping):
     """Stop after ``max_views`` views and never before, however sure the belief is; the threshold counts for nothing."""
 
-    def threshold_at(self, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
+    def threshold_at(self, n_views: NDArray | int) -> NDArray[np.float64]:
         """Infinity, which no belief reaches, same shape."""
         return np.full(np.shape(n_views), np.inf)
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from nextview.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
 from nextview.errors import PolicyError, SessionError, UsageError
-from nextview.observation import Observation
+from nextview.observation import Observation, SceneView
+from nextview.occupancy import SeenScene, expected_visibility
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.off_grid import OffGrid
 from nextview.viewsphere import SNAP, Viewpoints, angle_between, turn_of
@@ -31,7 +32,8 @@ class Step:
         stopped: whether the episode ended here, (A,) bool.
         next_views: where it goes next, (A,) int64; -1 where it ended.
         total: sum of the log-evidence in it and before, (A, D), see ``belief.log_evidence_of``.
-        seen: views so far in which anything was seen, (A,) int64.
+        seen: views so far in which anything was seen, each as much as it counts, (A,) float64; see
+            ``Calibration.weights``.
         state: what the policy was shown of the episodes that go on; None where all ended.
     """
 
@@ -42,7 +44,7 @@ class Step:
     stopped: NDArray[np.bool_]
     next_views: NDArray[np.int64]
     total: NDArray[np.float64]
-    seen: NDArray[np.int64]
+    seen: NDArray[np.float64]
     state: EpisodeState | None = None
 
 
@@ -74,10 +76,14 @@ class _Sums:
     """What A episodes have taken in: see ``Step`` and ``EpisodeState``."""
 
     total: NDArray[np.float64]
-    seen: NDArray[np.int64]
+    seen: NDArray[np.float64]
     visited: NDArray[np.bool_]
     azimuth: NDArray[np.float64]
     places: NDArray[np.float64] | None
+
+
+Visible = Callable[[EpisodeState], NDArray[np.float64]]
+"""Share of the object that is expected to show from each view in the episodes of a state, (B, V)."""
 
 
 def unconstrained(state: EpisodeState) -> EpisodeState:
@@ -95,6 +101,8 @@ class Episodes:
         stopping: when an episode ends; a sphere with fewer views than ``max_views`` ends it too.
         rng: for policies that draw.
         calibration: how far to trust the sum of the logits; fully by default.
+        visibility: what is expected to show from each view, for policies that need it, (B, V) of a state that lacks
+            it; by default what the scenes in the observations of the evidence tell, see ``SeenScene``.
     """
 
     def __init__(
@@ -105,9 +113,10 @@ class Episodes:
         stopping: Stopping,
         rng: np.random.Generator,
         calibration: Calibration = PLAIN_SUM,
+        visibility: Visible | None = None,
     ) -> None:
         self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
-        self.calibration = calibration
+        self.calibration, self.visibility = calibration, visibility
         self.running = np.arange(len(starts))
         self.current = np.array(starts, np.int64)
         if ((self.current < 0) | (self.current >= len(sphere))).any():
@@ -115,8 +124,9 @@ class Episodes:
         self.steps: list[Step] = []
         self._visited = np.zeros((len(starts), len(sphere)), bool)
         self._total: NDArray[np.float64] = np.zeros((len(starts), 0))
-        self._seen = np.zeros(len(starts), np.int64)
+        self._seen = np.zeros(len(starts))
         self._places: NDArray[np.float64] | None = None
+        self._scenes: dict[int, tuple[list[SceneView], SeenScene]] = {}
 
     def update(
         self,
@@ -154,20 +164,20 @@ class Episodes:
             if "azimuth_bins" in needs:
                 classes, azimuth = evidence.logits.shape[1], sums.azimuth[going]
                 azimuth_bins = self.calibration.azimuth_bins(sums.total[going], weighed[going], classes, azimuth)
-            state, next_views = self._move(
-                EpisodeState(
-                    step.views[going],
-                    sums.visited[going],
-                    step.belief[going],
-                    step.evidence.of(going),
-                    n_views,
-                    step.episodes[going],
-                    azimuth_bins,
-                    places=places,
-                    observations=observations,
-                ),
-                constrain,
+            state = EpisodeState(
+                step.views[going],
+                sums.visited[going],
+                step.belief[going],
+                step.evidence.of(going),
+                n_views,
+                step.episodes[going],
+                azimuth_bins,
+                places=places,
+                observations=observations,
             )
+            if "visibility" in needs:
+                state = replace(state, visibility=self._visibility(step, state))
+            state, next_views = self._move(state, constrain)
             step.next_views[going] = next_views
             step = replace(step, state=state)
         self._keep(replace(step, stopped=step.next_views < 0), sums)
@@ -219,13 +229,36 @@ class Episodes:
             visited |= arc <= VISITED
         visited[np.arange(len(now)), views] = True
         before = self._total[now] if self.steps else 0.0
-        total = before + np.asarray(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64)
-        counted = self._seen[now] + seen
+        weights = seen * np.asarray(self.calibration.weights(evidence.shown))
+        said = np.asarray(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64)
+        total, counted = before + weights[:, None] * said, self._seen[now] + weights
         # Before anything is seen the total is zero, whatever it is divided by.
         belief = self.calibration.belief(total, np.maximum(counted, 1), evidence.logits.shape[1])
         going, nowhere = np.zeros(len(now), bool), np.full(len(now), -1)
         step = Step(now, views, evidence, belief, going, nowhere, total, counted)
         return step, _Sums(total, counted, visited, azimuth, places)
+
+    def _visibility(self, last: Step, state: EpisodeState) -> NDArray[np.float64]:
+        """What is expected to show from each view in the episodes of a state."""
+        if self.visibility is not None:
+            return self.visibility(state)
+        if any(step.evidence.observations is None for step in (*self.steps, last)):
+            return np.ones(state.visited.shape)
+        positions, found = self.sphere.poses[:, :3, 3], []
+        for episode, views in zip(state.episodes, self._observations(last, state.episodes), strict=True):
+            scenes = [seen.scene for seen in views if seen.scene is not None]
+            found.append(expected_visibility(self._seen_scene(int(episode), scenes), positions).expected)
+        return np.stack(found)
+
+    def _seen_scene(self, episode: int, scenes: list[SceneView]) -> SeenScene:
+        """What the frames of an episode say together: that of all but the last ones is kept."""
+        known, seen = self._scenes.get(episode, ([], SeenScene.unseen()))
+        if any(old is not new for old, new in zip(known, scenes, strict=False)):
+            known, seen = [], SeenScene.unseen()
+        for scene in scenes[len(known) :]:
+            seen = seen.seen(scene)
+        self._scenes[episode] = scenes, seen
+        return seen
 
     def _observations(self, last: Step, episodes: NDArray[np.int64]) -> list[list[Observation]]:
         """All that was seen so far in some episodes, the last step included."""
@@ -379,6 +412,8 @@ def run_episodes(
     stopping: Stopping,
     rng: np.random.Generator,
     calibration: Calibration = PLAIN_SUM,
+    constrain: Callable[[EpisodeState], EpisodeState] = unconstrained,
+    visibility: Visible | None = None,
 ) -> Episodes:
     """Run episodes to their end.
 
@@ -390,8 +425,10 @@ def run_episodes(
         stopping: when an episode ends.
         rng: for policies that draw.
         calibration: how far to trust the sum of the logits; fully by default.
+        constrain: see ``Episodes.update``.
+        visibility: see ``Episodes``.
     """
-    episodes = Episodes(sphere, policy, starts, stopping, rng, calibration)
+    episodes = Episodes(sphere, policy, starts, stopping, rng, calibration, visibility)
     while len(episodes.running):
-        episodes.update(observe(episodes.running, episodes.current[episodes.running]))
+        episodes.update(observe(episodes.running, episodes.current[episodes.running]), constrain=constrain)
     return episodes

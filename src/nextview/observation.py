@@ -31,6 +31,38 @@ RIGID = 1e-3
 
 
 @dataclass(frozen=True)
+class SceneView:
+    """All that one frame shows, the object and what stands around it, in the object frame and object radii.
+
+    It may be of another pinhole than the observation that it goes with, and from another distance.
+
+    Attributes:
+        depth: along the optical axis, (H, W) float32, object radii, 0 where nothing was measured.
+        target: pixels that show the object, (H, W) bool.
+        pose: camera-to-world, (4, 4) float64, OpenCV axes; the world is the object frame.
+        intrinsics: pinhole matrix, (3, 3) float64, pixels; the first pixel's centre is at 0.5.
+        background_free: whether nothing is there where nothing was measured, as in renders. A sensor may measure
+            nothing on what is black or shiny.
+
+    Raises:
+        ObservationError: depth and target are no images of one shape.
+    """
+
+    depth: NDArray[np.float32]
+    target: NDArray[np.bool_]
+    pose: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
+    background_free: bool = False
+
+    def __post_init__(self) -> None:
+        if self.depth.ndim != 2 or self.target.shape != self.depth.shape:
+            raise ObservationError(
+                f"the depth of a scene and the object's pixels are images of one shape, not {self.depth.shape} and "
+                f"{self.target.shape}"
+            )
+
+
+@dataclass(frozen=True)
 class Observation:
     """One view of an object. Lists are converted; arrays of the right type are not copied.
 
@@ -42,6 +74,7 @@ class Observation:
             (column + 0.5, row + 0.5).
         radius: the object radius, metres: what positions were divided by. None if the camera does not know its scale.
         image: grey picture, (H, W) uint8, 0 where there is no object. None if the camera has none.
+        scene: all that the camera saw. None where only the object is known: then nothing is taken to hide it.
 
     Raises:
         ObservationError: shapes that are not these, or numbers that no camera can have: what is wrong, and what it
@@ -53,6 +86,7 @@ class Observation:
     intrinsics: NDArray[np.float64]
     radius: float | None = None
     image: NDArray[np.uint8] | None = None
+    scene: SceneView | None = None
 
     def __post_init__(self) -> None:
         given = _depth(self.depth)

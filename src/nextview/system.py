@@ -25,7 +25,7 @@ from nextview.models.inference import MapNetwork, Models, Recogniser
 from nextview.observation import Camera
 from nextview.policies.base import Policy, maps_among
 from nextview.policies.maps import MapPeak, SpherePeak
-from nextview.policies.registry import make_policy_anywhere
+from nextview.policies.registry import make_policy_anywhere, with_cards
 from nextview.session import FrameCamera, Recognition, Session
 from nextview.viewsphere import LAYOUTS, Viewpoints, ViewSphere, viewpoints_of
 
@@ -219,7 +219,7 @@ def load(
     if policy is None:
         policy, made = _default_policy(found.policies, sphere, recogniser)
     else:
-        name = str(found.policies.get(policy, policy))
+        name = with_cards(policy, found.policies)
         made = make_policy_anywhere(name, sphere, (), recogniser.classes, found.maps)
     names = dict.fromkeys(name.removesuffix("-sphere") for name in maps_among(made.needs))
     missing = [name for name in names if name not in found.maps]

@@ -13,13 +13,14 @@ from scipy.special import log_softmax
 from nextview.benchmark.stored import stored_rows
 from nextview.benchmark.true_maps import TRUE, known_maps, true_measure
 from nextview.data.predictions import Predictions
+from nextview.data.world_sight import WorldSight
 from nextview.errors import EntryError, OtherUseError
 from nextview.policies.base import Policy, Scope
 from nextview.policies.fixed import ViewList, orbit, ranked
 from nextview.policies.maps import MapPeak
 from nextview.policies.oracle import OracleGain, OracleMeasure, OracleValley
 from nextview.policies.policy_card import bundled_policies
-from nextview.policies.registry import POLICIES, make_policy
+from nextview.policies.registry import DEFAULT, POLICIES, VISIBLE, make_policy
 
 
 @dataclass(frozen=True)
@@ -32,12 +33,14 @@ class EpisodeSpecs:
         starts: first view of each, (E,) int64.
         valleys: classes (indices) for which the valley of a map is taken to be the better view, of every map; None for
             those that each map's card names.
+        worlds: that the objects stand in; None if they stand alone.
     """
 
     predictions: Predictions
     objects: NDArray[np.int64]
     starts: NDArray[np.int64]
     valleys: tuple[int, ...] | None = None
+    worlds: WorldSight | None = None
 
     @property
     def labels(self) -> NDArray[np.int64]:
@@ -88,18 +91,28 @@ def is_oracle(policy: str) -> bool:
 
 
 def _gain(t: EpisodeSpecs, scope: Scope) -> Policy:
-    p = t.predictions
-    return OracleGain(p.sphere, p.log_evidence, len(p.classes), p.labels, t.objects, scope, p.calibration)
+    p, said = t.predictions, t.predictions.log_evidence
+    if t.worlds is not None and p.calibration.visibility is not None:
+        said = said * np.asarray(p.calibration.weights(t.worlds.all_shown()))[..., None]
+    return OracleGain(p.sphere, said, len(p.classes), p.labels, t.objects, scope, p.calibration)
+
+
+IN_WORLDS = ("visibility", f"{VISIBLE}{DEFAULT}", "true-visible_share-all")
+"""Entries that make a difference only where things hide an object."""
 
 
 def default_entries(specs: EpisodeSpecs) -> list[str]:
-    """All that these predictions allow."""
+    """All that these predictions allow. Fixed views do not ask what can be reached, so worlds have none."""
     sphere = specs.predictions.sphere
     n, v = sphere.azimuths, len(sphere)
     maps = [name for name in specs.predictions.maps if name not in POLICIES and not name.endswith("-sphere")]
     names = [*POLICIES, *(each for name in maps for each in (name, f"{name}-peak"))]
     names = [*names, *(name for name in bundled_policies() if _fits(name, specs)), *ORACLES]
+    among = [name for name in IN_WORLDS if not name.startswith(VISIBLE) or _fits(name, specs)]
+    names = [*(name for name in names if name not in IN_WORLDS), *(among if specs.worlds is not None else [])]
     names = [name for name in names if _ready(name, specs)]
+    if specs.worlds is not None:
+        return names
     names += [f"{kind}-{min(5, v)}" for kind in FIXED if kind != "orbit"]
     return names + [f"orbit-{k}" for k in sorted({n, v})]
 
@@ -131,7 +144,7 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
     if true := TRUE_MEASURE.fullmatch(name):
         values = true_measure(specs.predictions, true[1])[specs.objects].astype(np.float64)
         return OracleMeasure(specs.predictions.sphere, values, true[2] == "-peak")
-    card, p = name.partition("@")[0], specs.predictions
+    card, p = name.partition("@")[0].removeprefix(VISIBLE), specs.predictions
     by_map = None if name in POLICIES or card in bundled_policies() else _map_policy(name, specs)
     if by_map is not None:
         return by_map
@@ -180,6 +193,7 @@ def _lacking(policy: Policy, specs: EpisodeSpecs) -> list[str]:
         *p.maps,
         *(TRUE + name for name in known_maps(p)),
         *(["azimuth_bins"] if p.azimuth_bins is not None else []),
+        "visibility",
     }
     return [wanted for wanted in policy.needs if wanted not in there]
 

@@ -76,6 +76,41 @@ def promised_risks(tables: Tables) -> list[PromisedRisk]:
     return [PromisedRisk(*row) for row in tables.risks.to_numpy(object).tolist()]
 
 
+class LevelCell(NamedTuple):
+    """A policy in the worlds of one level after some views; difference and what follows are NaN for the reference."""
+
+    accuracy: float
+    low: float
+    high: float
+    travel: float
+    difference: float
+    difference_low: float
+    difference_high: float
+    p_holm: float
+
+
+class LevelRow(NamedTuple):
+    """A policy in the worlds of one level; its cells by the number of views."""
+
+    level: str
+    worlds: int
+    policy: str
+    cells: list[tuple[int, LevelCell]]
+
+
+def level_rows(tables: Tables) -> list[list[LevelRow]]:
+    """The policies at each level, those that no robot could follow last; nothing where the objects are no worlds."""
+    found: list[list[LevelRow]] = []
+    for level, rows in tables.levels.groupby("level", sort=False):
+        policies = []
+        for policy, mine in rows.groupby("policy", sort=False):
+            values = mine[list(LevelCell._fields)].to_numpy(float).tolist()
+            cells = [(int(k), LevelCell(*row)) for k, row in zip(mine["n_views"], values, strict=True)]
+            policies.append(LevelRow(str(level), int(mine["worlds"].iloc[0]), str(policy), cells))
+        found.append(sorted(policies, key=lambda row: is_oracle(row.policy)))
+    return found
+
+
 def nothing_differs(tables: Tables, threshold: float, reference: str) -> str | None:
     """A sentence where no policy that a robot could follow differs from the reference in accuracy; else None."""
     tests = _robot_tests(tables, threshold)

@@ -18,6 +18,7 @@ from nextview.belief import FixedLength, Stopping
 from nextview.benchmark.entries import EpisodeSpecs, entry_policy, fixed_views
 from nextview.benchmark.true_maps import TRUE, true_map
 from nextview.data.predictions import Predictions
+from nextview.data.world_sight import sight_of, worlds_of
 from nextview.episode import run_episodes
 from nextview.errors import EntryError, PolicyError, UsageError
 from nextview.policies.base import Evidence, Policy, maps_among
@@ -66,14 +67,19 @@ def make_specs(
     Args:
         predictions: what the models say.
         runs: first views of each object.
-        seed: decides them, alone: they are the same for every policy and threshold.
+        seed: decides them, alone: they are the same for every policy and threshold. In worlds they are drawn among
+            those that can be reached.
         valley_classes: classes (indices) for the policies that need them; those of each map's card by default.
     """
     if runs < 1:
         raise UsageError(f"at least one run is needed, not {runs}")
-    n = len(predictions)
-    starts = np.random.default_rng([seed]).integers(len(predictions.sphere), size=runs * n)
-    return EpisodeSpecs(predictions, np.tile(np.arange(n), runs), starts, valley_classes)
+    n, rng, worlds = len(predictions), np.random.default_rng([seed]), worlds_of(predictions)
+    starts = rng.integers(len(predictions.sphere), size=runs * n)
+    objects = np.tile(np.arange(n), runs)
+    if worlds is not None:
+        draws = rng.random((len(objects), len(predictions.sphere)))
+        starts = np.where(worlds.reachable[objects], draws, -1).argmax(1)
+    return EpisodeSpecs(predictions, objects, starts, valley_classes, worlds)
 
 
 def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int) -> Trajectories:
@@ -117,10 +123,14 @@ def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng
     p = replace(p, maps=maps)
 
     def observe(which: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
-        return p.evidence(objects[which], views)
+        evidence = p.evidence(objects[which], views)
+        if specs.worlds is None or p.calibration.visibility is None:
+            return evidence
+        return replace(evidence, shown=specs.worlds.shown(objects[which], views))
 
+    sight = sight_of(specs.worlds, objects)
     try:
-        done = run_episodes(observe, p.sphere, policy, specs.starts, stopping, rng, p.calibration)
+        done = run_episodes(observe, p.sphere, policy, specs.starts, stopping, rng, p.calibration, *sight)
     except PolicyError as error:
         where = "" if error.episode is None else f" (object {p.names[objects[error.episode]]})"
         raise EntryError(f"{name}: {error}{where}") from error

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from nextview.benchmark.experiment import Grid
+from nextview.benchmark.levels import COLUMNS
 from nextview.benchmark.replay import Outcomes
 from nextview.benchmark.summary import Tables
 from nextview.data.predictions import Predictions
@@ -63,7 +64,7 @@ def load(folder: Path) -> Results:
     """
     try:
         settings = json.loads((folder / "benchmark.json").read_text())
-        tables = Tables(**{name: pd.read_csv(folder / f"{name}.csv") for name in Tables.__dataclass_fields__})
+        tables = Tables(**{name: _table(folder, name) for name in Tables.__dataclass_fields__})
         if not (folder / "episodes.parquet").exists():
             raise FileNotFoundError
     except FileNotFoundError:
@@ -76,6 +77,12 @@ def load(folder: Path) -> Results:
     except ValueError as error:
         raise ResultsError(f"{folder}: these benchmark results are damaged ({error})") from None
     return Results(folder, settings, Predictions.load(folder / "predictions.npz"), tables)
+
+
+def _table(folder: Path, name: str) -> pd.DataFrame:
+    """One of the tables; results that were made before there were worlds have no levels."""
+    path = folder / f"{name}.csv"
+    return pd.DataFrame(columns=COLUMNS) if name == "levels" and not path.exists() else pd.read_csv(path)
 
 
 def _write_episodes(path: Path, grid: Grid) -> None:

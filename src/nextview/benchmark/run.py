@@ -18,6 +18,7 @@ from nextview.data.predictions import Predictions
 from nextview.errors import EntryError, UsageError
 from nextview.models.model_card import file_hash
 from nextview.outputs import check_folder, written_results
+from nextview.policies.registry import with_cards
 
 Track = Callable[[Iterable[int], int, str], object]
 """Exhausts counts of what is done, given the last count and what is being done."""
@@ -101,7 +102,7 @@ def run_benchmark(
     valleys = None if valley_classes is None else tuple(map(table.classes.index, valley_classes))
     specs = make_specs(table, runs, seed, valleys)
     own = own or {}
-    wanted = [str(own.get(name, name)) for name in policies] or [*default_entries(specs), *map(str, own.values())]
+    wanted = [with_cards(name, own) for name in policies] or [*default_entries(specs), *map(str, own.values())]
     names = list(dict.fromkeys([*([reference] if policies else []), *wanted]))
     grid = Grid(specs, runs, tuple(sorted({*thresholds, *promised.values()})), max_views, seed, threshold_decay)
     with written_results(out, results.KIND) as part:

@@ -13,6 +13,7 @@ from nextview import metrics
 from nextview.benchmark import statistics as st
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.experiment import Grid
+from nextview.benchmark.levels import by_level
 from nextview.benchmark.published import published
 from nextview.benchmark.replay import Outcomes, truncate
 
@@ -45,6 +46,7 @@ class Tables:
         reliability: policy, threshold, bin, confidence, accuracy, episodes.
         risks: policy, risk (an error rate that was promised), threshold that promises it, error (measured among the
             episodes that reached it), low, high, confident (their share): only of policies a robot could follow.
+        levels: of worlds, see ``levels.by_level``.
     """
 
     summary: pd.DataFrame
@@ -54,6 +56,7 @@ class Tables:
     areas: pd.DataFrame
     reliability: pd.DataFrame
     risks: pd.DataFrame
+    levels: pd.DataFrame
 
     def named(self) -> dict[str, pd.DataFrame]:
         """The tables by name."""
@@ -78,7 +81,8 @@ def summarise(
     sweep, areas = _areas(grid, reference, weights[:500])
     tests = _tests(grid, cells, summary, drawn, reference)
     per_class, risks = _per_class(grid, cells, weights), _risks(summary, promised or {})
-    return Tables(summary, per_class, tests, sweep, areas, _reliability(grid, cells), risks)
+    levels = by_level(grid, reference, samples, rng)
+    return Tables(summary, per_class, tests, sweep, areas, _reliability(grid, cells), risks, levels)
 
 
 def _measures(grid: Grid, ends: Outcomes) -> dict[str, tuple[Float, Float]]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.belief import FixedLength, log_evidence_of
-from nextview.data.predictions import Predictions
+from nextview.data.predictions import SAME, Predictions
 from nextview.data.splits import deduplicated, divide
 from nextview.episode import run_episodes
 from nextview.errors import PredictionsError
@@ -69,6 +69,11 @@ class FittingSet:
     def log_evidence(self) -> NDArray[np.float32]:
         """All of it, so that views can be summed, (N, V, D); see ``log_evidence_of``."""
         return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.turn)
+
+    @cached_property
+    def seen(self) -> NDArray[np.bool_]:
+        """Whether anything was seen in each view, (N, V); see ``Predictions.seen``."""
+        return np.ptp(self.logits, axis=2) > SAME
 
     def of(self, kept: NDArray) -> FittingSet:
         """Some of the objects."""

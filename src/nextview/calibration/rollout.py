@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from nextview.belief import PLAIN_SUM, Calibration, FixedLength, of_true_class
 from nextview.calibration.fitting_set import FittingSet
 from nextview.calibration.temperature import fit_temperature
 from nextview.data.predictions import Predictions
+from nextview.data.world_sight import WorldSight, sight_of, worlds_of
 from nextview.episode import run_episodes
 from nextview.errors import PredictionsError
 from nextview.policies.base import EpisodeState, Evidence, Policy
@@ -32,11 +34,19 @@ class ReplayTable:
         data: what the recogniser says, and the truth.
         maps: predicted local maps by name, each (N, V, R, 3).
         calibration: of the belief.
+        worlds: that the objects stand in; None if they stand alone.
     """
 
     data: FittingSet
     maps: dict[str, NDArray[np.float32]]
     calibration: Calibration
+    worlds: WorldSight | None = None
+
+    @cached_property
+    def weights(self) -> Float:
+        """As how much of a view each counts, (N, V); 0 where nothing is seen."""
+        shown = None if self.worlds is None or self.calibration.visibility is None else self.worlds.all_shown()
+        return self.data.seen * np.asarray(self.calibration.weights(shown))
 
     @classmethod
     def of(
@@ -59,7 +69,9 @@ class ReplayTable:
         data = FittingSet.joined([FittingSet.of_all(part) for part in parts])
         maps = {name: np.concatenate([part.maps[name] for part in parts]) for name in predictions.maps}
         known = predictions.calibration != PLAIN_SUM
-        return cls(data, maps, predictions.calibration if known else fit_temperature(data, rng))
+        calibration = predictions.calibration if known else fit_temperature(data, rng)
+        worlds = worlds_of(predictions)
+        return cls(data, maps, calibration, None if worlds is None else worlds.of_worlds(np.tile(kept, len(parts))))
 
 
 @dataclass(frozen=True)
@@ -70,55 +82,67 @@ class DecisionState:
         state: what the policy is shown.
         total: sum of the log-evidence so far, (N, D) float64, see ``log_evidence_of``.
         travel: so far, grid cells, (N,) float64.
+        seen: views so far in which anything was seen, each as much as it counts, (N,) float64.
     """
 
     state: EpisodeState
     total: Float
     travel: Float
+    seen: Float
 
 
-def rollout(table: ReplayTable, policy: Policy, n_views: int, rng: np.random.Generator) -> Iterator[DecisionState]:
-    """Every object once, from a random first view to where the policy leads.
+def rollout(
+    table: ReplayTable, policy: Policy, n_views: int, rng: np.random.Generator, visibility: bool = False
+) -> Iterator[DecisionState]:
+    """Every object once, from a random first view to where the policy leads; in worlds where cameras can be.
 
     Args:
         table: what is seen.
         policy: which is followed.
         n_views: at most.
         rng: draws the first views, and what the policy draws.
+        visibility: tell in the states what is expected to show.
 
     Yields:
         The decision state after each view.
     """
-    data, sphere = table.data, table.data.sphere
+    data, sphere, everything = table.data, table.data.sphere, np.arange(len(table.data))
     starts = rng.integers(len(sphere), size=len(data))
+    if table.worlds is not None:
+        starts = np.where(table.worlds.reachable, rng.random(table.worlds.reachable.shape), -1).argmax(1)
+    constrain, visible = sight_of(table.worlds, everything)
+    weigh = None if table.calibration.visibility is None else table.worlds
 
     def observe(objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
         return Evidence(
             data.logits[objects, views],
             {name: values[objects, views] for name, values in table.maps.items()},
             azimuth_bins=None if data.azimuth_bins is None else data.azimuth_bins[objects, views],
+            seen=data.seen[objects, views],
+            shown=None if weigh is None else weigh.shown(objects, views),
         )
 
     length = FixedLength(max_views=n_views)
-    steps = run_episodes(observe, sphere, policy, starts, length, rng, table.calibration).steps
+    steps = run_episodes(observe, sphere, policy, starts, length, rng, table.calibration, constrain, visible).steps
     visited, travel = np.zeros((len(data), len(sphere)), bool), np.zeros(len(data))
     for k, step in enumerate(steps, 1):
         visited[step.episodes, step.views] = True
-        turn = sphere.turn[step.views]
-        azimuth_bins = table.calibration.azimuth_bins(step.total, k, len(data.classes), turn)
+        turn, seen = sphere.turn[step.views], np.maximum(step.seen, 1)
+        azimuth_bins = table.calibration.azimuth_bins(step.total, seen, len(data.classes), turn)
         state = EpisodeState(step.views, visited.copy(), step.belief, step.evidence, k, step.episodes, azimuth_bins)
-        yield DecisionState(state, step.total, travel)
+        state = constrain(replace(state, visibility=visible(state) if visibility else None))
+        yield DecisionState(state, step.total, travel, step.seen)
         if k < len(steps):
             travel = travel + sphere.travel[step.views, step.next_views]
 
 
-def outcome(table: ReplayTable, total: Float, n_views: int, kind: str) -> Float:
+def outcome(table: ReplayTable, total: Float, n_views: NDArray | int, kind: str) -> Float:
     """What sums of the log-evidence of each object are worth.
 
     Args:
         table: holds the truth.
         total: (N, ..., D), see ``log_evidence_of``.
-        n_views: how many were summed.
+        n_views: how many were summed, (N, ...) or one number.
         kind: one of OUTCOMES.
 
     Returns:
@@ -147,7 +171,9 @@ def outcome_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
 
 def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Float:
     """The outcome of looking from every view next, (N, V) float64."""
-    return outcome(table, moment.total[:, None] + table.data.log_evidence, moment.state.step + 1, kind)
+    n_views = np.maximum(moment.seen[:, None] + table.weights, 1)
+    said = table.weights[..., None] * table.data.log_evidence
+    return outcome(table, moment.total[:, None] + said, n_views, kind)
 
 
 @dataclass(frozen=True)
@@ -174,7 +200,7 @@ def judge(
         for moment in rollout(table, policy, n_views, rng):
             k = moment.state.step
             if k > 1:
-                value = outcome(table, moment.total, k, kind)
+                value = outcome(table, moment.total, np.maximum(moment.seen, 1), kind)
                 reached[:, k - 2] += weights @ value, weights @ moment.travel
     return Value(*reached)
 

@@ -18,11 +18,13 @@ from nextview.calibration.policy_tables import fit_class_table, fit_ring, fit_se
 from nextview.calibration.size_density import densities, fit_weight
 from nextview.calibration.temperature import fit_risk, fit_temperature, loss
 from nextview.calibration.valleys import valley_gains
+from nextview.calibration.visibility_weight import visibility_losses
 from nextview.command_line import command_line
 from nextview.data.folders import list_dataset
 from nextview.data.predictions import Predictions
 from nextview.data.splits import deduplicated
 from nextview.data.store import ViewStore
+from nextview.data.world_sight import worlds_of
 from nextview.errors import DatasetError, ModelError, PredictionsError, UsageError
 from nextview.models.model_card import file_hash, read_card, write_card
 from nextview.models.size_evidence import SizeEvidence
@@ -95,7 +97,7 @@ def fit_calibration(
     walks = 1 + 8000 // len(data)  # few objects are walked over more often
     calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=walks)
     risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
-    calibration = replace(calibration, risk=risk)
+    calibration = replace(calibration, risk=risk, visibility=model.calibration.visibility)
     command = command_line(
         "fit calibration", predictions, card,
         validation=validation, split_seed=split_seed, delta=delta, seed=seed, sensed=tuple(sensed),
@@ -106,6 +108,53 @@ def fit_calibration(
     write_card(card, model.made_by(*table.commands, command))
     before, after = (loss(data, c, np.random.default_rng([seed, 2]), walks=walks) for c in (PLAIN_SUM, calibration))
     return FittedCalibration(calibration, len(data), before, after)
+
+
+@dataclass(frozen=True)
+class FittedVisibility:
+    """What ``fit_visibility`` found.
+
+    Attributes:
+        power: written into the card's calibration.
+        worlds: fitted to.
+        losses: mean negative log-likelihood over 1 to 5 views at each power that was tried.
+    """
+
+    power: float
+    worlds: int
+    losses: dict[float, float]
+
+
+def fit_visibility(predictions: Path, card: Path, seed: int = 0) -> FittedVisibility:
+    """Learn from worlds how much a view counts that shows only a share of the object.
+
+    Args:
+        predictions: of worlds of the training split; their store has to be there.
+        card: of the recogniser, which is calibrated already; is written anew. Those worlds are taken around objects
+            that it calls held out.
+        seed: of the walks over which is fitted.
+
+    Raises:
+        ModelError, PredictionsError, DatasetError: what was given does not fit together.
+    """
+    model, table = read_card(card), Predictions.load(predictions).by_shape()
+    if not model.is_recogniser or table.models["recogniser"][1] != model.sha256:
+        raise PredictionsError(f"{predictions}: comes from another recogniser than {card}")
+    FittingSet.of_all(table)  # refuses the test split
+    kept = np.flatnonzero(np.isin([name.partition("@")[0] for name in table.names], model.held_out))
+    if len(kept) == 0:
+        raise PredictionsError(f"{predictions}: holds no world around an object that {card} calls held out")
+    table = table.of_objects(kept)
+    worlds = worlds_of(table)
+    if worlds is None:
+        raise PredictionsError(f"{predictions}: is of no worlds, or their store is gone")
+    losses = visibility_losses(FittingSet.of_all(table), worlds, model.calibration, np.random.default_rng(seed))
+    power = min(losses, key=lambda power: losses[power])
+    command = command_line("fit visibility", predictions, card, seed=seed)
+    fitted_to = {**model.fitted_to, "visibility": f"{len(table)} worlds around objects held out of its training"}
+    model = replace(model, calibration=replace(model.calibration, visibility=power), fitted_to=fitted_to)
+    write_card(card, model.made_by(*table.commands, command))
+    return FittedVisibility(power, len(table), losses)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from nextview.cli.export_maps import export_lcm, export_lem, export_map
 from nextview.cli.fit import fit_calibration, fit_size, fit_valleys
 from nextview.cli.fit_policies import fit_policies
 from nextview.cli.fit_unknown import fit_unknown
+from nextview.cli.fit_visibility import fit_visibility
 from nextview.cli.inspect import inspect
 from nextview.cli.measure import measure
 from nextview.cli.measures import measures
@@ -63,6 +64,7 @@ COMMANDS: dict[str, Any] = {
     "fit": {
         "size": fit_size,
         "calibration": fit_calibration,
+        "visibility": fit_visibility,
         "unknown": fit_unknown,
         "valleys": fit_valleys,
         "policies": fit_policies,

@@ -8,11 +8,13 @@ from rich.table import Table
 
 from nextview.benchmark.leaderboard import (
     SIGNIFICANT,
+    LevelRow,
     PromisedRisk,
     Standing,
     headline_threshold,
     is_oracle,
     leaderboard,
+    level_rows,
     nothing_differs,
     promised_risks,
     too_few,
@@ -31,6 +33,8 @@ def print_leaderboard(results: Results) -> None:
         for sentence in (nothing_differs(tables, at, reference), too_few(tables, at, len(results.predictions))):
             if sentence:
                 console.print(sentence)
+    for level in level_rows(tables):
+        console.print(_level(level, reference))
     if promised := promised_risks(tables):
         console.print(_risks(promised))
 
@@ -65,6 +69,21 @@ def _policies(board: list[Standing], threshold: float, reference: str) -> Table:
             p,
             style="dim" if oracle else "bold" if s.differs else None,
         )
+    return table
+
+
+def _level(rows: list[LevelRow], reference: str) -> Table:
+    counts = [n_views for n_views, _ in rows[0].cells]
+    title = f"{rows[0].level}: {rows[0].worlds} worlds, accuracy after so many views; points over {reference}"
+    table = _table(title)
+    for k in counts:
+        table.add_column(f"{k}", justify="right", no_wrap=True)
+    for row in rows:
+        cells = []
+        for _, cell in row.cells:
+            over = "" if cell.difference != cell.difference else f" {round(100 * cell.difference, 1) + 0.0:+.1f}"
+            cells.append(f"{cell.accuracy:.3f}{over}{'*' if cell.p_holm < SIGNIFICANT else ' '}")
+        table.add_row(row.policy, *cells, style="dim" if is_oracle(row.policy) else None)
     return table
 
 

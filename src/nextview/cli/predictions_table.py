@@ -30,7 +30,7 @@ def print_predictions(p: Predictions) -> None:
             these = here & (p.labels == label)
             table.add_row(*_row(f"  {p.classes[label].replace('_', ' ')}", right[these], fused[these]))
         if len(labels) > WORST:
-            mean = [f"{metrics.mean_over_classes(x[here], p.labels[here]):.3f}" for x in (right, fused)]
+            mean = [f"{metrics.mean_over_classes(x[here], p.labels[here]):.3f}" for x in (right.mean(1), fused)]
             table.add_row(f"  mean of {len(labels)} classes", "", *mean)
     Terminal().print(table)
 

@@ -15,6 +15,7 @@ def worlds(
     level: tuple[Literal["light", "medium", "heavy"], ...] = ("light", "medium", "heavy"),
     worlds: int | None = None,
     split: Literal["train", "test"] | None = None,
+    held_out: Path | None = None,
     seed: int = 0,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -37,6 +38,8 @@ def worlds(
         level: how much of the target shows, on the average over the 40 views: light 85 %, medium 65 %, heavy 45 %.
         worlds: how many at each level, of each split; by default one around each object.
         split: only this one.
+        held_out: only around objects that the model of this card (NAME.json) calls held out of its training: worlds for
+            learning policies.
         seed: decides which objects are targets, and all that stands around them.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler to use instead, as tcp://HOST:8786.
@@ -45,14 +48,14 @@ def worlds(
     from nextview.data.world_drawing import draw_worlds, tasks
     from nextview.errors import DatasetError
 
-    total = len(tasks(meshes, out, level, worlds, seed, split))
+    total = len(tasks(meshes, out, level, worlds, seed, split, held_out))
     reasons: list[str] = []
 
     def count(n: int, reason: str | None) -> int:
         reasons.extend([] if reason is None else [reason])
         return n
 
-    drawn = draw_worlds(meshes, out, level, worlds, seed, split, workers, scheduler)
+    drawn = draw_worlds(meshes, out, level, worlds, seed, split, workers, scheduler, held_out)
     track((count(n, reason) for n, (_, reason) in enumerate(drawn, 1)), total, f"drawing {out.name}")
     for reason in reasons:
         console.print(f"left out: {reason}", style="yellow", highlight=False)

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from nextview.belief import FixedLength
 from nextview.data.measuring import Made, keep
 from nextview.data.store import PLANNED, ViewStore
+from nextview.data.world_sight import WorldSight, sight_of
+from nextview.data.world_views import world_views
 from nextview.episode import run_episodes
 from nextview.errors import DatasetError
 from nextview.observation import Observation
@@ -62,9 +64,11 @@ def plan(
 
 
 def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> Made:
-    sphere = store.sphere
+    sphere, worlds = store.sphere, WorldSight.of(store, [store.names[i]])
+    scenes = None if worlds is None else world_views(store, i)
     views = [
-        Observation(depth, pose, store.intrinsics) for depth, pose in zip(store.depth(i), sphere.poses, strict=True)
+        Observation(depth, pose, store.intrinsics, scene=None if scenes is None else scenes.scene_view(view))
+        for view, (depth, pose) in enumerate(zip(store.depth(i), sphere.poses, strict=True))
     ]
 
     def observe(episodes: NDArray[np.int64], at: NDArray[np.int64]) -> Evidence:
@@ -73,6 +77,8 @@ def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> Made:
     found = {}
     for name in names:
         starts, length = np.arange(len(sphere)), FixedLength(max_views=PLANNED)
-        episodes = run_episodes(observe, sphere, make_policy(name, sphere), starts, length, np.random.default_rng(0))
+        constrain, _ = sight_of(worlds, np.zeros(len(sphere), np.int64))
+        rng = np.random.default_rng(0)
+        episodes = run_episodes(observe, sphere, make_policy(name, sphere), starts, length, rng, constrain=constrain)
         found[f"plans/{name}"] = episodes.outcome.views.astype(np.float32)
     return found, None

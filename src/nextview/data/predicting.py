@@ -238,7 +238,8 @@ def judges(recognisers: Sequence[ModelCard], names: Sequence[str]) -> NDArray[np
         for what in ("classes", "azimuth_bins"):
             if getattr(card, what) != getattr(recognisers[0], what):
                 raise DatasetError(f"recognisers {recognisers[0].name} and {card.name} do not know the same {what}")
-    held_out = np.array([np.isin(names, card.held_out) for card in recognisers])
+    targets = [name.partition("@")[0] for name in names]  # in worlds; all of the name for others
+    held_out = np.array([np.isin(names, card.held_out) | np.isin(targets, card.held_out) for card in recognisers])
     return np.where(held_out.any(0), held_out.argmax(0), -1)
 
 

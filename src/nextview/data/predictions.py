@@ -25,6 +25,8 @@ KEYS = (
 )  # fmt: skip
 GROUPS = ("map/", "valley/")
 """The arrays of a file, and how the names of those begin of which there may be several; others are not read."""
+SAME = 1e-5
+"""Difference between logits that are the same, but for rounding."""
 KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}
 """Of numpy's types; all other arrays are of floats."""
 
@@ -114,12 +116,18 @@ class Predictions:
         """What the recogniser says of each view, so that views can be summed, (N, V, D); see ``log_evidence_of``."""
         return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.turn)
 
+    @cached_property
+    def seen(self) -> NDArray[np.bool_]:
+        """Whether enough of the object shows in each view to say anything of it, (N, V): else all classes are alike."""
+        return np.ptp(self.by_shape().logits, axis=2) > (SAME if len(self.classes) > 1 else -1)
+
     def evidence(self, objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
         """What the models say of objects (rows), (B,), each seen from one view, (B,)."""
         return Evidence(
             self.logits[objects, views],
             {name: values[objects, views] for name, values in self.maps.items()},
             azimuth_bins=None if self.azimuth_bins is None else self.azimuth_bins[objects, views],
+            seen=self.seen[objects, views],
         )
 
     def of_split(self, split: str) -> Predictions:

@@ -13,6 +13,7 @@ from nextview.data.folders import Entry, list_dataset
 from nextview.data.lock import only_one, writing
 from nextview.data.pool import each
 from nextview.errors import DatasetError, MeshError, UsageError
+from nextview.models.model_card import read_card
 from nextview.worlds.drawing import Meshes, draw_world
 from nextview.worlds.world import LEVELS, SUFFIX, World
 
@@ -45,6 +46,7 @@ def draw_worlds(
     split: str | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
+    held_out: Path | None = None,
 ) -> Iterator[tuple[str, str | None]]:
     """Draw the worlds that are not in the folder yet. Which they are depends on the seed alone.
 
@@ -61,6 +63,7 @@ def draw_worlds(
         split: only this one.
         workers: processes; one for each core by default; 0 to work in this one.
         scheduler: address of a dask.distributed scheduler whose workers see the same files, instead of processes here.
+        held_out: draw worlds only around objects that the model of this card calls held out of its training.
 
     Yields:
         (name, None) for each world that is there, (name, reason) for one that cannot be drawn.
@@ -68,9 +71,10 @@ def draw_worlds(
     Raises:
         DatasetError: the dataset is unusable, another run is writing, the folder cannot be written, or worlds in it
             were drawn with another seed.
+        ModelError: the card is none.
         UsageError: a level, a number or a seed that makes no sense.
     """
-    wanted = tasks(dataset, out, levels, worlds, seed, split)
+    wanted = tasks(dataset, out, levels, worlds, seed, split, held_out)
     there = next(out.rglob(f"*@*{SUFFIX}"), None)
     if there is not None and World.load(there).seed != seed:
         raise DatasetError(f"{there}: was drawn with another seed; give another folder or the same seed")
@@ -92,6 +96,7 @@ def tasks(
     worlds: int | None,
     seed: int,
     split: str | None,
+    held_out: Path | None = None,
 ) -> list[Task]:
     """All worlds that are asked for, see ``draw_worlds``."""
     unknown = [level for level in levels if level not in LEVELS]
@@ -105,6 +110,11 @@ def tasks(
     entries = [entry for entry in list_dataset(dataset) if split in (None, entry.split)]
     if not entries:
         raise DatasetError(f"{dataset}: no meshes in CLASS/{split}/MESH below it")
+    if held_out is not None:
+        kept = set(read_card(held_out).held_out)
+        entries = [entry for entry in entries if entry.name in kept]
+        if not entries:
+            raise DatasetError(f"{dataset}: holds no object that {held_out} calls held out")
     for one in dict.fromkeys(entry.split for entry in entries):
         mine = [entry for entry in entries if entry.split == one]
         order = np.random.default_rng([seed, *one.encode()]).permutation(len(mine))

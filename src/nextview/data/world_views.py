@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
+from nextview.observation import SceneView
 from nextview.viewsphere import ViewSphere
-from nextview.worlds.occluded_camera import SceneCamera, visible_shares
+from nextview.worlds.occluded_camera import TARGET, SceneCamera, visible_shares
 from nextview.worlds.scene import Scene
 
 SIDE = 80
@@ -65,6 +66,10 @@ class WorldViews:
     reachable: NDArray[np.bool_]
     visible_share: NDArray[np.float32]
     clearance: NDArray[np.float32]
+
+    def scene_view(self, view: int) -> SceneView:
+        """What a camera sees from there: things and table alike are no target."""
+        return SceneView(self.depth[view], self.owner[view] == TARGET, self.poses[view], self.intrinsics, True)
 
 
 def world_views(store: ViewStore, i: int) -> WorldViews:

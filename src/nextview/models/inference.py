@@ -17,6 +17,7 @@ from nextview.models.network_input import from_observations
 from nextview.models.onnx_file import check_end, open_onnx
 from nextview.novelty import novelty_path, read_novelty
 from nextview.observation import Observation
+from nextview.occupancy import shown_share
 from nextview.policies.base import Evidence, maps_among
 
 RECOGNISER = "recogniser-modelnet10"
@@ -167,7 +168,10 @@ class Models:
     def evidence(self, observations: Sequence[Observation]) -> Evidence:
         """What the models say of views from one camera."""
         maps = {name: values for network in self.maps.values() for name, values in network(observations).items()}
-        return replace(self.recogniser(observations), maps=maps, observations=observations)
+        said, shown = self.recogniser(observations), None
+        if self.recogniser.calibration.visibility is not None:
+            shown = np.array([1.0 if seen.scene is None else shown_share(seen.scene) for seen in observations])
+        return replace(said, maps=maps, observations=observations, shown=shown)
 
 
 def load_models(maps: Sequence[str] = ("lem",), recogniser: str | Path = RECOGNISER, threads: int = 0) -> Models:

@@ -9,6 +9,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.errors import PolicyError
 from nextview.observation import Observation
 from nextview.viewsphere import Viewpoints, ViewSphere
 
@@ -31,6 +32,8 @@ class Evidence:
             episodes all the above counts as zero there.
         novelty: how strange each view is, (B,) float, see ``nextview.novelty``; None if the recogniser cannot tell.
         observations: the views themselves, B of them; None where only what the models say of them is known.
+        shown: share of the object that shows in each view, as far as it can tell, (B,) float; None where nothing is
+            known to hide any, or that does not matter. See ``Calibration.weights``.
     """
 
     logits: NDArray[np.floating]
@@ -39,6 +42,7 @@ class Evidence:
     seen: NDArray[np.bool_] | None = None
     novelty: NDArray[np.floating] | None = None
     observations: Sequence[Observation] | None = None
+    shown: NDArray[np.floating] | None = None
 
     def of(self, rows: Any) -> Evidence:
         """That of some of the episodes, by index or mask."""
@@ -49,6 +53,7 @@ class Evidence:
             None if self.seen is None else self.seen[rows],
             None if self.novelty is None else self.novelty[rows],
             _some(self.observations, rows),
+            None if self.shown is None else self.shown[rows],
         )
 
 
@@ -78,6 +83,8 @@ class EpisodeState:
             None where these are the views themselves. Then ``visited`` are the views nearest to them.
         observations: all views taken so far in each episode, in order, B sequences; None if "observations" is not among
             the policy's needs.
+        visibility: share of the object that is expected to show from each view, 0 to 1, (B, V) float64; None if
+            "visibility" is not among the policy's needs. 1 where nothing is known to stand around the object.
     """
 
     current: NDArray[np.int64]
@@ -91,6 +98,7 @@ class EpisodeState:
     travel: NDArray[np.float64] | None = None
     places: NDArray[np.float64] | None = None
     observations: Sequence[Sequence[Observation]] | None = None
+    visibility: NDArray[np.float64] | None = None
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -115,6 +123,7 @@ class EpisodeState:
             part(self.travel),
             part(self.places),
             _some(self.observations, rows),
+            part(self.visibility),
         )
 
 
@@ -123,8 +132,8 @@ class Policy(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the maps it wants in the evidence; "azimuth_bins" for what the recogniser says of them; and
-        "observations" for the depth seen so far.
+        """Names of the maps it wants in the evidence; "azimuth_bins" for what the recogniser says of them;
+        "observations" for the depth seen so far; and "visibility" for what is expected to show from each view.
         """
         ...
 
@@ -164,12 +173,23 @@ class ScoresViews(Protocol):
 
 def maps_among(needs: Sequence[str]) -> list[str]:
     """Those of a policy's needs that are maps."""
-    return [name for name in needs if name not in ("azimuth_bins", "observations")]
+    return [name for name in needs if name not in ("azimuth_bins", "observations", "visibility")]
 
 
 def travel_from(sphere: Viewpoints, state: EpisodeState) -> NDArray[np.float64]:
     """What it costs to go from where the camera is to each view, grid cells, (B, V)."""
     return sphere.travel[state.current] if state.travel is None else state.travel
+
+
+def visibility_of(state: EpisodeState) -> NDArray[np.float64]:
+    """What is expected to show from each view, (B, V).
+
+    Raises:
+        PolicyError: it is not told, though a policy needs it.
+    """
+    if state.visibility is None:
+        raise PolicyError("this policy needs the share of the object that is expected to show from each view")
+    return state.visibility
 
 
 def in_window(sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -102,8 +102,23 @@ class OffGrid:
         visited[rows[:, 0], current] = True
         lost = ~(reachable & ~visited).any(1)  # the only free view lies in the camera's own cell
         reachable[lost] = True
-        turned = replace(state, current=current, visited=visited, reachable=reachable, travel=None, places=None)
+        turned = replace(
+            state,
+            current=current,
+            visited=visited,
+            reachable=reachable,
+            travel=None,
+            places=None,
+            visibility=None if state.visibility is None else self._nearest_of(state.visibility, ahead),
+        )
         return turned, ahead
+
+    def _nearest_of(self, values: Float, ahead: Float) -> Float:
+        """Of the views' values, (B, V), that of the view nearest to each cell of the turned grid, (B, grid)."""
+        behind = ahead[:, None] * 2 * np.pi / self.grid.azimuths - 2 * np.pi * self.grid.turn[:, None]
+        up, other = np.radians(self.grid.elevations)[self.grid.ring][:, None], self.sphere.elevation
+        near = np.sin(up) * np.sin(other) + np.cos(up) * np.cos(other) * np.cos(behind)
+        return np.take_along_axis(values, near.argmax(2), 1)
 
     def _between(self, values: Float, ahead: Float) -> Float:
         """Values of the turned grid's views, (B, grid), between which the views lie, (B, V); NaN beside a NaN."""

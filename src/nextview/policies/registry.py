@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from nextview.policies.gain import Gain
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card
 from nextview.policies.spread import Spread
+from nextview.policies.visibility import Visibility, VisibleGain
 from nextview.policies.volumetric import Volumetric
 from nextview.viewsphere import Viewpoints, ViewSphere
 
@@ -37,10 +38,14 @@ POLICIES: dict[str, Callable[[Any, tuple[int, ...]], Policy]] = {
     "lem-sphere-peak": lambda sphere, valleys: SpherePeak(sphere, "lem-sphere"),
     "volumetric": lambda sphere, valleys: Volumetric(sphere, new_volume),
     "coverage": lambda sphere, valleys: Volumetric(sphere, new_surface),
+    "visibility": lambda sphere, valleys: Visibility(sphere),
 }
 
-ANYWHERE = ("random-all", "spread", "volumetric", "coverage")
+ANYWHERE = ("random-all", "spread", "volumetric", "coverage", "visibility")
 """Those that ask for no grid."""
+
+VISIBLE = "visible-"
+"""Before the name of a learned policy: its values times the share of the object that is expected to show."""
 
 DEFAULT = "gain"
 """The policy where none is named."""
@@ -57,9 +62,9 @@ def make_policy(
 
     Args:
         name: one of POLICIES, a map's name ("view_area": its peak, or its valley for the valley classes), the same with
-            "-peak" (always that), a learned one that is bundled, the path of a learned one's card (.json), or
-            "module:Class" for one of your own, which is called with the sphere alone. A learned one that weighs
-            travel takes another travel weight as NAME@WEIGHT.
+            "-peak" (always that), a learned one that is bundled, the path of a learned one's card (.json), the same
+            with "visible-" before it (a gain policy, times what shows), or "module:Class" for one of your own, which is
+            called with the sphere alone. One that weighs travel takes another travel weight as NAME@WEIGHT.
         sphere: the viewpoints; a ``ViewSphere`` but for those of ANYWHERE and your own.
         valley_classes: classes (indices) whose believers go to the map's valley.
         classes: names of the recogniser's classes; a learned policy for others is refused.
@@ -72,6 +77,14 @@ def make_policy(
     of_kind(sphere, Viewpoints, "the viewpoints of a policy are a ViewSphere or Directions", PolicyError)
     if not np.iterable(valley_classes) or not (classes is None or np.iterable(classes)):
         raise PolicyError(f"classes are a list of them, not {as_line(valley_classes)} and {as_line(classes)}")
+    if "@" in name and ":" not in name:
+        card, _, travel_weight = name.partition("@")
+        return _at_travel_weight(make_policy(card, sphere, valley_classes, classes, maps), name, travel_weight)
+    learned = bundled_policies()
+    if name.startswith(VISIBLE):
+        card = name.removeprefix(VISIBLE)
+        if card in learned or card.endswith(".json"):
+            return _visible(read_policy(learned.get(card, Path(card)), sphere, classes), name)
     if name in POLICIES:
         if name not in ANYWHERE and not isinstance(sphere, ViewSphere):
             raise PolicyError(f"policy {name} needs viewpoints on rings")
@@ -80,14 +93,21 @@ def make_policy(
         if not isinstance(sphere, ViewSphere):
             raise PolicyError(f"policy {name} needs viewpoints on rings")
         return MapPeak(sphere, name.removesuffix("-peak"), () if name.endswith("-peak") else tuple(valley_classes))
-    learned = bundled_policies()
-    card, weighted, travel_weight = name.partition("@")
-    if card in learned or card.endswith(".json"):
-        policy = read_policy(learned.get(card, Path(card)), sphere, classes)
-        return _at_travel_weight(policy, name, travel_weight) if weighted else policy
+    if name in learned or name.endswith(".json"):
+        return read_policy(learned.get(name, Path(name)), sphere, classes)
     if ":" in name:
         return _import_policy(name, sphere)
-    raise PolicyError(f"no policy is called {name!r}; there are {', '.join([*POLICIES, *maps, *learned])}")
+    known = [*POLICIES, *maps, *learned, f"{VISIBLE}{DEFAULT}"]
+    raise PolicyError(f"no policy is called {name!r}; there are {', '.join(known)}")
+
+
+def with_cards(name: str, cards: Mapping[str, Path]) -> str:
+    """The name, or what it means where it is that of one of these cards: also after "visible-" and before "@WEIGHT"."""
+    policy, weighted, travel_weight = name.partition("@")
+    if policy in cards:
+        return f"{cards[policy]}{weighted}{travel_weight}"
+    card = cards.get(policy.removeprefix(VISIBLE)) if policy.startswith(VISIBLE) else None
+    return name if card is None else f"{VISIBLE}{card}{weighted}{travel_weight}"
 
 
 def make_policy_anywhere(
@@ -102,7 +122,7 @@ def make_policy_anywhere(
     One that was learned on a grid is made for that, the baselines that know neighbours for the 40 views where the
     viewpoints are on no grid, and all others for the viewpoints. Arguments and errors as for ``make_policy``.
     """
-    card = name.partition("@")[0]
+    card = name.partition("@")[0].removeprefix(VISIBLE)
     path = bundled_policies().get(card, Path(card) if card.endswith(".json") else None)
     if path is not None:
         about = read_policy_card(path)
@@ -113,8 +133,14 @@ def make_policy_anywhere(
     return make_policy(name, viewpoints, valley_classes, classes, maps)
 
 
-def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
+def _visible(policy: Policy, name: str) -> Policy:
     if not isinstance(policy, Gain):
+        raise PolicyError(f"{name}: this policy values no views that could be weighed by what shows")
+    return VisibleGain(policy, policy.travel_weight)
+
+
+def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
+    if not isinstance(policy, Gain | Visibility | VisibleGain):
         raise PolicyError(f"{name}: this policy does not weigh travel")
     try:
         return replace(policy, travel_weight=float(travel_weight))

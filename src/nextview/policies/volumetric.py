@@ -3,28 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
 from nextview.observation import Observation
-from nextview.occupancy import Occupancy, VoxelGrid, new_volume
+from nextview.occupancy import Occupancy, SeenScene, VoxelGrid, new_volume
 from nextview.policies.base import EpisodeState, travel_from
 from nextview.viewsphere import Viewpoints
 
-Gain = Callable[[Occupancy, NDArray[np.floating]], NDArray[np.float64]]
-"""What each of some positions, (V, 3), would bring into view, (V,)."""
+Gain = Callable[[Occupancy, NDArray[np.floating], NDArray[np.bool_]], NDArray[np.float64]]
+"""What each of some positions, (V, 3), would bring into view of a region, (n, n, n) bool: (V,)."""
 GRID = VoxelGrid(64)
 """Around the object's unit sphere."""
+SCENE_SIZE = 2.0
+"""So many times as wide is the grid, of as many voxels, where other things stand around the object."""
 
 
 def occupancy_of(observations: Sequence[Observation], grid: VoxelGrid) -> Occupancy:
     """What is known of the space around an object after some views of it, object frame, object radii.
 
-    Observations show the object alone: what is no object in them is taken to be free, as is all beyond its radius.
+    Observations without their scene show the object alone: what is no object in them is taken to be free, as is all
+    beyond its radius. With their scene everything beside the object is an occluder, and unseen before it was seen.
     """
+    scenes = [seen.scene for seen in observations if seen.scene is not None]
+    if scenes:
+        return SeenScene.of(scenes, replace(grid, half=SCENE_SIZE * grid.half)).occupancy
     found = Occupancy.unseen(grid, grid.ball)
     for seen in observations:
         found = found.seen(seen.depth, seen.pose, seen.intrinsics)
@@ -62,7 +68,8 @@ class Volumetric:
         if state.observations is None:
             raise PolicyError("this policy needs the depth that was seen")
         positions = self.sphere.poses[:, :3, 3]
-        return np.stack([self.gain(occupancy_of(views, self.grid), positions) for views in state.observations])
+        known = [occupancy_of(views, self.grid) for views in state.observations]
+        return np.stack([self.gain(each, positions, each.grid.within(self.grid.half)) for each in known])
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""

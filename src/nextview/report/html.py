@@ -103,6 +103,7 @@ def page(results: Results, pictures: Pictures) -> str:
         reliability=_reliability(results, best, at),
         calibration=tables.calibration(results, curves.followed(results)),
         risks=tables.risks(results),
+        levels=tables.levels(results),
         class_figures=_classes(results, best, at),
         class_tables=[tables.per_class(results, measure, at) for measure in ("accuracy", "travel_moved")],
         fixed_views=tables.five_views(results),

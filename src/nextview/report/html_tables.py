@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nextview.benchmark.entries import is_oracle
-from nextview.benchmark.leaderboard import promised_risks
+from nextview.benchmark.leaderboard import level_rows, promised_risks
 from nextview.benchmark.published import COLUMNS, published_threshold
 from nextview.benchmark.results import Results
 from nextview.report.elements import NONE, Cell, Table, cell, label, numbers, percent
@@ -88,6 +88,34 @@ def risks(results: Results) -> Table | None:
     ]
     caption = "Promised error rates of those who stop early, and measured ones."
     return Table(["policy", "promised", "threshold", "measured", "stopped early"], rows, caption) if rows else None
+
+
+def levels(results: Results) -> list[Table]:
+    """Of worlds: accuracy and travel after so many views, a table a level; none where the objects are no worlds."""
+    found = []
+    for rows in level_rows(results.tables):
+        counts = [n_views for n_views, _ in rows[0].cells]
+        head = ["policy", *(f"{k} view{'s' * (k > 1)}" for k in counts), *(f"travel, {k}" for k in counts if k > 1)]
+        body: list[list[Cell | str]] = []
+        for row in rows:
+            line: list[Cell | str] = [named(row.policy)]
+            for _, at in row.cells:
+                small = [f"{at.low:.3f} … {at.high:.3f}"]
+                if not np.isnan(at.difference):
+                    small.append(
+                        f"{100 * at.difference:+.1f} ({100 * at.difference_low:+.1f} … {100 * at.difference_high:+.1f})"
+                    )
+                if not np.isnan(at.p_holm):
+                    small.append(f"p {p_value(at.p_holm)}")
+                line.append(Cell(f"{at.accuracy:.3f}", tuple(small)))
+            body.append([*line, *(f"{at.travel:.2f}" for k, at in row.cells if k > 1)])
+        caption = (
+            f"Clutter {rows[0].level}, {rows[0].worlds} worlds: accuracy after a fixed number of views. Small print: "
+            f"95\u00a0% intervals, points over {results.settings['reference']} with theirs, and p-values with one Holm "
+            "correction for all levels, policies and numbers of views."
+        )
+        found.append(Table(head, body, caption))
+    return found
 
 
 def per_class(results: Results, measure: str, fallback: float) -> Table:

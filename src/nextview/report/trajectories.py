@@ -19,8 +19,10 @@ from nextview.benchmark.replay import replay, truncate
 from nextview.benchmark.results import Results
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
+from nextview.data.world_views import world_views
 from nextview.errors import DatasetError, ResultsError
 from nextview.measures.depth_entropy import normalise_per_object
+from nextview.shading import headlight
 
 CLOUD = 1500
 """Points of an object in the viewer."""
@@ -95,8 +97,19 @@ class Pictures:
         row = self.row(name)
         if row is None or self.store is None:
             return {}
-        images = self.store.image(row)
+        images = self.store.image(row) if "scene" not in self.store.group.attrs else _scenes(self.store, row)
         return {view: _data_uri(images[view]) for view in views}
+
+
+OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])
+"""Colours of nothing, the target, other things and the table."""
+
+
+def _scenes(store: ViewStore, row: int) -> NDArray[np.uint8]:
+    """A world as it looks from all views, the target told from all else by its colour, (V, S, S, 3) uint8."""
+    world = world_views(store, row)
+    shade = np.stack([headlight(depth, world.intrinsics) for depth in world.depth])[..., None] / 255
+    return np.where(world.owner[..., None] > 0, OWNERS[world.owner] * (0.35 + 0.65 * shade), 255).astype(np.uint8)
 
 
 def _data_uri(image: NDArray[np.uint8]) -> str:

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from nextview.arguments import as_line, of_kind
 from nextview.errors import ObservationError, UsageError
-from nextview.observation import Observation, pinhole
+from nextview.observation import Observation, SceneView, pinhole
 from nextview.sensing import segmentation
 from nextview.sensing.facets import Facets, fit_facets
 from nextview.sensing.frame import Frame
@@ -35,6 +35,8 @@ NEAREST = 0.01
 """Metres between the camera and the point that names an object: nothing nearer can be measured."""
 MENDED = 0.03
 """Share of an object's pixels in an earlier frame that has to change before they are looked at again."""
+FINEST = 1 / 32
+"""Object radii that a pixel of the scene may show: half a voxel of ``occupancy.expected_visibility``."""
 SAME = 0.01
 """Change of the centre or the radius, in object radii, below which the object frame is left as it is."""
 
@@ -47,6 +49,7 @@ class Sighting:
         frame: as it came.
         noise: of the whole frame.
         facets: the object's surface, camera frame.
+        mask: its pixels that show the object, (H, W) bool.
         hull: corners of the convex hull of that surface, world, (K, 3) float64.
         plane: the support plane as this frame sees it; None if it sees none.
         footprint: of all that is above the plane; None where the object was found otherwise.
@@ -56,6 +59,7 @@ class Sighting:
     frame: Frame
     noise: Noise
     facets: Facets
+    mask: Mask
     hull: Float
     plane: Plane | None
     footprint: Footprint | None
@@ -305,15 +309,14 @@ class ObservedObject:
         left, right = max(columns[0] - 2, 0), min(columns[-1] + 3, width)
         part = slice(top, bottom), slice(left, right)
         coarse = max(1, max(bottom - top, right - left) // SIZE)
-        depth, mask = frame.depth[part], mask[part]
-        facets = fit_facets(depth, mask, frame.intrinsics, (top, left), self.denoise, coarse, noise)
+        facets = fit_facets(frame.depth[part], mask[part], frame.intrinsics, (top, left), self.denoise, coarse, noise)
         if len(facets.planes) * coarse**2 < FEWEST:
             raise ObservationError("too little is seen of the object")
         pose = frame.camera_to_world
         points = facets.points[:: max(1, len(facets.planes) // 3000)] @ pose[:3, :3].T + pose[:3, 3]
         with suppress(QhullError):  # all in one plane: they do as they are
             points = points[ConvexHull(points).vertices]
-        return Sighting(frame, noise, facets, points, plane, None, None)
+        return Sighting(frame, noise, facets, mask, points, plane, None, None)
 
     # Where the object is, and how it looks from there
 
@@ -336,7 +339,8 @@ class ObservedObject:
         if sighting.frame.image is not None:
             facets = sighting.facets
             image = np.where(facet >= 0, sighting.frame.image[facets.rows[facet], facets.columns[facet]], 0)
-        return _observation(depth, virtual_pose(pose), found.radius if self.life_size else None, image)
+        radius, scene = found.radius if self.life_size else None, _scene(sighting, pose, found.radius)
+        return _observation(depth, virtual_pose(pose), radius, image, scene)
 
 
 def _towards(frame: Frame, up: Float) -> Float:
@@ -346,11 +350,21 @@ def _towards(frame: Frame, up: Float) -> Float:
 
 
 def _observation(
-    depth: NDArray[np.float32], pose: Float, radius: float | None, image: NDArray[np.uint8] | None
+    depth: NDArray[np.float32], pose: Float, radius: float | None, image: NDArray[np.uint8] | None, scene: SceneView
 ) -> Observation:
     """The only place that makes one."""
     intrinsics = pinhole(SIZE, DISTANCE)
-    return Observation(depth, pose, intrinsics, radius, image)
+    return Observation(depth, pose, intrinsics, radius, image, scene)
+
+
+def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
+    """All that a frame shows, from a pose in the object frame, in object radii; no finer than it has to be."""
+    k = sighting.frame.intrinsics.copy()
+    step = max(1, int(FINEST * min(k[0, 0], k[1, 1]) / max(float(np.linalg.norm(pose[:3, 3])), 1.0)))
+    k[:2] /= step
+    k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
+    few = (slice(step // 2, None, step),) * 2
+    return SceneView(sighting.frame.depth[few] / np.float32(radius), sighting.mask[few], pose, k)
 
 
 def _same(new: ObjectFrame, old: ObjectFrame) -> bool:

@@ -203,7 +203,8 @@ class GainRecipe:
     """How the gain policy is trained.
 
     Attributes:
-        inputs: of the networks; see ``policies.gain.INPUTS``.
+        inputs: of the networks; see ``policies.gain.INPUTS``; in worlds "visibility" too, the share of the object that
+            is expected to show from each view.
         frame: from where azimuths are counted: from the camera's, or from the one at which the object is believed to
             show its azimuth bin 0, which takes a recogniser that was taught the azimuth bins.
         outcome: the value of a view: belief in the true class after it, its logarithm, or whether the answer is right.
@@ -218,7 +219,7 @@ class GainRecipe:
         seed: of everything random.
     """
 
-    inputs: tuple[PolicyInput, ...] = POLICY_INPUTS
+    inputs: tuple[PolicyInput | Literal["visibility"], ...] = POLICY_INPUTS
     frame: Literal["camera", "object"] = "object"
     outcome: Literal["belief", "log-belief", "right"] = "log-belief"
     n_views: int = 5

@@ -3,6 +3,7 @@
 from nextview.policies.gain.decision_features import (
     INPUTS,
     MAPS,
+    VISIBILITY,
     Frame,
     features,
     mirrored,
@@ -11,4 +12,4 @@ from nextview.policies.gain.decision_features import (
 )
 from nextview.policies.gain.gain_policy import Gain
 
-__all__ = ["INPUTS", "MAPS", "Frame", "Gain", "features", "mirrored", "mirrored_features", "origin"]
+__all__ = ["INPUTS", "MAPS", "VISIBILITY", "Frame", "Gain", "features", "mirrored", "mirrored_features", "origin"]

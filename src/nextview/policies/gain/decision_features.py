@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
-from nextview.policies.base import EpisodeState
+from nextview.policies.base import EpisodeState, visibility_of
 from nextview.policies.learned_tables import cells_from
 from nextview.viewsphere import ViewSphere
 
@@ -27,6 +27,9 @@ INPUTS = ("belief", "view", "place", *MAPS, "azimuth_bin")
 """What a network may take: the belief over all views; what the last view alone says; the ring and the views that are
 visited; the maps that were predicted from the last view; and which azimuth bin of the object is seen, if it is of the
 class that is believed most, and over all classes."""
+
+VISIBILITY = "visibility"
+"""One more input, for worlds: the share of the object that is expected to show from each view."""
 
 Frame = Literal["camera", "object"]
 """From where the azimuths of cells are counted: from the camera's, or from that at which the object, if it is of the
@@ -75,14 +78,15 @@ def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], fra
     Args:
         sphere: the viewpoints.
         state: the episodes.
-        inputs: some of INPUTS.
+        inputs: some of INPUTS and VISIBILITY.
         frame: in which cells are counted.
 
     Returns:
         (B, D) float64.
 
     Raises:
-        PolicyError: the azimuth bins matter, and the recogniser does not tell as many apart as the sphere has azimuths.
+        PolicyError: the azimuth bins matter, and the recogniser does not tell as many apart as the sphere has azimuths;
+            or what shows matters and is not told.
     """
     n, start = sphere.azimuths, origin(sphere, state, frame)
     ahead = (sphere.azimuth_index[state.current] - sphere.azimuth_index[start]) % n
@@ -109,6 +113,8 @@ def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], fra
         azimuth_bins = _bin_belief(sphere, state)
         for believed in (_own(state.belief, azimuth_bins), (state.belief[:, :, None] * azimuth_bins).sum(1)):
             parts.append(np.take_along_axis(believed, (np.arange(n) + ahead[:, None]) % n, 1))
+    if VISIBILITY in inputs:
+        parts.append(visibility_of(state)[rows[:, None], cells_from(sphere)[start]])
     return np.concatenate([np.asarray(part, np.float64).reshape(len(rows), -1) for part in parts], 1)
 
 
@@ -132,8 +138,9 @@ def mirrored_features(
     blocks |= {name: mirrored(sphere) if name.endswith("-sphere") else window for name in MAPS}
     n = sphere.azimuths
     blocks["azimuth_bin"] = np.concatenate([k * n + -np.arange(n) % n for k in range(2 if frame == "camera" else 3)])
+    blocks[VISIBILITY] = mirrored(sphere)
     found, begin = [], 0
-    for name in [name for name in INPUTS if name in inputs]:
+    for name in [name for name in (*INPUTS, VISIBILITY) if name in inputs]:
         found.append(begin + blocks[name])
         begin += len(blocks[name])
     return np.concatenate(found)

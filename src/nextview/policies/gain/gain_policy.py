@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
 from nextview.policies.base import EpisodeState, Scope, best_in_window, in_window, travel_from
-from nextview.policies.gain.decision_features import INPUTS, MAPS, Frame, features, origin
+from nextview.policies.gain.decision_features import INPUTS, MAPS, VISIBILITY, Frame, features, origin
 from nextview.policies.learned_tables import cells_to
 from nextview.viewsphere import ViewSphere
 
@@ -32,7 +32,7 @@ class Gain:
         classes: how many, C.
         score: from the features, (B, D) float32, to the value of each cell, (B, V) float32: the mean over some
             networks and over the object and its mirror image. Each row by itself, to the last bit.
-        inputs: what the features are made of, some of INPUTS.
+        inputs: what the features are made of, some of INPUTS and VISIBILITY.
         travel_weight: of a grid cell of travel, in the unit of the values: log-belief for the bundled one.
         scope: "global", among all views; or "local", among those of the local window.
         frame: in which cells are counted, "camera" or "object".
@@ -55,9 +55,10 @@ class Gain:
     frame: Frame = "camera"
 
     def __post_init__(self) -> None:
-        unknown = sorted(set(self.inputs) - set(INPUTS))
+        known = (*INPUTS, VISIBILITY)
+        unknown = sorted(set(self.inputs) - set(known))
         if unknown or not self.inputs:
-            raise PolicyError(f"a gain policy takes some of {', '.join(INPUTS)}, not {', '.join(unknown) or 'nothing'}")
+            raise PolicyError(f"a gain policy takes some of {', '.join(known)}, not {', '.join(unknown) or 'nothing'}")
         if not np.isfinite(self.travel_weight) or self.travel_weight < 0:
             raise PolicyError(f"needs a travel weight that is not negative, not {self.travel_weight}")
         if self.frame not in get_args(Frame):
@@ -65,9 +66,10 @@ class Gain:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The maps that the features are made of, and the azimuth bins."""
+        """The maps that the features are made of, the azimuth bins, and what shows."""
         azimuth_bins = "azimuth_bin" in self.inputs or self.frame == "object"
-        return (*(name for name in MAPS if name in self.inputs), *(["azimuth_bins"] if azimuth_bins else []))
+        others = {"azimuth_bins": azimuth_bins, VISIBILITY: VISIBILITY in self.inputs}
+        return (*(name for name in MAPS if name in self.inputs), *(name for name, taken in others.items() if taken))
 
     def to_dict(self) -> dict[str, Any]:
         """What a card says of it beside the sphere, for JSON."""

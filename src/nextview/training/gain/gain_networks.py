@@ -19,7 +19,7 @@ from torch import nn
 from nextview.calibration.rollout import ReplayTable, Value, candidate_values, judge, mean_value, rollout
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Random, RandomAll
-from nextview.policies.gain import Gain, features, mirrored, mirrored_features, origin
+from nextview.policies.gain import VISIBILITY, Gain, features, mirrored, mirrored_features, origin
 from nextview.policies.learned_tables import cells_from
 from nextview.training.gain.perceptrons import Layers, Perceptrons
 from nextview.training.recipes import GainRecipe
@@ -34,7 +34,7 @@ class States:
     Attributes:
         features: to the networks, (S, D).
         outcomes: of a view of each cell, less the mean over the free ones, (S, V).
-        free: whether the cell is unvisited, (S, V) bool.
+        free: whether the cell is unvisited and can be reached, (S, V) bool.
         objects: rows of the fitting set, (S,).
     """
 
@@ -48,12 +48,12 @@ def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np
     """The states met when each of the policies is followed once over every object."""
     sphere, parts = table.data.sphere, []
     for policy in policies:
-        for moment in rollout(table, policy, recipe.n_views - 1, rng):
+        for moment in rollout(table, policy, recipe.n_views - 1, rng, VISIBILITY in recipe.inputs):
             state = moment.state
             view = cells_from(sphere)[origin(sphere, state, recipe.frame)]
             value = np.take_along_axis(candidate_values(table, moment, recipe.outcome), view, 1)
-            free = ~np.take_along_axis(state.visited, view, 1)
-            mean = (value * free).sum(1, keepdims=True) / free.sum(1, keepdims=True)
+            free = np.take_along_axis(state.free, view, 1)
+            mean = (value * free).sum(1, keepdims=True) / np.maximum(free.sum(1, keepdims=True), 1)
             seen = features(sphere, state, recipe.inputs, recipe.frame)
             parts.append((seen.astype(np.float32), (value - mean).astype(np.float32), free, state.episodes))
     return States(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
@@ -122,7 +122,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
             turned = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
             seen = torch.where(turned, seen[:, flip], seen)
             value, free = (torch.where(turned, a[:, cells_flip], a) for a in (value, free))
-            error = (((networks(seen) - value) ** 2) * free).sum(-1) / free.sum(-1)
+            error = (((networks(seen) - value) ** 2) * free).sum(-1) / free.sum(-1).clamp(min=1)
             loss = (weights[:, states.objects[batch]] * error).sum() / len(batch)
             optimiser.zero_grad()
             loss.backward()

@@ -13,9 +13,10 @@ from nextview.calibration.fitting_set import load_sensed
 from nextview.calibration.rollout import ReplayTable, Value, fit_travel_weight
 from nextview.command_line import command_line
 from nextview.data.predictions import Predictions
+from nextview.data.world_sight import worlds_of
 from nextview.errors import PredictionsError, UsageError
 from nextview.models.model_card import file_hash
-from nextview.policies.gain import MAPS, Gain
+from nextview.policies.gain import MAPS, VISIBILITY, Gain
 from nextview.policies.policy_card import LearnedFrom, PolicyCard
 from nextview.tracking import Track, silently
 from nextview.training.folds import hold_out
@@ -97,11 +98,11 @@ def train_gain(
         _check(path, p, recipe)
     everything = np.arange(len(table))
     if validation is None:
-        validating = hold_out(table.labels, table.depth_entropy, folds, recipe.seed)
+        validating = hold_out(table.labels, _shapes(table), folds, recipe.seed)
         learning = [np.setdiff1d(everything, part) for part in validating]
         validated_on = f"the same, each judged by networks of {folds - 1} other folds"
     else:
-        validating, learning = [np.arange(len(other))], [everything[~np.isin(table.names, other.names)]]
+        validating, learning = [np.arange(len(other))], [everything[~np.isin(_targets(table), _targets(other))]]
         validated_on = f"{len(other)} others"
     rng = np.random.default_rng([recipe.seed, 1])
     learned = [ReplayTable.of(table, part, rng, variants) for part in learning]
@@ -139,11 +140,25 @@ def train_gain(
     return TrainedGain(card, objects, validated_on, value.outcome, travel_weight, len(states), difference)
 
 
+def _targets(p: Predictions) -> list[str]:
+    """What the objects are called, whichever world they stand in."""
+    return [name.partition("@")[0] for name in p.names]
+
+
+def _shapes(p: Predictions) -> NDArray[np.floating]:
+    """Rows that are the same where the shape is, (N, ...): by what is seen of it, or in worlds by its name."""
+    if worlds_of(p) is None:
+        return p.depth_entropy
+    return np.unique(_targets(p), return_inverse=True)[1][:, None].astype(np.float64)
+
+
 def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
     """Refuse predictions without what the policy is to take from them."""
     lacking = [name for name in recipe.inputs if name in MAPS and name not in p.maps]
     if lacking:
         raise PredictionsError(f"{path}: holds no map {lacking[0]!r}; predict it, or choose other --inputs")
+    if VISIBILITY in recipe.inputs and worlds_of(p) is None:
+        raise PredictionsError(f"{path}: is of no worlds, in which all would show; choose other --inputs")
     if p.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
         raise PredictionsError(
             f"{path}: holds no azimuth bins; train the recogniser with --azimuth-bins-weight, or give --frame camera "

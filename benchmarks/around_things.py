@@ -1,0 +1,99 @@
+"""Draw one object behind others, and what two policies show of it: the same first view, then their own ways.
+
+    python benchmarks/around_things.py ModelNet10 docs/images/around_things.png [--target chair_0917 --level heavy]
+
+Each row is a session through a simulated depth camera: its views in order, with the share of the target that shows and
+what is believed after each; and the table from above, with the way of the camera. The target is orange, what stands
+around it grey. The first view is that from which least of the target shows, of those that can be reached and show some.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import tyro
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from world_pictures import COLOURS, SIZE, picture
+
+import nextview
+from nextview.belief import FixedLength
+from nextview.data.folders import list_dataset
+from nextview.errors import UsageError
+from nextview.report.style import STYLE
+from nextview.session import Recognition, Session
+from nextview.viewsphere import ViewSphere, look_at_origin
+from nextview.worlds import OTHER, TARGET, Meshes, Scene, WorldCamera, build_scene, draw_world
+from nextview.worlds.footprint import footprint
+
+SHOWS = 0.15
+"""Share of the target that the first view shows at least."""
+SPHERE = ViewSphere.named("40")
+
+
+def session(scene: Scene, policy: str, start: int, views: int, seed: int) -> Recognition:
+    """What a policy makes of a scene."""
+    system = nextview.load(policy=policy)
+    camera, rng = WorldCamera(scene, named="box"), np.random.default_rng(seed)
+    rule = FixedLength(max_views=views)
+    made = Session(system.models, system.policy, system.sphere, start, rule, rng, camera.object)
+    made.reachable = camera.reachable
+    return made.run(camera)
+
+
+def from_above(axis: Axes, scene: Scene, directions: list[np.ndarray]) -> None:
+    """The table, and the way of the camera above it."""
+    for outline, colour in [(footprint(scene.target.vertices), TARGET), *((i.footprint, OTHER) for i in scene.items)]:
+        axis.add_patch(Polygon(outline, color=COLOURS[colour]))
+    at = 3 * np.array(directions)
+    axis.plot(at[:, 0], at[:, 1], "-", color="#0b5fa5", linewidth=1)
+    for k, place in enumerate(at, 1):
+        axis.text(place[0], place[1], str(k), ha="center", va="center", fontsize=8, color="w",
+                  bbox={"boxstyle": "circle,pad=0.15", "color": "#0b5fa5"})  # fmt: skip
+    axis.set(xlim=(-3.6, 3.6), ylim=(-3.6, 3.6), xticks=[], yticks=[], aspect="equal")
+
+
+def main(
+    dataset: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    target: str = "chair_0917",
+    level: str = "heavy",
+    policies: tuple[str, ...] = ("random-all", "visible-gain"),
+    views: int = 3,
+    split: str = "test",
+    seed: int = 0,
+) -> None:
+    """Draw it."""
+    files = {e.name: e.path.relative_to(dataset).as_posix() for e in list_dataset(dataset) if e.split == split}
+    if target not in files:
+        raise UsageError(f"{dataset}: no object of the split {split} is called {target}")
+    world = draw_world(
+        files[target], Meshes(dataset, tuple(sorted(files.values()))), level, seed, f"{target}@{level}-0"
+    )
+    scene, shows = build_scene(world, dataset), np.array(world.visible)
+    may = (shows >= SHOWS) & ~np.isin(np.arange(len(shows)), world.unreachable)
+    start = int(np.where(may, shows, np.inf).argmin())
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure = Figure((2.1 * (views + 1), 2.4 * len(policies)))
+        axes = figure.subplots(len(policies), views + 1, squeeze=False, gridspec_kw={"wspace": 0.05, "hspace": 0.2})
+        for row, policy in zip(axes, policies, strict=True):
+            found = session(scene, policy, start, views, seed)
+            for axis, view in zip(row, found.views, strict=False):
+                elevation, azimuth = np.radians(view.angles)
+                axis.imshow(picture(scene, look_at_origin(elevation, azimuth)))
+                best = int(view.belief.argmax())
+                axis.set_title(
+                    f"{shows[view.index]:.0%} shows: {found.classes[best]} {view.belief[best]:.2f}", fontsize=8, pad=3
+                )
+            for axis in row[:-1]:
+                axis.set(xticks=[], yticks=[], xlim=(0, SIZE - 1), ylim=(SIZE - 1, 0))
+            row[0].set_ylabel(policy, fontsize=9)
+            from_above(row[-1], scene, [view.direction for view in found.views])
+        figure.savefig(out, dpi=90, facecolor="white", bbox_inches="tight", pad_inches=0.05)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

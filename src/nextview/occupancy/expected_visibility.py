@@ -1,0 +1,205 @@
+"""How much of an object that stands among others will show from elsewhere, by what depth frames have shown so far."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.observation import SceneView
+from nextview.occupancy.voxel_grid import OBJECT, OCCLUDER, UNSEEN, Occupancy, VoxelGrid
+
+GRID = VoxelGrid(64, 2.0)
+"""Around the object, in object radii: what stands beside it has a place there."""
+BLOCK = 4
+"""Voxels along the side of the blocks that stand for parts of the object."""
+UNSEEN_PART = 0.1
+"""What an unseen voxel of the object's unit ball counts for as a part of it, where one that was seen counts for 1."""
+DENSITY = 0.2
+"""How often unseen space is filled, per object radius: between the two bounds."""
+SOLID = 1e3
+"""A density, per voxel, through which nothing is seen."""
+TOGETHER = 400
+"""Lines that are drawn at once."""
+LOWEST = 0.02
+"""Share of a frame's points that may lie below the height of the table: noise."""
+
+
+@dataclass(frozen=True)
+class SeenScene:
+    """What frames of a scene say of the space around its target, in the object frame and object radii.
+
+    Attributes:
+        occupancy: the target as the object, table and other things as occluders.
+        floor: height below which nothing of the target is; infinity before anything was seen.
+
+    >>> seen = SeenScene.of(observation.scene for observation in observations)  # doctest: +SKIP
+    >>> expected_visibility(seen, sphere.poses[:, :3, 3]).expected              # doctest: +SKIP
+    """
+
+    occupancy: Occupancy
+    floor: float = np.inf
+
+    @classmethod
+    def unseen(cls, grid: VoxelGrid = GRID) -> Self:
+        """Before the first frame."""
+        return cls(Occupancy.unseen(grid))
+
+    @classmethod
+    def of(cls, views: Sequence[SceneView], grid: VoxelGrid = GRID) -> Self:
+        """After some frames."""
+        found = cls.unseen(grid)
+        for view in views:
+            found = found.seen(view)
+        return found
+
+    def seen(self, view: SceneView) -> Self:
+        """With what one more frame says."""
+        occupancy = self.occupancy.seen(view.depth, view.pose, view.intrinsics, view.target, view.background_free)
+        return type(self)(occupancy, min(self.floor, _lowest(view)))
+
+    def and_also(self, other: SeenScene) -> Self:
+        """What both say together, of one grid: as if all frames of both had been seen."""
+        return type(self)(self.occupancy.and_also(other.occupancy), min(self.floor, other.floor))
+
+
+def _lowest(view: SceneView) -> float:
+    """Height of the lowest that a frame shows near the target, but for noise."""
+    rows, columns = np.nonzero(view.depth[::2, ::2])
+    depth = view.depth[::2, ::2][rows, columns]
+    ahead = np.stack([2 * columns + 0.5, 2 * rows + 0.5, np.ones(len(rows))])
+    rays = view.pose[2, :3] @ np.linalg.inv(view.intrinsics) @ ahead
+    heights = rays * depth + view.pose[2, 3]
+    near = np.abs(heights) <= 1.2
+    return float(np.quantile(heights[near], LOWEST)) if near.any() else np.inf
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """Share of an object that shows from V positions: as much as is known of it.
+
+    Attributes:
+        least: if all unseen space were solid, (V,) float64, 0 to 1.
+        expected: if it is filled as often as it is on the average.
+        most: if all of it were free.
+    """
+
+    least: NDArray[np.float64]
+    expected: NDArray[np.float64]
+    most: NDArray[np.float64]
+
+
+def expected_visibility(
+    seen: SeenScene, positions: NDArray[np.floating], density: float = DENSITY, unseen_part: float = UNSEEN_PART
+) -> Visibility:
+    """Share of the object to which the line of sight will be clear of other things, from each position.
+
+    The object is what was seen of it, and what may be it: unseen voxels of its unit ball above the table, which count
+    for less. It does not hide itself. What is unseen elsewhere lets a sight of length s through with probability
+    exp(-density * s).
+
+    Args:
+        seen: what is known, on a grid whose blocks fit.
+        positions: of the cameras, (V, 3), object frame, object radii.
+        density: how often unseen space is filled, per object radius.
+        unseen_part: what an unseen voxel counts for as a part of the object.
+
+    Returns:
+        Of each position; 1 where nothing is known of the object at all.
+    """
+    lines = sight_lines(seen.occupancy.grid, np.asarray(positions, np.float64).tobytes())
+    return lines.visibility(seen, density, unseen_part)
+
+
+def shown_share(view: SceneView) -> float:
+    """Share of the object that shows in a frame, as far as that frame alone can tell."""
+    return shown_in(SeenScene.unseen().seen(view), view.pose[:3, 3])
+
+
+def shown_in(seen: SeenScene, position: NDArray[np.floating]) -> float:
+    """The same, of what the frame says, and of where its camera stood, (3,)."""
+    lines = SightLines(seen.occupancy.grid, np.asarray(position, np.float64)[None])
+    return float(lines.visibility(seen, DENSITY, UNSEEN_PART).expected[0])
+
+
+@lru_cache(maxsize=16)
+def sight_lines(grid: VoxelGrid, positions: bytes) -> SightLines:
+    """Those from positions, the bytes of (V, 3) float64: the same ones are asked for again and again."""
+    return SightLines(grid, np.frombuffer(positions).reshape(-1, 3))
+
+
+@dataclass(frozen=True)
+class SightLines:
+    """The voxels between the parts of an object and some cameras, found once for all scenes.
+
+    Attributes:
+        grid: of voxels, around the object's unit ball.
+        positions: of the cameras, (V, 3).
+    """
+
+    grid: VoxelGrid
+    positions: NDArray[np.float64]
+
+    @cached_property
+    def own(self) -> NDArray[np.bool_]:
+        """Voxels where the object can be, (n, n, n)."""
+        return self.grid.within(1.0)
+
+    @cached_property
+    def parts(self) -> NDArray[np.int64]:
+        """The blocks that the object can have a part in, as indices of all blocks, (P,)."""
+        return np.flatnonzero(self._blocks(self.own.astype(np.float32)))
+
+    @cached_property
+    def passed(self) -> NDArray[np.int32]:
+        """Voxels on the line from each part to each camera, (P, steps, V); n^3 stands for none."""
+        grid, m = self.grid, self.grid.n // BLOCK
+        block = np.stack(np.unravel_index(self.parts, (m, m, m)), 1)
+        start = (block + 0.5) * BLOCK  # in voxels from the grid's corner
+        eyes = (self.positions - np.array(grid.centre) + grid.half) / grid.pitch
+        towards = eyes[None] - start[:, None]
+        length = np.linalg.norm(towards, axis=2)
+        along = np.arange(0.5, np.sqrt(3) * grid.n)[:, None]
+        found = np.full((len(start), len(along), len(eyes)), grid.n**3, np.int32)
+        for some in np.array_split(np.arange(len(start)), -(-len(start) * len(eyes) // TOGETHER)):
+            ahead = towards[some] / length[some, :, None]
+            at = np.floor(start[some, None, None] + along[:, :, None] * ahead[:, None])
+            inside = (along < length[some, None]) & ((at >= 0) & (at < grid.n)).all(3)
+            x, y, z = np.where(inside[..., None], at, 0).astype(np.int64).transpose(3, 0, 1, 2)
+            found[some] = np.where(inside, (x * grid.n + y) * grid.n + z, grid.n**3)
+        longest = int(np.flatnonzero((found < grid.n**3).any(axis=(0, 2))).max(initial=-1)) + 1
+        return np.ascontiguousarray(found[:, :longest, :])
+
+    def visibility(self, seen: SeenScene, density: float, unseen_part: float) -> Visibility:
+        """See ``expected_visibility``."""
+        cells, grid = seen.occupancy.cells, self.grid
+        weights = self._weights(seen, unseen_part)
+        known = np.flatnonzero(weights)
+        if len(known) == 0:
+            return Visibility(*np.ones((3, len(self.positions))))
+        flat, own = cells.reshape(-1), self.own.reshape(-1)
+        cost = np.zeros(len(flat) + 1, np.float32)
+        cost[:-1][(flat == UNSEEN) & ~own] = 1.0
+        cost[:-1][flat == OCCLUDER] = SOLID
+        passed = cost[self.passed[known]].sum(1)  # (known parts, V): thousands are occluders, the rest is unseen
+        free = passed < SOLID
+        share = weights[known] / weights[known].sum()
+        veil = np.exp(-density * grid.pitch * np.where(free, passed, 0)) * free
+        return Visibility(share @ (passed == 0), share @ veil, share @ free)
+
+    def _weights(self, seen: SeenScene, unseen_part: float) -> NDArray[np.float64]:
+        """How much of the object each part is expected to hold, (P,)."""
+        cells = seen.occupancy.cells
+        above = self.grid.axes[2] > seen.floor
+        maybe = (cells == UNSEEN) & self.own & above
+        mine = np.where(maybe, np.float32(unseen_part), (cells == OBJECT) & self.own & above)
+        return self._blocks(mine.astype(np.float32)).reshape(-1)[self.parts].astype(np.float64)
+
+    def _blocks(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Sums over blocks of voxels, (m, m, m)."""
+        m = self.grid.n // BLOCK
+        return values.reshape(m, BLOCK, m, BLOCK, m, BLOCK).sum((1, 3, 5))
