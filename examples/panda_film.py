@@ -4,7 +4,8 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from nextview.cameras.arm import along, cast, seconds_of
+from nextview.cameras.arm import along, seconds_of
+from nextview.cameras.ray_caster import RayCaster
 from nextview.shading import headlight
 from nextview.viewsphere import look_at_origin
 
@@ -77,12 +78,13 @@ def scene(things, pose):
     x, y = np.meshgrid((np.arange(width) + 0.5) / width - 0.5, (np.arange(height) + 0.5 - height / 2) / width)
     rays = np.stack([x, y, np.full(x.shape, 1.0)], -1).reshape(-1, 3) @ pose[:3, :3].T
     triangles, colours = [each for each, _ in things], np.array([colour for _, colour in things])
-    hits = cast(triangles, pose[:3, 3], rays)
+    caster = RayCaster(triangles)
+    hits = caster.hits(pose[:3, 3], rays)
     hit = hits["primID"] >= 0
     normals = hits["Ng"][hit] / np.linalg.norm(hits["Ng"][hit], axis=1, keepdims=True)
     normals *= -np.sign((normals * rays[hit]).sum(1))[:, None]
     points = pose[:3, 3] + rays[hit] * hits["tfar"][hit, None] + 1e-3 * normals
-    shadow = cast(triangles, points, np.broadcast_to(LIGHT, points.shape))["primID"] >= 0
+    shadow = caster.hits(points, np.broadcast_to(LIGHT, points.shape))["primID"] >= 0
     lit = np.maximum(normals @ LIGHT, 0) * ~shadow
     facing = np.abs((normals * rays[hit]).sum(1)) / np.linalg.norm(rays[hit], axis=1)
     picture = np.tile(np.array(BACKGROUND, float) / 255, (len(rays), 1))

@@ -22,9 +22,9 @@ from nextview.cameras.arm import (
     STRAIGHT,
     Arm,
     along,
-    cast,
     seconds_of,
 )
+from nextview.cameras.ray_caster import RayCaster
 from nextview.cameras.sensors import SENSORS
 from nextview.cli.extra import missing_extra
 from nextview.data.samples import sample_mesh
@@ -152,7 +152,7 @@ def test_depth_is_what_mujocos_own_rays_say(at_home):
     pixels = rng.uniform(0, [sensor.width, sensor.height], (300, 2))
     k = sensor.intrinsics
     rays = np.column_stack([(pixels - k[:2, 2]) / k[[0, 1], [0, 1]], np.ones(300)]) @ pose[:3, :3].T
-    ours = cast([triangles for triangles, _ in at_home.things()], pose[:3, 3], rays)
+    ours = RayCaster([triangles for triangles, _ in at_home.things()]).hits(pose[:3, 3], rays)
     seen, groups, geom = np.zeros(300), np.array([1, 1, 1, 0, 1, 1], np.uint8), np.zeros(1, np.int32)
     for i, ray in enumerate(rays):
         seen[i] = mujoco.mj_ray(

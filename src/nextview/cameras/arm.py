@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.cameras.ray_caster import RayCaster, Triangles, pixel_rays
 from nextview.cameras.sensors import SENSORS, Sensor
 from nextview.errors import ObservationError
 from nextview.mesh import Mesh
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from nextview.session import Recognition, Session
 
 Float = NDArray[np.float64]
-Triangles = tuple[Float, NDArray[np.int32]]
 
 FASTEST = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])
 """Velocity limits of the seven joints, rad/s (Franka Control Interface, robot and interface specifications)."""
@@ -262,11 +262,9 @@ class Arm:
     def look(self) -> Frame:
         """What the camera on the wrist gives."""
         pose, (height, width), k = self.pose, self.sensor.shape, self.sensor.intrinsics
-        x, y = (np.arange(width) + 0.5 - k[0, 2]) / k[0, 0], (np.arange(height) + 0.5 - k[1, 2]) / k[1, 1]
-        rays = np.stack([*np.meshgrid(x, y), np.ones((height, width))], -1).reshape(-1, 3)
-        things = [triangles for triangles, _ in self.things()]
-        depth = cast(things, pose[:3, 3], rays @ pose[:3, :3].T)["tfar"]  # z = 1: Embree's distance is the depth
-        depth = np.where(np.isfinite(depth) & (depth < self.sensor.farthest), depth, 0).astype(np.float32)
+        rays = pixel_rays(k, (height, width)).reshape(-1, 3) @ pose[:3, :3].T
+        depth, _ = RayCaster([triangles for triangles, _ in self.things()]).cast(pose[:3, 3], rays)
+        depth = np.where(depth < self.sensor.farthest, depth, 0).astype(np.float32)
         measured, _ = self.sensor.measure(depth.reshape(height, width), self._rng)
         return Frame(measured, k, pose, pixel_centre=0.5)
 
@@ -326,18 +324,6 @@ def along(way: Sequence[Float], step: float) -> list[Float]:
         n = max(1, int(np.ceil(np.abs(b - a).max() / step)))
         found += [a + (b - a) * k / n for k in range(1, n + 1)]
     return found
-
-
-def cast(things: Sequence[Triangles], origin: Float, rays: Float) -> Any:
-    """What rays, (N, 3), from a point, (3,), or points, (N, 3), hit: Embree's arrays, "geomID" the thing's index."""
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-
-    scene = EmbreeScene()
-    for vertices, faces in things:
-        TriangleMesh(scene, vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32))
-    origins = np.ascontiguousarray(np.broadcast_to(origin, rays.shape), np.float32)
-    return scene.run(origins, np.ascontiguousarray(rays, np.float32), output=1)
 
 
 def _turned_least(rotation: Float, forward: Float) -> Float:

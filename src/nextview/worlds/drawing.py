@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.cameras.ray_caster import RayCaster
 from nextview.cameras.sensors.boxes_around import FOOTPRINT, HEIGHT
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.errors import DatasetError, MeshError
@@ -20,7 +21,6 @@ from nextview.mesh import Mesh
 from nextview.viewsphere import ViewSphere
 from nextview.worlds.footprint import footprint, separation
 from nextview.worlds.occluded_camera import visible_shares
-from nextview.worlds.ray_caster import RayCaster
 from nextview.worlds.scene import TABLE, Item, Scene, block_item, cached_mesh, mesh_hash, place
 from nextview.worlds.world import LEVELS, Block, Placement, World
 
@@ -126,8 +126,7 @@ class _Hiding:
 
     def by(self, item: Item, still: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Which of the rays that are still free end on something first, (R,)."""
-        thing = Mesh(item.vertices, item.faces, np.zeros(3), 1.0)
-        length, _ = RayCaster([thing]).cast(self.eyes[still], self.rays[still])
+        length, _ = RayCaster([(item.vertices, item.faces)]).cast(self.eyes[still], self.rays[still])
         hidden = np.zeros(len(still), bool)
         hidden[still] = length < 1
         return hidden

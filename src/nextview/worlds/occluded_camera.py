@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.cameras.ray_caster import RayCaster, pixel_rays
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.observation import Observation, pinhole
 from nextview.viewsphere import DISTANCE
-from nextview.worlds.ray_caster import RayCaster, pixel_rays
 from nextview.worlds.scene import Scene
 
 NOTHING, TARGET, OTHER, TABLE_TOP = np.arange(4, dtype=np.uint8)
@@ -33,7 +33,8 @@ class OccludedCamera:
     def __init__(self, scene: Scene, size: int = 224, distance: float = DISTANCE) -> None:
         self.scene = scene
         self._target = SimulatedCamera(scene.target, size, distance)
-        self._others = RayCaster([scene.table] if scene.around is None else [scene.table, scene.around])
+        others = [scene.table] if scene.around is None else [scene.table, scene.around]
+        self._others = RayCaster([(mesh.vertices, mesh.faces) for mesh in others])
         self._rays = pixel_rays(pinhole(size, distance), (size, size))
 
     def observe(self, pose: NDArray[np.float64]) -> Observation:
@@ -70,7 +71,8 @@ class SceneCamera:
 
     def __init__(self, scene: Scene, intrinsics: NDArray[np.float64], shape: tuple[int, int]) -> None:
         meshes = [scene.target, scene.table] if scene.around is None else [scene.target, scene.table, scene.around]
-        self._caster, self._rays = RayCaster(meshes), pixel_rays(intrinsics, shape)
+        self._caster = RayCaster([(mesh.vertices, mesh.faces) for mesh in meshes])
+        self._rays = pixel_rays(intrinsics, shape)
         self._owners = np.array([TARGET, TABLE_TOP, OTHER, NOTHING])
 
     def look(self, pose: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

@@ -1,4 +1,4 @@
-"""Several meshes in one Embree scene: how far rays go, and which mesh they end on."""
+"""Several things in one Embree scene: how far rays go, and which thing they end on."""
 
 from __future__ import annotations
 
@@ -7,27 +7,32 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.mesh import Mesh
+Triangles = tuple[NDArray[np.float64], NDArray[np.int32]]
+"""Vertices, (N, 3), and faces, (F, 3)."""
 
 
 class RayCaster:
-    """Casts rays at some meshes of one frame.
+    """Casts rays at some things of one frame.
 
     Args:
-        meshes: at least one.
+        things: at least one.
     """
 
-    def __init__(self, meshes: Sequence[Mesh]) -> None:
+    def __init__(self, things: Sequence[Triangles]) -> None:
         from embreex.mesh_construction import TriangleMesh  # only who simulates a camera pays for the import
         from embreex.rtcore_scene import EmbreeScene
 
         self._scene = EmbreeScene()
-        for mesh in meshes:
-            faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
-            TriangleMesh(self._scene, mesh.vertices.astype(np.float32), faces)
+        for vertices, faces in things:
+            TriangleMesh(self._scene, vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32))
+
+    def hits(self, origins: NDArray[np.floating], rays: NDArray[np.floating]) -> dict[str, NDArray]:
+        """What rays, (N, 3), from one point or (N, 3) points hit: Embree's arrays, "geomID" the index of the thing."""
+        origins = np.ascontiguousarray(np.broadcast_to(origins, rays.shape), np.float32)
+        return self._scene.run(origins, np.ascontiguousarray(rays, np.float32), output=1)
 
     def cast(
-        self, origins: NDArray[np.float32], rays: NDArray[np.float32]
+        self, origins: NDArray[np.floating], rays: NDArray[np.floating]
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Where rays end first.
 
@@ -36,10 +41,9 @@ class RayCaster:
             rays: (N, 3), of any length.
 
         Returns:
-            How many times its length each ray goes, (N,), infinity if it ends nowhere; and on which mesh, -1 for none.
+            How many times its length each ray goes, (N,), infinity if it ends nowhere; and on which thing, -1 for none.
         """
-        origins = np.ascontiguousarray(np.broadcast_to(np.asarray(origins, np.float32), rays.shape))
-        hits = self._scene.run(origins, np.ascontiguousarray(rays, np.float32), output=1)
+        hits = self.hits(origins, rays)
         hit = hits["primID"] >= 0
         return np.where(hit, hits["tfar"], np.float32(np.inf)), np.where(hit, hits["geomID"].astype(np.int64), -1)
 
