@@ -13,6 +13,8 @@ from nextview.cameras.sensors.projector_shadow import in_shadow
 from nextview.cameras.sensors.surface_angle import across_edges, incidence, inverse_depth, slopes
 from nextview.errors import UsageError
 
+STRONGEST = 100
+"""How many times as strong errors can be made: of what is left at 10 nothing can be made."""
 MARGIN = 16
 """How far beside what there is a pixel may show it, pixels."""
 
@@ -102,10 +104,10 @@ class Sensor:
         """The same sensor with all errors so many times as strong; 0 for none.
 
         Raises:
-            UsageError: a strength that is negative or not finite.
+            UsageError: a strength that is negative, or more than STRONGEST.
         """
-        if not 0 <= strength < np.inf:
-            raise UsageError(f"the strength of a sensor is a finite number of at least 0, not {strength}")
+        if not 0 <= strength <= STRONGEST:
+            raise UsageError(f"the strength of a sensor is a number from 0 to {STRONGEST}, not {strength}")
         name = self.name if strength == 1 else f"{self.name}:{strength:g}"
         return replace(self, name=name, **{error: getattr(self, error) * strength for error in ERRORS})
 
