@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from nextview.cameras.sensors import SENSORS
 from nextview.errors import NextviewError
-from nextview.explorer.card import gallery, preview_card, walk_card
+from nextview.explorer.card import class_card, gallery, preview_card, walk_card
 from nextview.explorer.exploration import Exploration, Walk
 from nextview.explorer.walk_scene import WalkScene
 from nextview.policies.policy_card import bundled_policies
@@ -81,7 +81,7 @@ class Page:
             gui.add_html(gallery(exploration.pictures()))
             names = gui.add_button_group("Object", list(exploration.objects))
             names.on_click(lambda event: setattr(self._object, "value", names.value))
-        self._label = gui.add_markdown("")
+        self._label = gui.add_html("")  # and no Markdown: viser would take a name for HTML
         self._policy = gui.add_dropdown("Policy", policies, initial_value=exploration.policies[0])
         self._second = gui.add_dropdown("Compare with", [NOTHING, *policies], initial_value=second)
         name, _, strength = (exploration.sensor or "").partition(":")
@@ -212,7 +212,7 @@ class Page:
             self._panels.append(panel)
         self._stand_back(n)
         label = self.exploration.shown.label
-        self._label.content = "" if label is None else f"Its class is **{label}**; no policy knows."
+        self._label.content = "" if label is None else class_card(label)
         self._draw()
 
     def _stand_back(self, walks: int) -> None:
