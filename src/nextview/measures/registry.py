@@ -90,7 +90,7 @@ def find_measure(name: str) -> Measure:
         sys.path.insert(0, here)  # where a user's own measure lies
     try:
         found = getattr(importlib.import_module(module), attribute)
-    except Exception as error:  # whatever a user's module may raise
+    except (Exception, SystemExit) as error:  # whatever a user's module may raise
         raise MeasureError(f"measure {name} cannot be imported ({type(error).__name__}: {error})") from error
     if not callable(found):
         raise MeasureError(f"measure {name} is no function of a view")

@@ -46,7 +46,7 @@ class Recorder:
 
     def __init__(self, path: str | Path) -> None:
         if Path(path).suffix != ".rrd":
-            raise UsageError(f"{path}: a recording for Rerun is called .rrd")
+            raise UsageError(f"{Path(path).name}: a recording for Rerun is called .rrd")  # whoever made a folder for it
         self._stream = rr.RecordingStream("nextview", recording_id=uuid4())
         try:
             self._stream.save(path, default_blueprint=blueprint())
