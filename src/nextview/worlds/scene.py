@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.arguments import regular_file
+from nextview.arguments import of_kind, regular_file, whole
 from nextview.cameras.sensors.boxes_around import upright_boxes
 from nextview.errors import DatasetError, MeshError
 from nextview.mesh import Mesh, load_mesh
@@ -119,6 +119,9 @@ def build_scene(world: World, meshes: str | Path, max_faces: int = MAX_FACES) ->
         DatasetError: a mesh file is not the one that the world was made with.
         MeshError: it cannot be used, or there are too many faces.
     """
+    of_kind(world, World, "a scene is built of a World", DatasetError)
+    of_kind(meshes, str | Path, "meshes are a folder", DatasetError)
+    whole(max_faces, "the largest number of faces", 1)
     loaded: list[Mesh] = []
     for placed in (world.target, *world.objects):
         loaded.append(_load(Path(meshes), placed, max_faces))
@@ -171,5 +174,6 @@ def mesh_hash(path: Path) -> str:
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror}); is it the folder of the meshes?") from None
+    except (OSError, ValueError) as error:  # a zero byte in the name
+        reason = getattr(error, "strerror", error)
+        raise DatasetError(f"{path}: cannot be read ({reason}); is it the folder of the meshes?") from None

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from nextview.arguments import of_kind
 from nextview.errors import DatasetError, ModelError
 from nextview.json_file import Fields, read_object
 from nextview.outputs import written_whole
@@ -149,6 +150,7 @@ class World:
         Raises:
             DatasetError: there is no such file, or it holds something else.
         """
+        of_kind(path, str | Path, "a world is a file", DatasetError)
         path = Path(path)
         try:
             return cls.from_dict(read_object(path, "a world"), f"{path}")
