@@ -17,10 +17,12 @@ from nextview.belief import Calibration
 from nextview.calibration.rollout import ReplayTable, judge, rollout
 from nextview.cli.main import main
 from nextview.data.predictions import Predictions
-from nextview.errors import PolicyError
+from nextview.errors import PolicyError, ResultsError, UsageError
 from nextview.policies.agent import Agent
 from nextview.policies.baselines import RandomAll
 from nextview.policies.registry import make_policy
+from nextview.training.agent.agent_training import train_agent
+from nextview.training.recipes import AgentRecipe
 
 QUICK = ["--steps", "64", "--envs", "8", "--rollout", "4", "--evaluations", "2", "--hidden", "8", "--batch", "8"]
 PLAIN = ["--inputs", "belief", "place", "--frame", "camera"]
@@ -151,3 +153,15 @@ def test_what_makes_no_sense_is_refused_in_a_sentence(trained, arguments, senten
         main(["train", "agent", *arguments])
     assert end.value.code == 2
     assert sentence in capsys.readouterr().err
+
+
+def test_a_card_that_cannot_be_written_is_refused_before_any_learning(tmp_path):
+    (tmp_path / "a.json").mkdir()
+    with pytest.raises(ResultsError, match="is a folder"):
+        train_agent(tmp_path / "none.npz", tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("wrong", [{"seed": 2**32}, {"envs": 1, "rollout": 1}])
+def test_a_recipe_that_no_agent_can_follow_is_refused(wrong):
+    with pytest.raises(UsageError, match="--"):
+        AgentRecipe(**wrong)

@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 
 import nextview
-from nextview.cameras.sensors import SensedCamera, sensor_named
+from nextview.cameras.sensors import SensedCamera, Sensor, SensorMix, sensor_named
 from nextview.data.samples import sample_mesh
 from nextview.errors import NextviewError
+from nextview.measures.registry import find_measure
 from nextview.sensing import Box, Frame, ObjectFrame, ObservedObject
 from nextview.viewsphere import viewpoints_of
+from nextview.worlds import Placement, Scene, World, WorldCamera, build_scene
+from nextview.worlds.scene import mesh_hash
+
+Recorder = pytest.importorskip("nextview.report.recording").Recorder
 
 JUNK = {
     "None": None, "a truth": True, "-1": -1, "a half": 2.5, "NaN": np.nan, "infinity": np.inf, "huge": 10**40,
@@ -25,6 +30,7 @@ SPHERE = nextview.ViewSphere.named("40")
 CAMERA = nextview.SimulatedCamera(MESH, 32)
 SEEN = CAMERA.observe(SPHERE.poses[3])
 RNG = np.random.default_rng(0)
+WORLD = World("a", "light", 0, Placement("chair.off", mesh_hash(FILE / "chair.off")))
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +114,13 @@ DOORS = {
     **arguments(nextview.SimulatedCamera, "mesh size distance intrinsics shape", mesh=MESH, size=32),
     **arguments(CAMERA.observe, "pose"),
     **arguments(sensor_named, "text"),
+    "Sensor": lambda system, junk: Sensor(noise=junk),
+    "SensorMix": lambda system, junk: SensorMix(junk),
+    "find_measure": lambda system, junk: find_measure(junk),
+    "World.load": lambda system, junk: World.load(junk),
+    "Recorder": lambda system, junk: Recorder(junk),
+    **arguments(build_scene, "world meshes max_faces", world=WORLD, meshes=FILE),
+    **arguments(WorldCamera, "scene sensor rng named viewpoints", scene=Scene(MESH)),
     **arguments(SensedCamera, "mesh sensor rng", mesh=MESH, sensor="kinect", rng=RNG),
     **arguments(
         Frame, "depth intrinsics pose mask image axes pixel_centre", depth=SEEN.depth, intrinsics=SEEN.intrinsics

@@ -17,7 +17,7 @@ import nextview.envs  # noqa: E402, F401
 from nextview.belief import Calibration, Stopping, of_true_class  # noqa: E402
 from nextview.data.predictions import Predictions  # noqa: E402
 from nextview.episode import run_episodes  # noqa: E402
-from nextview.errors import DatasetError, PredictionsError, SessionError, UsageError  # noqa: E402
+from nextview.errors import DatasetError, NextviewError, PredictionsError, SessionError, UsageError  # noqa: E402
 from nextview.policies.learned_tables import cells_to  # noqa: E402
 from nextview.policies.spread import Spread  # noqa: E402
 
@@ -219,6 +219,40 @@ def test_every_class_is_drawn_equally_often_where_that_is_asked_for():
 def test_what_makes_no_sense_is_refused_in_a_sentence(file, options, error, sentence):
     with pytest.raises(error, match=sentence):
         gymnasium.make(RECOGNISE, predictions=str(file), **options)
+
+
+JUNK = {
+    "None": None, "-1": -1, "a half": 2.5, "NaN": np.nan, "huge": 10**40, "a word": "a", "uneven lists": [[1, 2], [3]],
+    "an object": object(), "no array": np.zeros(0), "zeros": np.zeros((4, 4)), "a path": Path("/no/such/file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("junk", JUNK)
+def test_wrong_arguments_are_one_sentence(file, junk):
+    single = gymnasium.make(RECOGNISE, predictions=str(file)).unwrapped
+    many = gymnasium.make_vec(RECOGNISE, num_envs=3, predictions=str(file))
+    single.reset(seed=0)
+    many.reset(seed=0)
+    doors = [
+        *(lambda junk, env=env: env.step(junk) for env in (single, many)),
+        *(lambda junk, env=env: env.reset(options={"object": junk}) for env in (single, many)),
+        *(lambda junk, env=env: env.reset(options={"start": junk}) for env in (single, many)),
+        lambda junk: gymnasium.make_vec(RECOGNISE, num_envs=junk, predictions=str(file)),
+        *(
+            lambda junk, name=name: gymnasium.make(RECOGNISE, **{"predictions": str(file), name: junk})
+            for name in ("predictions", "inputs", "frame", "outcome", "max_views")
+        ),
+    ]
+    for door in doors:
+        with pytest.raises(NextviewError):
+            door(JUNK[junk])
+    for name in ("view_price", "travel_price") if junk not in ("a half", "huge") else ():
+        with pytest.raises(NextviewError):
+            gymnasium.make(RECOGNISE, predictions=str(file), **{name: JUNK[junk]})
+    if junk != "None":
+        for door in (single.reset, many.reset):
+            with pytest.raises(NextviewError):
+                door(options=JUNK[junk])
 
 
 def test_a_step_without_an_episode_is_refused(file):

@@ -9,9 +9,11 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("viser", reason="the extra 'explore' is not installed")
 
+from nextview.data.samples import sample_mesh
+from nextview.errors import UsageError
 from nextview.explorer.exploration import Exploration
 from nextview.explorer.page import APART, NOTHING, Page
-from nextview.explorer.shown_object import shown_objects
+from nextview.explorer.shown_object import ShownObject, shown_objects
 from nextview.explorer.walk_scene import wxyz
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -57,6 +59,25 @@ def test_what_is_chosen_is_done_and_shown(page):
     page._drag(0, np.array([1.0, -2.0, 1.0]), True)
     until(lambda: len(exploration.walks[0].views) == 1, "a view from where the camera was let go")
     assert not page._preview.visible
+
+
+@pytest.mark.parametrize(
+    ("host", "port"), [("127.0.0.1", -1), ("127.0.0.1", 65536), ("", 8790), ("nowhere.invalid", 8790), ("1.2.3", "a")]
+)
+def test_an_address_where_no_page_can_be_is_refused(host, port):
+    with pytest.raises(UsageError, match=r"page can be served|port is a whole number"):
+        Page(None, host, port)
+
+
+def test_a_name_means_nothing_in_the_page_and_a_sensor_may_be_any():
+    shown = ShownObject("<img src=x>", lambda: sample_mesh("chair"), "<img src=x onerror=alert(1)>")
+    page = Page(Exploration([shown], sensor="mix:0.5", threads=1), port=8790)
+    try:
+        assert (page._sensor.value, page._strength.value) == ("mix", 0.5)
+        assert "&lt;img src=x onerror=alert(1)&gt;" in page._label.content
+        assert "<img" not in page._label.content
+    finally:
+        page.stop()
 
 
 def test_what_cannot_be_done_changes_nothing(page):

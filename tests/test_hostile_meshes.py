@@ -13,14 +13,19 @@ import pytest
 import trimesh
 
 from nextview.cli.main import main
+from nextview.data.predictions import Predictions
 from nextview.data.rendering import render
 from nextview.data.store import ViewStore
-from nextview.errors import MeshError
+from nextview.errors import MeshError, NextviewError
 from nextview.glb import read_glb
 from nextview.mesh import load_mesh, make_mesh
 from nextview.mesh_format import BYTES_PER_FACE
+from nextview.models.model_card import read_card
 from nextview.ply import read_ply
+from nextview.policies.policy_card import read_policy_card
 from nextview.viewsphere import ViewSphere
+from nextview.weights_file import checked_content
+from nextview.worlds import World
 
 CORNERS = "0 0 0\n1 0 0\n0 1 1\n"
 FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 1\nendloop\nendfacet\n"
@@ -181,6 +186,16 @@ def test_only_regular_files_are_read(tmp_path):
     for name in ("pipe.off", "endless.off"):
         with pytest.raises(MeshError, match=rf"{name}: is a pipe or a device"):
             load_mesh(tmp_path / name)
+
+
+def test_cards_and_predictions_are_regular_files_too(tmp_path):
+    os.mkfifo(tmp_path / "pipe.json")
+    (tmp_path / "endless.json").symlink_to("/dev/zero")
+    for name in ("pipe.json", "endless.json"):
+        path = tmp_path / name
+        for read in (read_card, read_policy_card, World.load, Predictions.load, lambda p: checked_content(p, "")):
+            with pytest.raises(NextviewError, match=rf"{name}: is a pipe or a device"):
+                read(path)
 
 
 def test_a_mesh_is_the_same_with_copies_of_its_triangles(tmp_path):

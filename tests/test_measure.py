@@ -162,11 +162,16 @@ def test_a_measure_of_ones_own_is_kept_by_its_import_path(views, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine_to_measure.py").write_text(
         "def rows(view):\n    return view.near.shape[0]\ndef broken(view):\n    return view.nothing\n"
-        "def endless(view):\n    return float('inf')\nconstant = 3\n"
+        "def endless(view):\n    return float('inf')\nconstant = 3\ndef large(view):\n    return 1e300\n"
+        "def leave(view):\n    exit(0)\n"
     )
     list(measure(views, ["mine_to_measure:rows"], workers=0))
     assert 40 < ViewStore.open(views).measure("mine_to_measure:rows")[0].min() <= 96
+    (tmp_path / "mine_to_leave.py").write_text("raise SystemExit(0)")
     for name, problem in {
+        "mine_to_measure:large": "of b.*, view 0, is not finite",
+        "mine_to_measure:leave": "measure mine_to_measure:leave of b.*: SystemExit",
+        "mine_to_leave:none": "cannot be imported .SystemExit",
         "mine_to_measure:broken": "measure mine_to_measure:broken of b.*: AttributeError",
         "mine_to_measure:endless": "of b.*, view 0, is not finite",
         "mine_to_measure:constant": "is no function",

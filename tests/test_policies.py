@@ -11,8 +11,10 @@ from scipy.ndimage import maximum_filter
 from scipy.stats import chisquare
 from skimage.feature import peak_local_max
 
-from nextview.belief import Calibration
+from nextview.belief import Calibration, FixedLength
 from nextview.data.planning import plannable
+from nextview.episode import run_episodes
+from nextview.errors import PolicyError
 from nextview.policies.base import EpisodeState, Evidence, best_in_window
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence, cells_from, cells_to
@@ -429,3 +431,27 @@ def test_policies_by_name():
 def test_a_policy_of_ones_own_that_cannot_be_made(name):
     with pytest.raises(ValueError, match=r"^policy "):
         make_policy(name, SPHERE)
+
+
+def test_a_policy_of_ones_own_whose_needs_are_none_or_that_leaves(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    parts = "class {}:\n    needs = {}\n    def __init__(self, sphere): pass\n"
+    parts += "    def next_views(self, state, rng): exit(0)\n"
+    made = {"Nothing": "None", "Number": "3", "Word": "'lem'", "Numbers": "(1,)", "Leaves": "()"}
+    (tmp_path / "mine_to_need.py").write_text("".join(parts.format(*each) for each in made.items()))
+    (tmp_path / "mine_to_leave.py").write_text("raise SystemExit(0)")
+    for name in ("Nothing", "Number", "Word", "Numbers"):
+        with pytest.raises(PolicyError, match=f"mine_to_need:{name}: its needs are a tuple of names"):
+            make_policy(f"mine_to_need:{name}", SPHERE)
+    with pytest.raises(PolicyError, match=r"cannot be made \(SystemExit"):
+        make_policy("mine_to_leave:Policy", SPHERE)
+    policy = make_policy("mine_to_need:Leaves", SPHERE)
+    with pytest.raises(PolicyError, match="policy Leaves raised SystemExit"):
+        run_episodes(
+            lambda episodes, views: Evidence(np.zeros((len(views), 2))),
+            SPHERE,
+            policy,
+            np.zeros(1, int),
+            FixedLength(max_views=2),
+            np.random.default_rng(0),
+        )

@@ -177,7 +177,7 @@ def test_a_command_that_fails_leaves_no_recording(tmp_path, capsys):
         main(["recognise", str(tmp_path / "none.off"), "--record", str(tmp_path / "episode.rrd")])
     with pytest.raises(SystemExit):
         main(["recognise", str(SAMPLE), "--record", str(tmp_path / "episode.json")])
-    assert "is called .rrd" in capsys.readouterr().err
+    assert capsys.readouterr().err.endswith("nextview: episode.json: a recording for Rerun is called .rrd\n")
     assert [path.name for path in tmp_path.iterdir()] == ["none.off"]
 
 

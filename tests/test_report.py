@@ -295,3 +295,11 @@ def test_the_viewer_draws_and_the_page_fits_a_phone(made):
     assert page_width <= 360  # nothing but the tables' own boxes scrolls sideways
     assert 250 < canvas_width < 360
     assert path > 100  # the camera's place is drawn
+
+
+@pytest.mark.parametrize("name", ["benchmark.json", "episodes.parquet", "summary.csv", "predictions.npz"])
+def test_results_that_were_changed_are_refused(made, tmp_path, name):
+    shutil.copytree(made / "out", tmp_path / "out")
+    (tmp_path / "out" / name).write_text("[]")
+    with pytest.raises(ResultsError, match=f"results are damaged .{name} is not as it was written"):
+        results.load(tmp_path / "out")

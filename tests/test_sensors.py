@@ -355,7 +355,8 @@ def test_a_sensor_that_measures_nothing_sees_nothing():
 
 
 @pytest.mark.parametrize(
-    "text", ["kinekt", "kinect:", "kinect:x", "kinect:-1", "kinect:inf", "kinect:nan", "mix:-1", ""]
+    "text",
+    ["kinekt", "kinect:", "kinect:x", "kinect:-1", "kinect:inf", "kinect:nan", "kinect:101", "mix:-1", "mix:1e30", ""],
 )
 def test_what_is_no_sensor_is_refused(text):
     with pytest.raises(UsageError, match="sensor"):

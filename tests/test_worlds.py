@@ -1,6 +1,8 @@
 """Worlds: what hides what, by closed forms and another ray caster; nothing overlaps; the same seed, the same world."""
 
 import json
+import os
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -18,7 +20,7 @@ from nextview.data.rendering import render
 from nextview.data.store import PENDING, ViewStore
 from nextview.data.world_drawing import draw_worlds
 from nextview.data.world_views import world_views
-from nextview.errors import DatasetError, NoViewLeftError, UsageError
+from nextview.errors import DatasetError, MeshError, NoViewLeftError, UsageError
 from nextview.mesh import make_mesh
 from nextview.viewsphere import ViewSphere, look_at_origin
 from nextview.worlds import (
@@ -29,6 +31,7 @@ from nextview.worlds import (
     TARGET,
     Block,
     OccludedCamera,
+    Placement,
     Scene,
     SceneCamera,
     World,
@@ -233,6 +236,48 @@ def test_what_is_no_world_is_refused(worlds, tmp_path, change):
     (tmp_path / "w.json").write_text(json.dumps(values | change))
     with pytest.raises(DatasetError, match=r"w\.json"):
         World.load(tmp_path / "w.json")
+
+
+HERE = {"mesh": "a.off", "sha256": "0" * 64, "x": 0, "y": 0, "turn": 0, "radius": 1}
+BLOCK = {"x": 1, "y": 1, "turn": 0, "width": 1, "depth": 1, "height": 1}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *(
+            {"target": {"mesh": mesh, "sha256": "0" * 64}}
+            for mesh in ("/etc/passwd", "../a.off", "a/../../b", "C:\\a.off")
+        ),
+        *({"objects": [HERE | {"mesh": mesh}]} for mesh in ("..", "a\0.off", "\ud800.off", "a\n.off")),
+        *({"objects": [HERE | {name: 1e300}]} for name in ("x", "y", "turn", "radius")),
+        *({"blocks": [BLOCK | {name: 1e39}]} for name in BLOCK),
+        {"blocks": [BLOCK] * 1001},
+        {"visible": [0.5] * 3},
+        {"visible": [2] * 40},
+        {"unreachable": [40]},
+        {"unreachable": [1e300]},
+        {"unreachable": [0.5]},
+    ],
+)
+def test_a_world_that_cannot_be_is_refused(worlds, tmp_path, change):
+    test_what_is_no_world_is_refused(worlds, tmp_path, change)
+
+
+def test_a_world_reads_mesh_files_alone_and_no_more_triangles_than_are_allowed(worlds, meshes, tmp_path):
+    world = World.load(sorted(worlds.rglob("*.json"))[0])
+    os.mkfifo(tmp_path / "pipe.off")
+    with pytest.raises(DatasetError, match="is a pipe or a device"):
+        build_scene(replace(world, target=Placement("pipe.off", "0" * 64)), tmp_path)
+    alone = len(build_scene(replace(world, objects=()), meshes).target.faces)
+    twice = replace(world, objects=(replace(world.target, x=2.0),))
+    with pytest.raises(MeshError, match=f"{2 * alone:,} triangles, more than {2 * alone - 1:,}"):
+        build_scene(twice, meshes, 2 * alone - 1)
+
+
+def test_there_are_not_more_worlds_than_anyone_can_draw(meshes, tmp_path):
+    with pytest.raises(UsageError, match="from 1 to 100,000"):
+        next(draw_worlds(meshes, tmp_path / "w", ["light"], 10**12))
 
 
 def test_a_world_of_other_meshes_is_refused(worlds, meshes, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from numbers import Integral, Real
+from pathlib import Path
 from types import UnionType
 from typing import Any
 
@@ -60,3 +61,18 @@ def of_kind(value: Any, kinds: type | UnionType, what: str, error: type[Nextview
     """
     if not isinstance(value, kinds):
         raise error(f"{what}, not {as_line(value)}")
+
+
+def regular_file(path: Path, what: str, error: type[NextviewError]) -> None:
+    """See that a path names no pipe, which would wait for its writer, and no device, which might never end.
+
+    Args:
+        path: of a file, a folder, or of nothing.
+        what: it is to be, "a model card".
+        error: to raise.
+
+    Raises:
+        NextviewError: it names one: an ``error``.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise error(f"{path}: is a pipe or a device, not {what}")

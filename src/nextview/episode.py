@@ -333,7 +333,7 @@ class Episodes:
         name = self._name
         try:
             chosen = np.asarray(self.policy.next_views(state, self.rng))
-        except Exception as error:  # whatever a user's policy may raise
+        except (Exception, SystemExit) as error:  # whatever a user's policy may raise
             reason = f"policy {name} raised {type(error).__name__}: {error}"
             raise PolicyError(reason, self._first_to_fail(state)) from error
         if chosen.shape != state.current.shape or not np.issubdtype(chosen.dtype, np.integer):
@@ -354,7 +354,7 @@ class Episodes:
         for episode in state.episodes:
             try:
                 self.policy.next_views(state.of(state.episodes == episode), self.rng)
-            except Exception:
+            except (Exception, SystemExit):
                 return int(episode)
         return None
 

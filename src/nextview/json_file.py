@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import regular_file
 from nextview.errors import ModelError
 
 LARGEST = 64 * 2**20
@@ -31,6 +32,7 @@ def read_object(path: Path, what: str) -> dict[str, Any]:
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is not a finite number")
 
+    regular_file(path, what, ModelError)
     try:
         if path.stat().st_size > LARGEST:
             raise ModelError(f"{path}: not {what}, which takes {LARGEST >> 20} MB at most")

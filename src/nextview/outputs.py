@@ -189,6 +189,14 @@ def check_added(folder: Path, name: str, kind: str) -> None:
         raise ResultsError(f"{folder / name}: is there and is not as nextview wrote it; move it or give another name")
 
 
+def changed_files(folder: Path, kind: str) -> list[str]:
+    """Names of the files of a folder of results that are there and not as they were written."""
+    files = _read_manifest(folder, kind) or {}
+    return [
+        name for name, noted in files.items() if (folder / name).exists() and not _is_as_noted(folder / name, noted)
+    ]
+
+
 def left_by_a_cut(folder: Path, kind: str) -> Path | None:
     """Whole results, beside ``folder``, of a run that was killed just while it put them there; None if there are none.
 

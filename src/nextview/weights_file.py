@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+from nextview.arguments import regular_file
 from nextview.errors import ModelError
 
 
@@ -19,6 +20,7 @@ def checked_content(path: Path, sha256: str, what: str = "the weights are") -> b
     Raises:
         ModelError: the file is missing, or is not the one that the card describes.
     """
+    regular_file(path, "weights", ModelError)
     try:
         content = path.read_bytes()
     except OSError as error:

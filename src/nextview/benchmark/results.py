@@ -19,7 +19,7 @@ from nextview.benchmark.replay import Outcomes
 from nextview.benchmark.summary import Tables
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError
-from nextview.outputs import left_by_a_cut
+from nextview.outputs import changed_files, left_by_a_cut
 
 KIND = "benchmark"
 """Of these results, in their manifest."""
@@ -60,8 +60,11 @@ def load(folder: Path) -> Results:
     """Read a folder of results.
 
     Raises:
-        ResultsError: it is none, or a part of it is missing.
+        ResultsError: it is none, or a part of it is missing or was changed.
     """
+    changed = [name for name in changed_files(folder, KIND) if not name.endswith(".html")]
+    if changed:
+        raise ResultsError(f"{folder}: these benchmark results are damaged ({changed[0]} is not as it was written)")
     try:
         settings = json.loads((folder / "benchmark.json").read_text())
         tables = Tables(**{name: _table(folder, name) for name in Tables.__dataclass_fields__})
@@ -74,7 +77,7 @@ def load(folder: Path) -> Results:
                 f"{folder}: a run was killed while it put its results there; rename {left} to it"
             ) from None
         raise ResultsError(f"{folder}: holds no benchmark results; make some with nextview benchmark") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ResultsError(f"{folder}: these benchmark results are damaged ({error})") from None
     return Results(folder, settings, Predictions.load(folder / "predictions.npz"), tables)
 

@@ -151,8 +151,9 @@ def _measure(names: tuple[str, ...], meshes: Path | None, max_faces: int, store:
         lap(READING if camera is None else CASTING)
         for name, function in measures.items():
             try:
-                values[name][k] = function(view)
-            except Exception as error:  # whatever a user's measure may raise
+                with np.errstate(over="ignore"):  # what is too large for float32 is told below
+                    values[name][k] = function(view)
+            except (Exception, SystemExit) as error:  # whatever a user's measure may raise
                 if ":" not in name or isinstance(error, MeasureError):
                     raise
                 raise MeasureError(f"measure {name} of {store.names[i]}: {type(error).__name__}: {error}") from error

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import regular_file
 from nextview.belief import PLAIN_SUM, Calibration, log_evidence_of
 from nextview.data.splits import deduplicated
 from nextview.errors import PredictionsError
@@ -198,6 +199,7 @@ class Predictions:
         Raises:
             PredictionsError: there is no such file, it is damaged, or what it holds does not fit together.
         """
+        regular_file(Path(path), "a predictions file", PredictionsError)
         try:
             with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
                 f = {name: file[name] for name in file.files if name in KEYS or name.startswith(GROUPS)}

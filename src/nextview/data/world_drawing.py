@@ -17,6 +17,9 @@ from nextview.models.model_card import read_card
 from nextview.worlds.drawing import Meshes, draw_world
 from nextview.worlds.world import LEVELS, SUFFIX, World
 
+MOST = 100_000
+"""Worlds at each level, of each split."""
+
 
 @dataclass(frozen=True)
 class Task:
@@ -79,7 +82,8 @@ def draw_worlds(
     if there is not None and World.load(there).seed != seed:
         raise DatasetError(f"{there}: was drawn with another seed; give another folder or the same seed")
     todo = [task for task in wanted if not task.path.exists()]
-    yield from ((task.name, None) for task in wanted if task not in todo)
+    lacking = set(todo)
+    yield from ((task.name, None) for task in wanted if task not in lacking)
     files: dict[str, list[str]] = {}
     for entry in list_dataset(dataset):
         files.setdefault(entry.split, []).append(_relative(entry, dataset))
@@ -102,8 +106,8 @@ def tasks(
     unknown = [level for level in levels if level not in LEVELS]
     if unknown or not levels:
         raise UsageError(f"the level of a world is {', '.join(LEVELS)}, not {unknown[0] if unknown else 'none'}")
-    if worlds is not None and worlds < 1:
-        raise UsageError(f"there cannot be {worlds} worlds")
+    if worlds is not None and not 1 <= worlds <= MOST:
+        raise UsageError(f"worlds at each level are from 1 to {MOST:,}, not {worlds}")
     if not 0 <= seed < 2**31:
         raise UsageError(f"a seed is from 0 to {2**31 - 1}, not {seed}")
     found: list[Task] = []

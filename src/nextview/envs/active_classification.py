@@ -73,6 +73,6 @@ class ActiveRecogniseVectorEnv(ap_gym.ActiveClassificationVectorEnv):
         return self._env.reset(options=options)
 
     def _step(self, action: Any, prediction: NDArray[np.floating]) -> tuple[Any, Any, Any, Any, dict, Any]:
-        seen, info = self._env._go(np.asarray(action, np.int64))
+        seen, info = self._env._go(action)
         target = info["final_info"]["prediction_target"] if "final_info" in info else info["prediction_target"]
         return seen.observation, -seen.price, seen.ended, np.zeros(self.num_envs, bool), info, target

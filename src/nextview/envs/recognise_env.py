@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from nextview.data.predictions import Predictions
 from nextview.envs.cohort import Cohort, Seen
 from nextview.envs.replayed import replayed
-from nextview.envs.task import Rules, Split, Task
+from nextview.envs.task import Rules, Split, Task, rows
 from nextview.errors import SessionError
 
 
@@ -34,9 +34,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See ``gymnasium.Env.reset``."""
         super().reset(seed=seed)
-        drawn = dict(zip(("object", "start"), self.task.draw(1, self.np_random), strict=True)) | (options or {})
-        objects, starts = (np.array(drawn[name], np.int64).reshape(1) for name in ("object", "start"))
-        self._cohort = Cohort(self.task, objects, starts)
+        self._cohort = Cohort(self.task, *self.task.begin(options, 1, self.np_random))
         return self._observed(self._cohort.first)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -44,6 +42,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
 
         Raises:
             SessionError: no episode is under way.
+            UsageError: there is no such action.
         """
         seen = self._go(action)
         observation, info = self._observed(seen)
@@ -52,7 +51,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
     def _go(self, action: Any) -> Seen:
         if self._cohort is None or len(self._cohort.running) == 0:
             raise SessionError("no episode is under way; call reset")
-        return self._cohort.step(np.array([action], np.int64))
+        return self._cohort.step(rows(action, 1, len(self.task.sphere), "action"))
 
     def _observed(self, seen: Seen) -> tuple[NDArray[np.float32], dict[str, Any]]:
         return seen.observation[0], info_of(seen)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from nextview.arguments import of_kind
 from nextview.data.predictions import Predictions
 from nextview.envs.task import Rules, Split, Task
 from nextview.errors import PredictionsError
@@ -27,6 +28,8 @@ def replayed(
     Raises:
         PredictionsError: there are no objects of that split, or no such map or azimuth bins.
     """
+    of_kind(predictions, str | Path | Predictions, "predictions are a file, or what it holds", PredictionsError)
+    of_kind(split, str | None, "a split is a name", PredictionsError)
     p = predictions if isinstance(predictions, Predictions) else Predictions.load(predictions)
     p = p if split is None else p.of_split(split)
     p = p.deduplicate() if split == "train" else p

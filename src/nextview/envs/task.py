@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import as_line, number, of_kind, whole
 from nextview.belief import Calibration, FixedLength, Stopping
 from nextview.calibration.rollout import OUTCOMES
 from nextview.errors import UsageError
@@ -57,21 +58,25 @@ class Rules:
     travel_price: float = 0.0
 
     def __post_init__(self) -> None:
+        if isinstance(self.inputs, str) or not np.iterable(self.inputs):
+            raise UsageError(f"the inputs are a tuple of names, not {as_line(self.inputs)}")
+        for word in (*self.inputs, self.frame, self.outcome):
+            of_kind(word, str, "inputs, frame and outcome are names")
         for given, known, what in (
             (self.inputs, INPUTS, "an observation"),
             ((self.frame,), get_args(Frame), "the frame"),
             ((self.outcome,), OUTCOMES, "the outcome"),
         ):
             unknown = [name for name in given if name not in known]
-            if unknown or not given:
+            if unknown or not len(given):
                 other = repr(unknown[0]) if unknown else "nothing"
                 raise UsageError(f"{what} is of {', '.join(known)}, not {other}")
-        if self.max_views < 2:
+        if whole(self.max_views, "the number of views") < 2:
             raise UsageError(
                 f"an episode takes at least two views, of which the agent chooses one, not {self.max_views}"
             )
         for name in ("view_price", "travel_price"):
-            if not 0 <= getattr(self, name) < np.inf:
+            if not 0 <= number(getattr(self, name), f"the {name}") < np.inf:
                 raise UsageError(f"the {name} is a number from 0 on, not {getattr(self, name)}")
         Stopping(0.5 if self.threshold is None else self.threshold)  # says what is wrong with it
 
@@ -85,6 +90,28 @@ class Rules:
         if self.threshold is None:
             return FixedLength(max_views=self.max_views)
         return AfterAction(self.threshold, self.max_views, calibration.correlation)
+
+
+def rows(values: Any, n: int, below: int, what: str) -> NDArray[np.int64]:
+    """What an agent or a user chose.
+
+    Args:
+        values: (n,), or one number for one.
+        n: how many.
+        below: 0 is the least, this minus 1 the highest.
+        what: they are, for the sentence.
+
+    Raises:
+        UsageError: they are something else.
+    """
+    try:
+        found = np.atleast_1d(np.asarray(values))
+    except ValueError:  # lists of unequal length
+        found = np.zeros(0)
+    if found.shape != (n,) or found.dtype.kind not in "iu" or not ((found >= 0) & (found < below)).all():
+        many = "a whole number" if n == 1 else f"{n} whole numbers"
+        raise UsageError(f"{what}: {many} from 0 to {below - 1}, not {as_line(values)}")
+    return found.astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -134,6 +161,17 @@ class Task:
     def draw(self, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Objects and first views of ``n`` episodes, each (n,) int64."""
         return rng.choice(len(self.labels), n, p=self._chance), rng.integers(len(self.sphere), size=n)
+
+    def begin(self, options: Any, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Objects and first views of ``n`` episodes, each (n,) int64: those of the options of ``reset``, else drawn.
+
+        Raises:
+            UsageError: there is no such object or view.
+        """
+        of_kind(options, dict | None, "the options of reset are a dict")
+        objects, starts = self.draw(n, rng)
+        given = {"object": objects, "start": starts} | (options or {})
+        return rows(given["object"], n, len(self.labels), "object"), rows(given["start"], n, len(self.sphere), "start")
 
     @property
     def observation_space(self) -> gymnasium.spaces.Box:

@@ -10,13 +10,15 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from nextview.arguments import whole
 from nextview.data.predictions import Predictions
 from nextview.envs.cohort import Cohort, Seen
 from nextview.envs.replayed import replayed
-from nextview.envs.task import Rules, Split, Task
+from nextview.envs.task import Rules, Split, Task, rows
 from nextview.errors import SessionError
 
 Rows = NDArray[np.int64]
+MOST_ENVS = 1_000_000
 
 
 class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
@@ -34,7 +36,7 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(self, task: Task, num_envs: int) -> None:
-        self.task, self.num_envs = task, num_envs
+        self.task, self.num_envs = task, whole(num_envs, "the number of environments", 1, MOST_ENVS)
         self.single_observation_space, self.single_action_space = task.observation_space, task.action_space
         self.observation_space = batch_space(task.observation_space, num_envs)
         self.action_space = batch_space(task.action_space, num_envs)
@@ -45,10 +47,7 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """See ``gymnasium.vector.VectorEnv.reset``."""
         super().reset(seed=seed)
-        drawn = dict(zip(("object", "start"), self.task.draw(self.num_envs, self.np_random), strict=True))
-        drawn |= options or {}
-        objects, starts = (np.array(drawn[name], np.int64) for name in ("object", "start"))
-        cohort = Cohort(self.task, objects, starts)
+        cohort = Cohort(self.task, *self.task.begin(options, self.num_envs, self.np_random))
         self._cohorts = [(cohort, np.arange(self.num_envs))]
         return cohort.first.observation, cohort.first.info
 
@@ -59,21 +58,23 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
 
         Raises:
             SessionError: ``reset`` was never called.
+            UsageError: there are no such actions.
         """
-        seen, info = self._go(np.asarray(actions, np.int64))
+        seen, info = self._go(actions)
         observation, still = seen.observation, np.zeros(self.num_envs, bool)
         return observation, seen.change - seen.price, seen.ended, still, info
 
-    def _go(self, actions: Rows) -> tuple[Seen, dict[str, Any]]:
+    def _go(self, actions: Any) -> tuple[Seen, dict[str, Any]]:
         """What is seen in each episode; where one ended, the observation and the info are those of the next."""
         if not self._cohorts:
             raise SessionError("no episode is under way; call reset")
+        actions = rows(actions, self.num_envs, len(self.task.sphere), "actions")
         parts = []
-        for cohort, rows in self._cohorts:
-            where = rows[cohort.running]
+        for cohort, members in self._cohorts:
+            where = members[cohort.running]
             parts.append((where, cohort.step(actions[where])))
         seen = _merged(parts, self.num_envs)
-        self._cohorts = [(cohort, rows) for cohort, rows in self._cohorts if len(cohort.running)]
+        self._cohorts = [(cohort, members) for cohort, members in self._cohorts if len(cohort.running)]
         over = np.flatnonzero(seen.ended)
         if len(over) == 0:
             return seen, seen.info

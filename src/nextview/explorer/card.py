@@ -61,6 +61,11 @@ def preview_card(observation: Observation) -> str:
     return f'{STYLE}<div class="nv"><h3>from here</h3>{_image(observation.picture, 200)}</div>'
 
 
+def class_card(label: str) -> str:
+    """What the object is."""
+    return f'{STYLE}<div class="nv">Its class is <b>{escape(label)}</b>; no policy knows.</div>'
+
+
 def gallery(pictures: Mapping[str, NDArray[np.uint8]]) -> str:
     """Small pictures in a row, with their names."""
     width = 225 // max(len(pictures), 3)

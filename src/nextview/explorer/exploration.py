@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import whole
 from nextview.belief import FixedLength, Stopping
 from nextview.errors import NextviewError, UsageError
 from nextview.explorer.shown_object import ShownObject
@@ -121,7 +122,8 @@ class Exploration:
         options: of ``nextview.load``, but for the policy.
 
     Raises:
-        UsageError: there is no such sensor, or the object has only stored views and no sensor can look at it.
+        UsageError: there is no such sensor, or the object has only stored views and no sensor can look at it; or the
+            seed or the first view is none.
         NextviewError: the object or the models cannot be opened.
     """
 
@@ -134,6 +136,7 @@ class Exploration:
         seed: int = 0,
         **options: Any,
     ) -> None:
+        whole(seed, "the seed", most=2**63 - 1)
         self.objects, self.sensor, self.seed = {shown.name: shown for shown in objects}, sensor, seed
         self._load = lru_cache(maxsize=None)(lambda policy: load(policy=policy, **options))
         self.systems: list[System] = [self._load(policy) for policy in policies]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -13,9 +15,10 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from nextview.arguments import whole
 from nextview.cameras.sensors import SENSORS
-from nextview.errors import NextviewError
-from nextview.explorer.card import gallery, preview_card, walk_card
+from nextview.errors import NextviewError, UsageError
+from nextview.explorer.card import class_card, gallery, preview_card, walk_card
 from nextview.explorer.exploration import Exploration, Walk
 from nextview.explorer.walk_scene import WalkScene
 from nextview.policies.policy_card import bundled_policies
@@ -33,6 +36,20 @@ what the policy values them at: yellow most, violet least, grey what it does not
 one next; small dark ones were visited."""
 
 
+def _check_address(host: str, port: int) -> None:
+    """See that something can be served at an address: viser would wait for ever, and take no host for all of them."""
+    whole(port, "a port", 0, 65535)
+    try:
+        if not host:
+            raise OSError("there is no name")
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as tried:
+            tried.bind(address)
+    except (OSError, UnicodeError) as error:
+        if getattr(error, "errno", None) != errno.EADDRINUSE:
+            raise UsageError(f"no page can be served at {host!r}, port {port} ({error})") from None
+
+
 class Page:
     """A page in the browser on an exploration. All who open it see and drive the same.
 
@@ -40,9 +57,13 @@ class Page:
         exploration: what is shown.
         host: address that the page is served at; 0.0.0.0 for all of this machine.
         port: of the page; the next free one if it is taken.
+
+    Raises:
+        UsageError: nothing can be served there.
     """
 
     def __init__(self, exploration: Exploration, host: str = "127.0.0.1", port: int = 8080) -> None:
+        _check_address(host, port)
         self.exploration = exploration
         self.server = viser.ViserServer(host, port, label="nextview explore", verbose=False)
         self._lock, self._quiet = threading.RLock(), False
@@ -81,11 +102,11 @@ class Page:
             gui.add_html(gallery(exploration.pictures()))
             names = gui.add_button_group("Object", list(exploration.objects))
             names.on_click(lambda event: setattr(self._object, "value", names.value))
-        self._label = gui.add_markdown("")
+        self._label = gui.add_html("")  # and no Markdown: viser would take a name for HTML
         self._policy = gui.add_dropdown("Policy", policies, initial_value=exploration.policies[0])
         self._second = gui.add_dropdown("Compare with", [NOTHING, *policies], initial_value=second)
         name, _, strength = (exploration.sensor or "").partition(":")
-        self._sensor = gui.add_dropdown("Sensor", [CLEAN, *SENSORS], initial_value=name or CLEAN)
+        self._sensor = gui.add_dropdown("Sensor", [CLEAN, *SENSORS, "mix"], initial_value=name or CLEAN)
         given = float(strength or 1)
         self._strength = gui.add_slider("Noise strength", 0.0, max(4.0, given), 0.25, initial_value=given)
         self._hide = gui.add_checkbox("Hide what was not seen", initial_value=exploration.mesh is None)
@@ -212,7 +233,7 @@ class Page:
             self._panels.append(panel)
         self._stand_back(n)
         label = self.exploration.shown.label
-        self._label.content = "" if label is None else f"Its class is **{label}**; no policy knows."
+        self._label.content = "" if label is None else class_card(label)
         self._draw()
 
     def _stand_back(self, walks: int) -> None:

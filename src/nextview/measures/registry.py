@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from nextview.arguments import of_kind
 from nextview.errors import MeasureError
 from nextview.measures.area import surface_visibility, view_area, viewpoint_entropy, visible_area_ratio
 from nextview.measures.curvature import curvature_entropy, gaussian_curvature, mean_curvature
@@ -80,6 +81,7 @@ def find_measure(name: str) -> Measure:
     Raises:
         MeasureError: there is none, or it cannot be imported.
     """
+    of_kind(name, str, "a measure is a name", MeasureError)
     if name in MEASURES:
         return MEASURES[name]
     if ":" not in name:
@@ -90,7 +92,7 @@ def find_measure(name: str) -> Measure:
         sys.path.insert(0, here)  # where a user's own measure lies
     try:
         found = getattr(importlib.import_module(module), attribute)
-    except Exception as error:  # whatever a user's module may raise
+    except (Exception, SystemExit) as error:  # whatever a user's module may raise
         raise MeasureError(f"measure {name} cannot be imported ({type(error).__name__}: {error})") from error
     if not callable(found):
         raise MeasureError(f"measure {name} is no function of a view")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from nextview.arguments import regular_file
 from nextview.errors import ModelError
 from nextview.models.inference import MAPS, RECOGNISER
 from nextview.models.model_card import find_card, read_card
@@ -58,6 +59,7 @@ def find_models(models: str | Path) -> Collection:
 
 def _is_policy(path: Path) -> bool:
     """Whether a card is of a policy: these name the viewpoints that they were learned for."""
+    regular_file(path, "a card", ModelError)
     try:
         return '"elevations"' in path.read_text(errors="replace")
     except OSError as error:

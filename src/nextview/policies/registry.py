@@ -155,9 +155,11 @@ def _import_policy(path: str, sphere: Viewpoints) -> Policy:
         sys.path.insert(0, here)  # where a user's own policy lies
     try:
         policy = getattr(importlib.import_module(module), attribute)(sphere)
-    except Exception as error:  # whatever a user's module may raise
+    except (Exception, SystemExit) as error:  # whatever a user's module may raise
         raise PolicyError(f"policy {path} cannot be made ({type(error).__name__}: {error})") from error
     for part in ("next_views", "needs"):
         if not hasattr(policy, part):
             raise PolicyError(f"policy {path} has no {part}; see nextview.policies.base.Policy")
+    if not isinstance(policy.needs, tuple | list) or not all(isinstance(need, str) for need in policy.needs):
+        raise PolicyError(f"policy {path}: its needs are a tuple of names, not {as_line(policy.needs)}")
     return policy

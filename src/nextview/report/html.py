@@ -67,8 +67,13 @@ def check_page(path: Path, results: Path) -> None:
         if path.name != PAGE:
             raise ResultsError(f"{path}: in a folder of results the page is called {PAGE}; give a path outside of it")
         check_added(results, path.name, KIND)
-    elif path.exists() and GENERATOR.encode() not in path.read_bytes()[:1000]:
+    elif path.exists() and not (path.is_file() and GENERATOR.encode() in _beginning(path)):
         raise ResultsError(f"{path}: is there and is no page of nextview's; give another name")
+
+
+def _beginning(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(1000)
 
 
 def _is_beside(path: Path, results: Path) -> bool:

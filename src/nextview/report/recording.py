@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from nextview.arguments import of_kind
 from nextview.errors import UsageError
 from nextview.report.style import heat
 
@@ -45,8 +46,9 @@ class Recorder:
     """
 
     def __init__(self, path: str | Path) -> None:
+        of_kind(path, str | Path, "a recording is a file")
         if Path(path).suffix != ".rrd":
-            raise UsageError(f"{path}: a recording for Rerun is called .rrd")
+            raise UsageError(f"{Path(path).name}: a recording for Rerun is called .rrd")  # whoever made a folder for it
         self._stream = rr.RecordingStream("nextview", recording_id=uuid4())
         try:
             self._stream.save(path, default_blueprint=blueprint())

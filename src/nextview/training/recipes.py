@@ -298,6 +298,10 @@ class AgentRecipe:
         _at_least(1, updates=self.updates, evaluations=self.evaluations)
         _at_least(0, lr=self.lr, entropy=self.entropy, view_price=self.view_price, travel_price=self.travel_price)
         _at_least(0, seed=self.seed)
+        if self.seed >= 2**32:
+            raise UsageError(f"--seed is below {2**32}, not {self.seed}")
+        if self.algorithm == "ppo" and self.envs * self.rollout < 2:
+            raise UsageError("--envs times --rollout is at least 2")
         if not all(0 <= share <= 1 for share in (self.discount, *self.exploration)):
             raise UsageError("--discount and --exploration are numbers from 0 to 1")
 

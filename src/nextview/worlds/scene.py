@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import of_kind, regular_file, whole
 from nextview.cameras.sensors.boxes_around import upright_boxes
-from nextview.errors import DatasetError
+from nextview.errors import DatasetError, MeshError
 from nextview.mesh import Mesh, load_mesh
 from nextview.mesh_format import MAX_FACES
 from nextview.worlds.footprint import Float, distances, footprint, separation
@@ -112,16 +113,26 @@ def build_scene(world: World, meshes: str | Path, max_faces: int = MAX_FACES) ->
     Args:
         world: in words.
         meshes: the folder below which its mesh files are.
-        max_faces: see ``load_mesh``.
+        max_faces: of all meshes together, each as often as it stands there; see ``load_mesh``.
 
     Raises:
         DatasetError: a mesh file is not the one that the world was made with.
-        MeshError: it cannot be used.
+        MeshError: it cannot be used, or there are too many faces.
     """
-    target, *others = (_load(Path(meshes), placed, max_faces) for placed in (world.target, *world.objects))
+    of_kind(world, World, "a scene is built of a World", DatasetError)
+    of_kind(meshes, str | Path, "meshes are a folder", DatasetError)
+    whole(max_faces, "the largest number of faces", 1)
+    loaded: list[Mesh] = []
+    for placed in (world.target, *world.objects):
+        loaded.append(_load(Path(meshes), placed, max_faces))
+        faces = sum(len(mesh.faces) for mesh in loaded)
+        if faces > max_faces:
+            most = f"more than {max_faces:,}; --max-faces (max_faces) allows more"
+            raise MeshError(f"world {world.name}: its meshes have {faces:,} triangles, {most}")
+    target, *others = loaded
     floor = float(target.vertices[:, 2].min())
-    placed = [place(mesh, at, floor) for mesh, at in zip(others, world.objects, strict=True)]
-    return Scene(target, (*placed, *(block_item(block, floor) for block in world.blocks)))
+    objects = [place(mesh, at, floor) for mesh, at in zip(others, world.objects, strict=True)]
+    return Scene(target, (*objects, *(block_item(block, floor) for block in world.blocks)))
 
 
 def place(mesh: Mesh, at: Placement, floor: float) -> Item:
@@ -159,8 +170,10 @@ def mesh_hash(path: Path) -> str:
     Raises:
         DatasetError: it cannot be read.
     """
+    regular_file(path, "a mesh file", DatasetError)
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror}); is it the folder of the meshes?") from None
+    except (OSError, ValueError) as error:  # a zero byte in the name
+        reason = getattr(error, "strerror", error)
+        raise DatasetError(f"{path}: cannot be read ({reason}); is it the folder of the meshes?") from None

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
+from nextview.arguments import of_kind
 from nextview.errors import DatasetError, ModelError
 from nextview.json_file import Fields, read_object
 from nextview.outputs import written_whole
@@ -17,6 +18,12 @@ SCHEMA = 1
 LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}
 """Share of the target that shows, on the average over the 40 views."""
 SUFFIX = ".json"
+VIEWS = 40
+"""Of which a world says how much of the target they show."""
+FARTHEST = 1000.0
+"""Every length, place and angle of a world is at most this: what is computed with more has no precision left."""
+THINGS = 1000
+"""Objects and blocks around a target at most."""
 
 
 @dataclass(frozen=True)
@@ -112,16 +119,18 @@ class World:
             for name, found in lists.items():
                 if not isinstance(found, list):
                     raise fields.wrong(name, "a list")
+                if len(found) > THINGS:
+                    raise fields.wrong(name, f"a list of at most {THINGS:,}")
             target = Fields(fields.mapping("target"), f"the target of {what}")
             world = cls(
                 fields.text("name"),
                 fields.text("level"),
                 fields.whole("seed"),
-                Placement(target.text("mesh"), target.sha256("sha256")),
+                Placement(_mesh(target), target.sha256("sha256")),
                 tuple(_placement(each, what) for each in lists["objects"]),
                 tuple(_block(each, what) for each in lists["blocks"]),
-                tuple(fields.numbers("visible", 1, np.zeros(0)).tolist()),
-                tuple(fields.numbers("unreachable", 1, np.zeros(0)).astype(int).tolist()),
+                _visible(fields),
+                _unreachable(fields),
             )
             target.end()
             fields.end()
@@ -141,6 +150,7 @@ class World:
         Raises:
             DatasetError: there is no such file, or it holds something else.
         """
+        of_kind(path, str | Path, "a world is a file", DatasetError)
         path = Path(path)
         try:
             return cls.from_dict(read_object(path, "a world"), f"{path}")
@@ -150,10 +160,41 @@ class World:
             raise DatasetError(str(error)) from None
 
 
+def _mesh(fields: Fields) -> str:
+    """A mesh file below the folder of meshes: a world never makes anyone open another one."""
+    name = fields.text("mesh")
+    paths = PurePosixPath(name), PureWindowsPath(name)
+    if not name.isprintable() or any(path.anchor or ".." in path.parts for path in paths):
+        raise fields.wrong("mesh", "a path below the folder of meshes")
+    return name
+
+
+def _visible(fields: Fields) -> tuple[float, ...]:
+    found = fields.numbers("visible", 1, np.zeros(0))
+    if len(found) not in (0, VIEWS) or not ((found >= 0) & (found <= 1)).all():
+        raise fields.wrong("visible", f"a list of {VIEWS} numbers from 0 to 1")
+    return tuple(found.tolist())
+
+
+def _unreachable(fields: Fields) -> tuple[int, ...]:
+    found = fields.numbers("unreachable", 1, np.zeros(0))
+    if not np.isin(found, np.arange(VIEWS)).all():
+        raise fields.wrong("unreachable", f"a list of whole numbers from 0 to {VIEWS - 1}")
+    return tuple(found.astype(int).tolist())
+
+
+def _numbers(fields: Fields, *names: str) -> dict[str, float]:
+    found = {name: fields.number(name) for name in names}
+    for name, value in found.items():
+        if abs(value) > FARTHEST:
+            raise fields.wrong(name, f"within {FARTHEST:g} of 0")
+    return found
+
+
 def _placement(values: Any, what: str) -> Placement:
     fields = Fields(values, f"an object of {what}")
-    numbers = {name: fields.number(name) for name in ("x", "y", "turn", "radius")}
-    found = Placement(fields.text("mesh"), fields.sha256("sha256"), **numbers)
+    numbers = _numbers(fields, "x", "y", "turn", "radius")
+    found = Placement(_mesh(fields), fields.sha256("sha256"), **numbers)
     fields.end()
     if not found.radius > 0:
         raise fields.wrong("radius", "positive")
@@ -162,7 +203,7 @@ def _placement(values: Any, what: str) -> Placement:
 
 def _block(values: Any, what: str) -> Block:
     fields = Fields(values, f"a block of {what}")
-    numbers = {name: fields.number(name) for name in ("x", "y", "turn", "width", "depth", "height")}
+    numbers = _numbers(fields, "x", "y", "turn", "width", "depth", "height")
     wall = fields.take("wall", False)
     fields.end()
     if not isinstance(wall, bool):

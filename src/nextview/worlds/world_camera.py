@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import as_line, of_kind
 from nextview.cameras.sensors import SensedCamera, Sensor, SensorMix, sensor_named
 from nextview.errors import NoViewLeftError, ObservationError, UsageError
 from nextview.sensing import Frame, ObservedObject
@@ -28,6 +29,7 @@ def world_sensor(sensor: Sensor | SensorMix | str, rng: np.random.Generator) -> 
         sensor: or its name, see ``sensor_named``.
         rng: draws one of a mix.
     """
+    of_kind(sensor, Sensor | SensorMix | str, "a sensor is one of nextview.cameras.sensors, or its name")
     known = sensor_named(sensor) if isinstance(sensor, str) else sensor
     drawn = known.draw(rng) if isinstance(known, SensorMix) else known
     return replace(drawn, radius=drawn.distance / DISTANCE, boxes=0.0)
@@ -85,8 +87,11 @@ class WorldCamera:
         named: Named = "point",
         viewpoints: Viewpoints | None = None,
     ) -> None:
-        if named not in get_args(Named):
-            raise UsageError(f"a target is named by {', '.join(get_args(Named))}, not by {named!r}")
+        of_kind(scene, Scene, "a world's camera looks at a Scene")
+        of_kind(rng, np.random.Generator | None, "the errors are drawn by a numpy.random.Generator")
+        of_kind(viewpoints, Viewpoints | None, "the viewpoints are a ViewSphere or Directions")
+        if not isinstance(named, str) or named not in get_args(Named):
+            raise UsageError(f"a target is named by {', '.join(get_args(Named))}, not by {as_line(named)}")
         self.scene, self.named = scene, named
         self._directions = (viewpoints or ViewSphere.named("40")).directions
         self._camera = sensed_camera(scene, sensor, rng or np.random.default_rng(0))

@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import number
 from nextview.cameras.sensors.depth_noise import kinect_axial, kinect_lateral, normal_field, uniform_field
 from nextview.cameras.sensors.projector_shadow import in_shadow
 from nextview.cameras.sensors.surface_angle import across_edges, incidence, inverse_depth, slopes
 from nextview.errors import UsageError
 
+STRONGEST = 100
+"""How many times as strong errors can be made: of what is left at 10 nothing can be made."""
 MARGIN = 16
 """How far beside what there is a pixel may show it, pixels."""
 
@@ -90,7 +93,7 @@ class Sensor:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name != "name" and not 0 <= value < np.inf:
+            if field.name != "name" and not 0 <= number(value, f"sensor {self.name}: {field.name}") < np.inf:
                 raise UsageError(f"sensor {self.name}: {field.name} is a finite number of at least 0, not {value}")
         for positive in ("height", "width", "focal", "baseline", "radius"):
             if not getattr(self, positive) > 0:
@@ -102,10 +105,10 @@ class Sensor:
         """The same sensor with all errors so many times as strong; 0 for none.
 
         Raises:
-            UsageError: a strength that is negative or not finite.
+            UsageError: a strength that is negative, or more than STRONGEST.
         """
-        if not 0 <= strength < np.inf:
-            raise UsageError(f"the strength of a sensor is a finite number of at least 0, not {strength}")
+        if not 0 <= number(strength, "the strength of a sensor") <= STRONGEST:
+            raise UsageError(f"the strength of a sensor is a number from 0 to {STRONGEST}, not {strength}")
         name = self.name if strength == 1 else f"{self.name}:{strength:g}"
         return replace(self, name=name, **{error: getattr(self, error) * strength for error in ERRORS})
 

@@ -41,6 +41,9 @@ class SensorMix:
 
     strength: float = 1.0
 
+    def __post_init__(self) -> None:
+        SENSORS["none"].scaled(self.strength)  # says what is wrong with it
+
     @property
     def name(self) -> str:
         """What it is called."""
@@ -94,6 +97,5 @@ def sensor_named(text: str) -> Sensor | SensorMix:
     except ValueError:
         raise UsageError(f"{text}: a sensor is NAME or NAME:STRENGTH, a number of at least 0") from None
     if name == "mix":
-        SENSORS["none"].scaled(times)  # says what is wrong with the strength
         return SensorMix(times)
     return SENSORS[name].scaled(times) if given else SENSORS[name]

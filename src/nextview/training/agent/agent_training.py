@@ -18,6 +18,7 @@ from nextview.envs.task import Rules
 from nextview.envs.vector_env import TaskVectorEnv
 from nextview.errors import UsageError
 from nextview.models.model_card import file_hash
+from nextview.outputs import check_file
 from nextview.policies.agent import Agent
 from nextview.policies.gain import features
 from nextview.policies.policy_card import LearnedFrom, PolicyCard
@@ -64,12 +65,15 @@ def train_agent(
 
     Raises:
         UsageError: the card is not called NAME.json.
+        ResultsError: it cannot be written.
         PredictionsError: the predictions lack what the recipe takes, or hold no objects of the training split.
         DatasetError: the objects cannot be divided.
         ModelError: the ONNX file does not answer as the network does; nothing is written then.
     """
     if card.suffix != ".json":
         raise UsageError(f"{card}: the card of a policy is called NAME.json")
+    for path in (card, card.with_suffix(".onnx")):
+        check_file(path)
     table = Predictions.load(predictions).of_split("train").deduplicate()
     judging = hold_out(table.labels, table.depth_entropy, recipe.holdout, recipe.seed)[0]
     learning = np.setdiff1d(np.arange(len(table)), judging)
