@@ -43,7 +43,7 @@ def test_an_agent_finds_the_views_that_tell_the_class_believed(tmp_path, preset,
     """Every class is told on one ring alone, and each view hints at the class: go to the ring of the class believed."""
     as_predictions(telling(SMALL, [[0], [1], [2]], 150)).save(tmp_path / "p.npz")
     learns = ["--steps", str(steps), "--envs", "64", "--evaluations", "4", "--batch", "256", "--n-views", "2"]
-    learns += ["--outcome", "log-belief", *PLAIN]
+    learns += ["--objective", "log-belief", *PLAIN]
     main(["train", "agent", str(tmp_path / "p.npz"), str(tmp_path / "a.json"), "--preset", preset, *learns])
     fresh = ReplayTable(telling(SMALL, [[0], [1], [2]], 90, seed=1), {}, Calibration(1.01))
     agent = make_policy(str(tmp_path / "a.json"), SMALL)
@@ -54,7 +54,7 @@ def test_an_agent_finds_the_views_that_tell_the_class_believed(tmp_path, preset,
     blind, ours = (
         judge(fresh, policy, 2, "log-belief", np.random.default_rng(0)) for policy in (RandomAll(SMALL), agent)
     )
-    assert ours.outcome[-1] > blind.outcome[-1]
+    assert ours.mean[-1] > blind.mean[-1]
 
 
 @pytest.fixture(scope="module")

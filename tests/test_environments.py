@@ -48,7 +48,7 @@ def file(tmp_path_factory):
     "options",
     [
         {},
-        {"inputs": INPUTS, "frame": "object", "outcome": "log-belief"},
+        {"inputs": INPUTS, "frame": "object", "objective": "log-belief"},
         {"threshold": 0.6, "view_price": 0.1, "travel_price": 0.01, "balanced": True, "inputs": ("lem", "azimuth_bin")},
     ],
 )
@@ -127,7 +127,7 @@ def test_an_episode_is_the_loop_of_a_robot():
         rng = np.random.default_rng(k)
         expected = run_episodes(observe, p.sphere, policy, np.array([3 * k]), stopping, rng, p.calibration)
         views = expected.outcome.views[0]
-        env = gymnasium.make(RECOGNISE, predictions=p, threshold=0.75, outcome="belief", inputs=("belief",))
+        env = gymnasium.make(RECOGNISE, predictions=p, threshold=0.75, objective="belief", inputs=("belief",))
         observation, info = env.reset(options={"object": k, "start": int(views[0])})
         total, ended = observation[p.labels[k]], False
         for step, (here, there) in zip(expected.steps[1:], pairwise(views), strict=False):
@@ -146,7 +146,7 @@ def test_an_episode_is_the_loop_of_a_robot():
 def test_rewards_are_what_a_view_changes_less_its_prices():
     p = learnable()
     prices = {"view_price": 0.25, "travel_price": 0.125}
-    env = gymnasium.make(RECOGNISE, predictions=p, outcome="log-belief", **prices)
+    env = gymnasium.make(RECOGNISE, predictions=p, objective="log-belief", **prices)
     for k in range(5):
         _, info = env.reset(seed=k)
         first, row, views, total, ended = info["view"], info["object"], [info["view"]], 0.0, False
@@ -208,7 +208,7 @@ def test_every_class_is_drawn_equally_often_where_that_is_asked_for():
     [
         ({"inputs": ("belief", "smell")}, UsageError, "not 'smell'"),
         ({"inputs": ()}, UsageError, "not nothing"),
-        ({"outcome": "joy"}, UsageError, "not 'joy'"),
+        ({"objective": "joy"}, UsageError, "not 'joy'"),
         ({"max_views": 1}, UsageError, "at least two views"),
         ({"max_views": 41}, UsageError, "40 views"),
         ({"travel_price": -1.0}, UsageError, "travel_price"),
@@ -240,7 +240,7 @@ def test_wrong_arguments_are_one_sentence(file, junk):
         lambda junk: gymnasium.make_vec(RECOGNISE, num_envs=junk, predictions=str(file)),
         *(
             lambda junk, name=name: gymnasium.make(RECOGNISE, **{"predictions": str(file), name: junk})
-            for name in ("predictions", "inputs", "frame", "outcome", "max_views")
+            for name in ("predictions", "inputs", "frame", "objective", "max_views")
         ),
     ]
     for door in doors:

@@ -16,13 +16,13 @@ from test_predictions import some_predictions
 
 from nextview.belief import PLAIN_SUM, Calibration, reorient
 from nextview.calibration.rollout import (
-    OUTCOMES,
+    OBJECTIVES,
     ReplayTable,
     candidate_values,
     fit_travel_weight,
     judge,
-    outcome,
     rollout,
+    value_after,
 )
 from nextview.cli.main import main
 from nextview.errors import PolicyError
@@ -205,10 +205,10 @@ def test_what_a_choice_leads_to_is_what_is_there_after_it(azimuth_bins):
             before, log_evidence = seen[-1]
             moved = SMALL.travel[before.state.current, state.current]
             np.testing.assert_allclose(moment.travel - before.travel, moved)
-            for kind in OUTCOMES:
-                reached = outcome(table, moment.total, state.step, kind)
+            for kind in OBJECTIVES:
+                reached = value_after(table, moment.total, state.step, kind)
                 np.testing.assert_allclose(reached, log_evidence[kind][np.arange(30), state.current], atol=1e-9)
-        seen.append((moment, {kind: candidate_values(table, moment, kind) for kind in OUTCOMES}))
+        seen.append((moment, {kind: candidate_values(table, moment, kind) for kind in OBJECTIVES}))
     moment = seen[-1][0]
     logits = np.stack([table.data.logits[np.arange(30), m.state.current] for m, _ in seen], 1).astype(float)
     logs = logits.sum(1) / (0.8 * 2.5)
@@ -222,9 +222,9 @@ def test_what_a_choice_leads_to_is_what_is_there_after_it(azimuth_bins):
     np.testing.assert_allclose(np.log(moment.state.belief), logs, atol=1e-9)
     assert (moment.state.visited.sum(1) == 4).all()
     of_truth = logs[np.arange(30), table.data.labels]
-    np.testing.assert_allclose(outcome(table, moment.total, 4, "log-belief"), of_truth, atol=1e-9)
+    np.testing.assert_allclose(value_after(table, moment.total, 4, "log-belief"), of_truth, atol=1e-9)
     right = (logs.argmax(1) == table.data.labels).astype(float)
-    np.testing.assert_array_equal(outcome(table, moment.total, 4, "right"), right)
+    np.testing.assert_array_equal(value_after(table, moment.total, 4, "right"), right)
 
 
 def test_objects_that_the_recogniser_knows_or_of_the_test_split_are_refused():
@@ -432,7 +432,7 @@ def test_training_finds_the_views_that_tell_the_class_believed():
     not_told_yet = first != fresh.data.labels
     assert np.mean((second == fresh.data.labels)[not_told_yet]) > 0.9
     blind = judge(fresh, RandomAll(SMALL), 3, "log-belief", np.random.default_rng(0))
-    assert (value.outcome > blind.outcome + 0.05).all()
+    assert (value.mean > blind.mean + 0.05).all()
     # What may be bought for little travel depends on where one stands: dearer ways are shorter.
     travel = [
         judge(fresh, replace(policy, travel_weight=p), 3, "log-belief", np.random.default_rng(0)).travel[-1]
@@ -475,7 +475,7 @@ def test_folds_judge_policies_that_have_not_seen_them_and_are_averaged(monkeypat
     values = [
         judge(t, p, 3, "log-belief", np.random.default_rng([0, 2]), 4) for t, p in zip(parts[1:], policies, strict=True)
     ]
-    np.testing.assert_allclose(value.outcome, np.mean([w.outcome for w in values], 0))
+    np.testing.assert_allclose(value.mean, np.mean([w.mean for w in values], 0))
     told_some = np.random.default_rng(0).random((7, len(policies[0].score.features_flip))).astype(np.float32)
     one, other = (policy.score(told_some) for policy in policies)
     assert np.abs(one - other).max() > 1e-3

@@ -22,7 +22,7 @@ from nextview.policies.gain import Gain
 
 Float = NDArray[np.float64]
 
-OUTCOMES = ("belief", "log-belief", "right")
+OBJECTIVES = ("belief", "log-belief", "right")
 """What what was seen is worth: the belief in the true class, its logarithm, or whether the answer is right."""
 
 
@@ -136,29 +136,29 @@ def rollout(
             travel = travel + sphere.travel[step.views, step.next_views]
 
 
-def outcome(table: ReplayTable, total: Float, n_views: NDArray | int, kind: str) -> Float:
+def value_after(table: ReplayTable, total: Float, n_views: NDArray | int, kind: str) -> Float:
     """What sums of the log-evidence of each object are worth.
 
     Args:
         table: holds the truth.
         total: (N, ..., D), see ``log_evidence_of``.
         n_views: how many were summed, (N, ...) or one number.
-        kind: one of OUTCOMES.
+        kind: one of OBJECTIVES.
 
     Returns:
         (N, ...) float64.
     """
     logs = table.calibration.log_belief(total, n_views, len(table.data.classes))
-    return outcome_of(logs, table.data.labels, kind)
+    return value_of(logs, table.data.labels, kind)
 
 
-def outcome_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
+def value_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
     """What beliefs are worth.
 
     Args:
         logs: of the belief in each class, up to a constant, (N, ..., C).
         labels: the truth, (N,).
-        kind: one of OUTCOMES.
+        kind: one of OBJECTIVES.
 
     Returns:
         (N, ...) float64.
@@ -170,10 +170,10 @@ def outcome_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
 
 
 def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Float:
-    """The outcome of looking from every view next, (N, V) float64."""
+    """The value of looking from every view next, (N, V) float64."""
     n_views = np.maximum(moment.seen[:, None] + table.weights, 1)
     said = table.weights[..., None] * table.data.log_evidence
-    return outcome(table, moment.total[:, None] + said, n_views, kind)
+    return value_after(table, moment.total[:, None] + said, n_views, kind)
 
 
 @dataclass(frozen=True)
@@ -181,18 +181,18 @@ class Value:
     """What a policy reaches on average, classes weighted evenly, after 2, 3, ... views.
 
     Attributes:
-        outcome: (views - 1,).
+        mean: (views - 1,).
         travel: grid cells, (views - 1,).
     """
 
-    outcome: Float
+    mean: Float
     travel: Float
 
 
 def judge(
     table: ReplayTable, policy: Policy, n_views: int, kind: str, rng: np.random.Generator, rounds: int = 8
 ) -> Value:
-    """Follow a policy ``rounds`` times over every object; the other arguments as for ``rollout`` and ``outcome``."""
+    """Follow a policy ``rounds`` times over every object; the other arguments as for ``rollout`` and ``objective``."""
     data = table.data
     weights = data.weights / len(data) / rounds
     reached = np.zeros((2, n_views - 1))
@@ -200,18 +200,18 @@ def judge(
         for moment in rollout(table, policy, n_views, rng):
             k = moment.state.step
             if k > 1:
-                value = outcome(table, moment.total, np.maximum(moment.seen, 1), kind)
+                value = value_after(table, moment.total, np.maximum(moment.seen, 1), kind)
                 reached[:, k - 2] += weights @ value, weights @ moment.travel
     return Value(*reached)
 
 
 TRAVEL_WEIGHTS = (0.0, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.012, 0.015, 0.02, 0.03, 0.05, 0.1)
-"""Of a grid cell of travel, in the unit of the outcome."""
+"""Of a grid cell of travel, in the unit of the objective."""
 
 
 def mean_value(parts: Sequence[Value], sizes: Sequence[int]) -> Value:
     """What policies reach on average, each on objects of its own."""
-    return Value(*(np.average([getattr(p, name) for p in parts], 0, sizes) for name in ("outcome", "travel")))
+    return Value(*(np.average([getattr(p, name) for p in parts], 0, sizes) for name in ("mean", "travel")))
 
 
 def fit_travel_weight(judged: Sequence[tuple[ReplayTable, Gain]], n_views: int, kind: str, seed: int) -> float:
@@ -220,7 +220,7 @@ def fit_travel_weight(judged: Sequence[tuple[ReplayTable, Gain]], n_views: int, 
     Args:
         judged: the policies whose travel weight is set, each with what is seen of the objects that judge it.
         n_views: at most.
-        kind: one of OUTCOMES.
+        kind: one of OBJECTIVES.
         seed: of the first views.
     """
 

@@ -32,7 +32,7 @@ def train_agent(
 
     made = stage.train_agent(predictions, out, recipe, track=track)
     console.print(
-        f"learned from {made.objects} objects; on {made.held_out} others the {recipe.outcome} after 2, 3, ... views is "
-        f"{', '.join(f'{x:.4f}' for x in made.value.outcome)} for {made.value.travel[-1]:.2f} cells of travel; best "
+        f"learned from {made.objects} objects; on {made.held_out} others the {recipe.objective} after 2, 3, ... views "
+        f"is {', '.join(f'{x:.4f}' for x in made.value.mean)} for {made.value.travel[-1]:.2f} cells of travel; best "
         f"after {made.steps} steps: {out}"
     )

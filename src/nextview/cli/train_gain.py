@@ -45,7 +45,7 @@ def train_gain(
         validation=validation, folds=folds, travel_weight=travel_weight, local=local, sensed=sensed, track=track,
     )  # fmt: skip
     console.print(
-        f"learned from {made.objects} objects; on {made.validated_on} the {recipe.outcome} after 2, 3, ... views is "
+        f"learned from {made.objects} objects; on {made.validated_on} the {recipe.objective} after 2, 3, ... views is "
         f"{', '.join(f'{x:.4f}' for x in made.value)} at travel weight 0; travel weight {made.travel_weight:g}: {out}"
     )
     console.print(

@@ -4,7 +4,7 @@ ap_gym (Schneider et al., "Active Perception Gym") asks an agent for an action a
 ``{"action": view, "prediction": logits}``. The reward is a base reward less the loss of the prediction. The base reward
 is the price of the view and of the way there with a minus; the loss is ap_gym's, the cross-entropy over that of a
 guess. The truth stands in the info as ``info["prediction"]["target"]``. What the recogniser believes is in the
-observation, and ``Rules.outcome`` counts for nothing.
+observation, and ``Rules.objective`` counts for nothing.
 """
 
 from __future__ import annotations

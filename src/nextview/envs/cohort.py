@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.calibration.rollout import outcome_of
+from nextview.calibration.rollout import value_of
 from nextview.envs.task import Task
 from nextview.episode import Episodes
 from nextview.policies.base import EpisodeState
@@ -41,7 +41,7 @@ class Seen:
 
     Attributes:
         observation: (A, D) float32.
-        change: of the outcome by this view, (A,) float64; 0 at the first.
+        change: of the objective by this view, (A,) float64; 0 at the first.
         price: of this view and of the way there, (A,) float64; 0 at the first.
         ended: which episodes ended with it, (A,) bool.
         info: for each episode: "object", "view", "n_views", "travel" (cells so far), "answer", its "confidence",
@@ -104,7 +104,7 @@ class Cohort:
         visited, labels = self._visited[running], task.labels[objects]
         azimuth_bins = calibration.azimuth_bins(step.total, n_seen, classes, sphere.turn[views])
         state = EpisodeState(views, visited, step.belief, step.evidence, k, running, azimuth_bins)
-        value = outcome_of(calibration.log_belief(step.total, n_seen, classes), labels, task.rules.outcome)
+        value = value_of(calibration.log_belief(step.total, n_seen, classes), labels, task.rules.objective)
         change = value - self._value[running] if k > 1 else np.zeros(len(running))
         self._value[running] = value
         reached = cells_from(sphere)[origin(sphere, state, task.rules.frame)]

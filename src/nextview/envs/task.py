@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from nextview.arguments import as_line, number, of_kind, whole
 from nextview.belief import Calibration, FixedLength, Stopping
-from nextview.calibration.rollout import OUTCOMES
+from nextview.calibration.rollout import OBJECTIVES
 from nextview.errors import UsageError
 from nextview.policies.base import Evidence
 from nextview.policies.gain import INPUTS, MAPS, Frame, mirrored_features
@@ -36,7 +36,7 @@ class Rules:
             "azimuth_bin". None of it depends on the absolute azimuth.
         frame: from where the azimuths of actions and observations are counted: the camera's, or that at which the
             object is believed to show its azimuth bin 0.
-        outcome: what is paid: by how much a view changes "right", 1 where the most believed class is the true one, 0
+        objective: what is paid: by how much a view changes "right", 1 where the most believed class is the true one, 0
             where not; or the "belief" in the true class, or its "log-belief". The differences of an episode add up to
             the change from the first view to the last (Ng, Harada and Russell, ICML 1999).
         max_views: views at most, the first included, which is not the agent's; at least 2.
@@ -51,7 +51,7 @@ class Rules:
 
     inputs: tuple[str, ...] = ("belief", "view", "place")
     frame: Frame = "camera"
-    outcome: str = "right"
+    objective: str = "right"
     max_views: int = 5
     threshold: float | None = None
     view_price: float = 0.0
@@ -60,12 +60,12 @@ class Rules:
     def __post_init__(self) -> None:
         if isinstance(self.inputs, str) or not np.iterable(self.inputs):
             raise UsageError(f"the inputs are a tuple of names, not {as_line(self.inputs)}")
-        for word in (*self.inputs, self.frame, self.outcome):
-            of_kind(word, str, "inputs, frame and outcome are names")
+        for word in (*self.inputs, self.frame, self.objective):
+            of_kind(word, str, "inputs, frame and objective are names")
         for given, known, what in (
             (self.inputs, INPUTS, "an observation"),
             ((self.frame,), get_args(Frame), "the frame"),
-            ((self.outcome,), OUTCOMES, "the outcome"),
+            ((self.objective,), OBJECTIVES, "the objective"),
         ):
             unknown = [name for name in given if name not in known]
             if unknown or not len(given):

@@ -207,7 +207,8 @@ class GainRecipe:
             is expected to show from each view.
         frame: from where azimuths are counted: from the camera's, or from the one at which the object is believed to
             show its azimuth bin 0, which takes a recogniser that was taught the azimuth bins.
-        outcome: the value of a view: belief in the true class after it, its logarithm, or whether the answer is right.
+        objective: what a view is valued by: the belief in the true class after it, its logarithm, or whether the answer
+            is right.
         n_views: the values of views 2 to this one are learned.
         hidden: width of the two hidden layers.
         networks: that are averaged, of each fold; each weighs the objects by a bootstrap draw of its own.
@@ -221,7 +222,7 @@ class GainRecipe:
 
     inputs: tuple[PolicyInput | Literal["visibility"], ...] = POLICY_INPUTS
     frame: Literal["camera", "object"] = "object"
-    outcome: Literal["belief", "log-belief", "right"] = "log-belief"
+    objective: Literal["belief", "log-belief", "right"] = "log-belief"
     n_views: int = 5
     hidden: int = 32
     networks: int = 2
@@ -248,8 +249,8 @@ class AgentRecipe:
         algorithm: of Stable-Baselines3: PPO (Schulman et al., 2017) or DQN (Mnih et al., Nature 518, 2015).
         inputs: what the agent sees; see ``policies.gain.INPUTS``.
         frame: from where the azimuths of actions and observations are counted, see ``GainRecipe``.
-        outcome: what is paid: the change of "right" (1 if the most believed class is the true one), of the "belief" in
-            the true class or of its "log-belief".
+        objective: what is paid: the change of "right" (1 if the most believed class is the true one), of the "belief"
+            in the true class or of its "log-belief".
         n_views: views of an episode, the first included.
         view_price: taken from the reward for each view.
         travel_price: taken from it for each grid cell of travel.
@@ -272,7 +273,7 @@ class AgentRecipe:
     algorithm: Literal["ppo", "dqn"] = "ppo"
     inputs: tuple[PolicyInput, ...] = POLICY_INPUTS
     frame: Literal["camera", "object"] = "object"
-    outcome: Literal["belief", "log-belief", "right"] = "log-belief"
+    objective: Literal["belief", "log-belief", "right"] = "log-belief"
     n_views: int = 5
     view_price: float = 0.0
     travel_price: float = 0.0
@@ -310,7 +311,7 @@ MVSELECT = AgentRecipe(
     algorithm="dqn",
     inputs=("belief", "place"),
     frame="camera",
-    outcome="right",
+    objective="right",
     rollout=1,
     updates=4,
     discount=0.99,

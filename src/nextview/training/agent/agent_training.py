@@ -38,7 +38,7 @@ class TrainedAgent:
         card: its card (.json); the network is the .onnx beside it.
         objects: from how many it learned.
         held_out: how many judged it.
-        value: the mean outcome after 2, 3, ... views on those, and the travel there.
+        value: the mean objective after 2, 3, ... views on those, and the travel there.
         steps: after which it was the best.
     """
 
@@ -55,7 +55,7 @@ def train_agent(
     """Train an agent on predictions of objects that the recogniser was not trained on.
 
     One part of the objects is held out; the agent is judged on these from time to time, as it will be used, and the one
-    with the best outcome less prices is kept.
+    with the best objective less prices is kept.
 
     Args:
         predictions: of such objects of the training split.
@@ -78,7 +78,7 @@ def train_agent(
     judging = hold_out(table.labels, table.depth_entropy, recipe.holdout, recipe.seed)[0]
     learning = np.setdiff1d(np.arange(len(table)), judging)
     rules = Rules(
-        recipe.inputs, recipe.frame, recipe.outcome, recipe.n_views,
+        recipe.inputs, recipe.frame, recipe.objective, recipe.n_views,
         view_price=recipe.view_price, travel_price=recipe.travel_price,
     )  # fmt: skip
     env = TaskVectorEnv(replayed(table.of_objects(learning), "train", True, rules), recipe.envs)
@@ -117,8 +117,8 @@ def _best(env: TaskVectorEnv, judges: ReplayTable, recipe: AgentRecipe, track: T
         for k, layers in enumerate(learn(model, recipe), 1):
             agent = _agent(env, layers, recipe)
             rng = np.random.default_rng([recipe.seed, 2])
-            value = judge(judges, agent, recipe.n_views, recipe.outcome, rng, rounds=4)
-            score = float(value.outcome.mean() - recipe.travel_price * value.travel[-1])
+            value = judge(judges, agent, recipe.n_views, recipe.objective, rng, rounds=4)
+            score = float(value.mean.mean() - recipe.travel_price * value.travel[-1])
             if not found or score > found[-1][0]:
                 found.append((score, model.num_timesteps, agent, value))
             yield k

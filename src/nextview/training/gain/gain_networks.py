@@ -1,4 +1,4 @@
-"""Training of the gain policy: networks regress the outcome of every choice, which the predictions know.
+"""Training of the gain policy: networks regress the value of every choice, which the predictions know.
 
 States come from random walks and from the networks' own. Several networks, each of which weighs the objects by a
 bootstrap draw of its own, are averaged: the highest of many noisy estimates is too high by chance, and less so if it
@@ -33,13 +33,13 @@ class States:
 
     Attributes:
         features: to the networks, (S, D).
-        outcomes: of a view of each cell, less the mean over the free ones, (S, V).
+        values: of a view of each cell, less the mean over the free ones, (S, V).
         free: whether the cell is unvisited and can be reached, (S, V) bool.
         objects: rows of the fitting set, (S,).
     """
 
     features: NDArray[np.float32]
-    outcomes: NDArray[np.float32]
+    values: NDArray[np.float32]
     free: NDArray[np.bool_]
     objects: NDArray[np.int64]
 
@@ -51,7 +51,7 @@ def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np
         for moment in rollout(table, policy, recipe.n_views - 1, rng, VISIBILITY in recipe.inputs):
             state = moment.state
             view = cells_from(sphere)[origin(sphere, state, recipe.frame)]
-            value = np.take_along_axis(candidate_values(table, moment, recipe.outcome), view, 1)
+            value = np.take_along_axis(candidate_values(table, moment, recipe.objective), view, 1)
             free = np.take_along_axis(state.free, view, 1)
             mean = (value * free).sum(1, keepdims=True) / np.maximum(free.sum(1, keepdims=True), 1)
             seen = features(sphere, state, recipe.inputs, recipe.frame)
@@ -118,7 +118,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
         states = walk(table, policies, recipe, rng)
         order = rng.permutation(len(states.objects))
         for batch in np.array_split(order, -(-states_each // recipe.batch)):
-            seen, value, free = (torch.from_numpy(a[batch]) for a in (states.features, states.outcomes, states.free))
+            seen, value, free = (torch.from_numpy(a[batch]) for a in (states.features, states.values, states.free))
             turned = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
             seen = torch.where(turned, seen[:, flip], seen)
             value, free = (torch.where(turned, a[:, cells_flip], a) for a in (value, free))
@@ -136,7 +136,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
 def best_epoch(
     folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], recipe: GainRecipe
 ) -> Iterator[tuple[tuple[Gain, ...], Value]]:
-    """After every epoch, the policies of the best epoch so far by their outcome over 2 to ``recipe.n_views`` views.
+    """After every epoch, the policies of the best epoch so far by their objective over 2 to ``recipe.n_views`` views.
 
     Args:
         folds: trainings side by side, each a policy an epoch.
@@ -149,11 +149,11 @@ def best_epoch(
     best = None
     for policies in zip(*folds, strict=True):
         values = [
-            judge(table, policy, recipe.n_views, recipe.outcome, np.random.default_rng([recipe.seed, 2]), rounds=4)
+            judge(table, policy, recipe.n_views, recipe.objective, np.random.default_rng([recipe.seed, 2]), rounds=4)
             for table, policy in zip(tables, policies, strict=True)
         ]
         value = mean_value(values, [len(table.data) for table in tables])
-        if best is None or value.outcome.mean() > best[1].outcome.mean():
+        if best is None or value.mean.mean() > best[1].mean.mean():
             best = policies, value
         yield best
 

@@ -33,7 +33,7 @@ class TrainedGain:
         card: its card (.json); the networks are the .onnx beside it.
         objects: from how many it learned.
         validated_on: which objects chose the epoch and the travel weight, in words.
-        value: the mean value of 2, 3, ... views on those at travel weight 0, see ``GainRecipe.outcome``.
+        value: the mean value of 2, 3, ... views on those at travel weight 0, see ``GainRecipe.objective``.
         travel_weight: that of the policy.
         states: in so many the ONNX file was compared with the networks.
         difference: by which its answers differ from theirs at most.
@@ -112,7 +112,7 @@ def train_gain(
     asked_travel_weight = travel_weight
     if travel_weight is None:
         judged = list(zip(validated, policies, strict=True))
-        travel_weight = fit_travel_weight(judged, recipe.n_views, recipe.outcome, recipe.seed)
+        travel_weight = fit_travel_weight(judged, recipe.n_views, recipe.objective, recipe.seed)
     policy = averaged(policies)
     objects = len(np.unique(np.concatenate(learning)))
     command = command_line(
@@ -137,7 +137,7 @@ def train_gain(
     states = np.concatenate([walk(part, [policy], recipe, rng).features for part in validated])
     card.parent.mkdir(parents=True, exist_ok=True)
     difference = write_gain(card, replace(policy, travel_weight=travel_weight), about, states)
-    return TrainedGain(card, objects, validated_on, value.outcome, travel_weight, len(states), difference)
+    return TrainedGain(card, objects, validated_on, value.mean, travel_weight, len(states), difference)
 
 
 def _targets(p: Predictions) -> list[str]:
