@@ -275,7 +275,7 @@ def test_what_is_known_through_sensors_is_known(boxes, capsys):
     assert "clean and through sensors" in read_card(boxes / "tiny.json").fitted_to["novelty"]
     assert f"--sensed {sensed} {sensed}" in read_card(boxes / "tiny.json").training.commands[-1]
     list(render(boxes / "meshes", few, sphere, workers=0, sensor="mix", held_out=boxes / "tiny.json"))
-    with pytest.raises(nextview.DatasetError, match="lacks 8 of 8 objects"):
+    with pytest.raises(nextview.DatasetError, match="holds none of 8 objects"):
         stages.fit_unknown(*arguments, sensed=(few, few), workers=0)
 
 

@@ -267,6 +267,13 @@ def page_as_is(stage: Path) -> Iterator[str]:
     yield ""
 
 
+def robustness(stage: Path) -> Iterator[str]:
+    """Noise, wrong object frames, occlusion, sensors."""
+    yield from page_as_is(stage)
+    yield "![Accuracy under every condition](images/robustness.png)"
+    yield ""
+
+
 def text_as_is(stage: Path) -> Iterator[str]:
     """Text that a script printed."""
     yield f"```\n{stage.read_text().rstrip()}\n```"
@@ -284,6 +291,7 @@ SECTIONS: list[tuple[str, str, Callable[[Path], Iterator[str]]]] = [
     ("benchmark-published", "Beside the thesis", thesis),
     ("agreement.md", "Views that agree on the azimuth bin", page_as_is),
     ("size.md", "The size of the object", page_as_is),
+    ("robustness.md", "Under every condition", robustness),
     ("unseen.txt", "Classes that no network has seen", text_as_is),
     ("unknown.md", "Objects of no known class", page_as_is),
     ("latency.txt", "Latency", text_as_is),

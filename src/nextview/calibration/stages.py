@@ -252,7 +252,7 @@ def fit_unknown(
         card: of the recogniser; is written anew, and NAME.novelty.safetensors beside it.
         made_up: so many objects.
         seed: of all that is drawn.
-        sensed: stores of the objects that it learned and of those that it holds out, seen through sensors: both count
+        sensed: stores of objects that it learned and of some that it holds out, seen through sensors: both count
             as known as well, and every second made-up object is seen through the mix of sensors.
         workers: processes; one for each core by default.
         progress: of rendering and of running the recogniser.
@@ -286,12 +286,13 @@ def fit_unknown(
     of_held_out = drawn(views, held_out, HELD_OUT_VIEWS)
     labels, held_out_labels = (classes[views.labels[rows]] for rows in (learned, held_out))
     if sensed is not None:
-        seen = [
+        (first, at, there), (second, held_at, held_there) = (
             _rows(path, [views.names[i] for i in rows]) for path, rows in zip(sensed, (learned, held_out), strict=True)
-        ]
-        of_learned += drawn(*seen[0], LEARNED_VIEWS)
-        of_held_out += drawn(*seen[1], HELD_OUT_VIEWS)
-        labels, held_out_labels = np.tile(labels, 2), np.tile(held_out_labels, 2)
+        )
+        of_learned += drawn(first, at, LEARNED_VIEWS)
+        of_held_out += drawn(second, held_at, HELD_OUT_VIEWS)
+        labels = np.concatenate([labels, labels[there]])
+        held_out_labels = np.concatenate([held_out_labels, held_out_labels[held_there]])
     of_made_up: list[MadeUp] = []
     for k, at in enumerate(rng.integers(len(entries), size=(made_up, 2))):
         one, other = (str(entries[j].path.absolute()) for j in at)
@@ -326,18 +327,19 @@ def fit_unknown(
     return FittedUnknown(len(learned), number, len(held_out))
 
 
-def _rows(path: Path, names: list[str]) -> tuple[ViewStore, NDArray[np.int64]]:
-    """A store, and where it holds some objects.
+def _rows(path: Path, names: list[str]) -> tuple[ViewStore, NDArray[np.int64], NDArray[np.int64]]:
+    """A store, where it holds those of some objects that it holds, and which ones these are.
 
     Raises:
-        DatasetError: it lacks one.
+        DatasetError: it holds none.
     """
     store = ViewStore.open(path)
-    row = {name: i for i, name in enumerate(store.names) if store.done[i]}
-    missing = [name for name in names if name not in row]
-    if missing:
-        raise DatasetError(f"{path}: lacks {len(missing)} of {len(names)} objects, {missing[0]} among them")
-    return store, np.array([row[name] for name in names])
+    done = store.done
+    row = {name: i for i, name in enumerate(store.names) if done[i]}
+    there = np.array([k for k, name in enumerate(names) if name in row], np.int64)
+    if len(there) == 0:
+        raise DatasetError(f"{path}: holds none of {len(names)} objects, {names[0]} among them")
+    return store, np.array([row[names[k]] for k in there]), there
 
 
 @dataclass(frozen=True)
