@@ -267,10 +267,10 @@ def page_as_is(stage: Path) -> Iterator[str]:
     yield ""
 
 
-def robustness(stage: Path) -> Iterator[str]:
+def conditions(stage: Path) -> Iterator[str]:
     """Noise, wrong object frames, occlusion, sensors."""
     yield from page_as_is(stage)
-    yield "![Accuracy under every condition](images/robustness.png)"
+    yield "![Accuracy under every condition](images/conditions.png)"
     yield ""
 
 
@@ -291,7 +291,7 @@ SECTIONS: list[tuple[str, str, Callable[[Path], Iterator[str]]]] = [
     ("benchmark-published", "Beside the thesis", thesis),
     ("agreement.md", "Views that agree on the azimuth bin", page_as_is),
     ("size.md", "The size of the object", page_as_is),
-    ("robustness.md", "Under every condition", robustness),
+    ("conditions.md", "Under every condition", conditions),
     ("unseen.txt", "Classes that no network has seen", text_as_is),
     ("unknown.md", "Objects of no known class", page_as_is),
     ("latency.txt", "Latency", text_as_is),
