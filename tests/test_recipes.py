@@ -17,6 +17,7 @@ from nextview.training.recipes import GainRecipe, MapRecipe, RecogniserRecipe
         (RecogniserRecipe, {"network": "lite0", "dropout": 1.0}, "--dropout is 0 or more and less than 1, not 1.0"),
         (RecogniserRecipe, {"validation": float("nan")}, "--validation is 0 or more and less than 1, not nan"),
         (RecogniserRecipe, {"deformed_share": 1.5}, "--deformed-share is a chance, from 0 to 1, not 1.5"),
+        (RecogniserRecipe, {"way": 0.0}, "--way is more than 0 and at most 1, not 0.0"),
         (RecogniserRecipe, {"epochs": 0}, "--epochs is at least 1, not 0"),
         (RecogniserRecipe, {"weight_decay": -1.0}, "--weight-decay is at least 0, not -1.0"),
         (MapRecipe, {"points": 1025}, "--points is 1024 at most"),

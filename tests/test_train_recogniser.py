@@ -35,7 +35,14 @@ from nextview.training.loop import WholeCheckpoints  # noqa: E402
 from nextview.training.packed import load_packed, pack, save_packed  # noqa: E402
 from nextview.training.recipes import THESIS_RECOGNISER, MapRecipe, RecogniserRecipe  # noqa: E402
 from nextview.training.recogniser.grid_training import published_cells  # noqa: E402
-from nextview.training.recogniser.recogniser_module import RecogniserModule, Source, ValidationViews, Views, augment  # noqa: E402
+from nextview.training.recogniser.recogniser_module import (  # noqa: E402
+    RecogniserModule,
+    Source,
+    ValidationViews,
+    Views,
+    augment,
+    part_way,
+)
 from nextview.training.runs import begin  # noqa: E402
 from nextview.viewsphere import ViewSphere  # noqa: E402
 
@@ -538,3 +545,12 @@ def test_the_recipes_of_the_cards_are_recipes_of_this_version(name):
     for noted in training.recipes:
         recipe = asdict(kind(**noted))
         assert recipe | noted == recipe  # an option that came later has its default
+
+
+def test_part_of_the_way_is_between_the_beginning_and_the_end():
+    start = {"weight": torch.tensor([0.0, 2.0]), "count": torch.tensor(3)}
+    end = {"weight": torch.tensor([1.0, 0.0]), "count": torch.tensor(8)}
+    between = part_way(start, end, 0.75)
+    np.testing.assert_allclose(between["weight"], [0.75, 0.5])
+    assert between["count"] == 8
+    assert torch.equal(part_way(start, end, 1.0)["weight"], end["weight"])

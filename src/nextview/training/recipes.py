@@ -61,6 +61,9 @@ class RecogniserRecipe:
         balanced: draw rare classes more often; otherwise every view comes once before any comes again.
         schedule: of the learning rate: up and down once, or halved every fifth epoch from the peak.
         patience: stop after so many epochs without a better class mean on validation; 0 never stops early.
+        way: in the end, how much of the way the parameters go from those that training began with to those it found.
+            Less than 1 keeps more of what a network knew before it went on (Wortsman et al., "Robust fine-tuning of
+            zero-shot models", CVPR 2022).
     """
 
     network: Literal["resnet", "lite0"] = "resnet"
@@ -83,6 +86,7 @@ class RecogniserRecipe:
     balanced: bool = True
     schedule: Literal["one-cycle", "halving"] = "one-cycle"
     patience: int = 0
+    way: float = 1.0
 
     def __post_init__(self) -> None:
         if self.network != "resnet" and self.depth != RecogniserRecipe.depth:
@@ -95,6 +99,8 @@ class RecogniserRecipe:
         _share(dropout=self.dropout, smoothing=self.smoothing, validation=self.validation)
         if not 0 <= self.deformed_share <= 1:
             raise UsageError(f"--deformed-share is a chance, from 0 to 1, not {self.deformed_share}")
+        if not 0 < self.way <= 1:
+            raise UsageError(f"--way is more than 0 and at most 1, not {self.way}")
 
 
 THESIS_RECOGNISER = RecogniserRecipe(

@@ -235,6 +235,16 @@ def fit_recogniser(
         load_exported(module.net, weights, augment(sample)[0] if recipe.augment else sample)
     elif weights:
         load_checkpoint(module.net, weights)
+    start = {name: values.clone() for name, values in module.net.state_dict().items()}
     validation_views = ValidationViews(sources[0].inputs, validation, labels)
     best = fit(module, views, validation_views, recipe.epochs, out, "class_accuracy", "max", recipe.patience, hardware)
+    best.net.load_state_dict(part_way(start, best.net.state_dict(), recipe.way))
     return best.net.eval()
+
+
+def part_way(start: dict[str, Tensor], end: dict[str, Tensor], way: float) -> dict[str, Tensor]:
+    """Parameters a part of the way between two states of one network; counters are those of the end."""
+    return {
+        name: torch.lerp(start[name].to(values), values, way) if values.is_floating_point() else values
+        for name, values in end.items()
+    }
