@@ -92,8 +92,8 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
     planned = result.stdout + result.stderr
     for card in (BUNDLED / "models/bundled").glob("*.json"):
         assert f"--name {card.stem}" in planned or f"{card.stem.partition('-')[0]} runs/" in planned
-    for command in ("fit calibration", "fit size", "fit valleys", "fit policies", "train gain", "evaluate", "benchmark",
-                    "report"):  # fmt: skip
+    for command in ("render ModelNet10 sensed-held-out.zarr --sensor mix", "fit calibration", "fit size", "fit valleys",
+                    "fit policies", "train gain", "evaluate", "benchmark", "report"):  # fmt: skip
         assert f"nextview {command} " in planned
     assert "docs/results.md" in planned
 
