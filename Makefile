@@ -6,7 +6,7 @@ PYTHON ?= python3
 demo: .venv/installed  ## look at a sample object, with the base installation (no torch)
 	.venv/bin/nextview demo --figure nextview_demo.png
 
-test: .venv-test/installed  ## run all tests
+test: .venv-test/installed  ## run the tests; NEXTVIEW_TESTS=all: also those that take minutes each
 	OMP_NUM_THREADS=1 .venv-test/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # one file is run by one process, of one thread
 
 lint: .venv-test/installed  ## style and types

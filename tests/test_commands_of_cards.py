@@ -37,6 +37,7 @@ def meshes(folder):
             write_off(folder / label / "train" / f"{label}_{k}.off", boxes_mesh(boxes, label))
 
 
+@pytest.mark.long
 def test_the_commands_on_a_card_make_the_model_again(tmp_path, monkeypatch):
     first, again = tmp_path / "first", tmp_path / "again"
     meshes(first / "Boxes")

@@ -505,6 +505,7 @@ def test_the_grid_replaces_nothing_that_is_a_user_s(store, tmp_path, capsys, nam
     assert not list(tmp_path.glob("resnet*"))  # before anything is trained
 
 
+@pytest.mark.long
 def test_two_devices_train_one_network(store, tmp_path):
     """As Lightning starts them; each is a process of its own."""
     run = tmp_path / "run"

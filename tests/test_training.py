@@ -254,6 +254,7 @@ def test_devices_share_every_batch_of_maps(kind, training):
         assert torch.equal(torch.stack([of_a, of_b], 1).flatten(0, 1), found[1])
 
 
+@pytest.mark.long
 def test_two_devices_train_one_map_network(trained, tmp_path):
     """As Lightning starts them; each is a process of its own."""
     run = tmp_path / "run"
@@ -302,6 +303,7 @@ def test_a_finished_run_is_not_trained_again(trained):
     assert "1," in log
 
 
+@pytest.mark.long
 def test_an_lcm_learns_from_recognisers_that_have_not_seen_the_objects(trained):
     store, runs, models = trained / "views.zarr", trained / "runs", trained / "models"
     small = ["--epochs", "1", "--views", "2", "--batch", "8", "--validation", "0.25"]
@@ -409,6 +411,7 @@ def test_valley_classes_are_fitted_to_objects_that_neither_network_has_seen(trai
         assert sentence in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.long
 def test_a_recogniser_of_images_sees_images_live_and_in_predictions(trained):
     store, run, models = trained / "views.zarr", trained / "runs/image", trained / "models"
     small = ["--epochs", "1", "--views", "2", "--batch", "8", "--validation", "0.25", "--size", "56"]
@@ -510,6 +513,7 @@ def test_eight_bits_a_weight_are_enough_for_the_answers_and_nearly_halve_the_fil
     assert (tmp_path / "8.onnx").stat().st_size < 0.55 * (tmp_path / "16.onnx").stat().st_size
 
 
+@pytest.mark.long
 def test_a_lite_network_goes_from_a_checkpoint_to_a_card_that_it_shares(trained, tmp_path, capsys):
     checkpoint(tmp_path / "imagenet.pth")
     run, store, models = trained / "runs/lite", str(trained / "views.zarr"), trained / "models"

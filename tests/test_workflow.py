@@ -108,6 +108,7 @@ def test_the_graph_from_the_bundled_models_makes_tables_alone(tmp_path):
     assert "docs/results.md" in result.stdout + result.stderr
 
 
+@pytest.mark.long
 def test_a_small_run_of_the_whole_graph(tmp_path):
     """From the meshes of box furniture to the page of results, by networks that learn next to nothing."""
     for package in ("torch", "onnx", "pandas", "jinja2"):

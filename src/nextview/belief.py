@@ -344,7 +344,8 @@ class Stopping:
     def __post_init__(self) -> None:
         if not 0 <= number(self.threshold, "the threshold") <= 1:
             raise UsageError(f"the threshold is a probability between 0 and 1, not {self.threshold}")
-        whole(self.max_views, "the number of views", 1)
+        if whole(self.max_views, "the number of views", -(2**31)) < 1:
+            raise UsageError(f"at least one view has to be taken, not {self.max_views}")
         if not 0 <= number(self.threshold_decay, "the threshold decay") < np.inf:
             raise UsageError(f"the threshold decay is a number from 0 on, not {self.threshold_decay}")
 

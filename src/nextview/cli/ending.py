@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -41,7 +42,7 @@ def say(sentence: str) -> None:
 
 @contextmanager
 def orderly_end(advice: str) -> Iterator[None]:
-    """Let a command end in one sentence: at an error, at a signal, and where its output goes nowhere.
+    """Let a command end in one sentence.
 
     A ``NextviewError``, and an OSError that names its file, end with status 2; an output that cannot be written with 1;
     Ctrl-C with 130 and SIGTERM with 143, as shells do. Anything else is a bug and keeps its traceback.
@@ -77,12 +78,11 @@ def orderly_end(advice: str) -> Iterator[None]:
             say(f"standard output or a file cannot be written ({error.strerror or 'it is closed'})")
             _forget(sys.stdout)
             sys.exit(1)
-        except (KeyboardInterrupt, SystemExit) as ended:
-            # Lightning makes one of the other.
+        except (KeyboardInterrupt, SystemExit) as ended:  # Lightning makes one of the other
             interrupt = ended.__context__ if isinstance(ended, SystemExit) else ended
             if not isinstance(interrupt, KeyboardInterrupt):
                 raise
-            # The reads that zarr has begun would complain, at great length, of being left.
+            warnings.simplefilter("ignore")  # the reads that zarr has begun would complain, at length, of being left
             logging.getLogger("asyncio").disabled = True
             sys.unraisablehook = lambda unraisable: None
             say(f"stopped; {advice}")
