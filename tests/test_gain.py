@@ -494,6 +494,7 @@ def unseen(tmp_path):
     return path
 
 
+@pytest.mark.long
 def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, capsys):
     card = tmp_path / "mine.json"
     main(["train", "gain", str(unseen), str(card), "--epochs", "2", "--inputs", "belief", "place", "--frame", "camera"])

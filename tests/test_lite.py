@@ -127,6 +127,7 @@ def test_single_kernels_stay_in_single_precision():
         assert kernels(torch.rand(1, 8, 5, 5, dtype=torch.bfloat16)).dtype == torch.float32
 
 
+@pytest.mark.long
 def test_it_goes_on_from_its_export_also_beside_another(tmp_path):
     torch.manual_seed(0)
     networks = [LiteNet(2, 4, 8), LiteNet(2, 4, 8)]

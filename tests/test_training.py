@@ -452,6 +452,7 @@ def test_what_is_no_finished_run_is_not_exported(trained, tmp_path, capsys):
     assert not (tmp_path / "models").exists()
 
 
+@pytest.mark.long
 def test_a_run_joins_recognisers_that_were_exported_before(trained, capsys):
     run, store, models = trained / "runs/recogniser", trained / "views.zarr", trained / "models"
     command = ["export", "recogniser", str(run), str(store), str(models)]

@@ -266,6 +266,7 @@ def test_a_recogniser_is_taught_by_one_command(boxes, capsys, monkeypatch):
     assert novelty_path(card.path).read_bytes() == first  # the same whatever the number of processes
 
 
+@pytest.mark.long
 def test_what_is_known_through_sensors_is_known(boxes, capsys):
     sensed, few, sphere = boxes / "sensed.zarr", boxes / "few.zarr", replace(ViewSphere.named("40"), azimuths=3)
     list(render(boxes / "meshes", sensed, sphere, workers=0, sensor="mix"))
