@@ -25,9 +25,9 @@ def check(
     """Read every rendered object and hold its arrays against each other.
 
     Image and depth must show the same silhouette, points lie where the depth says (if no sensor was in between),
-    measures that need no mesh and correspondence, where they are made, must be those of depth and points. Every chunk must be there and have its
-    checksum, and the object's arrays and name must have the digest that they were rendered with, where the store keeps
-    one. An object whose status is lost is damaged too.
+    measures that need no mesh and correspondence, where they are made, must be those of depth and points. Every chunk
+    must be there and have its checksum, and the object's arrays and name must have the digest that they were rendered
+    with, where the store keeps one. An object whose status is lost is damaged too.
 
     Args:
         path: the store.
@@ -104,8 +104,8 @@ def _check_object(path: Path, i: int) -> str | None:
         visible_points(d * np.float32(DEPTH_UNIT), pose, store.intrinsics)
         for d, pose in zip(depth, store.sphere.poses, strict=True)
     ]
-    # Half a step of the depth, along a ray that is at most a little longer, and half a step of each coordinate. A setup's
-    # errors take a view from near its pose, which is not kept: there the points have their checksum alone.
+    # Half a step of the depth, along a ray that is at most a little longer, and half a step of each coordinate. Errors
+    # of a setup take a view from near its pose, which is not kept: there the points have their checksum alone.
     exact, apart = store.group.attrs.get("sensor") is None, DEPTH_UNIT + POINT_UNIT
     if exact and not np.allclose(np.clip(expected, -1, 1), arrays["points"] * POINT_UNIT, rtol=0, atol=apart):
         return "points do not lie where the depth says"
