@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nextview.arguments import takes_paths
 from nextview.data.folders import Entry, list_dataset
 from nextview.data.lock import only_one, writing
 from nextview.data.pool import each
@@ -40,6 +41,7 @@ class Task:
     path: Path
 
 
+@takes_paths("dataset", "out", "held_out")
 def draw_worlds(
     dataset: Path,
     out: Path,

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.arguments import of_kind, regular_file, whole
+from nextview.arguments import of_kind, regular_file, takes_paths, whole
 from nextview.cameras.sensors.boxes_around import upright_boxes
 from nextview.errors import DatasetError, MeshError
 from nextview.mesh import Mesh, load_mesh
@@ -163,6 +163,7 @@ def cached_mesh(path: Path, max_faces: int = MAX_FACES) -> Mesh:
     return load_mesh(path, max_faces=max_faces)
 
 
+@takes_paths("path")
 @lru_cache(maxsize=4096)
 def mesh_hash(path: Path) -> str:
     """SHA-256 of a mesh file in hexadecimal.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.errors import ModelError
 from nextview.json_file import Fields
 from nextview.models.onnx_file import check_end, open_onnx
@@ -20,6 +21,7 @@ FEATURES_INPUT = "told"
 """The name that the features have in the ONNX file."""
 
 
+@takes_paths("weights")
 def read_gain(
     sphere: ViewSphere, table: Any, scope: Scope, weights: Path, sha256: str, kind: type[Gain] = Gain
 ) -> Gain:
