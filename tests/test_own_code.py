@@ -74,7 +74,10 @@ def asked(name: str) -> None:
         ("Strange", "policy Strange raised Other: no exception, at code_of_mine.py:13"),
         ("Says", "policy Says raised Silent, at code_of_mine.py:13"),
         ("Needs", r"policy code_of_mine:Needs cannot be made \(KeyError: 'which', at code_of_mine.py:27\)"),
-        ("Values", r"policy Values, asked what it values views at, raised ZeroDivisionError: .*, at code_of_mine.py:33"),
+        (
+            "Values",
+            r"policy Values, asked what it values views at, raised ZeroDivisionError: .*, at code_of_mine.py:33",
+        ),
         ("Flat", r"policy Flat values views by \(B, V\) numbers, here \(1, 40\)"),
     ],
 )

@@ -12,6 +12,7 @@ from types import UnionType
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nextview.errors import NextviewError, UsageError
 
@@ -65,6 +66,21 @@ def number(value: Any, what: str) -> float:
 def _too_large(value: Any) -> bool:
     """Whether a number is finite, but hardly: what is computed with it would not be."""
     return bool(1e300 < abs(value) < np.inf)
+
+
+def places(value: Any, what: str) -> NDArray[np.float64]:
+    """Points in space, (N, 3).
+
+    Raises:
+        UsageError: ``what`` are none.
+    """
+    try:
+        found = np.asarray(value)
+    except (TypeError, ValueError):  # rows of different lengths, or what no array is made of
+        found = np.zeros(0)
+    if found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in "fiu" or not np.isfinite(found).all():
+        raise UsageError(f"{what} are points, (N, 3) finite numbers, not {as_line(value)}")
+    return found.astype(np.float64, copy=False)
 
 
 def of_kind(value: Any, kinds: type | UnionType, what: str, error: type[NextviewError] = UsageError) -> None:
