@@ -294,7 +294,7 @@ def test_grids_and_frames_that_cannot_be():
 
 
 def test_the_room_imports_only_from_rooms_above_it():
-    above = {"errors", "viewsphere", "mesh", "observation", "depth", "cloud", "sensing", "occupancy"}
+    above = {"arguments", "errors", "viewsphere", "mesh", "observation", "depth", "cloud", "sensing", "occupancy"}
     for file in Path(nextview.occupancy.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.ImportFrom) and node.module.startswith("nextview"):

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.arguments import as_line, number
+from nextview.arguments import as_line, number, of_kind
 from nextview.cloud import visible_points
 from nextview.depth import FARTHEST, object_depth
 from nextview.errors import ObservationError
@@ -55,6 +55,8 @@ class SceneView:
     background_free: bool = False
 
     def __post_init__(self) -> None:
+        of_kind(self.depth, np.ndarray, "the depth of a scene is an array", ObservationError)
+        of_kind(self.target, np.ndarray, "the object's pixels are an array", ObservationError)
         if self.depth.ndim != 2 or self.target.shape != self.depth.shape:
             raise ObservationError(
                 f"the depth of a scene and the object's pixels are images of one shape, not {self.depth.shape} and "

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nextview.arguments import takes_paths
 from nextview.cloud import POINTS, visible_points
 from nextview.data.correspond import ARRAY, correspondence
 from nextview.data.lock import only_one, writing
@@ -19,6 +20,7 @@ from nextview.measures.measured_view import MeasuredView
 from nextview.measures.registry import MEASURES
 
 
+@takes_paths("path")
 def check(
     path: Path, repair: bool = False, workers: int | None = None, scheduler: str | None = None
 ) -> Iterator[tuple[str, str | None]]:
@@ -62,6 +64,7 @@ def check(
             yield store.names[i], None if problem is None else f"{problem}"
 
 
+@takes_paths("path")
 def mend(path: Path) -> None:
     """Make the arrays that rendering fills and that are missing or cannot be opened; chunks that are there are kept.
 

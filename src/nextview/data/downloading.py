@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.error import HTTPError, URLError
 
+from nextview.arguments import takes_paths
 from nextview.data.lock import only_one
 from nextview.errors import DatasetError
 from nextview.outputs import written_whole
@@ -56,6 +57,7 @@ ARCHIVES = {
 }
 
 
+@takes_paths("destination")
 def download(
     archive: Archive, destination: Path, timeout: float = 60, pause: float = 1
 ) -> Iterator[tuple[str, int, int]]:

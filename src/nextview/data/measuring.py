@@ -7,6 +7,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.folders import list_dataset
 from nextview.data.lock import only_one, writing
@@ -28,6 +30,7 @@ from nextview.measures.surface import Surface
 from nextview.mesh import load_mesh
 from nextview.mesh_format import MAX_FACES
 from nextview.models.model_card import file_hash
+from nextview.own_code import own_code
 
 READING, CASTING = "reading depth", "finding faces"
 """What is done for all measures, beside them."""
@@ -62,6 +65,7 @@ class Cost:
         return rates | {"all": self.views / max(sum(self.seconds.values()), 1e-9)}
 
 
+@takes_paths("path", "meshes")
 def measure(
     path: Path,
     names: Sequence[str] = (),
@@ -150,19 +154,19 @@ def _measure(names: tuple[str, ...], meshes: Path | None, max_faces: int, store:
         view = MeasuredView(depth, pose, store.intrinsics, surface, faces)
         lap(READING if camera is None else CASTING)
         for name, function in measures.items():
-            try:
-                with np.errstate(over="ignore"):  # what is too large for float32 is told below
-                    values[name][k] = function(view)
-            except (Exception, SystemExit) as error:  # whatever a user's measure may raise
-                if ":" not in name or isinstance(error, MeasureError):
-                    raise
-                raise MeasureError(f"measure {name} of {store.names[i]}: {type(error).__name__}: {error}") from error
+            own = own_code(partial(_failed, name, store.names[i])) if ":" in name else nullcontext()
+            with own, np.errstate(over="ignore"):  # what is too large for float32 is told below
+                values[name][k] = function(view)
             lap(name)
     for name, found in values.items():
         if not np.isfinite(found).all():
             raise MeasureError(f"measure {name} of {store.names[i]}, view {np.isfinite(found).argmin()}, is not finite")
     cost.peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     return {f"measures/{name}": found for name, found in values.items()}, cost
+
+
+def _failed(name: str, of: str, said: str) -> MeasureError:
+    return MeasureError(f"measure {name} of {of}: {said}")
 
 
 def keep(

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.belief import FixedLength
 from nextview.data.measuring import Made, keep
 from nextview.data.store import PLANNED, ViewStore
@@ -32,6 +33,7 @@ def plannable() -> list[str]:
     return [name for name, make in POLICIES.items() if tuple(make(grid, ()).needs) == ("observations",)]
 
 
+@takes_paths("path")
 def plan(
     path: Path, names: Sequence[str] = (), workers: int | None = None, scheduler: str | None = None
 ) -> Iterator[tuple[int, int]]:

@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.folders import list_dataset
 from nextview.data.samples import SAMPLES, sample_mesh
@@ -48,6 +49,7 @@ class RecogniseMeshEnv(TaskEnv):
         ModelError: there are no such models, or maps.
     """
 
+    @takes_paths("meshes")
     def __init__(
         self,
         meshes: str | Path | None = None,

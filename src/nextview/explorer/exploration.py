@@ -141,9 +141,8 @@ class Exploration:
         self._load = lru_cache(maxsize=None)(lambda policy: load(policy=policy, **options))
         self.systems: list[System] = [self._load(policy) for policy in policies]
         views = len(self.systems[0].sphere)
-        self.start = int(np.random.default_rng(seed).integers(views)) if start is None else start
-        if not 0 <= self.start < views:
-            raise UsageError(f"there is no view {self.start}, only 0 to {views - 1}")
+        drawn = int(np.random.default_rng(seed).integers(views))
+        self.start = drawn if start is None else whole(start, "the first view", 0, views - 1)
         self.show(objects[0].name)
 
     @property

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import of_kind, places
 from nextview.errors import UsageError
-from nextview.occupancy.voxel_grid import FREE, OCCLUDER, UNSEEN, Occupancy
+from nextview.occupancy.voxel_grid import FREE, OCCLUDER, UNSEEN, Occupancy, region_of
 
 Float = NDArray[np.float32]
 
@@ -35,10 +36,12 @@ def new_volume(
         (V,) float64, cubes of the grid's unit.
 
     Raises:
-        UsageError: a camera stands within the region.
+        UsageError: a camera stands within the region, or these are no cameras and no region.
     """
+    of_kind(occupancy, Occupancy, "what is known is an Occupancy")
+    positions = places(positions, "the positions of cameras")
     grid, cells = occupancy.grid, occupancy.cells.reshape(-1)
-    counts = (cells == UNSEEN) & (grid.ball if region is None else region).reshape(-1)
+    counts = (cells == UNSEEN) & region_of(grid, region).reshape(-1)
     asked, blockers = grid.middles[:, counts], grid.middles[:, cells >= OCCLUDER]
     found = np.zeros(len(positions))
     for at, eye in enumerate(_eyes(asked, positions, grid.pitch)):
@@ -70,8 +73,10 @@ def new_surface(
     Raises:
         UsageError: a camera stands within the region.
     """
+    of_kind(occupancy, Occupancy, "what is known is an Occupancy")
+    positions = places(positions, "the positions of cameras")
     grid, cells = occupancy.grid, occupancy.cells
-    solid = (cells != FREE) & (grid.ball if region is None else region) | (cells >= OCCLUDER)
+    solid = (cells != FREE) & region_of(grid, region) | (cells >= OCCLUDER)
     border = (solid & ~_enclosed(solid)).reshape(-1)
     unseen = border & (cells.reshape(-1) == UNSEEN)
     asked, blockers = grid.middles[:, unseen], grid.middles[:, border & ~unseen]

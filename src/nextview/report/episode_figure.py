@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from mpl_toolkits.mplot3d import Axes3D
 
+from nextview.arguments import takes_paths
 from nextview.errors import UsageError
 from nextview.report.style import PlainFigure
 from nextview.session import Recognition, View
@@ -19,6 +20,7 @@ from nextview.viewsphere import Viewpoints, ViewSphere
 INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
 
 
+@takes_paths("path")
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure into a PNG, PDF or SVG file.
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.data.store import RENDERED, ViewStore
 from nextview.outputs import written_whole
 from nextview.report.style import PlainFigure
@@ -22,6 +23,7 @@ CELL = 112
 """Largest side of one view in a mosaic, pixels."""
 
 
+@takes_paths("path")
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG or whatever the suffix says, aside and then renamed."""
     with written_whole(path) as part:
