@@ -25,7 +25,7 @@ from nextview.cameras.sensors import SENSORS, Sensor
 from nextview.errors import ObservationError
 from nextview.mesh import Mesh
 from nextview.sensing.frame import Frame
-from nextview.viewsphere import angle_between, look_at_origin
+from nextview.viewsphere import look_at_origin
 
 if TYPE_CHECKING:
     from nextview.session import Recognition, Session
@@ -213,7 +213,7 @@ class Arm:
         mink, arm = self._mink, self._mink.Configuration(self._model, start)
         for _ in range(ITERATIONS):
             here = arm.get_transform_frame_to_world("camera", "site").as_matrix()
-            tilt = angle_between(here[:3, 2], pose[:3, 2])
+            tilt = np.linalg.norm(here[:3, 2] - pose[:3, 2])
             if np.linalg.norm(here[:3, 3] - pose[:3, 3]) < CLOSE and tilt < STRAIGHT:
                 return arm.q.copy()
             target = pose.copy()
@@ -327,14 +327,13 @@ def along(way: Sequence[Float], step: float) -> list[Float]:
 
 
 def _turned_least(rotation: Float, forward: Float) -> Float:
-    """A rotation, (3, 3), turned by the least angle that takes its z axis to a direction, (3,)."""
-    from scipy.spatial.transform import Rotation
-
-    axis = np.cross(rotation[:, 2], forward)
-    sine = np.linalg.norm(axis)
-    angle = np.arctan2(sine, rotation[:, 2] @ forward)
-    axis = axis / sine if sine > 1e-9 else rotation[:, 0]
-    return Rotation.from_rotvec(angle * axis).as_matrix() @ rotation
+    """A rotation, (3, 3), turned by the least angle that takes its z axis to a direction, (3,) (Rodrigues' formula)."""
+    now = rotation[:, 2]
+    cosine = now @ forward
+    if cosine < -1 + 1e-9:  # it looks the other way: any axis across it will do
+        return rotation * [1, -1, -1]
+    across = np.outer(forward, now) - np.outer(now, forward)  # times a vector: its cross product with the axis
+    return (np.eye(3) + across + across @ across / (1 + cosine)) @ rotation
 
 
 CORNERS = np.stack(np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1], indexing="ij"), -1).reshape(8, 3)
