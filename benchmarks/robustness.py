@@ -31,7 +31,6 @@ SENSORS = (
     "none",
     *(f"{name}:{strength}" for name in ("kinect", "stereo", "setup", "wrist") for strength in (1, 2)),
 )
-COLOURS = ("#0b6e99", "#c4532d", "#4b8b3b", "#7a5195", "#b8860b", "#555555")
 
 
 @dataclass(frozen=True)
@@ -97,15 +96,13 @@ def draw(table: dict[tuple[str, bool], tuple[float, ...]], path: Path) -> None:
     import matplotlib
     from matplotlib.figure import Figure
 
-    from nextview.report.style import STYLE, to_png
+    from nextview.report.style import SERIES, STYLE, to_png
 
     with matplotlib.rc_context(STYLE):
         figure = Figure((6.2, 2.6))
         left, right = figure.subplots(1, 2)
         names = list(dict.fromkeys(text.partition(":")[0] for text, _ in table if ":" in text))
-        for name, colour in zip(
-            names, ("#0b6e99", "#c4532d", "#4b8b3b", "#7a5195", "#b8860b", "#555555"), strict=False
-        ):
+        for name, colour in zip(names, SERIES, strict=False):
             for denoise, style in ((True, "o-"), (False, "o:")):
                 some = [(t, v) for (t, d), v in table.items() if d == denoise and t.partition(":")[0] == name]
                 if not some:
