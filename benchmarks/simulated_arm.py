@@ -109,7 +109,7 @@ def episode(arm: Arm, system: nextview.System, name: str, label: str, seed: int)
     }  # fmt: skip
 
 
-def run(settings: Settings, done: set[tuple[str, int, str]]) -> Iterator[int]:
+def run(settings: Settings, done: dict[tuple[str, int, str], dict[str, Any]]) -> Iterator[int]:
     """Append what is missing; yields how many episodes are done."""
     entries = [entry for entry in list_dataset(settings.dataset) if entry.split == "test"]
     entries = entries[:: len(entries) // settings.objects][: settings.objects]
@@ -117,16 +117,16 @@ def run(settings: Settings, done: set[tuple[str, int, str]]) -> Iterator[int]:
     with settings.episodes.open("a", buffering=1) as file:
         for start in range(settings.starts):
             for i, entry in enumerate(entries):
-                mesh, ended = nextview.load_mesh(entry.path), {"views": 0}
-                for name in POLICIES:
-                    if (entry.path.stem, start, name) not in done:
-                        if ended["views"] != 1:  # the first view is the same for all, and no policy chose it
-                            arm = begin(mesh, settings, (i, start))
-                            ended = episode(arm, by_policy[name], name, entry.label, settings.seed + start)
-                        row = {"object": entry.path.stem, "start": start, **ended, "policy": name}
-                        file.write(json.dumps(row) + "\n")
-                    count += 1
-                    yield count
+                asked = [(entry.path.stem, start, name) for name in POLICIES]
+                ended = next((done[each] for each in asked if each in done), {"views": 0})
+                for name in (each for *_, each in asked if (entry.path.stem, start, each) not in done):
+                    if ended["views"] != 1:  # the first view is the same for all, and no policy chose it
+                        arm = begin(nextview.load_mesh(entry.path), settings, (i, start))
+                        ended = episode(arm, by_policy[name], name, entry.label, settings.seed + start)
+                    row = {"object": entry.path.stem, "start": start, **ended, "policy": name}
+                    file.write(json.dumps(row) + "\n")
+                count += len(POLICIES)
+                yield count
 
 
 def table(rows: list[dict[str, Any]], samples: int = 2000) -> Iterator[str]:
@@ -155,7 +155,7 @@ def table(rows: list[dict[str, Any]], samples: int = 2000) -> Iterator[str]:
 
 def main(settings: Settings) -> None:
     rows = [json.loads(line) for line in settings.episodes.open()] if settings.episodes.exists() else []
-    done = {(row["object"], row["start"], row["policy"]) for row in rows}
+    done = {(row["object"], row["start"], row["policy"]): row for row in rows}
     track(run(settings, done), settings.objects * settings.starts * len(POLICIES), "recognising")
     rows = [row for row in map(json.loads, settings.episodes.open()) if row["start"] < settings.starts]
     print("\n".join(table(rows)))

@@ -11,7 +11,6 @@ Embree: MuJoCo's own renderer needs OpenGL, which not every machine has. The arm
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -159,7 +158,7 @@ class Arm:
         names = [self._model.joint(k).name for k in range(7)]
         limits = dict(zip(names, FASTEST, strict=True))
         self._limits = [mink.ConfigurationLimit(self._model), mink.VelocityLimit(self._model, limits)]
-        self._solved = lru_cache(maxsize=1000)(self._solve)
+        self._solved: dict[tuple[bytes, bytes], Float | None] = {}
 
     # Kinematics
 
@@ -196,13 +195,15 @@ class Arm:
             (7,), within the joint limits and without a collision; None if none are found, from where the arm is or from
             any of STARTS.
         """
-        return self._solved(pose.tobytes(), self.joints.tobytes())
+        asked = pose.tobytes(), self.joints.tobytes()
+        if asked not in self._solved:
+            self._solved[asked] = self._solve(pose)
+        return self._solved[asked]
 
-    def _solve(self, target: bytes, joints: bytes) -> Float | None:
-        pose = np.frombuffer(target).reshape(4, 4)
+    def _solve(self, pose: Float) -> Float | None:
         if np.linalg.norm(pose[:3, 3] - [0, 0, 0.333]) > LONGEST or pose[2, 3] < 0:
             return None
-        for start in (np.frombuffer(joints), *STARTS):
+        for start in (self.joints, *STARTS):
             found = self._descend(pose, start)
             if found is not None and not self.touches(found):
                 return found
