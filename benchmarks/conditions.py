@@ -170,14 +170,12 @@ def draw(table: dict[str, dict[str, tuple[float, float, float]]], path: Path) ->
     import matplotlib
     from matplotlib.figure import Figure
 
-    from nextview.report.style import STYLE, to_png
+    from nextview.report.style import SERIES, STYLE, to_png
 
     with matplotlib.rc_context(STYLE):
         figure = Figure((6.4, 4.6))
         axes = figure.subplots()
-        for k, ((models, rows), colour) in enumerate(
-            zip(table.items(), ("#c4532d", "#0b6e99", "#4b8b3b"), strict=False)
-        ):
+        for k, ((models, rows), colour) in enumerate(zip(table.items(), SERIES, strict=False)):
             at = np.arange(len(rows)) + (k - (len(table) - 1) / 2) * 0.25
             value, low, high = np.array(list(rows.values())).T
             axes.hlines(at, low, high, lw=1.2, color=colour)

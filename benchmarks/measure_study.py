@@ -46,7 +46,7 @@ from nextview.errors import UsageError
 from nextview.measures.map_names import map_name
 from nextview.metrics import ratio
 from nextview.outputs import written_whole
-from nextview.report.style import INK, STYLE, PlainFigure, to_png
+from nextview.report.style import BLUE, INK, STYLE, PlainFigure, to_png
 
 RANDOM = "random"
 """What the policies are compared with: a view of the local window drawn at random."""
@@ -204,7 +204,7 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
     middle.set_xlabel("the same, by class")
     made.colorbar(shown, ax=middle, location="top", shrink=0.6, aspect=30)
 
-    for step, (k, colour) in enumerate(zip(n_views, ("#0b5fa5", "#c2571a", "#00805a", "#7a6fd0"), strict=False)):
+    for step, (k, colour) in enumerate(zip(n_views, (BLUE, "#c2571a", "#00805a", "#7a6fd0"), strict=False)):
         over = numbers(f"over_random_{k}")
         at = y + 0.22 * (len(n_views) - 1) / 2 - 0.22 * step
         right.hlines(at, 100 * over["low"], 100 * over["high"], color=colour)

@@ -47,12 +47,12 @@ from nextview.occupancy import (
 )
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.volumetric import Volumetric, occupancy_of
-from nextview.report.style import STYLE
+from nextview.report.style import ACCENT, BLUE, STYLE
 from nextview.session import Session
 from nextview.worlds import TARGET, Block, Scene, SceneCamera
 from nextview.worlds.scene import block_item
 
-COLOURS = ListedColormap(["#c9c9c9", "#ffffff", "#d1495b", "#0b5fa5"])
+COLOURS = ListedColormap(["#c9c9c9", "#ffffff", ACCENT, BLUE])
 """Of unseen, free, occluder and object."""
 
 

@@ -13,11 +13,10 @@ from PIL import Image
 
 from nextview.explorer.exploration import Walk
 from nextview.observation import Observation
-from nextview.report.style import heat
+from nextview.report.style import ACCENT, FAINT, INK, heat
 from nextview.session import View
 from nextview.viewsphere import ViewSphere
 
-INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
 CELL = 11
 """Side of a cell of a map, pixels."""
 SHOWN = 5

@@ -19,7 +19,7 @@ from nextview.mesh import Mesh
 from nextview.observation import Camera, Observation
 from nextview.session import Session, View
 from nextview.system import System, load, simulated
-from nextview.viewsphere import Viewpoints, elevation_of, look_at_origin, turn_of
+from nextview.viewsphere import Viewpoints, level_pose, look_at_origin
 
 Float = NDArray[np.float64]
 
@@ -214,5 +214,4 @@ class Exploration:
         """A level pose, (4, 4), in the direction of a position, (3,), as far away as the candidate views are."""
         length = np.linalg.norm(position)
         outward = position / length if length > 0 else np.array([1.0, 0, 0])
-        turn = 2 * np.pi * turn_of(outward)
-        return look_at_origin(elevation_of(outward), turn, self.walks[0].sphere.distance)
+        return level_pose(outward, self.walks[0].sphere.distance)

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from nextview.arguments import takes_paths
 from nextview.data.store import RENDERED, ViewStore
 from nextview.outputs import written_whole
-from nextview.report.style import PlainFigure
+from nextview.report.style import BLUE, GREY, PlainFigure
 from nextview.viewsphere import ViewSphere
 
-BLUE, ORANGE, GREY = "#2f6db3", "#e08a2e", "#8a8a8a"
+ORANGE = "#e08a2e"
 MAPS_ACROSS = 6
 """Maps of measures side by side; more go into further rows."""
 CELL = 112

@@ -110,8 +110,8 @@ class RecogniserRecipe:
         ensemble_seed: which network of an ensemble this is: the seed's objects validate all of them, but each has first
             weights and draws of its own.
         input: what the network sees: the geometry that a depth camera sees, or the shaded image.
-        augment: vary what is seen; see ``recogniser.augment``.
-        balanced: draw rare classes more often; otherwise every view comes once before any comes again.
+        augment: whether what is seen is varied; see ``recogniser.augment``.
+        balanced: whether rare classes are drawn more often; otherwise every view comes once before any comes again.
         schedule: of the learning rate: up and down once, or halved every fifth epoch from the peak.
         patience: stop after so many epochs without a better class mean on validation; 0 never stops early.
         way: in the end, how much of the way the parameters go from those that training began with to those it found.
@@ -203,7 +203,7 @@ class MapRecipe:
         sharpness: see ``peak``.
         reach: 0 if only the highest cell itself counts for ``peak``, 1 if its neighbours above, below, left and right
             do as well: what is within one cell.
-        mirror: exchange left and right in half of the views, in the map too.
+        mirror: whether left and right are exchanged in half of the views, in the map too.
         schedule: of the learning rate: up and down once, or a tenth every fifth epoch from the peak.
         validation: part of the training split held out for validation.
         seed: decides everything random.
