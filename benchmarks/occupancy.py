@@ -3,6 +3,7 @@
     python benchmarks/occupancy.py latency MESH [--n 64] [--views 40 15]
     python benchmarks/occupancy.py picture MESH grid.png [--start 11]
     python benchmarks/occupancy.py accuracy DATASET/ModelNet10 [--objects 60] [--policies random volumetric gain]
+    python benchmarks/occupancy.py shares learning.zarr
 
 ``latency``: milliseconds of an update with one frame, of the expected gain of all candidate views, of the visible share
 of 256 points from all of them, and of a whole decision of the policy after one, two, three and four views; of an update
@@ -10,7 +11,8 @@ with one frame of a scene, a box before the object, and of what is expected to s
 by the clock, and of processor time. ``picture``: the grid from above and from the side after one, two and three views
 that the policy chose, and the expected gain of each candidate. ``accuracy``: sessions of fixed length with the
 simulated camera on test objects, the same first views for every policy; accuracy and travel after each view, with 95 %
-bootstrap intervals over objects.
+bootstrap intervals over objects. ``shares``: in worlds for learning, how the share that is expected to show correlates
+with the true one, over the views that are free after one, two and three random ones.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ from nextview.belief import FixedLength
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
-from nextview.data.world_views import scene_intrinsics
+from nextview.data.store import ViewStore
+from nextview.data.world_views import scene_intrinsics, world_views
+from nextview.errors import UsageError
 from nextview.observation import SceneView
 from nextview.occupancy import (
     UNSEEN,
@@ -206,6 +210,49 @@ def accuracy(
         print(f"{name:14}" + "   ".join(f"{cell:>24}" for cell in cells))
 
 
+DENSITIES, UNSEEN_PARTS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8), (0.0, 0.02, 0.05, 0.1, 0.2, 0.5)
+
+
+def shares(
+    store: tyro.conf.Positional[Path],
+    densities: tuple[float, ...] = DENSITIES,
+    unseen_parts: tuple[float, ...] = UNSEEN_PARTS,
+    walks: int = 2,
+    seed: int = 0,
+) -> None:
+    """Print how the expected share correlates with the true one, over the views of a world that are free."""
+    opened, rng = ViewStore.open(store), np.random.default_rng(seed)
+    if "test" in opened.splits:
+        raise UsageError(f"{store}: holds worlds of the test split, which chooses nothing")
+    positions, truth = opened.sphere.poses[:, :3, 3], opened.measure("visible_share")
+    found = np.full((len(opened), walks, 3, len(densities), len(unseen_parts)), np.nan)
+
+    def run() -> Any:
+        for i in range(len(opened)):
+            world = world_views(opened, i)
+            for walk in range(walks):
+                reachable, seen = np.flatnonzero(world.reachable), SeenScene.unseen()
+                for k, view in enumerate(rng.permutation(reachable)[:3]):
+                    seen = seen.seen(world.scene_view(view))
+                    reachable = reachable[reachable != view]
+                    for a, b in np.ndindex(found.shape[3:]):
+                        says = expected_visibility(seen, positions, densities[a], unseen_parts[b]).expected[reachable]
+                        if np.ptp(says) > 0 and np.ptp(truth[i, reachable]) > 0:
+                            found[i, walk, k, a, b] = np.corrcoef(says, truth[i, reachable])[0, 1]
+            yield i + 1
+
+    track(run(), len(opened), "expecting")
+    for label, means in [("1 to 3 views", np.nanmean(found, (0, 1, 2)))] + [
+        (f"{k + 1} view" + "s" * (k > 0), np.nanmean(found[:, :, k], (0, 1))) for k in range(3)
+    ]:
+        print(f"after {label}: mean correlation within {len(opened)} worlds, density (rows) and unseen part (columns)")
+        print(" " * 8 + "".join(f"{part:8g}" for part in unseen_parts))
+        for density, row in zip(densities, means, strict=True):
+            print(f"{density:8g}" + "".join(f"{value:8.3f}" for value in row))
+
+
 if __name__ == "__main__":
     with orderly_end("run it again"):
-        tyro.extras.subcommand_cli_from_dict({"latency": latency, "picture": picture, "accuracy": accuracy})
+        tyro.extras.subcommand_cli_from_dict(
+            {"latency": latency, "picture": picture, "accuracy": accuracy, "shares": shares}
+        )
