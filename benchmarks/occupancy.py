@@ -3,6 +3,7 @@
     python benchmarks/occupancy.py latency MESH [--n 64] [--views 40 15]
     python benchmarks/occupancy.py picture MESH grid.png [--start 11]
     python benchmarks/occupancy.py accuracy DATASET/ModelNet10 [--objects 60] [--policies random volumetric gain]
+    python benchmarks/occupancy.py decision MESH [--sensor wrist] [--policy visible-gain] [--threads 2]
     python benchmarks/occupancy.py shares learning.zarr
 
 ``latency``: milliseconds of an update with one frame, of the expected gain of all candidate views, of the visible share
@@ -11,8 +12,10 @@ with one frame of a scene, a box before the object, and of what is expected to s
 by the clock, and of processor time. ``picture``: the grid from above and from the side after one, two and three views
 that the policy chose, and the expected gain of each candidate. ``accuracy``: sessions of fixed length with the
 simulated camera on test objects, the same first views for every policy; accuracy and travel after each view, with 95 %
-bootstrap intervals over objects. ``shares``: in worlds for learning, how the share that is expected to show correlates
-with the true one, over the views that are free after one, two and three random ones.
+bootstrap intervals over objects. ``decision``: milliseconds of a session's update, from the frame of a depth camera to
+the next pose, with boxes around the object: by the clock and of the processor's time. ``shares``: in worlds for
+learning, how the share that is expected to show correlates with the true one, over the views that are free after one,
+two and three random ones.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
 from nextview.data.store import ViewStore
 from nextview.data.world_views import scene_intrinsics, world_views
-from nextview.errors import UsageError
+from nextview.errors import ObservationError, UsageError
 from nextview.observation import SceneView
 from nextview.occupancy import (
     UNSEEN,
@@ -53,7 +56,7 @@ from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.volumetric import Volumetric, occupancy_of
 from nextview.report.style import STYLE
 from nextview.session import Session
-from nextview.worlds import TARGET, Block, Scene, SceneCamera
+from nextview.worlds import TARGET, Block, Scene, SceneCamera, WorldCamera
 from nextview.worlds.scene import block_item
 
 COLOURS = ListedColormap(["#c9c9c9", "#ffffff", "#d1495b", "#0b5fa5"])
@@ -210,6 +213,45 @@ def accuracy(
         print(f"{name:14}" + "   ".join(f"{cell:>24}" for cell in cells))
 
 
+def decision(
+    mesh: tyro.conf.Positional[Path],
+    sensor: str = "wrist",
+    policy: str = "visible-gain",
+    models: str = "modelnet10",
+    rounds: int = 10,
+    threads: int = 2,
+) -> None:
+    """Print how long a session takes from a frame to the next pose, with all that stands around the object."""
+    target = load_mesh(mesh)
+    floor = float(target.vertices[:, 2].min())
+    blocks = (Block(1.6, 0, 0, 0.3, 2, 1.5), Block(-0.3, 1.5, 0.5, 0.4, 0.5, 1.8), Block(0.2, -1.7, 0, 0.8, 0.3, 0.9))
+    scene = Scene(target, tuple(block_item(block, floor) for block in blocks))
+    system = nextview.load(models, policy=policy, threshold=1.0, max_views=5, threads=threads)
+    taken: dict[int, list[tuple[float, float]]] = {}
+    for n in range(rounds + 1):  # the first is not counted
+        camera = WorldCamera(scene, sensor, np.random.default_rng(n), named="box")
+        session = system.session_with(camera, seed=n)
+        session.reachable = camera.reachable
+        while not session.done:
+            frame = camera.observe(session.pose)
+            began, before = time.perf_counter(), time.process_time()
+            try:
+                session.update(frame)
+            except ObservationError as error:
+                camera.refused(error)
+                continue
+            times = time.perf_counter() - began, time.process_time() - before
+            if n:
+                taken.setdefault(len(session.views), []).append(times)
+    everything = [times for some in taken.values() for times in some]
+    height, width = frame.depth.shape
+    print(f"{policy}, frames of {width} x {height}, {threads} threads: ms from a frame to the next pose")
+    print(f"{'':10}{'updates':>8}{'median':>9}{'worst':>9}{'CPU':>9}{'worst':>9}")
+    for label, rows in [*((f"frame {k}", taken[k]) for k in sorted(taken)), ("all", everything)]:
+        clock, cpu = 1e3 * np.array(rows).T
+        print(f"{label:10}{len(rows):8}{np.median(clock):9.1f}{clock.max():9.1f}{np.median(cpu):9.1f}{cpu.max():9.1f}")
+
+
 DENSITIES, UNSEEN_PARTS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8), (0.0, 0.02, 0.05, 0.1, 0.2, 0.5)
 
 
@@ -254,5 +296,5 @@ def shares(
 if __name__ == "__main__":
     with orderly_end("run it again"):
         tyro.extras.subcommand_cli_from_dict(
-            {"latency": latency, "picture": picture, "accuracy": accuracy, "shares": shares}
+            {"latency": latency, "picture": picture, "accuracy": accuracy, "decision": decision, "shares": shares}
         )
