@@ -34,9 +34,9 @@ SHOWS = 0.15
 SPHERE = ViewSphere.named("40")
 
 
-def session(scene: Scene, policy: str, start: int, views: int, seed: int) -> Recognition:
+def session(scene: Scene, policy: str, models: str, start: int, views: int, seed: int) -> Recognition:
     """What a policy makes of a scene."""
-    system = nextview.load(policy=policy)
+    system = nextview.load(models, policy=policy)
     camera, rng = WorldCamera(scene, named="box"), np.random.default_rng(seed)
     rule = FixedLength(max_views=views)
     made = Session(system.models, system.policy, system.sphere, start, rule, rng, camera.object)
@@ -62,6 +62,7 @@ def main(
     target: str = "chair_0917",
     level: str = "heavy",
     policies: tuple[str, ...] = ("random-all", "visible-gain"),
+    models: str = "modelnet10",
     views: int = 3,
     split: str = "test",
     seed: int = 0,
@@ -80,7 +81,7 @@ def main(
         figure = Figure((2.1 * (views + 1), 2.4 * len(policies)))
         axes = figure.subplots(len(policies), views + 1, squeeze=False, gridspec_kw={"wspace": 0.05, "hspace": 0.2})
         for row, policy in zip(axes, policies, strict=True):
-            found = session(scene, policy, start, views, seed)
+            found = session(scene, policy, models, start, views, seed)
             for axis, view in zip(row, found.views, strict=False):
                 elevation, azimuth = np.radians(view.angles)
                 axis.imshow(picture(scene, look_at_origin(elevation, azimuth)))

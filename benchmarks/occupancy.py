@@ -3,6 +3,8 @@
     python benchmarks/occupancy.py latency MESH [--n 64] [--views 40 15]
     python benchmarks/occupancy.py picture MESH grid.png [--start 11]
     python benchmarks/occupancy.py accuracy DATASET/ModelNet10 [--objects 60] [--policies random volumetric gain]
+    python benchmarks/occupancy.py decision MESH [--sensor wrist] [--policy visible-gain] [--threads 2]
+    python benchmarks/occupancy.py shares learning.zarr
 
 ``latency``: milliseconds of an update with one frame, of the expected gain of all candidate views, of the visible share
 of 256 points from all of them, and of a whole decision of the policy after one, two, three and four views; of an update
@@ -10,7 +12,10 @@ with one frame of a scene, a box before the object, and of what is expected to s
 by the clock, and of processor time. ``picture``: the grid from above and from the side after one, two and three views
 that the policy chose, and the expected gain of each candidate. ``accuracy``: sessions of fixed length with the
 simulated camera on test objects, the same first views for every policy; accuracy and travel after each view, with 95 %
-bootstrap intervals over objects.
+bootstrap intervals over objects. ``decision``: milliseconds of a session's update, from the frame of a depth camera to
+the next pose, with boxes around the object: by the clock and of the processor's time. ``shares``: in worlds for
+learning, how the share that is expected to show correlates with the true one, over the views that are free after one,
+two and three random ones.
 """
 
 from __future__ import annotations
@@ -33,7 +38,9 @@ from nextview.belief import FixedLength
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
-from nextview.data.world_views import scene_intrinsics
+from nextview.data.store import ViewStore
+from nextview.data.world_views import scene_intrinsics, world_views
+from nextview.errors import ObservationError, UsageError
 from nextview.observation import SceneView
 from nextview.occupancy import (
     UNSEEN,
@@ -49,7 +56,7 @@ from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.volumetric import Volumetric, occupancy_of
 from nextview.report.style import ACCENT, BLUE, STYLE
 from nextview.session import Session
-from nextview.worlds import TARGET, Block, Scene, SceneCamera
+from nextview.worlds import TARGET, Block, Scene, SceneCamera, WorldCamera
 from nextview.worlds.scene import block_item
 
 COLOURS = ListedColormap(["#c9c9c9", "#ffffff", ACCENT, BLUE])
@@ -206,6 +213,88 @@ def accuracy(
         print(f"{name:14}" + "   ".join(f"{cell:>24}" for cell in cells))
 
 
+def decision(
+    mesh: tyro.conf.Positional[Path],
+    sensor: str = "wrist",
+    policy: str = "visible-gain",
+    models: str = "modelnet10",
+    rounds: int = 10,
+    threads: int = 2,
+) -> None:
+    """Print how long a session takes from a frame to the next pose, with all that stands around the object."""
+    target = load_mesh(mesh)
+    floor = float(target.vertices[:, 2].min())
+    blocks = (Block(1.6, 0, 0, 0.3, 2, 1.5), Block(-0.3, 1.5, 0.5, 0.4, 0.5, 1.8), Block(0.2, -1.7, 0, 0.8, 0.3, 0.9))
+    scene = Scene(target, tuple(block_item(block, floor) for block in blocks))
+    system = nextview.load(models, policy=policy, threshold=1.0, max_views=5, threads=threads)
+    taken: dict[int, list[tuple[float, float]]] = {}
+    for n in range(rounds + 1):  # the first is not counted
+        camera = WorldCamera(scene, sensor, np.random.default_rng(n), named="box")
+        session = system.session_with(camera, seed=n)
+        session.reachable = camera.reachable
+        while not session.done:
+            frame = camera.observe(session.pose)
+            began, before = time.perf_counter(), time.process_time()
+            try:
+                session.update(frame)
+            except ObservationError as error:
+                camera.refused(error)
+                continue
+            times = time.perf_counter() - began, time.process_time() - before
+            if n:
+                taken.setdefault(len(session.views), []).append(times)
+    everything = [times for some in taken.values() for times in some]
+    height, width = frame.depth.shape
+    print(f"{policy}, frames of {width} x {height}, {threads} threads: ms from a frame to the next pose")
+    print(f"{'':10}{'updates':>8}{'median':>9}{'worst':>9}{'CPU':>9}{'worst':>9}")
+    for label, rows in [*((f"frame {k}", taken[k]) for k in sorted(taken)), ("all", everything)]:
+        clock, cpu = 1e3 * np.array(rows).T
+        print(f"{label:10}{len(rows):8}{np.median(clock):9.1f}{clock.max():9.1f}{np.median(cpu):9.1f}{cpu.max():9.1f}")
+
+
+DENSITIES, UNSEEN_PARTS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8), (0.0, 0.02, 0.05, 0.1, 0.2, 0.5)
+
+
+def shares(
+    store: tyro.conf.Positional[Path],
+    densities: tuple[float, ...] = DENSITIES,
+    unseen_parts: tuple[float, ...] = UNSEEN_PARTS,
+    walks: int = 2,
+    seed: int = 0,
+) -> None:
+    """Print how the expected share correlates with the true one, over the views of a world that are free."""
+    opened, rng = ViewStore.open(store), np.random.default_rng(seed)
+    if "test" in opened.splits:
+        raise UsageError(f"{store}: holds worlds of the test split, which chooses nothing")
+    positions, truth = opened.sphere.poses[:, :3, 3], opened.measure("visible_share")
+    found = np.full((len(opened), walks, 3, len(densities), len(unseen_parts)), np.nan)
+
+    def run() -> Any:
+        for i in range(len(opened)):
+            world = world_views(opened, i)
+            for walk in range(walks):
+                reachable, seen = np.flatnonzero(world.reachable), SeenScene.unseen()
+                for k, view in enumerate(rng.permutation(reachable)[:3]):
+                    seen = seen.seen(world.scene_view(view))
+                    reachable = reachable[reachable != view]
+                    for a, b in np.ndindex(found.shape[3:]):
+                        says = expected_visibility(seen, positions, densities[a], unseen_parts[b]).expected[reachable]
+                        if np.ptp(says) > 0 and np.ptp(truth[i, reachable]) > 0:
+                            found[i, walk, k, a, b] = np.corrcoef(says, truth[i, reachable])[0, 1]
+            yield i + 1
+
+    track(run(), len(opened), "expecting")
+    for label, means in [("1 to 3 views", np.nanmean(found, (0, 1, 2)))] + [
+        (f"{k + 1} view" + "s" * (k > 0), np.nanmean(found[:, :, k], (0, 1))) for k in range(3)
+    ]:
+        print(f"after {label}: mean correlation within {len(opened)} worlds, density (rows) and unseen part (columns)")
+        print(" " * 8 + "".join(f"{part:8g}" for part in unseen_parts))
+        for density, row in zip(densities, means, strict=True):
+            print(f"{density:8g}" + "".join(f"{value:8.3f}" for value in row))
+
+
 if __name__ == "__main__":
     with orderly_end("run it again"):
-        tyro.extras.subcommand_cli_from_dict({"latency": latency, "picture": picture, "accuracy": accuracy})
+        tyro.extras.subcommand_cli_from_dict(
+            {"latency": latency, "picture": picture, "accuracy": accuracy, "decision": decision, "shares": shares}
+        )

@@ -345,6 +345,24 @@ def test_gain_learns_in_worlds_what_to_make_of_what_shows(predictions, tmp_path)
         train_gain(tmp_path / "alone.npz", tmp_path / "alone.json", recipe, folds=2)
 
 
+def test_folds_look_at_a_frame_once(predictions, tmp_path, monkeypatch):
+    from nextview.training.gain.gain_training import train_gain
+    from nextview.training.recipes import GainRecipe
+
+    taken, seen = [], SeenScene.seen
+
+    def counted(scene, view):
+        taken.append((view.depth.tobytes(), view.pose.tobytes()))
+        return seen(scene, view)
+
+    monkeypatch.setattr(SeenScene, "seen", counted)
+    replace(predictions, splits=np.array(["train"] * len(predictions))).save(tmp_path / "p.npz")
+    recipe = GainRecipe(("belief", "visibility"), "camera", epochs=2, walks=2, networks=1)
+    train_gain(tmp_path / "p.npz", tmp_path / "in-worlds.json", recipe, folds=2, travel_weight=0.01)
+    assert len(taken) > 40
+    assert len(taken) == len(set(taken))
+
+
 def test_worlds_for_learning_are_drawn_around_what_was_held_out(meshes, tmp_path):  # noqa: F811
     card = make_recogniser(tmp_path, ["crate", "jar"])
     card.write_text(json.dumps(json.loads(card.read_text()) | {"held_out": ["jar_0", "crate_3"]}))

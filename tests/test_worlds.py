@@ -378,6 +378,10 @@ def test_a_robot_looks_from_the_nearest_place_from_which_the_target_shows():
     away = frame.pose[:3, 3] / np.linalg.norm(frame.pose[:3, 3])
     assert 0 < np.degrees(np.arccos(away @ [1, 0, 0])) <= 55  # the views beside it, or above
     assert camera.reachable(frame.pose)
+    again = camera.observe(FRONT).pose  # the same frame would be taken for another view of the target
+    assert np.linalg.norm(again[:3, 3] - frame.pose[:3, 3]) > 0.1
+    there = camera.observe(frame.pose).pose  # unless it is asked for
+    np.testing.assert_allclose(there[:3, 3], frame.pose[:3, 3], atol=1e-6)
     filled = scene_of(Block(0.0, 0.0, 0.0, 7.0, 7.0, 6.0))  # all cameras would be in it
     with pytest.raises(NoViewLeftError):
         WorldCamera(filled, named="known").observe(FRONT)

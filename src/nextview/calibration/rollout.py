@@ -50,7 +50,12 @@ class ReplayTable:
 
     @classmethod
     def of(
-        cls, predictions: Predictions, kept: NDArray, rng: np.random.Generator, sensed: Sequence[Predictions] = ()
+        cls,
+        predictions: Predictions,
+        kept: NDArray,
+        rng: np.random.Generator,
+        sensed: Sequence[Predictions] = (),
+        worlds: WorldSight | None = None,
     ) -> ReplayTable:
         """Some of the objects of predictions, by index; calibrated anew where their recogniser is not.
 
@@ -59,6 +64,7 @@ class ReplayTable:
             kept: some of them.
             rng: for the calibration.
             sensed: the same objects through sensors, in the same order: they come after.
+            worlds: that the objects of the predictions stand in. Tables that share them share what was found there.
 
         Raises:
             PredictionsError: there are test objects among the predictions, or none is kept.
@@ -70,7 +76,7 @@ class ReplayTable:
         maps = {name: np.concatenate([part.maps[name] for part in parts]) for name in predictions.maps}
         known = predictions.calibration != PLAIN_SUM
         calibration = predictions.calibration if known else fit_temperature(data, rng)
-        worlds = worlds_of(predictions)
+        worlds = worlds or worlds_of(predictions)
         return cls(data, maps, calibration, None if worlds is None else worlds.of_worlds(np.tile(kept, len(parts))))
 
 

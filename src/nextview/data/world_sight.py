@@ -15,7 +15,7 @@ from nextview.data.world_views import WorldViews, world_views
 from nextview.episode import Visible, unconstrained
 from nextview.errors import DatasetError
 from nextview.occupancy import Occupancy, SeenScene, expected_visibility
-from nextview.occupancy.expected_visibility import GRID, shown_in
+from nextview.occupancy.expected_visibility import GRID, shown_in, sight_lines
 from nextview.policies.base import EpisodeState
 
 Constrain = Callable[[EpisodeState], EpisodeState]
@@ -131,10 +131,11 @@ class WorldSight:
         return self.shown(np.repeat(np.arange(n), v), np.tile(np.arange(v), n)).reshape(n, v)
 
     def _frame(self, row: int, view: int, views: tuple[int, WorldViews] | None) -> SeenScene:
-        """What the frame from one view says alone; kept packed, a tenth of its size or less."""
+        """What the frame from one view says alone of what lies on a line of sight; kept packed, a hundredth or so."""
         if (row, view) not in self._frames:
             assert views is not None
-            seen = SeenScene.unseen().seen(views[1].scene_view(view))
+            asked = sight_lines(GRID, self.store.sphere.poses[:, :3, 3].tobytes()).asked
+            seen = SeenScene(Occupancy.unseen(GRID, asked)).seen(views[1].scene_view(view))
             self._frames[row, view] = zlib.compress(seen.occupancy.cells.tobytes(), 1), seen.floor
         packed, floor = self._frames[row, view]
         cells = np.frombuffer(zlib.decompress(packed), np.uint8).reshape((GRID.n,) * 3)

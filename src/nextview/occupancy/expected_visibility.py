@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from nextview.arguments import number, of_kind, places
 from nextview.errors import UsageError
 from nextview.observation import SceneView
 from nextview.occupancy.voxel_grid import OBJECT, OCCLUDER, UNSEEN, Occupancy, VoxelGrid
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 GRID = VoxelGrid(64, 2.0)
 """Around the object, in object radii: what stands beside it has a place there."""
@@ -132,11 +135,10 @@ def shown_share(view: SceneView) -> float:
 
 def shown_in(seen: SeenScene, position: NDArray[np.floating]) -> float:
     """The same, of what the frame says, and of where its camera stood, (3,)."""
-    lines = SightLines(seen.occupancy.grid, np.asarray(position, np.float64)[None])
-    return float(lines.visibility(seen, DENSITY, UNSEEN_PART).expected[0])
+    return float(expected_visibility(seen, np.asarray(position, np.float64)[None]).expected[0])
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def sight_lines(grid: VoxelGrid, positions: bytes) -> SightLines:
     """Those from positions, the bytes of (V, 3) float64: the same ones are asked for again and again."""
     return SightLines(grid, np.frombuffer(positions).reshape(-1, 3))
@@ -160,56 +162,68 @@ class SightLines:
         return self.grid.within(1.0)
 
     @cached_property
-    def parts(self) -> NDArray[np.int64]:
-        """The blocks that the object can have a part in, as indices of all blocks, (P,)."""
-        return np.flatnonzero(self._blocks(self.own.astype(np.float32)))
+    def held(self) -> NDArray[np.int64]:
+        """The same as indices into ``cells.ravel()``, (Q,)."""
+        return np.flatnonzero(self.own)
 
     @cached_property
-    def passed(self) -> NDArray[np.int32]:
-        """Voxels on the line from each part to each camera, (P, steps, V); n^3 stands for none."""
+    def blocks(self) -> NDArray[np.int64]:
+        """The block of each of these, as an index of all blocks, (Q,)."""
+        m = self.grid.n // BLOCK
+        return np.ravel_multi_index(tuple(np.stack(self.own.nonzero()) // BLOCK), (m, m, m))
+
+    @cached_property
+    def parts(self) -> NDArray[np.int64]:
+        """The blocks that the object can have a part in, (P,)."""
+        return np.unique(self.blocks)
+
+    @cached_property
+    def passed(self) -> csr_array:
+        """How often the line from each part to each camera, in steps of a voxel, is in each voxel, (P * V, n^3)."""
+        from scipy.sparse import csr_array  # slow to import, and few sessions are about scenes
+
         grid, m = self.grid, self.grid.n // BLOCK
         block = np.stack(np.unravel_index(self.parts, (m, m, m)), 1)
         start = (block + 0.5) * BLOCK  # in voxels from the grid's corner
         eyes = (self.positions - np.array(grid.centre) + grid.half) / grid.pitch
         towards = eyes[None] - start[:, None]
         length = np.linalg.norm(towards, axis=2)
-        along = np.arange(0.5, np.sqrt(3) * grid.n)[:, None]
-        found = np.full((len(start), len(along), len(eyes)), grid.n**3, np.int32)
+        along = np.arange(0.5, np.sqrt(3) * grid.n)
+        voxels, steps = [], []
         for some in np.array_split(np.arange(len(start)), -(-len(start) * len(eyes) // TOGETHER)):
-            ahead = towards[some] / length[some, :, None]
-            at = np.floor(start[some, None, None] + along[:, :, None] * ahead[:, None])
-            inside = (along < length[some, None]) & ((at >= 0) & (at < grid.n)).all(3)
-            x, y, z = np.where(inside[..., None], at, 0).astype(np.int64).transpose(3, 0, 1, 2)
-            found[some] = np.where(inside, (x * grid.n + y) * grid.n + z, grid.n**3)
-        longest = int(np.flatnonzero((found < grid.n**3).any(axis=(0, 2))).max(initial=-1)) + 1
-        return np.ascontiguousarray(found[:, :longest, :])
+            ahead = (towards[some] / length[some, :, None])[:, :, None]
+            at = np.floor(start[some, None, None] + along[:, None] * ahead)
+            inside = (along < length[some, :, None]) & ((at >= 0) & (at < grid.n)).all(3)
+            x, y, z = at[inside].astype(np.int32).T
+            voxels.append((x * grid.n + y) * grid.n + z)
+            steps.append(inside.sum(2).reshape(-1))
+        found, ends = np.concatenate(voxels), np.concatenate([[0], *steps]).cumsum()
+        return csr_array((np.ones(len(found), np.float32), found, ends), shape=(len(ends) - 1, grid.n**3))
+
+    @cached_property
+    def asked(self) -> NDArray[np.bool_]:
+        """The voxels that the answer depends on, (n, n, n): frames need not be asked about others."""
+        found = self.own.copy()
+        found.reshape(-1)[self.passed.indices] = True
+        return found
 
     def visibility(self, seen: SeenScene, density: float, unseen_part: float) -> Visibility:
         """See ``expected_visibility``."""
-        cells, grid = seen.occupancy.cells, self.grid
+        cells, own = seen.occupancy.cells, self.own
         weights = self._weights(seen, unseen_part)
-        known = np.flatnonzero(weights)
-        if len(known) == 0:
+        if not weights.any():
             return Visibility(*np.ones((3, len(self.positions))))
-        flat, own = cells.reshape(-1), self.own.reshape(-1)
-        cost = np.zeros(len(flat) + 1, np.float32)
-        cost[:-1][(flat == UNSEEN) & ~own] = 1.0
-        cost[:-1][flat == OCCLUDER] = SOLID
-        passed = cost[self.passed[known]].sum(1)  # (known parts, V): thousands are occluders, the rest is unseen
+        cost = ((cells == UNSEEN) & ~own).astype(np.float32)
+        cost[cells == OCCLUDER] = SOLID
+        passed = (self.passed @ cost.reshape(-1)).reshape(len(weights), -1)  # thousands are occluders, else unseen
         free = passed < SOLID
-        share = weights[known] / weights[known].sum()
-        veil = np.exp(-density * grid.pitch * np.where(free, passed, 0)) * free
+        share = weights / weights.sum()
+        veil = np.exp(-density * self.grid.pitch * np.where(free, passed, 0)) * free
         return Visibility(share @ (passed == 0), share @ veil, share @ free)
 
     def _weights(self, seen: SeenScene, unseen_part: float) -> NDArray[np.float64]:
         """How much of the object each part is expected to hold, (P,)."""
-        cells = seen.occupancy.cells
-        above = self.grid.axes[2] > seen.floor
-        maybe = (cells == UNSEEN) & self.own & above
-        mine = np.where(maybe, np.float32(unseen_part), (cells == OBJECT) & self.own & above)
-        return self._blocks(mine.astype(np.float32)).reshape(-1)[self.parts].astype(np.float64)
-
-    def _blocks(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Sums over blocks of voxels, (m, m, m)."""
-        m = self.grid.n // BLOCK
-        return values.reshape(m, BLOCK, m, BLOCK, m, BLOCK).sum((1, 3, 5))
+        cells, most = seen.occupancy.cells.reshape(-1).take(self.held), self.parts[-1] + 1
+        above = self.grid.middles[2].take(self.held) > seen.floor
+        known, maybe = (np.bincount(self.blocks[above & (cells == what)], minlength=most) for what in (OBJECT, UNSEEN))
+        return (known + unseen_part * maybe)[self.parts]

@@ -58,7 +58,8 @@ class WorldCamera:
     - "mask": by masks that tell it from all else, its extent estimated.
 
     A pose that cannot be reached, or from which too little of the target is measured, is answered from the nearest of
-    the viewpoints that is not so, each at most once: ask only for what ``reachable`` allows to have every request met.
+    the viewpoints that is not so and where it has not stood yet: the same frame again would tell nothing, and be taken
+    for more. Ask only for what ``reachable`` allows to be answered from near.
 
     >>> camera = WorldCamera(build_scene(world, meshes), named="box")           # doctest: +SKIP
     >>> session = nextview.load().session_with(camera)                          # doctest: +SKIP
@@ -106,7 +107,7 @@ class WorldCamera:
         }[named]
         self.object = ObservedObject(denoise=denoise, life_size=False, **asked)  # type: ignore[arg-type]
         self._refused: list[Float] = []
-        self._last = np.zeros(3)
+        self._taken: list[Float] = []
 
     def reachable(self, pose: Float) -> bool:
         """Whether the camera can be brought to a pose of the world, (4, 4), metres: for ``Session.reachable``."""
@@ -123,16 +124,17 @@ class WorldCamera:
         order = np.argsort(angle_between(np.broadcast_to(asked, self._directions.shape), self._directions))
         for direction in (asked, *self._directions[order]):
             there = level_pose(direction)
-            used = any(angle_between(direction, other) < SAME for other in self._refused)
+            tried = self._refused if direction is asked else [*self._refused, *self._taken]
+            used = any(angle_between(direction, other) < SAME for other in tried)
             if used or not self.scene.reachable(there[None, :3, 3])[0]:
                 continue
             frame = self._camera.frame(there)
             if frame is not None:
-                self._last = direction
+                self._taken.append(direction)
                 return frame if self.named in ("known", "mask") else replace(frame, mask=None, pixel_centre=0.5)
             self._refused.append(direction)
         raise NoViewLeftError("the target shows from no other place that can be reached")
 
     def refused(self, error: ObservationError) -> None:
         """The target is not found in the last frame: no other one is taken from there."""
-        self._refused.append(self._last)
+        self._refused.append(self._taken.pop())

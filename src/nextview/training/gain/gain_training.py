@@ -107,8 +107,10 @@ def train_gain(
         validating, learning = [np.arange(len(other))], [everything[~np.isin(_targets(table), _targets(other))]]
         validated_on = f"{len(other)} others"
     rng = np.random.default_rng([recipe.seed, 1])
-    learned = [ReplayTable.of(table, part, rng, variants) for part in learning]
-    validated = [ReplayTable.of(other, part, rng, variants) for part in validating]
+    worlds = worlds_of(table)
+    others = worlds if validation is None else worlds_of(other)
+    learned = [ReplayTable.of(table, part, rng, variants, worlds) for part in learning]
+    validated = [ReplayTable.of(other, part, rng, variants, others) for part in validating]
     best, value = _best_epoch(learned, validated, recipe, track)
     policies = [replace(policy, scope="local" if local else "global") for policy in best]
     asked_travel_weight = travel_weight
