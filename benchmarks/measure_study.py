@@ -1,7 +1,7 @@
 """Which measure of a view serves recognition? Every measure that a store holds, against what a recogniser says.
 
     python benchmarks/measure_study.py test.npz validation.npz --out measures [--store views.zarr] [--runs 10]
-        [--policies random-all volumetric mvselect.json gain]
+        [--policies random-all volumetric mvselect.json gain] [--objects 300]
 
 Writes measures.md (the table), measures.csv (every number in a row of its own) and measures.png into the folder.
 
@@ -41,6 +41,7 @@ from nextview.calibration.valleys import valley_gains
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.predictions import Predictions
+from nextview.data.splits import sample
 from nextview.data.store import ViewStore
 from nextview.errors import UsageError
 from nextview.measures.map_names import map_name
@@ -222,6 +223,7 @@ def main(
     store: Path | None = None,
     measures: tuple[str, ...] = (),
     policies: tuple[str, ...] = (),
+    objects: int | None = None,
     n_views: tuple[int, ...] = (2, 3, 5),
     runs: int = 10,
     samples: int = 1000,
@@ -236,12 +238,14 @@ def main(
         store: the view store, if it is not where the predictions say, with its measures (nextview measure).
         measures: names; by default all that the store holds, and the confidence.
         policies: others in the same table, as nextview benchmark names them.
+        objects: only so many of each file, as nextview measure and nextview plan spread them.
         n_views: after which policies are compared.
         runs: random first views of each object.
         samples: of the bootstrap.
         seed: of everything random.
     """
     tables = [Predictions.load(path) for path in (test, validation)]
+    tables = [p.of_objects(sample(np.arange(len(p)), objects)) for p in tables]
     if store is not None:
         tables = [replace(p, store=str(store.resolve())) for p in tables]
     if set(tables[0].names) & set(tables[1].names):

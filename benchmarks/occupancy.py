@@ -124,13 +124,19 @@ def parts(policy: Volumetric, seen: list[nextview.Observation], visited: np.ndar
     known, now = occupancy_of(seen[:-1], grid), occupancy_of(seen, grid)
     flat = np.full((1, 2), 0.5)
     current = np.array([policy.sphere.nearest(last.pose[:3, 3] / np.linalg.norm(last.pose[:3, 3]))[0]])
-    state = EpisodeState(current, visited, flat, Evidence(flat), len(seen), observations=[seen])
+
+    def decision() -> int:
+        """With a frame that is new, after others that are known, as it is in an episode."""
+        views = [*seen[:-1], replace(last)]
+        state = EpisodeState(current, visited, flat, Evidence(flat), len(seen), observations=[views])
+        return int(policy.next_views(state, np.random.default_rng(0))[0])
+
     return {
         "update": lambda: known.seen(last.depth, last.pose, last.intrinsics),
         "new volume": lambda: new_volume(now, positions),
         "new surface": lambda: new_surface(now, positions),
         "visible share": lambda: visible_share(now, last.points[:256], positions),
-        "decision": lambda: policy.next_views(state, np.random.default_rng(0))[0],
+        "decision": decision,
     }
 
 

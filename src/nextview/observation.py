@@ -64,7 +64,7 @@ class SceneView:
             )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # each is itself, and can be the key of what is made of it
 class Observation:
     """One view of an object. Lists are converted; arrays of the right type are not copied.
 

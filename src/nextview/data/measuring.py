@@ -74,6 +74,7 @@ def measure(
     meshes: Path | None = None,
     max_faces: int = MAX_FACES,
     cost: Cost | None = None,
+    objects: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[int, int]]:
     """Put view measures into a store, as ``measures/NAME`` (N, V) float32.
 
@@ -85,6 +86,7 @@ def measure(
         meshes: the dataset folder that the store was rendered from, for measures that need the mesh.
         max_faces: of a mesh, as it was rendered.
         cost: is told what this run costs.
+        objects: indices of those to measure; all that are rendered by default.
 
     Yields:
         Objects done so far, and how many there are.
@@ -102,7 +104,7 @@ def measure(
         meshes = meshes.absolute()
         _check_meshes(store, meshes)
     function = partial(_measure, names, meshes, max_faces)
-    yield from keep(path, [f"measures/{name}" for name in names], function, workers, scheduler, cost)
+    yield from keep(path, [f"measures/{name}" for name in names], function, workers, scheduler, cost, objects)
 
 
 def _check_meshes(store: ViewStore, meshes: Path) -> None:
@@ -176,6 +178,7 @@ def keep(
     workers: int | None = None,
     scheduler: str | None = None,
     cost: Cost | None = None,
+    objects: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[int, int]]:
     """Call ``function(store, i)`` for the objects that lack a sound row of the arrays, and keep what it returns.
 
@@ -186,6 +189,7 @@ def keep(
         workers: processes; one for each core by default; 0 to work in this one.
         scheduler: address of a dask.distributed scheduler, to use instead.
         cost: is told what this run costs.
+        objects: indices of those that are wanted; all that are rendered by default.
 
     Yields:
         Objects done so far, and how many there are.
@@ -196,6 +200,7 @@ def keep(
     with only_one(path), writing(path):
         store = ViewStore.open(path.absolute())
         done = np.flatnonzero(store.done)
+        done = done if objects is None else np.intersect1d(done, objects)
         for name in names:
             if not store.sound(name):
                 store.add(name)
