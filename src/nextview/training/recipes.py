@@ -362,8 +362,9 @@ class AgentRecipe:
         _at_least(1, updates=self.updates, evaluations=self.evaluations)
         _at_least(0, lr=self.lr, entropy=self.entropy, view_price=self.view_price, travel_price=self.travel_price)
         _at_least(0, seed=self.seed)
-        if self.algorithm == "ppo" and self.envs * self.rollout < 2:
-            raise UsageError("--envs times --rollout is at least 2")
+        least = 2 if self.algorithm == "ppo" else 1
+        if not least <= self.envs * self.rollout <= 10_000_000:
+            raise UsageError(f"--envs times --rollout is from {least} to 10,000,000, not {self.envs * self.rollout:,}")
         shares = [number(share, "each of --discount and --exploration") for share in (self.discount, *self.exploration)]
         if len(shares) != 3 or not all(0 <= share <= 1 for share in shares):
             raise UsageError("--discount and the two numbers of --exploration are from 0 to 1")
