@@ -20,6 +20,7 @@ from nextview.data.samples import sample_mesh
 from nextview.data.store import ViewStore
 from nextview.errors import NextviewError, UsageError
 from nextview.measures.depth_entropy import depth_entropy, normalise_per_object
+from nextview.measures.measured_view import MeasuredView
 from nextview.measures.registry import find_measure
 from nextview.models.collection import find_models
 from nextview.models.model_card import find_card, read_card
@@ -164,6 +165,7 @@ DOORS = {
         name="a",
     ),
     **arguments(depth_entropy, "depth"),
+    **arguments(MeasuredView, "depth", pose=SEEN.pose, intrinsics=SEEN.intrinsics),
     **arguments(normalise_per_object, "values"),
     **arguments(VoxelGrid, "n half centre"),
     **arguments(Occupancy.unseen, "grid region", grid=GRID),

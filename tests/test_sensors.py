@@ -387,7 +387,7 @@ def test_every_number_of_a_sensor_has_its_limits(field):
 
 def test_a_shadow_wider_than_can_be_drawn_is_refused():
     near = Sensor(focal=1e5, distance=0.0011, radius=0.001, shadow=LARGEST)
-    with pytest.raises(UsageError, match="reaches .* pixels"):
+    with pytest.raises(UsageError, match=r"reaches .* pixels"):
         SensedCamera(BALL, near, rng()).observe(SPHERE.poses[0])
 
 
