@@ -49,7 +49,7 @@ def _check_types(recipe: Any) -> None:
         if kind is bool:
             of_kind(value, bool, f"{option} is true or false")
         elif kind is int:
-            whole(value, option, 0, MOST.get(field.name, 10**12))
+            whole(value, option, 0, int(MOST.get(field.name, 10**12)))
         elif kind is float:
             if abs(number(value, option)) > MOST.get(field.name, 1e6):
                 raise UsageError(f"{option} is a number of at most {MOST.get(field.name, 1e6):g}, not {value}")
