@@ -245,10 +245,20 @@ def array_of(values: Any, what: str) -> NDArray[Any]:
         raise ObservationError(f"{what} cannot be taken for an array of numbers ({error})") from None
 
 
-def _depth(depth: Any) -> NDArray[np.float32]:
+def depth_image(depth: Any) -> NDArray[Any]:
+    """A depth image, (H, W), of numbers in any unit.
+
+    Raises:
+        ObservationError: it is none.
+    """
     depth = numbers(depth, "the depth")
     if depth.ndim != 2 or depth.size == 0:
         raise ObservationError(f"the depth is one image of the shape (H, W), not {depth.shape}")
+    return depth
+
+
+def _depth(depth: Any) -> NDArray[np.float32]:
+    depth = depth_image(depth)
     with np.errstate(over="ignore"):  # what is too large becomes infinity, and so 0
         return depth.astype(np.float32, copy=False)
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -216,9 +215,10 @@ def _array(given: ArrayLike, what: str) -> NDArray:
 
 def _seconds(cost: Any) -> float:
     """What a callable says that a way costs; infinity is a cost, too."""
-    if not isinstance(cost, Real) or not cost >= 0:
-        raise UsageError(f"a travel cost is a number from 0 on, not {as_line(cost)}")
-    return number(cost, "a travel cost")
+    found = number(cost, "a travel cost")
+    if not found >= 0:
+        raise UsageError(f"a travel cost is a number from 0 on, not {found}")
+    return found
 
 
 def _truth(said: Any) -> bool:

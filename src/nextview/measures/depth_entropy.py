@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.depth import object_depth
-from nextview.errors import MeasureError, ObservationError
-from nextview.observation import numbers
+from nextview.errors import MeasureError
+from nextview.observation import depth_image, numbers
 
 QUANTUM = 1e-3
 """Depth values closer than this count as equal, object radii."""
@@ -25,10 +25,7 @@ def depth_entropy(depth: NDArray[np.floating]) -> float:
     Raises:
         ObservationError: no depth image.
     """
-    depth = numbers(depth, "the depth")
-    if depth.ndim != 2 or depth.size == 0:
-        raise ObservationError(f"the depth is one image of the shape (H, W), not {depth.shape}")
-    depth = object_depth(depth.astype(np.float64))
+    depth = object_depth(depth_image(depth).astype(np.float64, copy=False))
     seen = depth[depth > 0]
     counts = np.bincount(np.rint(seen / QUANTUM).astype(np.int64), minlength=1)
     counts[0] += depth.size - seen.size

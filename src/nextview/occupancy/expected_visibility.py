@@ -122,8 +122,8 @@ def expected_visibility(
     of_kind(seen, SeenScene, "what is known is a SeenScene")
     positions = places(positions, "the positions of cameras")
     for share, what in ((density, "how often unseen space is filled"), (unseen_part, "what unseen voxels count for")):
-        if not 0 <= number(share, what) < np.inf:
-            raise UsageError(f"{what} is a finite number from 0 on, not {share}")
+        if not 0 <= number(share, what) <= SOLID:
+            raise UsageError(f"{what} is a number from 0 to {SOLID:g}, not {share}")
     lines = sight_lines(seen.occupancy.grid, np.asarray(positions, np.float64).tobytes())
     return lines.visibility(seen, density, unseen_part)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from nextview.arguments import as_line, number, of_kind, places, whole
 from nextview.depth import FARTHEST
 from nextview.errors import ObservationError, UsageError
-from nextview.observation import checked_intrinsics, numbers
+from nextview.observation import array_of, checked_intrinsics, numbers
 
 UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)
 """What a voxel can be. Of what several frames say of it the largest counts, in whatever order they come."""
@@ -138,7 +138,8 @@ class Occupancy:
             ObservationError: depth and mask are no images of one shape, or pose and intrinsics none of a camera.
         """
         depth = numbers(depth, "the depth").astype(np.float32, copy=False)
-        shape = depth.shape if object_mask is None else np.shape(object_mask)
+        object_mask = None if object_mask is None else array_of(object_mask, "the mask")
+        shape = depth.shape if object_mask is None else object_mask.shape
         if depth.ndim != 2 or shape != depth.shape:
             raise ObservationError(f"depth and mask are images of one shape, not {depth.shape} and {shape}")
         pose = numbers(pose, "the pose")
@@ -151,7 +152,7 @@ class Occupancy:
         cells[unseen[_in_front(grid.middles[:, unseen], reach, pose, intrinsics)]] = FREE
         rows, columns = np.nonzero(depth)
         at, inside = grid.cell_of(_unproject(depth[rows, columns], rows, columns, pose, intrinsics))
-        mine = np.ones(len(at), bool) if object_mask is None else np.asarray(object_mask)[rows, columns]
+        mine = np.ones(len(at), bool) if object_mask is None else object_mask[rows, columns]
         for what in (OCCLUDER, OBJECT):
             hit = at[inside & (mine == (what == OBJECT))]
             cells[hit] = np.maximum(cells[hit], what)

@@ -49,7 +49,7 @@ def _check_types(recipe: Any) -> None:
         if kind is bool:
             of_kind(value, bool, f"{option} is true or false")
         elif kind is int:
-            whole(value, option, 0, MOST.get(field.name, 10**12))
+            whole(value, option, 0, int(MOST.get(field.name, 10**12)))
         elif kind is float:
             if abs(number(value, option)) > MOST.get(field.name, 1e6):
                 raise UsageError(f"{option} is a number of at most {MOST.get(field.name, 1e6):g}, not {value}")
@@ -362,8 +362,9 @@ class AgentRecipe:
         _at_least(1, updates=self.updates, evaluations=self.evaluations)
         _at_least(0, lr=self.lr, entropy=self.entropy, view_price=self.view_price, travel_price=self.travel_price)
         _at_least(0, seed=self.seed)
-        if self.algorithm == "ppo" and self.envs * self.rollout < 2:
-            raise UsageError("--envs times --rollout is at least 2")
+        least = 2 if self.algorithm == "ppo" else 1
+        if not least <= self.envs * self.rollout <= 10_000_000:
+            raise UsageError(f"--envs times --rollout is from {least} to 10,000,000, not {self.envs * self.rollout:,}")
         shares = [number(share, "each of --discount and --exploration") for share in (self.discount, *self.exploration)]
         if len(shares) != 3 or not all(0 <= share <= 1 for share in shares):
             raise UsageError("--discount and the two numbers of --exploration are from 0 to 1")

@@ -108,7 +108,7 @@ class Sensor:
         for name in (field.name for field in fields(self) if field.name != "name"):
             what, (least, most) = f"sensor {self.name}: {name}", LIMITS.get(name, (0, LARGEST))
             if name in ("height", "width"):
-                whole(getattr(self, name), what, least, most)
+                whole(getattr(self, name), what, int(least), int(most))
             elif not least <= number(getattr(self, name), what) <= most:
                 raise UsageError(f"{what} is a number from {least} to {most}, not {getattr(self, name)}")
         if not self.distance > self.radius:
