@@ -1,6 +1,6 @@
 """A simulated arm recognises objects on a table: how long does it move until it is right?
 
-    python benchmarks/simulated_arm.py DATASET/ModelNet10 episodes.jsonl [--objects 50] [--starts 2]
+    python benchmarks/simulated_arm.py DATASET/ModelNet10 episodes.jsonl [--objects 50] [--starts 1]
 
 Test objects of 10 cm radius stand on a table, turned at random; the camera on the wrist is a simulated stereo camera
 (``cameras.sensors``, "stereo"), 0.4 m away. Each policy starts from the same places with the same errors, and goes
@@ -69,7 +69,7 @@ class Settings:
     episodes: tyro.conf.Positional[Path]
     models: str = "modelnet10"
     objects: int = 50
-    starts: int = 2
+    starts: int = 1
     radius: float = 0.1
     seed: int = 0
 

@@ -53,7 +53,8 @@ def draw_episode(result: Recognition, title: str = "") -> Figure:
 def _draw_image(axis: Axes, view: View, step: int) -> None:
     elevation, azimuth = view.angles
     axis.imshow(view.observation.picture, cmap="gray", vmin=0, vmax=255)
-    axis.set_title(f"step {step}: view {view.index}\n{elevation:.0f}° up, {azimuth:.0f}° round", color=INK, fontsize=10)
+    where = f"{elevation:.0f}° up, {round(azimuth) % 360}° round"
+    axis.set_title(f"step {step}: view {view.index}\n{where}", color=INK, fontsize=10)
     axis.axis("off")
 
 
