@@ -184,7 +184,8 @@ class _Eyes:
         width = 2
         while width < 2 * widest:
             near = np.nonzero((width * z >= wide) & (width * z < 2 * wide))
-            coarse = _drawn(u[near] / width, v[near] / width, z[near], near[0], shape, width)
+            u_near, v_near = (c[near] / np.float32(width) for c in (u, v))
+            coarse = _drawn(u_near, v_near, z[near], near[0], shape, width)
             np.minimum(found, coarse, out=found)
             width *= 2
         return found
