@@ -233,7 +233,7 @@ def test_paths_may_be_strings_and_nothing_else():
         taking("a", several="abc")
 
 
-@pytest.mark.parametrize("wrong", NO_PATHS, ids=str)
+@pytest.mark.parametrize("wrong", NO_PATHS, ids=lambda wrong: type(wrong).__name__)
 @pytest.mark.parametrize("stage", [render, measure, predict, download, read_capture], ids=lambda stage: stage.__name__)
 def test_a_stage_looks_at_its_paths_before_it_does_anything(stage, wrong):
     """Before the first step of those that go on in steps, and whatever the other arguments are."""
