@@ -23,7 +23,7 @@ import nextview
 from nextview.belief import FixedLength
 from nextview.data.folders import list_dataset
 from nextview.errors import UsageError
-from nextview.report.style import STYLE
+from nextview.report.style import BLUE, STYLE
 from nextview.session import Recognition, Session
 from nextview.viewsphere import ViewSphere, look_at_origin
 from nextview.worlds import OTHER, TARGET, Meshes, Scene, WorldCamera, build_scene, draw_world
@@ -49,10 +49,10 @@ def from_above(axis: Axes, scene: Scene, directions: list[np.ndarray]) -> None:
     for outline, colour in [(footprint(scene.target.vertices), TARGET), *((i.footprint, OTHER) for i in scene.items)]:
         axis.add_patch(Polygon(outline, color=COLOURS[colour]))
     at = 3 * np.array(directions)
-    axis.plot(at[:, 0], at[:, 1], "-", color="#0b5fa5", linewidth=1)
+    axis.plot(at[:, 0], at[:, 1], "-", color=BLUE, linewidth=1)
     for k, place in enumerate(at, 1):
         axis.text(place[0], place[1], str(k), ha="center", va="center", fontsize=8, color="w",
-                  bbox={"boxstyle": "circle,pad=0.15", "color": "#0b5fa5"})  # fmt: skip
+                  bbox={"boxstyle": "circle,pad=0.15", "color": BLUE})  # fmt: skip
     axis.set(xlim=(-3.6, 3.6), ylim=(-3.6, 3.6), xticks=[], yticks=[], aspect="equal")
 
 

@@ -5,8 +5,8 @@
 "clean" is a render without a sensor. The next conditions are renders with one error each, of the strength that their
 name tells: depth noise and holes; a vertical that is wrong by 20 degrees, a centre by 0.15 radii, a radius by a
 quarter; a quarter of the object's width or height cut off; boxes that hide much of it. Then sensors. Every condition
-has the same objects, first views and draws. Prints, for each condition, with standard errors: the share of the object
-that no box hides in the first view, accuracy of the first view alone, accuracy at the end, views, travel (cells), the
+has the same objects, first views and draws. Prints, for each condition: the share of the object that no box hides in
+the first view, accuracy of the first view alone and at the end (95 % Wilson intervals), views, travel (cells), the
 calibration error of the last belief, and the share that is wrong at a belief of the threshold.
 """
 
@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
+from scipy.stats import binomtest
 
 import nextview
 from nextview import Camera, Mesh, System, load_mesh
@@ -32,8 +33,8 @@ from nextview.data.pool import WorkerDied, each
 from nextview.metrics import calibration_error
 from nextview.sensing import ObjectFrame
 
-BOXES = 14.0
-"""So many boxes on average leave 57 % of the object visible from the first views."""
+BOXES = 15.5
+"""So many boxes on average leave 57 % of an object visible: 59 % of 103 held-out training objects by 15, 55 % by 16."""
 
 
 class QuarterCut(SensedCamera):
@@ -164,24 +165,21 @@ def episodes(settings: Settings, item: tuple[int, Entry]) -> list[list[tuple[flo
     return found
 
 
-def draw(table: dict[str, dict[str, tuple[float, float]]], path: Path) -> None:
-    """Accuracy by condition, one colour for each set of models."""
+def draw(table: dict[str, dict[str, tuple[float, float, float]]], path: Path) -> None:
+    """Accuracy and its interval by condition, denoised, one colour for each set of models."""
     import matplotlib
     from matplotlib.figure import Figure
 
-    from nextview.report.style import STYLE, to_png
+    from nextview.report.style import SERIES, STYLE, to_png
 
     with matplotlib.rc_context(STYLE):
-        figure = Figure((6.4, 3.4))
+        figure = Figure((6.4, 4.6))
         axes = figure.subplots()
-        for k, ((models, rows), colour) in enumerate(
-            zip(table.items(), ("#c4532d", "#0b6e99", "#4b8b3b"), strict=False)
-        ):
+        for k, ((models, rows), colour) in enumerate(zip(table.items(), SERIES, strict=False)):
             at = np.arange(len(rows)) + (k - (len(table) - 1) / 2) * 0.25
-            value, error = np.array(list(rows.values())).T
-            axes.errorbar(
-                value, at, xerr=error, fmt="o", ms=4, capsize=2, lw=1.2, color=colour, label=Path(models).name
-            )
+            value, low, high = np.array(list(rows.values())).T
+            axes.hlines(at, low, high, lw=1.2, color=colour)
+            axes.plot(value, at, "o", ms=4, color=colour, label=Path(models).name)
         axes.set(yticks=range(len(rows)), yticklabels=list(rows), xlabel="accuracy", xlim=(None, 1))
         axes.invert_yaxis()
         axes.legend()
@@ -222,12 +220,12 @@ def main(settings: Settings) -> None:
             sure = float(((belief >= settings.threshold) & (right == 0)).mean())
             cells = [name, Path(models).name, "denoised" if denoise else "as it is", f"{shown.mean():.2f}"]
             for share in (single, right):
-                error = np.sqrt(share.mean() * (1 - share.mean()) / len(share))
-                cells.append(f"{share.mean():.3f} ({error:.3f})")
+                low, high = binomtest(int(share.sum()), len(share)).proportion_ci(method="wilson")
+                cells.append(f"{share.mean():.3f} ({low:.3f}-{high:.3f})")
             cells += [f"{views.mean():.2f}", f"{travel.mean():.2f}", f"{calibration:.3f}", f"{sure:.3f}"]
             print(f"| {' | '.join(cells)} |")
             if denoise:
-                table.setdefault(models, {})[name] = float(right.mean()), float(error)
+                table.setdefault(models, {})[name] = float(right.mean()), float(low), float(high)
     if settings.figure:
         draw(table, settings.figure)
 

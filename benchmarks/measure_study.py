@@ -1,7 +1,7 @@
 """Which measure of a view serves recognition? Every measure that a store holds, against what a recogniser says.
 
     python benchmarks/measure_study.py test.npz validation.npz --out measures [--store views.zarr] [--runs 10]
-        [--policies random-all volumetric mvselect.json gain]
+        [--policies random-all volumetric mvselect.json gain] [--objects 300]
 
 Writes measures.md (the table), measures.csv (every number in a row of its own) and measures.png into the folder.
 
@@ -41,12 +41,13 @@ from nextview.calibration.valleys import valley_gains
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.predictions import Predictions
+from nextview.data.splits import sample
 from nextview.data.store import ViewStore
 from nextview.errors import UsageError
 from nextview.measures.map_names import map_name
 from nextview.metrics import ratio
 from nextview.outputs import written_whole
-from nextview.report.style import INK, STYLE, PlainFigure, to_png
+from nextview.report.style import BLUE, INK, STYLE, PlainFigure, to_png
 
 RANDOM = "random"
 """What the policies are compared with: a view of the local window drawn at random."""
@@ -204,7 +205,7 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
     middle.set_xlabel("the same, by class")
     made.colorbar(shown, ax=middle, location="top", shrink=0.6, aspect=30)
 
-    for step, (k, colour) in enumerate(zip(n_views, ("#0b5fa5", "#c2571a", "#00805a", "#7a6fd0"), strict=False)):
+    for step, (k, colour) in enumerate(zip(n_views, (BLUE, "#c2571a", "#00805a", "#7a6fd0"), strict=False)):
         over = numbers(f"over_random_{k}")
         at = y + 0.22 * (len(n_views) - 1) / 2 - 0.22 * step
         right.hlines(at, 100 * over["low"], 100 * over["high"], color=colour)
@@ -222,6 +223,7 @@ def main(
     store: Path | None = None,
     measures: tuple[str, ...] = (),
     policies: tuple[str, ...] = (),
+    objects: int | None = None,
     n_views: tuple[int, ...] = (2, 3, 5),
     runs: int = 10,
     samples: int = 1000,
@@ -236,12 +238,14 @@ def main(
         store: the view store, if it is not where the predictions say, with its measures (nextview measure).
         measures: names; by default all that the store holds, and the confidence.
         policies: others in the same table, as nextview benchmark names them.
+        objects: only so many of each file, as nextview measure and nextview plan spread them.
         n_views: after which policies are compared.
         runs: random first views of each object.
         samples: of the bootstrap.
         seed: of everything random.
     """
     tables = [Predictions.load(path) for path in (test, validation)]
+    tables = [p.of_objects(sample(np.arange(len(p)), objects)) for p in tables]
     if store is not None:
         tables = [replace(p, store=str(store.resolve())) for p in tables]
     if set(tables[0].names) & set(tables[1].names):

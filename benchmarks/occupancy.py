@@ -54,12 +54,12 @@ from nextview.occupancy import (
 )
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.volumetric import Volumetric, occupancy_of
-from nextview.report.style import STYLE
+from nextview.report.style import ACCENT, BLUE, STYLE
 from nextview.session import Session
 from nextview.worlds import TARGET, Block, Scene, SceneCamera, WorldCamera
 from nextview.worlds.scene import block_item
 
-COLOURS = ListedColormap(["#c9c9c9", "#ffffff", "#d1495b", "#0b5fa5"])
+COLOURS = ListedColormap(["#c9c9c9", "#ffffff", ACCENT, BLUE])
 """Of unseen, free, occluder and object."""
 
 
@@ -124,13 +124,19 @@ def parts(policy: Volumetric, seen: list[nextview.Observation], visited: np.ndar
     known, now = occupancy_of(seen[:-1], grid), occupancy_of(seen, grid)
     flat = np.full((1, 2), 0.5)
     current = np.array([policy.sphere.nearest(last.pose[:3, 3] / np.linalg.norm(last.pose[:3, 3]))[0]])
-    state = EpisodeState(current, visited, flat, Evidence(flat), len(seen), observations=[seen])
+
+    def decision() -> int:
+        """With a frame that is new, after others that are known, as it is in an episode."""
+        views = [*seen[:-1], replace(last)]
+        state = EpisodeState(current, visited, flat, Evidence(flat), len(seen), observations=[views])
+        return int(policy.next_views(state, np.random.default_rng(0))[0])
+
     return {
         "update": lambda: known.seen(last.depth, last.pose, last.intrinsics),
         "new volume": lambda: new_volume(now, positions),
         "new surface": lambda: new_surface(now, positions),
         "visible share": lambda: visible_share(now, last.points[:256], positions),
-        "decision": lambda: policy.next_views(state, np.random.default_rng(0))[0],
+        "decision": decision,
     }
 
 

@@ -1,6 +1,6 @@
 """A simulated arm recognises objects on a table: how long does it move until it is right?
 
-    python benchmarks/simulated_arm.py DATASET/ModelNet10 episodes.jsonl [--objects 30] [--starts 3]
+    python benchmarks/simulated_arm.py DATASET/ModelNet10 episodes.jsonl [--objects 50] [--starts 1]
 
 Test objects of 10 cm radius stand on a table, turned at random; the camera on the wrist is a simulated stereo camera
 (``cameras.sensors``, "stereo"), 0.4 m away. Each policy starts from the same places with the same errors, and goes
@@ -58,6 +58,7 @@ class Settings:
     Attributes:
         dataset: folder in ModelNet's layout.
         episodes: file to which episodes are appended.
+        models: bundled models by name, or a folder with models of your own and their policy gain.
         objects: so many of the test split, spread over it.
         starts: first views of each, from directions drawn from those in reach.
         radius: of the objects, metres.
@@ -66,16 +67,17 @@ class Settings:
 
     dataset: tyro.conf.Positional[Path]
     episodes: tyro.conf.Positional[Path]
-    objects: int = 30
-    starts: int = 3
+    models: str = "modelnet10"
+    objects: int = 50
+    starts: int = 1
     radius: float = 0.1
     seed: int = 0
 
 
-def systems() -> dict[str, nextview.System]:
+def systems(models: str) -> dict[str, nextview.System]:
     """By policy."""
-    gain = nextview.load(policy="gain", threads=1)
-    made = {"gain": gain, "gain, in cells": gain, "random": nextview.load(policy="random-all", threads=1)}
+    gain = nextview.load(models, policy="gain", threads=1)
+    made = {"gain": gain, "gain, in cells": gain, "random": nextview.load(models, policy="random-all", threads=1)}
     return made | {"nearest": replace(gain, policy=Nearest(gain.sphere), policy_name="nearest")}
 
 
@@ -107,24 +109,24 @@ def episode(arm: Arm, system: nextview.System, name: str, label: str, seed: int)
     }  # fmt: skip
 
 
-def run(settings: Settings, done: set[tuple[str, int, str]]) -> Iterator[int]:
+def run(settings: Settings, done: dict[tuple[str, int, str], dict[str, Any]]) -> Iterator[int]:
     """Append what is missing; yields how many episodes are done."""
     entries = [entry for entry in list_dataset(settings.dataset) if entry.split == "test"]
     entries = entries[:: len(entries) // settings.objects][: settings.objects]
-    by_policy, count = systems(), 0
+    by_policy, count = systems(settings.models), 0
     with settings.episodes.open("a", buffering=1) as file:
         for start in range(settings.starts):
             for i, entry in enumerate(entries):
-                mesh, ended = nextview.load_mesh(entry.path), {"views": 0}
-                for name in POLICIES:
-                    if (entry.path.stem, start, name) not in done:
-                        if ended["views"] != 1:  # the first view is the same for all, and no policy chose it
-                            arm = begin(mesh, settings, (i, start))
-                            ended = episode(arm, by_policy[name], name, entry.label, settings.seed + start)
-                        row = {"object": entry.path.stem, "start": start, **ended, "policy": name}
-                        file.write(json.dumps(row) + "\n")
-                    count += 1
-                    yield count
+                asked = [(entry.path.stem, start, name) for name in POLICIES]
+                ended = next((done[each] for each in asked if each in done), {"views": 0})
+                for name in (each for *_, each in asked if (entry.path.stem, start, each) not in done):
+                    if ended["views"] != 1:  # the first view is the same for all, and no policy chose it
+                        arm = begin(nextview.load_mesh(entry.path), settings, (i, start))
+                        ended = episode(arm, by_policy[name], name, entry.label, settings.seed + start)
+                    row = {"object": entry.path.stem, "start": start, **ended, "policy": name}
+                    file.write(json.dumps(row) + "\n")
+                count += len(POLICIES)
+                yield count
 
 
 def table(rows: list[dict[str, Any]], samples: int = 2000) -> Iterator[str]:
@@ -153,7 +155,7 @@ def table(rows: list[dict[str, Any]], samples: int = 2000) -> Iterator[str]:
 
 def main(settings: Settings) -> None:
     rows = [json.loads(line) for line in settings.episodes.open()] if settings.episodes.exists() else []
-    done = {(row["object"], row["start"], row["policy"]) for row in rows}
+    done = {(row["object"], row["start"], row["policy"]): row for row in rows}
     track(run(settings, done), settings.objects * settings.starts * len(POLICIES), "recognising")
     rows = [row for row in map(json.loads, settings.episodes.open()) if row["start"] < settings.starts]
     print("\n".join(table(rows)))

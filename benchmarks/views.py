@@ -48,7 +48,7 @@ from nextview.errors import UsageError
 from nextview.metrics import ratio
 from nextview.report.curves import COLOURS, OWN, is_oracle
 from nextview.report.html_tables import KNOWING
-from nextview.report.style import STYLE, to_png
+from nextview.report.style import GREY, STYLE, to_png
 
 POLICIES = (
     "random",
@@ -272,7 +272,7 @@ def label(
         if far > 11:
             tied.append(tie)
             ends = axes.transData.inverted().transform(tie[[0, -1]])
-            axes.plot(*ends.T, color="#8a949e", linewidth=0.6, zorder=1, scalex=False, scaley=False)
+            axes.plot(*ends.T, color=GREY, linewidth=0.6, zorder=1, scalex=False, scaley=False)
 
 
 def _overlap(a: Bbox, b: Bbox) -> float:

@@ -1,18 +1,37 @@
 """Wrong arguments at every door of the Python interface: one sentence of nextview's own, never another error."""
 
+import inspect
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import nextview
+from nextview.arguments import as_line, takes_paths
+from nextview.cameras.captured import read_capture
 from nextview.cameras.sensors import SensedCamera, Sensor, SensorMix, sensor_named
+from nextview.data.downloading import Archive, download
+from nextview.data.measuring import measure
+from nextview.data.predicting import predict
+from nextview.data.predictions import Predictions
+from nextview.data.rendering import render
 from nextview.data.samples import sample_mesh
-from nextview.errors import NextviewError
+from nextview.data.store import ViewStore
+from nextview.errors import NextviewError, UsageError
+from nextview.measures.depth_entropy import depth_entropy, normalise_per_object
+from nextview.measures.measured_view import MeasuredView
 from nextview.measures.registry import find_measure
+from nextview.models.collection import find_models
+from nextview.models.model_card import find_card, read_card
+from nextview.occupancy import Occupancy, SeenScene, VoxelGrid, expected_visibility, new_surface, new_volume
+from nextview.occupancy.line_of_sight import visible_share
 from nextview.sensing import Box, Frame, ObjectFrame, ObservedObject
+from nextview.training.recipes import AgentRecipe, GainRecipe, MapRecipe, RecogniserRecipe
 from nextview.viewsphere import viewpoints_of
 from nextview.worlds import Placement, Scene, World, WorldCamera, build_scene
+from nextview.worlds.drawing import Meshes, draw_world
+from nextview.worlds.occluded_camera import OccludedCamera, SceneCamera
 from nextview.worlds.scene import mesh_hash
 
 Recorder = pytest.importorskip("nextview.report.recording").Recorder
@@ -31,6 +50,8 @@ CAMERA = nextview.SimulatedCamera(MESH, 32)
 SEEN = CAMERA.observe(SPHERE.poses[3])
 RNG = np.random.default_rng(0)
 WORLD = World("a", "light", 0, Placement("chair.off", mesh_hash(FILE / "chair.off")))
+SCENE, GRID, PLACES = Scene(MESH), VoxelGrid(16), 3 * np.eye(3)
+UNSEEN = Occupancy.unseen(GRID)
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +148,53 @@ DOORS = {
     ),
     **arguments(ObservedObject, "up point box known rng"),
     **arguments(ObservedObject().add, "frame"),
+    **arguments(OccludedCamera, "scene size distance", scene=SCENE, size=32),
+    **arguments(OccludedCamera(SCENE, 32).observe, "pose"),
+    **arguments(SceneCamera, "scene intrinsics shape", scene=SCENE, intrinsics=SEEN.intrinsics, shape=(32, 32)),
+    **arguments(SceneCamera(SCENE, SEEN.intrinsics, (32, 32)).look, "pose"),
+    **arguments(SCENE.clearance, "positions"),
+    **arguments(SCENE.reachable, "positions"),
+    **arguments(Meshes, "folder files", folder=FILE, files=("chair.off",)),
+    **arguments(
+        draw_world,
+        "target meshes level seed name",
+        target="none.off",
+        meshes=Meshes(FILE, ()),
+        level="light",
+        seed=0,
+        name="a",
+    ),
+    **arguments(depth_entropy, "depth"),
+    **arguments(MeasuredView, "depth", pose=SEEN.pose, intrinsics=SEEN.intrinsics),
+    **arguments(normalise_per_object, "values"),
+    **arguments(VoxelGrid, "n half centre"),
+    **arguments(Occupancy.unseen, "grid region", grid=GRID),
+    **arguments(
+        UNSEEN.seen,
+        "depth pose intrinsics object_mask",
+        **{name: getattr(SEEN, name) for name in ("depth", "pose", "intrinsics")},
+    ),
+    **arguments(new_volume, "occupancy positions region", occupancy=UNSEEN, positions=PLACES),
+    **arguments(new_surface, "occupancy positions region", occupancy=UNSEEN, positions=PLACES),
+    **arguments(
+        visible_share, "occupancy points positions density own", occupancy=UNSEEN, points=np.eye(3), positions=PLACES
+    ),
+    **arguments(
+        expected_visibility, "seen positions density unseen_part", seen=SeenScene.unseen(GRID), positions=PLACES
+    ),
+    "a field of a sensor": lambda system, junk: [replace(Sensor(), **{field.name: junk}) for field in fields(Sensor)],
+    **{
+        f"a recipe's {field.name}": lambda system, junk, recipe=recipe, name=field.name: recipe(**{name: junk})
+        for recipe in (RecogniserRecipe, MapRecipe, GainRecipe, AgentRecipe)
+        for field in fields(recipe)
+        if field.name != "measure"  # any word
+    },
+    **arguments(find_models, "models"),
+    **arguments(find_card, "model"),
+    **arguments(Archive, "url size sha256 folder", url="http://127.0.0.1/x.zip", size=1, sha256="0" * 64, folder="x"),
+    **arguments(ViewStore.open, "path"),
+    **arguments(Predictions.load, "path"),
+    **arguments(read_card, "path"),
     **arguments(Box, "low high axes", low=[0, 0, 0], high=[1, 1, 1]),
     **arguments(ObjectFrame, "centre radius axes", centre=[0, 0, 0], radius=1.0, axes=np.eye(3)),
 }
@@ -142,3 +210,46 @@ def test_a_wrong_argument_is_one_sentence(system, door):
             refused.append(str(error))
     assert len(refused) > len(JUNK) // 3
     assert all(said.strip() and "\n" not in said for said in refused)
+
+
+NO_PATHS = [5, True, b"x", object(), np.zeros(3), {}, "a\0b", Path("a\0b")]
+
+
+@takes_paths("one", "other", many=("several",))
+def taking(one, other=None, several=(), rest=None):
+    return one, other, several, rest
+
+
+def test_paths_may_be_strings_and_nothing_else():
+    assert taking("a", None, ["b", Path("c")], "d") == (Path("a"), None, (Path("b"), Path("c")), "d")
+    assert taking(Path("a")) == (Path("a"), None, (), None)
+    for wrong in [*NO_PATHS, [Path("a")]]:
+        for arguments in ({"one": wrong}, {"one": "a", "other": wrong}, {"one": "a", "several": [wrong]}):
+            with pytest.raises(UsageError, match=r"^(one|other|each of several) is a path"):
+                taking(**arguments)
+    with pytest.raises(UsageError, match=r"^one is a path, not None"):
+        taking(None)
+    with pytest.raises(UsageError, match=r"^several are several paths, not 'abc'"):
+        taking("a", several="abc")
+
+
+@pytest.mark.parametrize("wrong", NO_PATHS, ids=lambda wrong: type(wrong).__name__)
+@pytest.mark.parametrize("stage", [render, measure, predict, download, read_capture], ids=lambda stage: stage.__name__)
+def test_a_stage_looks_at_its_paths_before_it_does_anything(stage, wrong):
+    """Before the first step of those that go on in steps, and whatever the other arguments are."""
+    parameters = inspect.signature(stage).parameters.values()
+    path = next(p.name for p in parameters if p.name in ("dataset", "path", "destination", "folder"))
+    required = [p.name for p in parameters if p.default is p.empty]
+    sound = {name: "anywhere" if name == "out" else None for name in required}
+    with pytest.raises(UsageError, match=f"^{path} is a path"):
+        stage(**sound | {path: wrong})
+
+
+def test_whatever_is_handed_in_makes_one_line():
+    class Mute:
+        def __repr__(self):
+            raise RuntimeError
+
+    assert as_line(Mute()) == "a Mute"
+    assert as_line(10**5000) == "a int"
+    assert as_line("a\nb\x1b[2J" + "x" * 1000).isprintable()

@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import nextview
 from nextview.cameras import arm as module
@@ -202,3 +203,15 @@ def test_a_film_goes_in_step_with_time(monkeypatch):
         before = done * seconds_of(way)
         expected = before * 2.175 if before * 2.175 <= 0.5 else 1.0 - before * 2.175
         assert joints[0] == pytest.approx(expected, abs=0.025)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_camera_turns_by_the_least_angle(seed):
+    start, target = Rotation.random(2, random_state=seed).as_matrix()
+    turned = module._turned_least(start, target[:, 2])
+    np.testing.assert_allclose(turned[:, 2], target[:, 2], atol=1e-12)
+    least = np.arccos(start[:, 2] @ target[:, 2])
+    assert Rotation.from_matrix(turned @ start.T).magnitude() == pytest.approx(least)
+    behind = module._turned_least(start, -start[:, 2])
+    np.testing.assert_allclose(behind[:, 2], -start[:, 2], atol=1e-12)
+    assert np.linalg.det(behind) == pytest.approx(1)

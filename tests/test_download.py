@@ -2,9 +2,12 @@
 
 import hashlib
 import io
+import socket
 import stat
 import threading
 import zipfile
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -14,7 +17,7 @@ import pytest
 from nextview.data import downloading
 from nextview.data.downloading import PATIENCE, Archive
 from nextview.data.lock import only_one
-from nextview.errors import DatasetError
+from nextview.errors import DatasetError, NextviewError, UsageError
 
 download = partial(downloading.download, pause=0)
 MESH = b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
@@ -161,6 +164,53 @@ def test_headers_that_make_no_sense_get_one_sentence(tmp_path, headers, sentence
         list(download(server.archive(), tmp_path))
     assert "\n" not in str(refusal.value)
     assert len(server.ranges) == 1
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # urllib leaves what it stumbles over
+@pytest.mark.parametrize(
+    "reply",
+    [
+        "302 Found\r\nLocation: /",  # for ever; Python's own message has three lines
+        "302 Found\r\nLocation: http://[::1/x",
+        "302 Found\r\nLocation: http://" + "\xe4" * 70 + ".x/",
+        f"200 OK\r\nContent-Length: {'9' * 5000}",  # more digits than Python takes
+        f"404 {'x' * 60_000}",
+        "404 \x1b[31mred\x07",
+        "-1 what",
+    ],
+)
+def test_whatever_a_server_says_is_one_short_sentence(tmp_path, reply):
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def serve():
+            with suppress(OSError):
+                while True:
+                    connection, _ = listening.accept()
+                    with connection:
+                        connection.recv(65536)
+                        connection.sendall(f"HTTP/1.1 {reply}\r\n\r\n".encode("latin-1"))
+
+        threading.Thread(target=serve, daemon=True).start()
+        archive = Archive(f"http://127.0.0.1:{listening.getsockname()[1]}/shapes.zip", 100, "0" * 64, "Shapes")
+        with pytest.raises(DatasetError) as refused:
+            list(download(archive, tmp_path))
+        listening.shutdown(socket.SHUT_RDWR)
+    assert str(refused.value).isprintable()
+    assert len(str(refused.value)) < 400
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"url": 5}, {"size": "many"}, {"size": 0}, {"sha256": None}, {"folder": "../up"}, {"folder": ""}]
+)
+def test_an_archive_that_makes_no_sense_is_refused(wrong):
+    with pytest.raises(NextviewError):
+        replace(Archive("http://127.0.0.1/x.zip", 1, "0" * 64, "Shapes"), **wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"timeout": -1}, {"timeout": "long"}, {"timeout": 1e300}, {"pause": -1}])
+def test_times_that_make_no_sense_are_refused(tmp_path, wrong):
+    with pytest.raises(UsageError, match=f"the {next(iter(wrong))} is "):
+        list(downloading.download(Archive("http://127.0.0.1/x.zip", 1, "0" * 64, "Shapes"), tmp_path, **wrong))
 
 
 def test_a_file_or_an_empty_folder_is_no_dataset(tmp_path):

@@ -226,6 +226,13 @@ def test_a_card_says_what_is_believed(chair):
     assert preview_card(walk.views[0].observation).count("<img") == 1
 
 
+def test_an_azimuth_a_hair_below_a_full_turn_is_none(chair):
+    walk = chair.walks[0]
+    walk.look(chair.pose_towards(np.array([3.0, -1e-3, 0.0])))
+    assert walk.views[0].angles[1] > 359.9
+    assert "0° up, 0° round" in walk_card(walk)
+
+
 def test_a_card_shows_names_as_they_are(chair, monkeypatch):
     walk = chair.walks[0]
     walk.step()

@@ -342,9 +342,9 @@ FAULTS = {
         True,
         "has told (batch, ",
     ),
-    "nan": (lambda w: set_number(w, "weights0", np.nan), True, "a weight is not a finite number"),
-    "infinite": (lambda w: set_number(w, "weights2", np.inf), True, "a weight is not a finite number"),
-    "hidden by a ReLU": (lambda w: set_number(w, "bias0", -np.inf), True, "a weight is not a finite number"),
+    "nan": (lambda w: set_number(w, "weights0", np.nan), True, "gives cells that are not finite numbers"),
+    "infinite": (lambda w: set_number(w, "weights2", np.inf), True, "gives cells that are not finite numbers"),
+    "hidden by a ReLU": (lambda w: set_number(w, "bias0", -np.inf), True, "gives cells that are not finite numbers"),
 }
 """What is done to the ONNX file, whether the card then holds its new hash, and the log-evidence of it."""
 

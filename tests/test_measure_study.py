@@ -129,6 +129,17 @@ def test_table_and_figure_are_there(made):
     assert (made / "out" / "measures.png").stat().st_size > 10_000
 
 
+def test_some_objects_alone(made):
+    options = {"policies": (), "runs": 2, "samples": 10, "measures": ("view_area",), "objects": 3}
+    STUDY["main"](made / "test.npz", made / "validation.npz", made / "some", **options)
+    table = pd.read_csv(made / "some" / "measures.csv")
+    p = Predictions.load(made / "test.npz").of_objects(np.array([0, 2, 4]))
+    values = ViewStore.open(made / "views.zarr").measure("view_area")[[0, 4, 8]]
+    expected = STUDY["correlations"](values, STUDY["of_true_class"](p)).mean()
+    rows = table[(table["quantity"] == "correlation") & table["label"].isna()]
+    assert rows["value"].tolist() == pytest.approx([expected])
+
+
 def test_what_makes_no_sense_is_refused(made):
     with pytest.raises(UsageError, match="holds objects of"):
         STUDY["main"](made / "test.npz", made / "test.npz", made / "no")

@@ -1,6 +1,7 @@
 """The occupancy grid against closed forms: what a ball, a wall and empty space hide from where."""
 
 import ast
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -176,6 +177,18 @@ def test_what_a_wall_hides_is_new_from_behind_it():
     assert surface[0] < 0.15 * surface[1]  # a voxel on the edge of the shadow stands out beside the wall
 
 
+@pytest.mark.parametrize("together", [1, 3000, 10**9])
+@pytest.mark.parametrize("gain", [new_volume, new_surface])
+def test_cameras_that_are_asked_together_see_what_each_sees_alone(gain, together, monkeypatch):
+    """Also those that stand so near that what they see is drawn in wide pixels."""
+    cells = np.random.default_rng(0).choice(np.array([UNSEEN] * 6 + [FREE] * 3 + [OBJECT], np.uint8), (12, 12, 12))
+    occupancy = Occupancy(VoxelGrid(12), cells)
+    eyes = np.concatenate([scale * SPHERE.directions[::5] for scale in (1.3, 2, 3)])
+    alone = [gain(occupancy, eye[None])[0] for eye in eyes]
+    monkeypatch.setattr(sys.modules[gain.__module__], "TOGETHER", together)
+    np.testing.assert_array_equal(gain(occupancy, eyes), alone)
+
+
 def test_a_blocker_near_the_camera_has_no_holes():
     """A wall of voxels at a quarter of the distance: its voxels lie four pixels apart in the picture."""
     grid = VoxelGrid(64, half=2.0)
@@ -294,7 +307,7 @@ def test_grids_and_frames_that_cannot_be():
 
 
 def test_the_room_imports_only_from_rooms_above_it():
-    above = {"errors", "viewsphere", "mesh", "observation", "depth", "cloud", "sensing", "occupancy"}
+    above = {"arguments", "errors", "viewsphere", "mesh", "observation", "depth", "cloud", "sensing", "occupancy"}
     for file in Path(nextview.occupancy.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.ImportFrom) and node.module.startswith("nextview"):

@@ -6,7 +6,7 @@ import pytest
 
 from nextview.cli.main import main
 from nextview.errors import UsageError
-from nextview.training.recipes import GainRecipe, MapRecipe, RecogniserRecipe
+from nextview.training.recipes import AgentRecipe, GainRecipe, MapRecipe, RecogniserRecipe
 
 
 @pytest.mark.parametrize(
@@ -20,9 +20,18 @@ from nextview.training.recipes import GainRecipe, MapRecipe, RecogniserRecipe
         (RecogniserRecipe, {"way": 0.0}, "--way is more than 0 and at most 1, not 0.0"),
         (RecogniserRecipe, {"epochs": 0}, "--epochs is at least 1, not 0"),
         (RecogniserRecipe, {"weight_decay": -1.0}, "--weight-decay is at least 0, not -1.0"),
-        (MapRecipe, {"points": 1025}, "--points is 1024 at most"),
+        (MapRecipe, {"points": 1025}, "--points is a whole number from 0 to 1024, not 1025"),
         (MapRecipe, {"sharpness": 0.0}, "--sharpness is more than 0, not 0.0"),
-        (MapRecipe, {"lr": float("inf")}, "--lr is at least 0, not inf"),
+        (MapRecipe, {"lr": float("inf")}, "--lr is a number of at most 100, not inf"),
+        (MapRecipe, {"batch": 2.5}, "--batch is a whole number from 0 to 1000000, not 2.5"),
+        (RecogniserRecipe, {"size": 10**9}, "--size is a whole number from 0 to 4096, not 1000000000"),
+        (RecogniserRecipe, {"network": "vgg"}, "--network is resnet, lite0, not 'vgg'"),
+        (RecogniserRecipe, {"augment": 1}, "--augment is true or false, not 1"),
+        (RecogniserRecipe, {"lr": "fast"}, "--lr is a number, not 'fast'"),
+        (AgentRecipe, {"exploration": (0.9,)}, "the two numbers of --exploration are from 0 to 1"),
+        (AgentRecipe, {"envs": 10**6, "rollout": 10**6}, "--envs times --rollout is from 2 to 10,000,000"),
+        (AgentRecipe, {"seed": 2**32}, "--seed is a whole number from 0 to 4294967295"),
+        (GainRecipe, {"inputs": ("belief", "luck")}, "--inputs are some of belief, view, place"),
         (GainRecipe, {"n_views": 1}, "--n-views is at least 2, not 1"),
         (GainRecipe, {"inputs": ()}, "--inputs names at least one"),
     ],

@@ -222,7 +222,7 @@ class Unmakeable:
     [
         ("Backwards", r"chose view \d+, which was visited before \(object thing_0\)"),
         ("Beyond", r"chose view 40, which is not on the sphere \(object thing_7\)"),
-        ("Raises", r"raised RuntimeError: no idea \(object thing_11\)"),
+        ("Raises", r"raised RuntimeError: no idea, at test_replay.py:\d+ \(object thing_11\)"),
         ("Short", "has to return 120 integers"),
         ("Unmakeable", "cannot be made"),
         ("Missing", "cannot be made"),

@@ -1,12 +1,13 @@
 """The sensor models against closed forms, against casting rays from the projector, and through the front door."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import trimesh
 from scenes import box, cast, pose_at
+from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 from tiny_models import make_recogniser
 
@@ -14,7 +15,8 @@ import nextview
 from nextview import SimulatedCamera, ViewSphere
 from nextview.cameras.sensors import SENSORS, SensedCamera, Sensor, SensorMix, sensor_named
 from nextview.cameras.sensors.boxes_around import boxes_around
-from nextview.cameras.sensors.sensor import ERRORS
+from nextview.cameras.sensors.depth_noise import NO_GRAIN, normal_field
+from nextview.cameras.sensors.sensor import ERRORS, LARGEST, LIMITS
 from nextview.cli.main import main
 from nextview.data.rendering import render
 from nextview.data.samples import sample_mesh
@@ -370,6 +372,30 @@ def test_numbers_that_no_sensor_has_are_refused():
     assert sensor_named("wrist:0.5").table == SENSORS["wrist"].table / 2
     assert sensor_named("wrist:1") == SENSORS["wrist"]
     assert sensor_named("mix:0.5") == SensorMix(0.5)
+
+
+@pytest.mark.parametrize("field", [field.name for field in fields(Sensor) if field.name != "name"])
+def test_every_number_of_a_sensor_has_its_limits(field):
+    """Beyond them is no sensor: a shadow of 1,000 km takes 10 GB, a grain of as many pixels minutes."""
+    low, high = LIMITS.get(field, (0, LARGEST))
+    for within in (low, high) if field not in ("distance", "radius") else ():  # these two limit each other
+        replace(Sensor(), **{field: within})
+    for beyond in (-1, 1e6, 10**9, np.nan, np.inf, 10**400, "1", None):
+        with pytest.raises(UsageError, match=f"^sensor none: {field} is "):
+            replace(Sensor(), **{field: beyond})
+
+
+def test_a_shadow_wider_than_can_be_drawn_is_refused():
+    near = Sensor(focal=1e5, distance=0.0011, radius=0.001, shadow=LARGEST)
+    with pytest.raises(UsageError, match=r"reaches .* pixels"):
+        SensedCamera(BALL, near, rng()).observe(SPHERE.poses[0])
+
+
+def test_a_window_narrower_than_a_pixel_is_none():
+    white = rng(1).standard_normal((20, 30))
+    for grain in (0.0, 1e-300, NO_GRAIN / 2):
+        assert normal_field(rng(1), (20, 30), grain).tobytes() == white.tobytes()
+    assert gaussian_filter(white, 0.99 * NO_GRAIN, mode="wrap").tobytes() == white.tobytes()
 
 
 def test_recognise_through_a_sensor_by_python_and_command_line(tmp_path, capsys):

@@ -264,6 +264,15 @@ def test_wrong_values_with_a_right_checksum_are_found(views):
     assert found["b"] is None
 
 
+def test_what_a_sensor_saw_of_a_wrong_object_frame_is_sound_and_its_damage_is_found(views):
+    noisy = views.with_name("noisy.zarr")
+    list(render(views.with_name("meshes"), noisy, SPHERE, sensor="setup:2", workers=0))
+    assert [reason for _, reason in check(noisy, workers=0) if reason] == []
+    flip_a_byte(chunk(noisy, "points", 1))
+    found = [(name, reason) for name, reason in check(noisy, workers=0) if reason]
+    assert [name for name, _ in found] == ["b"]
+
+
 def test_correspondence_is_checked_where_it_is_made(views):
     steps = correspond(views, workers=0)
     next(steps), next(steps)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from nextview.viewsphere import LAYOUTS, ViewSphere, look_at_origin
+from nextview.viewsphere import LAYOUTS, ViewSphere, great_circle, level_pose, look_at_origin
 
 SPHERES = [
     ViewSphere.named("40"),
@@ -193,3 +193,18 @@ def test_an_unknown_layout():
     with pytest.raises(ValueError, match=r"'41'.*40, 12"):
         ViewSphere.named("41")
     assert set(LAYOUTS) == {"40", "12"}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_level_pose_stands_in_its_direction_and_a_great_circle_joins_its_ends(seed):
+    rng = np.random.default_rng(seed)
+    a, b = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
+    pose = level_pose(a, 1.7)
+    np.testing.assert_allclose(pose[:3, 3], 1.7 * a, atol=1e-12)
+    np.testing.assert_allclose(pose[:3, 2], -a, atol=1e-12)
+    assert pose[2, 0] == 0  # its right is level
+    arc = great_circle(a, b, 9)
+    np.testing.assert_allclose(np.linalg.norm(arc, axis=1), 1)
+    np.testing.assert_allclose(arc @ np.cross(a, b), 0, atol=1e-12)  # all in the plane through both
+    np.testing.assert_allclose(arc[[0, -1]], [a, b], atol=1e-12)
+    np.testing.assert_allclose(arc[4], (a + b) / np.linalg.norm(a + b), atol=1e-12)

@@ -1,5 +1,6 @@
 """Policies by what is unseen, by peaks of the whole sphere and by true measures; their way into the benchmark."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -19,8 +20,9 @@ from nextview.data.planning import plan as plan_store
 from nextview.data.planning import plannable
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import render
+from nextview.data.splits import sample
 from nextview.data.store import PLANNED, ViewStore
-from nextview.episode import Episodes
+from nextview.episode import Episodes, run_episodes
 from nextview.errors import DatasetError, EntryError, UsageError
 from nextview.mesh import make_mesh
 from nextview.observation import Observation
@@ -195,6 +197,50 @@ def test_the_benchmark_goes_the_way_that_was_planned(stored):
             assert gains[way[k + 1]] >= gains.max() - 1e-6
     with pytest.raises(EntryError, match="only 5 views are listed"):
         replay("volumetric", specs, 6, 0)
+
+
+@pytest.mark.parametrize("name", ["volumetric", "coverage"])
+def test_what_was_planned_is_where_the_policy_goes_by_itself(stored, name):
+    """One episode at a time, each with frames of its own: nothing that was found for another can be used."""
+    store, _ = stored
+    plan(store, (name,), workers=0)
+    views = ViewStore.open(store)
+    policy, rule, rng = make_policy(name, RING), FixedLength(max_views=PLANNED), np.random.default_rng(0)
+    for i in range(2):
+        for start in range(len(RING)):
+
+            def observe(episodes, at, i=i):
+                frames = [Observation(views.depth(i)[view].copy(), RING.poses[view], views.intrinsics) for view in at]
+                return Evidence(np.zeros((len(at), 2)), observations=frames)
+
+            alone = run_episodes(observe, RING, policy, np.array([start]), rule, rng)
+            np.testing.assert_array_equal(views.read(f"plans/{name}", i)[start], alone.outcome.views[0])
+
+
+def test_a_part_of_a_store_is_planned(stored, tmp_path):
+    store, predictions = stored
+    copy = shutil.copytree(store, tmp_path / "part.zarr")
+    shutil.rmtree(copy / "plans", ignore_errors=True)
+    specs = make_specs(replace(predictions, store=str(copy)), 2, 0)
+    plan(copy, ("volumetric",), split="test", objects=1, workers=0)
+    with pytest.raises(EntryError, match=r"nextview plan \S+ volumetric makes it"):
+        replay("volumetric", specs, 3, 0)
+    one = make_specs(replace(predictions, store=str(copy)).of_objects(np.array([0])), 2, 0)
+    assert replay("volumetric", one, 3, 0).views.shape == (2, 3)
+    with pytest.raises(DatasetError, match="no rendered object of the split 'train'"):
+        plan(copy, ("volumetric",), split="train", workers=0)
+
+
+def test_a_sample_is_spread_and_twice_as_many_hold_the_same():
+    objects = np.arange(100, 999)
+    for count in (1, 7, 150):
+        some, more = sample(objects, count), sample(objects, 2 * count)
+        assert len(some) == count
+        assert set(some) <= set(more) <= set(objects)
+        assert np.ptp(np.diff(more)) <= 1
+    assert len(sample(objects, 5000)) == 899
+    with pytest.raises(UsageError, match="at least one"):
+        sample(objects, 0)
 
 
 def test_true_measures_come_from_the_store(stored):

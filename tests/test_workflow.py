@@ -93,8 +93,10 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
     for card in (BUNDLED / "models/bundled").glob("*.json"):
         assert f"--name {card.stem}" in planned or f"{card.stem.partition('-')[0]} runs/" in planned
     for command in ("render ModelNet10 sensed-held-out.zarr --sensor mix", "fit calibration", "fit size", "fit valleys",
-                    "fit policies", "train gain", "evaluate", "benchmark", "report"):  # fmt: skip
+                    "fit policies", "train gain", "train agent", "measure", "plan", "evaluate", "benchmark",
+                    "report"):  # fmt: skip
         assert f"nextview {command} " in planned
+    assert "benchmarks/measure_study.py test.npz validation.npz --out measures" in planned
     assert "docs/results.md" in planned
 
 

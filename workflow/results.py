@@ -205,6 +205,15 @@ def fixed_views(stage: Path) -> Iterator[str]:
         yield ""
 
 
+def measures(stage: Path) -> Iterator[str]:
+    """Which measure of a view serves recognition."""
+    yield "[measures.md](measures.md) says what each is. `measures.csv`."
+    yield ""
+    yield (stage / "measures.md").read_text()
+    yield "![Correlation of every measure with recognition, and what its policy gains](images/measures.png)"
+    yield ""
+
+
 def risk(stage: Path) -> Iterator[str]:
     """What became of the promised error rates."""
     settings = json.loads((stage / "benchmark.json").read_text())
@@ -284,6 +293,7 @@ SECTIONS: list[tuple[str, str, Callable[[Path], Iterator[str]]]] = [
     ("benchmark", f"Policies at threshold {THRESHOLD}", comparison),
     ("views", "Policies after 2, 3 and 5 views", fixed_views),
     ("views-size", "Policies after 2, 3 and 5 views, size known", fixed_views),
+    ("measures", "Measures of a view", measures),
     ("benchmark-risk", "Promised error rates", risk),
     ("evaluation", "Recogniser", recogniser),
     ("evaluation", "Calibration", calibration),

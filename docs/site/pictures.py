@@ -18,13 +18,12 @@ import nextview
 from nextview.data.samples import sample_mesh
 from nextview.measures.depth_entropy import depth_entropy
 from nextview.policies.maps import local_peaks
-from nextview.report.style import STYLE, PlainFigure
+from nextview.report.style import ACCENT, BLUE, FAINT, INK, STYLE, PlainFigure
 from nextview.session import View
 from nextview.viewsphere import ViewSphere
 
 IMAGES = Path(__file__).parents[1] / "images"
 RESULTS = Path(__file__).parents[1] / "results.md"
-INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
 START = 33
 """A view from above, in which a table could be a desk."""
 SPHERE = ViewSphere.named("40")
@@ -168,8 +167,8 @@ def calibration() -> Figure:
     rows = re.findall(r"^\| (\d+) \| ([\d.]+) \(([\d.]+)-([\d.]+)\) \| [\d.]+ \| ([\d.]+) \|", part, re.M)
     n_views, accuracy, low, high, confidence = np.array(rows, float).T
     figure, (axes,) = new(1, 3.4, 5.6)
-    axes.fill_between(n_views, low, high, color="#0b5fa5", alpha=0.15, linewidth=0)
-    axes.plot(n_views, accuracy, marker="o", color="#0b5fa5", label="how often it is right, 95 % interval")
+    axes.fill_between(n_views, low, high, color=BLUE, alpha=0.15, linewidth=0)
+    axes.plot(n_views, accuracy, marker="o", color=BLUE, label="how often it is right, 95 % interval")
     axes.plot(n_views, confidence, marker="o", color=ACCENT, label="mean belief in the answer")
     axes.set_xscale("log", base=2)
     axes.set_xticks(n_views, [f"{n:.0f}" for n in n_views])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from nextview.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
 from nextview.errors import PolicyError, SessionError, UsageError
 from nextview.observation import Observation, SceneView
 from nextview.occupancy import SeenScene, expected_visibility
+from nextview.own_code import fails, own_code
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.off_grid import OffGrid
 from nextview.viewsphere import SNAP, Viewpoints, angle_between, turn_of
@@ -331,11 +333,8 @@ class Episodes:
     def _ask(self, state: EpisodeState) -> NDArray[np.int64]:
         """What the policy answers: views of the sphere, whichever."""
         name = self._name
-        try:
+        with own_code(lambda said: PolicyError(f"policy {name} raised {said}", self._first_to_fail(state))):
             chosen = np.asarray(self.policy.next_views(state, self.rng))
-        except (Exception, SystemExit) as error:  # whatever a user's policy may raise
-            reason = f"policy {name} raised {type(error).__name__}: {error}"
-            raise PolicyError(reason, self._first_to_fail(state)) from error
         if chosen.shape != state.current.shape or not np.issubdtype(chosen.dtype, np.integer):
             raise PolicyError(f"policy {name} has to return {len(state.current)} integers, one for each episode")
         off = (chosen < 0) | (chosen >= len(self.sphere))
@@ -352,9 +351,8 @@ class Episodes:
     def _first_to_fail(self, state: EpisodeState) -> int | None:
         """The first episode for which the policy raises even if asked for it alone."""
         for episode in state.episodes:
-            try:
-                self.policy.next_views(state.of(state.episodes == episode), self.rng)
-            except (Exception, SystemExit):
+            alone = state.of(state.episodes == episode)
+            if fails(partial(self.policy.next_views, alone, self.rng)):
                 return int(episode)
         return None
 

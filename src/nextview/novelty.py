@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from nextview.arguments import takes_paths
 from nextview.errors import ModelError
 from nextview.outputs import written_whole
 from nextview.weights_file import checked_content
@@ -114,6 +115,7 @@ class Novelty:
         """The p-value of one object by the scores of its views so far; 1 if there is none."""
         return float(self.p_value(float(np.mean(scores)), len(scores))) if scores else 1.0
 
+    @takes_paths("path")
     def save(self, path: Path) -> str:
         """Write a .safetensors file, the large tables in half precision if that holds them; returns its SHA-256."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -139,6 +141,7 @@ def novelty_path(weights: Path) -> Path:
     return weights.with_suffix(".novelty.safetensors")
 
 
+@takes_paths("path")
 def read_novelty(path: Path, sha256: str) -> Novelty:
     """Read what ``Novelty.save`` wrote.
 

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.arguments import as_line, number
+from nextview.arguments import as_line, number, of_kind
 from nextview.cloud import visible_points
 from nextview.depth import FARTHEST, object_depth
 from nextview.errors import ObservationError
@@ -55,6 +55,8 @@ class SceneView:
     background_free: bool = False
 
     def __post_init__(self) -> None:
+        of_kind(self.depth, np.ndarray, "the depth of a scene is an array", ObservationError)
+        of_kind(self.target, np.ndarray, "the object's pixels are an array", ObservationError)
         if self.depth.ndim != 2 or self.target.shape != self.depth.shape:
             raise ObservationError(
                 f"the depth of a scene and the object's pixels are images of one shape, not {self.depth.shape} and "
@@ -62,7 +64,7 @@ class SceneView:
             )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # each is itself, and can be the key of what is made of it
 class Observation:
     """One view of an object. Lists are converted; arrays of the right type are not copied.
 
@@ -243,10 +245,20 @@ def array_of(values: Any, what: str) -> NDArray[Any]:
         raise ObservationError(f"{what} cannot be taken for an array of numbers ({error})") from None
 
 
-def _depth(depth: Any) -> NDArray[np.float32]:
+def depth_image(depth: Any) -> NDArray[Any]:
+    """A depth image, (H, W), of numbers in any unit.
+
+    Raises:
+        ObservationError: it is none.
+    """
     depth = numbers(depth, "the depth")
     if depth.ndim != 2 or depth.size == 0:
         raise ObservationError(f"the depth is one image of the shape (H, W), not {depth.shape}")
+    return depth
+
+
+def _depth(depth: Any) -> NDArray[np.float32]:
+    depth = depth_image(depth)
     with np.errstate(over="ignore"):  # what is too large becomes infinity, and so 0
         return depth.astype(np.float32, copy=False)
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -14,13 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import ThreadpoolController
 
-from nextview.arguments import as_line, number, of_kind, whole
+from nextview.arguments import as_line, number, of_kind, takes_paths, whole
 from nextview.belief import Stopping, fuse
 from nextview.episode import Episodes, Step
-from nextview.errors import NoViewLeftError, ObservationError, SessionError, UsageError
+from nextview.errors import NoViewLeftError, ObservationError, PolicyError, SessionError, UsageError
 from nextview.models.inference import Models
 from nextview.novelty import Novelty
 from nextview.observation import Camera, Observation
+from nextview.own_code import own_code
 from nextview.policies.base import EpisodeState, Evidence, Policy, ValuesViews, maps_among, travel_from
 from nextview.policies.off_grid import anywhere
 from nextview.sensing.frame import Frame
@@ -187,6 +187,7 @@ class Recognition:
         doubts = f", doubtful: {', '.join(names)}" if names else ""
         return f"{self.answer} (belief {self.confidence:.3f}, {views}, {sure}{doubts})"
 
+    @takes_paths("path")
     def plot(self, path: str | Path | None = None, title: str = "") -> Figure:
         """Draw the episode: images, what the policy valued the views at, beliefs and the path on the sphere.
 
@@ -214,9 +215,16 @@ def _array(given: ArrayLike, what: str) -> NDArray:
 
 def _seconds(cost: Any) -> float:
     """What a callable says that a way costs; infinity is a cost, too."""
-    if not isinstance(cost, Real):
-        raise UsageError(f"a travel cost is a number from 0 on, not {as_line(cost)}")
-    return float(cost)
+    found = number(cost, "a travel cost")
+    if not found >= 0:
+        raise UsageError(f"a travel cost is a number from 0 on, not {found}")
+    return found
+
+
+def _truth(said: Any) -> bool:
+    """What a callable says of a pose. Nothing is no answer: it is what a function gives that forgets to."""
+    of_kind(said, bool | np.bool_ | int, "whether a view can be reached is true or false")
+    return bool(said)
 
 
 @lru_cache(maxsize=1)
@@ -457,7 +465,7 @@ class Session:
         if callable(self._reachable):
             poses = self.poses
             for k in np.flatnonzero(there):
-                there[k] = bool(self._reachable(poses[views[k]]))
+                there[k] = _truth(self._reachable(poses[views[k]]))
         elif self._reachable is not None:
             there &= self._reachable[views]
         return there
@@ -471,8 +479,6 @@ class Session:
             if callable(self._travel_cost):
                 poses = self.poses
                 cost = np.array([_seconds(self._travel_cost(self._here, poses[view])) for view in views], np.float64)
-                if not (cost >= 0).all():
-                    raise UsageError(f"a travel cost is a number from 0 on, not {cost[~(cost >= 0)][0]}")
             else:
                 cost = self._travel_cost[state.current[0], views]
             views, cost = views[cost < np.inf], cost[cost < np.inf]
@@ -669,7 +675,12 @@ class Session:
         if ended or step.state is None or not isinstance(self.policy, ValuesViews):
             return None
         assert isinstance(self._chooser, ValuesViews)
-        return self._chooser.view_values(step.state)[0]
+        name = type(self.policy).__name__
+        with own_code(lambda said: PolicyError(f"policy {name}, asked what it values views at, raised {said}")):
+            values = np.asarray(self._chooser.view_values(step.state), np.float64)
+        if values.shape != (1, len(self.sphere)):
+            raise PolicyError(f"policy {name} values views by (B, V) numbers, here (1, {len(self.sphere)})")
+        return values[0]
 
     @property
     def result(self) -> Recognition:

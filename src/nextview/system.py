@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.arguments import as_line, number, of_kind, whole
+from nextview.arguments import as_line, number, of_kind, takes_paths, whole
 from nextview.belief import Stopping
 from nextview.errors import MeshError, ModelError, OtherUseError, PolicyError, UsageError
 from nextview.mesh import Mesh, load_mesh
@@ -68,6 +68,7 @@ class System:
         """Names of the classes that it knows."""
         return self.models.classes
 
+    @takes_paths("record")
     def session(
         self,
         start: int | None = None,

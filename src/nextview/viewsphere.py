@@ -55,6 +55,17 @@ def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = D
     return pose
 
 
+def level_pose(direction: Float, distance: float = DISTANCE) -> Float:
+    """The level pose of a camera in some direction from the origin, (3,), that looks at it, (4, 4)."""
+    return look_at_origin(elevation_of(direction), 2 * np.pi * turn_of(direction), distance)
+
+
+def great_circle(a: Float, b: Float, n: int = 25) -> Float:
+    """Unit vectors from one to another, (3,) each, along the circle through both, (n, 3)."""
+    line = a + np.linspace(0, 1, n)[:, None] * (b - a)
+    return line / np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
+
+
 def _fixed(array: NDArray) -> NDArray:
     array.flags.writeable = False
     return array

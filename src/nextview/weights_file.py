@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from nextview.arguments import regular_file
+from nextview.arguments import regular_file, takes_paths
 from nextview.errors import ModelError
 
 
+@takes_paths("path")
 def checked_content(path: Path, sha256: str, what: str = "the weights are") -> bytes:
     """What is in a file.
 

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.benchmark.experiment import Grid
 from nextview.benchmark.levels import COLUMNS
 from nextview.benchmark.replay import Outcomes
@@ -56,6 +57,7 @@ def save(folder: Path, grid: Grid, tables: Tables, settings: dict[str, Any]) -> 
     (folder / "benchmark.json").write_text(json.dumps(settings, indent=1) + "\n")
 
 
+@takes_paths("folder")
 def load(folder: Path) -> Results:
     """Read a folder of results.
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nextview.arguments import takes_paths
 from nextview.belief import PLAIN_SUM, Stopping
 from nextview.benchmark import results
 from nextview.benchmark.entries import default_entries
@@ -29,6 +30,7 @@ def _unseen(done: Iterable[int], total: int, what: str) -> None:
         pass
 
 
+@takes_paths("predictions", "out")
 def run_benchmark(
     predictions: Path,
     out: Path,

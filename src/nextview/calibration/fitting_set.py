@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.belief import FixedLength, log_evidence_of
 from nextview.data.predictions import SAME, Predictions
 from nextview.data.splits import deduplicated, divide
@@ -93,6 +94,7 @@ def held_out_by(card: ModelCard, predictions: Predictions) -> NDArray[np.int64]:
     return once[np.isin(np.array(predictions.names)[once], card.held_out)]
 
 
+@takes_paths(many=("paths",))
 def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
     """Predictions of the same objects as seen otherwise, through sensors, in the order of ``table``.
 

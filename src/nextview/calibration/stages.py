@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.belief import PLAIN_SUM, Calibration
 from nextview.calibration.fitting_set import FittingSet, fitting_set, held_out_by, load_sensed
 from nextview.calibration.novelty_score import fit_novelty
@@ -50,6 +51,7 @@ class FittedCalibration:
     after: float
 
 
+@takes_paths("predictions", "card", many=("sensed",))
 def fit_calibration(
     predictions: Path,
     card: Path,
@@ -125,6 +127,7 @@ class FittedVisibility:
     losses: dict[float, float]
 
 
+@takes_paths("predictions", "card")
 def fit_visibility(predictions: Path, card: Path, seed: int = 0) -> FittedVisibility:
     """Learn from worlds how much a view counts that shows only a share of the object.
 
@@ -175,6 +178,7 @@ class FittedSize:
     after: float
 
 
+@takes_paths("store", "predictions", "card")
 def fit_size(store: Path, predictions: Path, card: Path) -> FittedSize:
     """Tell a recogniser how large the objects of each class are, for stores and cameras that know it.
 
@@ -232,6 +236,7 @@ LEARNED_VIEWS, MADE_UP_VIEWS, HELD_OUT_VIEWS = 3, 4, 12
 """Views of each object to which a novelty score is fitted."""
 
 
+@takes_paths("store", "meshes", "card", many=("sensed",))
 def fit_unknown(
     store: Path,
     meshes: Path,
@@ -357,6 +362,7 @@ class FittedValleys:
     objects: int
 
 
+@takes_paths("predictions", "card")
 def fit_valleys(predictions: Path, card: Path) -> FittedValleys:
     """Choose the classes for which the valley of a predicted map is the better view than its peak.
 
@@ -398,6 +404,7 @@ class FittedPolicies:
     objects: int
 
 
+@takes_paths("predictions", "out")
 def fit_policies(
     predictions: Path,
     out: Path,

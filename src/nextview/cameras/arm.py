@@ -11,7 +11,6 @@ Embree: MuJoCo's own renderer needs OpenGL, which not every machine has. The arm
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -25,7 +24,7 @@ from nextview.cameras.sensors import SENSORS, Sensor
 from nextview.errors import ObservationError
 from nextview.mesh import Mesh
 from nextview.sensing.frame import Frame
-from nextview.viewsphere import angle_between, look_at_origin
+from nextview.viewsphere import look_at_origin
 
 if TYPE_CHECKING:
     from nextview.session import Recognition, Session
@@ -159,7 +158,7 @@ class Arm:
         names = [self._model.joint(k).name for k in range(7)]
         limits = dict(zip(names, FASTEST, strict=True))
         self._limits = [mink.ConfigurationLimit(self._model), mink.VelocityLimit(self._model, limits)]
-        self._solved = lru_cache(maxsize=1000)(self._solve)
+        self._solved: dict[tuple[bytes, bytes], Float | None] = {}
 
     # Kinematics
 
@@ -196,13 +195,15 @@ class Arm:
             (7,), within the joint limits and without a collision; None if none are found, from where the arm is or from
             any of STARTS.
         """
-        return self._solved(pose.tobytes(), self.joints.tobytes())
+        asked = pose.tobytes(), self.joints.tobytes()
+        if asked not in self._solved:
+            self._solved[asked] = self._solve(pose)
+        return self._solved[asked]
 
-    def _solve(self, target: bytes, joints: bytes) -> Float | None:
-        pose = np.frombuffer(target).reshape(4, 4)
+    def _solve(self, pose: Float) -> Float | None:
         if np.linalg.norm(pose[:3, 3] - [0, 0, 0.333]) > LONGEST or pose[2, 3] < 0:
             return None
-        for start in (np.frombuffer(joints), *STARTS):
+        for start in (self.joints, *STARTS):
             found = self._descend(pose, start)
             if found is not None and not self.touches(found):
                 return found
@@ -213,7 +214,7 @@ class Arm:
         mink, arm = self._mink, self._mink.Configuration(self._model, start)
         for _ in range(ITERATIONS):
             here = arm.get_transform_frame_to_world("camera", "site").as_matrix()
-            tilt = angle_between(here[:3, 2], pose[:3, 2])
+            tilt = np.linalg.norm(here[:3, 2] - pose[:3, 2])
             if np.linalg.norm(here[:3, 3] - pose[:3, 3]) < CLOSE and tilt < STRAIGHT:
                 return arm.q.copy()
             target = pose.copy()
@@ -327,14 +328,13 @@ def along(way: Sequence[Float], step: float) -> list[Float]:
 
 
 def _turned_least(rotation: Float, forward: Float) -> Float:
-    """A rotation, (3, 3), turned by the least angle that takes its z axis to a direction, (3,)."""
-    from scipy.spatial.transform import Rotation
-
-    axis = np.cross(rotation[:, 2], forward)
-    sine = np.linalg.norm(axis)
-    angle = np.arctan2(sine, rotation[:, 2] @ forward)
-    axis = axis / sine if sine > 1e-9 else rotation[:, 0]
-    return Rotation.from_rotvec(angle * axis).as_matrix() @ rotation
+    """A rotation, (3, 3), turned by the least angle that takes its z axis to a direction, (3,) (Rodrigues' formula)."""
+    now = rotation[:, 2]
+    cosine = now @ forward
+    if cosine < -1 + 1e-9:  # it looks the other way: any axis across it will do
+        return rotation * [1, -1, -1]
+    across = np.outer(forward, now) - np.outer(now, forward)  # times a vector: its cross product with the axis
+    return (np.eye(3) + across + across @ across / (1 + cosine)) @ rotation
 
 
 CORNERS = np.stack(np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1], indexing="ij"), -1).reshape(8, 3)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.cameras.captured_bop import read_bop
 from nextview.cameras.captured_frame import CapturedFrame, pinhole_of, read_numbers
 from nextview.cameras.captured_seven_scenes import read_seven_scenes
@@ -42,6 +43,7 @@ class Capture:
         return f"{self.folder}: {self.layout} layout, {len(self.frames)} frames; " + "; ".join(self.notes)
 
 
+@takes_paths("folder")
 def read_capture(
     folder: str | Path,
     intrinsics: tuple[float, float, float, float] | str | Path | None = None,
@@ -87,6 +89,7 @@ def read_capture(
     return Capture(folder, found[0], tuple(frames), up, (*said, *notes))
 
 
+@takes_paths("path")
 def read_box(path: Path) -> Box:
     """An upright box in a JSON file: "low" and "high", its corners, metres, and "axes", rows, the world's by default.
 

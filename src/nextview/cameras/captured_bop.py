@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.cameras.captured_frame import CapturedFrame, inverse, rigid
 from nextview.errors import DatasetError, ModelError
 from nextview.json_file import Fields, read_object
@@ -18,6 +19,7 @@ Float = NDArray[np.float64]
 MILLIMETRES = 0.001
 
 
+@takes_paths("folder")
 def read_bop(folder: Path, object_id: int | None, intrinsics: Float | None) -> tuple[list[CapturedFrame], list[str]]:
     """The views of one scene.
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from nextview.arguments import takes_paths
 from nextview.errors import DatasetError, ObservationError
 from nextview.sensing.frame import Frame, check_pose
 
@@ -68,6 +69,7 @@ class CapturedFrame:
         return Frame(depth, self.intrinsics, self.pose, mask, image)
 
 
+@takes_paths("path")
 def read_depth(path: Path) -> NDArray[np.uint16]:
     """A 16-bit grey PNG, (H, W) uint16.
 
@@ -109,6 +111,7 @@ def _open(path: Path, formats: tuple[str, ...], load: bool = True) -> Image.Imag
         raise DatasetError(f"{path}: the image is damaged or cannot be read ({error})") from None
 
 
+@takes_paths("path")
 def read_numbers(path: Path, what: str, shape: tuple[int, ...]) -> Float:
     """A table of finite numbers in a text file.
 

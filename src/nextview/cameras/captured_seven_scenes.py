@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.cameras.captured_frame import CapturedFrame, pinhole_of, read_numbers, rigid
 
 KINECT = (585.0, 585.0, 320.0, 240.0)
@@ -14,6 +15,7 @@ KINECT = (585.0, 585.0, 320.0, 240.0)
 MILLIMETRES = 0.001
 
 
+@takes_paths("folder")
 def read_seven_scenes(folder: Path, intrinsics: NDArray[np.float64] | None) -> tuple[list[CapturedFrame], list[str]]:
     """The views of one sequence. Its colour images are not registered to the depth, and left alone.
 

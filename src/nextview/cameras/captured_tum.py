@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from nextview.arguments import takes_paths
 from nextview.cameras.captured_frame import CapturedFrame
 from nextview.errors import DatasetError
 
@@ -20,6 +21,7 @@ TOGETHER = 0.02
 """Seconds that an image and its pose, or depth and colour, may be apart."""
 
 
+@takes_paths("folder")
 def read_tum(folder: Path, intrinsics: Float | None) -> tuple[list[CapturedFrame], list[str]]:
     """The views of one recording.
 

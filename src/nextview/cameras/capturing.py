@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from nextview.arguments import takes_paths
 from nextview.cameras import captured_seven_scenes, captured_tum
 from nextview.cameras.captured import INTRINSICS
 from nextview.cameras.captured_frame import NOTHING, pinhole_of
@@ -86,6 +87,7 @@ def camera_poses(sphere: ViewSphere, setting: Setting, height: float, rng: np.ra
     return poses
 
 
+@takes_paths("folder")
 def write_capture(
     mesh: Mesh, folder: Path, layout: str, sphere: ViewSphere, setting: Setting, rng: np.random.Generator
 ) -> Iterator[int]:

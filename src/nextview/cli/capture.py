@@ -16,7 +16,7 @@ def capture(
     folder: tyro.conf.Positional[Path],
     /,
     layout: Literal["bop", "tum", "7scenes"] = "bop",
-    views: Literal["40", "12"] = "40",
+    viewpoints: Literal["40", "12"] = "40",
     table: bool = False,
     masks: bool = False,
     radius: float | None = None,
@@ -33,7 +33,7 @@ def capture(
         mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
         folder: where to; it must not be there yet, or be empty. It is whole or not there at all.
         layout: of the files: the BOP challenge's, TUM RGB-D's or 7-Scenes'.
-        views: the viewpoints.
+        viewpoints: from where it is captured, as in nextview recognise.
         table: the object stands on a table, which is seen too.
         masks: write masks of the object also with --table. Without a table they are always written.
         radius: object radius, metres, if the file's unit does not tell.
@@ -59,7 +59,7 @@ def capture(
     if metres is None:
         raise UsageError(f"{mesh}: how large is it? Give the file's --unit or the object's --radius in metres")
     setting = Setting(metres, distance, table, masks or not table, jitter)
-    sphere = ViewSphere.named(views)
+    sphere = ViewSphere.named(viewpoints)
     frames = write_capture(loaded, folder, layout, sphere, setting, np.random.default_rng(seed))
     track(frames, len(sphere), f"capturing {mesh.name}")
     console.print(f"{folder}: {len(sphere)} views; look at them with: nextview recognise {folder}", highlight=False)

@@ -17,7 +17,7 @@ from nextview.session import Recognition
 
 def _angles(view: int, angles: tuple[float, float]) -> str:
     elevation, azimuth = angles
-    return f"{view}\n{elevation:.0f}°, {azimuth:.0f}°"
+    return f"{view}\n{elevation:.0f}°, {round(azimuth) % 360}°"
 
 
 def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[str] = ()) -> None:

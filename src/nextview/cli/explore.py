@@ -65,7 +65,7 @@ def explore(
         webbrowser.open(page.address)
     try:
         page.server.sleep_forever()
-    except KeyboardInterrupt:
+    finally:
         page.stop()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -11,6 +12,9 @@ def plan(
     store: tyro.conf.Positional[Path],
     names: tyro.conf.Positional[tuple[str, ...]] = (),
     /,
+    split: Literal["train", "test"] | None = None,
+    held_out: str | None = None,
+    objects: int | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> None:
@@ -22,12 +26,18 @@ def plan(
     Args:
         store: view store made by nextview render.
         names: volumetric, coverage, or MODULE:CLASS for one of your own; the first two by default.
+        split: only this split.
+        held_out: only the objects that this model, bundled or a card (NAME.json), calls held out of its training.
+        objects: only so many of these, spread evenly; twice as many later hold the same.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler to use instead.
     """
     from nextview.cli.progress import track
     from nextview.data.planning import plan as plan_store
+    from nextview.data.splits import some_objects
+    from nextview.data.store import ViewStore
 
-    steps = plan_store(store, names, workers, scheduler)
+    chosen = some_objects(ViewStore.open(store), split, held_out, objects)
+    steps = plan_store(store, names, workers, scheduler, chosen)
     before, total = next(steps)
     track((done for done, _ in steps), total, f"planning {store.name}", before)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.data.measuring import Made, keep
 from nextview.data.store import ViewStore
 
@@ -17,6 +18,7 @@ TOLERANCE = 0.003
 camera to each point, this one and a pixel's four neighbours differ least; much more sees through table tops."""
 
 
+@takes_paths("path")
 def correspond(path: Path, workers: int | None = None, scheduler: str | None = None) -> Iterator[tuple[int, int]]:
     """Put the correspondence of every object into its store, as ``correspondence`` (N, V, V) float32.
 

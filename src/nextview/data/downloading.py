@@ -14,11 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.error import HTTPError, URLError
 
+from nextview.arguments import as_line, in_one_line, number, of_kind, takes_paths, whole
 from nextview.data.lock import only_one
-from nextview.errors import DatasetError
+from nextview.errors import DatasetError, UsageError
 from nextview.outputs import written_whole
 
 CHUNK = 1 << 18
+DAY = 86_400
+"""Seconds."""
+LONGEST = 200
+"""Letters of what a server says of itself."""
 PATIENCE = 5
 """Connections in a row that may bring nothing new before we give up."""
 
@@ -32,12 +37,23 @@ class Archive:
         size: in bytes.
         sha256: of the whole file, hexadecimal.
         folder: the only folder in it that is unpacked.
+
+    Raises:
+        DatasetError: these are none.
+        UsageError: there is no such size.
     """
 
     url: str
     size: int
     sha256: str
     folder: str
+
+    def __post_init__(self) -> None:
+        for text, what in ((self.url, "URL"), (self.sha256, "SHA-256"), (self.folder, "folder")):
+            of_kind(text, str, f"the {what} of an archive is a text", DatasetError)
+        whole(self.size, "the size of an archive", 1, 2**50)
+        if not self.folder or PurePosixPath(self.folder).name != self.folder:
+            raise DatasetError(f"the folder of an archive is a name, not {as_line(self.folder)}")
 
 
 ARCHIVES = {
@@ -56,6 +72,7 @@ ARCHIVES = {
 }
 
 
+@takes_paths("destination")
 def download(
     archive: Archive, destination: Path, timeout: float = 60, pause: float = 1
 ) -> Iterator[tuple[str, int, int]]:
@@ -75,7 +92,12 @@ def download(
 
     Raises:
         DatasetError: it cannot be fetched, is not the published file, or cannot be unpacked safely.
+        UsageError: no archive, or no times.
     """
+    of_kind(archive, Archive, "what is fetched is an Archive")
+    for seconds, what, least in ((timeout, "the timeout", 0.001), (pause, "the pause", 0)):
+        if not least <= number(seconds, what) <= DAY:
+            raise UsageError(f"{what} is from {least} to {DAY} seconds, not {seconds}")
     folder = destination / archive.folder
     try:
         destination.mkdir(parents=True, exist_ok=True)
@@ -118,12 +140,16 @@ def _fetch(archive: Archive, part: Path, timeout: float, pause: float) -> Iterat
                             furthest, failures = start, 0
                         yield start
             reason = "the connection ends before the file does"
+        except DatasetError:
+            raise
         except HTTPError as error:
+            error.close()
+            reason = f"the server answers {error.code} {in_one_line(str(error.reason), LONGEST)}"
             if error.code < 500:
-                raise DatasetError(f"{archive.url}: the server answers {error.code} {error.reason}") from None
-            reason = f"the server answers {error.code} {error.reason}"
-        except (http.client.HTTPException, ConnectionError, TimeoutError, URLError, UnicodeError) as error:
-            reason = f"the connection fails ({getattr(error, 'reason', error) or type(error).__name__})"
+                raise DatasetError(f"{archive.url}: {reason}") from None
+        except (http.client.HTTPException, ConnectionError, TimeoutError, URLError, ValueError) as error:
+            said = in_one_line(str(getattr(error, "reason", error)), LONGEST) or type(error).__name__
+            reason = f"the connection fails ({said})"
 
 
 def _announced(archive: Archive, answer: http.client.HTTPResponse, start: int) -> int:
@@ -139,7 +165,7 @@ def _announced(archive: Archive, answer: http.client.HTTPResponse, start: int) -
         raise DatasetError(f"{archive.url}: asked for the bytes from {start} on, the server sends {given[:60]!r}")
     if length is None:
         return start
-    if not (length.isascii() and length.isdigit()):
+    if not (length.isascii() and length.isdigit() and len(length) < 20):
         raise DatasetError(f"{archive.url}: the server announces {length[:60]!r} bytes, which is no number")
     if start + int(length) != archive.size:
         raise DatasetError(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
+from nextview.arguments import takes_paths
 from nextview.errors import DatasetError
 from nextview.mesh import FORMATS
 
@@ -22,6 +23,7 @@ class Entry:
     split: str
 
 
+@takes_paths("root")
 def list_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> list[Entry]:
     """All meshes of a dataset folder, or other files in its layout, sorted by class, split and name.
 

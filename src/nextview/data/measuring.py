@@ -7,6 +7,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.folders import list_dataset
 from nextview.data.lock import only_one, writing
@@ -28,6 +30,7 @@ from nextview.measures.surface import Surface
 from nextview.mesh import load_mesh
 from nextview.mesh_format import MAX_FACES
 from nextview.models.model_card import file_hash
+from nextview.own_code import own_code
 
 READING, CASTING = "reading depth", "finding faces"
 """What is done for all measures, beside them."""
@@ -62,6 +65,7 @@ class Cost:
         return rates | {"all": self.views / max(sum(self.seconds.values()), 1e-9)}
 
 
+@takes_paths("path", "meshes")
 def measure(
     path: Path,
     names: Sequence[str] = (),
@@ -70,6 +74,7 @@ def measure(
     meshes: Path | None = None,
     max_faces: int = MAX_FACES,
     cost: Cost | None = None,
+    objects: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[int, int]]:
     """Put view measures into a store, as ``measures/NAME`` (N, V) float32.
 
@@ -81,6 +86,7 @@ def measure(
         meshes: the dataset folder that the store was rendered from, for measures that need the mesh.
         max_faces: of a mesh, as it was rendered.
         cost: is told what this run costs.
+        objects: indices of those to measure; all that are rendered by default.
 
     Yields:
         Objects done so far, and how many there are.
@@ -98,7 +104,7 @@ def measure(
         meshes = meshes.absolute()
         _check_meshes(store, meshes)
     function = partial(_measure, names, meshes, max_faces)
-    yield from keep(path, [f"measures/{name}" for name in names], function, workers, scheduler, cost)
+    yield from keep(path, [f"measures/{name}" for name in names], function, workers, scheduler, cost, objects)
 
 
 def _check_meshes(store: ViewStore, meshes: Path) -> None:
@@ -150,19 +156,19 @@ def _measure(names: tuple[str, ...], meshes: Path | None, max_faces: int, store:
         view = MeasuredView(depth, pose, store.intrinsics, surface, faces)
         lap(READING if camera is None else CASTING)
         for name, function in measures.items():
-            try:
-                with np.errstate(over="ignore"):  # what is too large for float32 is told below
-                    values[name][k] = function(view)
-            except (Exception, SystemExit) as error:  # whatever a user's measure may raise
-                if ":" not in name or isinstance(error, MeasureError):
-                    raise
-                raise MeasureError(f"measure {name} of {store.names[i]}: {type(error).__name__}: {error}") from error
+            own = own_code(partial(_failed, name, store.names[i])) if ":" in name else nullcontext()
+            with own, np.errstate(over="ignore"):  # what is too large for float32 is told below
+                values[name][k] = function(view)
             lap(name)
     for name, found in values.items():
         if not np.isfinite(found).all():
             raise MeasureError(f"measure {name} of {store.names[i]}, view {np.isfinite(found).argmin()}, is not finite")
     cost.peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     return {f"measures/{name}": found for name, found in values.items()}, cost
+
+
+def _failed(name: str, of: str, said: str) -> MeasureError:
+    return MeasureError(f"measure {name} of {of}: {said}")
 
 
 def keep(
@@ -172,6 +178,7 @@ def keep(
     workers: int | None = None,
     scheduler: str | None = None,
     cost: Cost | None = None,
+    objects: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[int, int]]:
     """Call ``function(store, i)`` for the objects that lack a sound row of the arrays, and keep what it returns.
 
@@ -182,6 +189,7 @@ def keep(
         workers: processes; one for each core by default; 0 to work in this one.
         scheduler: address of a dask.distributed scheduler, to use instead.
         cost: is told what this run costs.
+        objects: indices of those that are wanted; all that are rendered by default.
 
     Yields:
         Objects done so far, and how many there are.
@@ -192,6 +200,7 @@ def keep(
     with only_one(path), writing(path):
         store = ViewStore.open(path.absolute())
         done = np.flatnonzero(store.done)
+        done = done if objects is None else np.intersect1d(done, objects)
         for name in names:
             if not store.sound(name):
                 store.add(name)

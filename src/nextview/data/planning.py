@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.belief import FixedLength
 from nextview.data.measuring import Made, keep
 from nextview.data.store import PLANNED, ViewStore
@@ -32,8 +33,13 @@ def plannable() -> list[str]:
     return [name for name, make in POLICIES.items() if tuple(make(grid, ()).needs) == ("observations",)]
 
 
+@takes_paths("path")
 def plan(
-    path: Path, names: Sequence[str] = (), workers: int | None = None, scheduler: str | None = None
+    path: Path,
+    names: Sequence[str] = (),
+    workers: int | None = None,
+    scheduler: str | None = None,
+    objects: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[int, int]]:
     """Put the views that policies take into a store, as ``plans/NAME`` (N, V, K) float32: row V from first view V.
 
@@ -42,6 +48,7 @@ def plan(
         names: of the policies, "MODULE:CLASS" for your own; all that are ``plannable`` by default.
         workers: processes; one for each core by default; 0 to work in this one.
         scheduler: address of a dask.distributed scheduler, to use instead.
+        objects: indices of those to plan for; all that are rendered by default.
 
     Yields:
         Objects done so far, and how many there are.
@@ -60,7 +67,8 @@ def plan(
                 f"policy {name} needs {', '.join(needs) or 'nothing that was seen'}; planned are those that need the "
                 "depth that was seen and nothing else"
             )
-    yield from keep(path, [f"plans/{name}" for name in names], partial(_plan, names), workers, scheduler)
+    arrays = [f"plans/{name}" for name in names]
+    yield from keep(path, arrays, partial(_plan, names), workers, scheduler, objects=objects)
 
 
 def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> Made:

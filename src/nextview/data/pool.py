@@ -15,8 +15,11 @@ from multiprocessing import resource_tracker
 from types import FrameType
 from typing import TypeVar
 
-from nextview.errors import DatasetError, UsageError
+from nextview.arguments import whole
+from nextview.errors import DatasetError
 
+MOST = 1024
+"""Processes on one machine."""
 PATIENCE = "10s"
 """How long a scheduler may take to answer."""
 
@@ -32,13 +35,11 @@ def count(workers: int | None) -> int:
     """How many processes are meant: one for each core by default.
 
     Raises:
-        UsageError: fewer than none.
+        UsageError: fewer than none, or more than any machine bears.
     """
     if workers is None:
         return os.cpu_count() or 1
-    if workers < 0:
-        raise UsageError(f"there cannot be {workers} workers")
-    return workers
+    return whole(workers, "the number of workers", 0, MOST)
 
 
 def each(

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.command_line import command_line
 from nextview.data.lock import only_one, writing
 from nextview.data.pool import WorkerDied, each
@@ -41,6 +42,7 @@ def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
     return (several.sum(1) > 1)[group] & store.done
 
 
+@takes_paths("path", "out")
 def predict(
     path: Path,
     out: Path,

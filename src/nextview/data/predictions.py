@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.arguments import regular_file
+from nextview.arguments import regular_file, takes_paths
 from nextview.belief import PLAIN_SUM, Calibration, log_evidence_of
 from nextview.data.splits import deduplicated
 from nextview.errors import PredictionsError
@@ -163,6 +163,7 @@ class Predictions:
             return self
         return replace(self, logits=self.logits - self.of_size[:, None], of_size=None)
 
+    @takes_paths("path")
     def save(self, path: Path) -> None:
         """Write one .npz file, aside and then renamed, so that it is whole or not there."""
         arrays: dict[str, Any] = {
@@ -193,6 +194,7 @@ class Predictions:
             np.savez_compressed(file, **arrays)
 
     @classmethod
+    @takes_paths("path")
     def load(cls, path: str | Path) -> Predictions:
         """Read what ``save`` wrote. Nothing is unpickled.
 

@@ -15,6 +15,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.cameras.sensors import SensedCamera, Sensor, SensorMix, sensor_named
 from nextview.cameras.simulated import SimulatedCamera
 from nextview.cloud import POINTS
@@ -103,6 +104,7 @@ def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np
     }
 
 
+@takes_paths("dataset", "path", "held_out", "meshes")
 def render(
     dataset: Path,
     path: Path,
@@ -191,6 +193,7 @@ def render(
             yield entry.name, None if reason is None else f"{reason}"
 
 
+@takes_paths("dataset", "held_out", "meshes")
 def entries_of(
     dataset: Path, split: str | None = None, held_out: Path | None = None, meshes: Path | None = None
 ) -> list[Entry]:

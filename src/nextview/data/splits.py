@@ -1,12 +1,15 @@
-"""Which objects train and which validate: by object, stratified by class, identical meshes together."""
+"""Which objects train and which validate: by object, stratified by class, identical meshes together. And samples."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError
+from nextview.errors import DatasetError, UsageError
+from nextview.models.model_card import find_card
 
 
 def duplicate_groups(measured: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -106,3 +109,40 @@ def deduplicate(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.int6
 def test_objects(store: ViewStore) -> NDArray[np.int64]:
     """Indices of the rendered objects of the test split."""
     return np.flatnonzero(store.done & (store.splits == "test"))
+
+
+def sample(objects: NDArray[np.int64], count: int | None = None) -> NDArray[np.int64]:
+    """So many of some objects, in even steps from the first one; all if there are no more. Twice as many hold the same.
+
+    Raises:
+        UsageError: less than one is asked for.
+    """
+    if count is not None and count < 1:
+        raise UsageError(f"a sample holds at least one object, not {count}")
+    n = len(objects)
+    return objects if count is None or count >= n else objects[np.arange(count) * n // count]
+
+
+def some_objects(
+    store: ViewStore, split: str | None = None, held_out: str | Path | None = None, count: int | None = None
+) -> NDArray[np.int64]:
+    """Indices of the rendered objects of a store that are asked for, sorted.
+
+    Args:
+        store: the views.
+        split: only this split.
+        held_out: only those that this model, bundled or of this card, calls held out of its training.
+        count: only so many of these, see ``sample``.
+
+    Raises:
+        DatasetError: there are none.
+        ModelError: the card is none.
+    """
+    chosen = store.done & (True if split is None else store.splits == split)
+    if held_out is not None:
+        targets = [name.partition("@")[0] for name in store.names]  # in worlds; all of the name for others
+        chosen &= np.isin(targets, find_card(held_out).held_out)
+    if not chosen.any():
+        of = (f" of the split {split!r}" if split else "") + (f" that {held_out} calls held out" if held_out else "")
+        raise DatasetError(f"{store.path}: holds no rendered object{of}")
+    return sample(np.flatnonzero(chosen), count)

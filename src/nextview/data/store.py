@@ -20,6 +20,7 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
+from nextview.arguments import takes_paths
 from nextview.cloud import POINTS
 from nextview.data.attributes import CHECKSUM, FORMAT, checksum, validate
 from nextview.data.folders import Entry
@@ -81,8 +82,10 @@ class ViewStore:
     group: zarr.Group
 
     @classmethod
+    @takes_paths("path")
     def create(cls, path: Path, entries: list[Entry], sphere: ViewSphere, size: int, recipe: dict) -> ViewStore:
         """Make an empty store, whole or not at all; ``recipe`` is kept in the attributes as it is (JSON values)."""
+        path = Path(os.path.realpath(path)) if path.name in ("", "..") else path  # "." has no name
         for left in path.parent.glob("*.part"):  # of a run that was killed while it did this; no other is under way
             if re.fullmatch(re.escape(path.name) + r"\.[0-9a-f]{32}\.part", left.name):
                 shutil.rmtree(left, ignore_errors=True)
@@ -161,6 +164,7 @@ class ViewStore:
         return layouts.get(name, ((v,), "float32", np.nan))  # another measure
 
     @classmethod
+    @takes_paths("path")
     def open(cls, path: str | Path) -> ViewStore:
         """Open a store for reading.
 

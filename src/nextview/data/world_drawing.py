@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nextview.arguments import as_line, of_kind, takes_paths, whole
 from nextview.data.folders import Entry, list_dataset
 from nextview.data.lock import only_one, writing
 from nextview.data.pool import each
@@ -40,6 +41,7 @@ class Task:
     path: Path
 
 
+@takes_paths("dataset", "out", "held_out")
 def draw_worlds(
     dataset: Path,
     out: Path,
@@ -103,13 +105,14 @@ def tasks(
     held_out: Path | None = None,
 ) -> list[Task]:
     """All worlds that are asked for, see ``draw_worlds``."""
-    unknown = [level for level in levels if level not in LEVELS]
+    of_kind(levels, tuple | list, "the levels of worlds are several")
+    unknown = [as_line(level) for level in levels if not isinstance(level, str) or level not in LEVELS]
     if unknown or not levels:
         raise UsageError(f"the level of a world is {', '.join(LEVELS)}, not {unknown[0] if unknown else 'none'}")
-    if worlds is not None and not 1 <= worlds <= MOST:
-        raise UsageError(f"worlds at each level are from 1 to {MOST:,}, not {worlds}")
-    if not 0 <= seed < 2**31:
-        raise UsageError(f"a seed is from 0 to {2**31 - 1}, not {seed}")
+    if worlds is not None:
+        whole(worlds, "the number of worlds at each level", 1, MOST)
+    whole(seed, "a seed", 0, 2**31 - 1)
+    of_kind(split, str | None, "a split is a name")
     found: list[Task] = []
     entries = [entry for entry in list_dataset(dataset) if split in (None, entry.split)]
     if not entries:

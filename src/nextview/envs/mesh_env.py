@@ -10,7 +10,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.cameras.simulated import SimulatedCamera
+from nextview.arguments import takes_paths, whole
+from nextview.cameras.simulated import LARGEST, SimulatedCamera
 from nextview.data.folders import list_dataset
 from nextview.data.samples import SAMPLES, sample_mesh
 from nextview.envs.cohort import Seen
@@ -46,8 +47,10 @@ class RecogniseMeshEnv(TaskEnv):
     Raises:
         DatasetError: there are no such meshes, or one is of a class that the recogniser does not know.
         ModelError: there are no such models, or maps.
+        UsageError: options that make no sense.
     """
 
+    @takes_paths("meshes")
     def __init__(
         self,
         meshes: str | Path | None = None,
@@ -59,6 +62,7 @@ class RecogniseMeshEnv(TaskEnv):
         balanced: bool = False,
         **rules: Any,
     ) -> None:
+        whole(size, "the side of an image", 1, LARGEST)
         given, found, sphere = Rules(**rules), find_models(models), ViewSphere.named(viewpoints)
         wanted = dict.fromkeys(name.removesuffix("-sphere") for name in given.maps)
         networks = Models(Recogniser(found.recogniser), {name: MapNetwork(found.maps[name]) for name in wanted})

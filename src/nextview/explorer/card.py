@@ -13,11 +13,10 @@ from PIL import Image
 
 from nextview.explorer.exploration import Walk
 from nextview.observation import Observation
-from nextview.report.style import heat
+from nextview.report.style import ACCENT, FAINT, INK, heat
 from nextview.session import View
 from nextview.viewsphere import ViewSphere
 
-INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
 CELL = 11
 """Side of a cell of a map, pixels."""
 SHOWN = 5
@@ -90,7 +89,8 @@ def _row(pictures: list[tuple[str, str]]) -> str:
 def _figures(walk: Walk, view: View) -> str:
     """The image, local maps, and the value of each view where they lie on rings; the highest ring on top."""
     elevation, azimuth = view.angles
-    found = [(f"view {view.index}: {elevation:.0f}° up, {azimuth:.0f}° round", _image(view.observation.picture, 120))]
+    where = f"view {view.index}: {elevation:.0f}° up, {round(azimuth) % 360}° round"
+    found = [(where, _image(view.observation.picture, 120))]
     for name, values in view.maps.items():
         found.append((f"{name}, from here", _image(heat(values[::-1]), CELL * values.shape[1])))
     if view.values is not None and isinstance(walk.sphere, ViewSphere):

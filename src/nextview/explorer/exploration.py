@@ -19,7 +19,7 @@ from nextview.mesh import Mesh
 from nextview.observation import Camera, Observation
 from nextview.session import Session, View
 from nextview.system import System, load, simulated
-from nextview.viewsphere import Viewpoints, elevation_of, look_at_origin, turn_of
+from nextview.viewsphere import Viewpoints, level_pose, look_at_origin
 
 Float = NDArray[np.float64]
 
@@ -141,9 +141,8 @@ class Exploration:
         self._load = lru_cache(maxsize=None)(lambda policy: load(policy=policy, **options))
         self.systems: list[System] = [self._load(policy) for policy in policies]
         views = len(self.systems[0].sphere)
-        self.start = int(np.random.default_rng(seed).integers(views)) if start is None else start
-        if not 0 <= self.start < views:
-            raise UsageError(f"there is no view {self.start}, only 0 to {views - 1}")
+        drawn = int(np.random.default_rng(seed).integers(views))
+        self.start = drawn if start is None else whole(start, "the first view", 0, views - 1)
         self.show(objects[0].name)
 
     @property
@@ -215,5 +214,4 @@ class Exploration:
         """A level pose, (4, 4), in the direction of a position, (3,), as far away as the candidate views are."""
         length = np.linalg.norm(position)
         outward = position / length if length > 0 else np.array([1.0, 0, 0])
-        turn = 2 * np.pi * turn_of(outward)
-        return look_at_origin(elevation_of(outward), turn, self.walks[0].sphere.distance)
+        return level_pose(outward, self.walks[0].sphere.distance)

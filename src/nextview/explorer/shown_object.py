@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.data.folders import list_dataset
 from nextview.data.samples import SAMPLES, sample_mesh
 from nextview.errors import DatasetError
@@ -59,6 +60,7 @@ class ShownObject:
     label: str | None = None
 
 
+@takes_paths("path")
 def shown_objects(path: Path | None = None, up: str | None = None) -> tuple[ShownObject, ...]:
     """The objects of a path, in order.
 

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from nextview.explorer.exploration import Walk
 from nextview.mesh import Mesh
-from nextview.report.style import heat
+from nextview.report.style import ACCENT, INK, heat, rgb
+from nextview.viewsphere import great_circle
 
 Float = NDArray[np.float64]
 
-INK, ACCENT = (34, 49, 63), (209, 73, 91)
 BALL = 0.12
 """Radius of a candidate view, object radii."""
 
@@ -95,7 +95,7 @@ class WalkScene:
             self._object.visible = not hide_unseen
         self._colour(walk)
         points, name = walk.points, self._name
-        self._scene.add_point_cloud(f"{name}/seen", points, ACCENT, point_size=0.012, visible=len(points) > 0)
+        self._scene.add_point_cloud(f"{name}/seen", points, rgb(ACCENT), point_size=0.012, visible=len(points) > 0)
         self._draw_path(walk)
         if not walk.views:
             return
@@ -108,7 +108,7 @@ class WalkScene:
             fov=2 * float(np.arctan(height / 2 / observation.intrinsics[1, 1])),
             aspect=width / height,
             scale=0.5,
-            color=ACCENT,
+            color=rgb(ACCENT),
             image=np.repeat(observation.picture[..., None], 3, -1),
             wxyz=wxyz(pose),
             position=pose[:3, 3],
@@ -121,7 +121,7 @@ class WalkScene:
         values[walk.visited] = np.nan
         for view, (ball, colour) in enumerate(zip(self._balls, heat(values), strict=True)):
             visited, asked = view in walk.visited, view == walk.next_view
-            ball.color = INK if visited else ACCENT if asked else tuple(int(c) for c in colour)
+            ball.color = rgb(INK) if visited else rgb(ACCENT) if asked else tuple(int(c) for c in colour)
             scale = 0.5 if visited else 1.5 if asked else 1.0
             if ball.scale != scale:
                 ball.scale = scale
@@ -133,9 +133,7 @@ class WalkScene:
             name = f"{self._name}/path/{step + 1}"
             self._scene.add_label(f"{name}/number", str(step + 1), position=1.1 * distance * places[step])
             if step:
-                a, b = places[step - 1], places[step]
-                line = a + np.linspace(0, 1, 25)[:, None] * (b - a)
-                line *= distance / np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
+                line = distance * great_circle(places[step - 1], places[step])
                 segments = np.stack([line[:-1], line[1:]], 1)
-                self._scene.add_line_segments(f"{name}/way", segments, ACCENT, thickness=0.03)
+                self._scene.add_line_segments(f"{name}/way", segments, rgb(ACCENT), thickness=0.03)
         self._drawn = len(places)

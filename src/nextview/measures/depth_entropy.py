@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.depth import object_depth
+from nextview.errors import MeasureError
+from nextview.observation import depth_image, numbers
 
 QUANTUM = 1e-3
 """Depth values closer than this count as equal, object radii."""
@@ -19,8 +21,11 @@ def depth_entropy(depth: NDArray[np.floating]) -> float:
 
     Returns:
         0 for an image of one value, at most log2 of the number of pixels.
+
+    Raises:
+        ObservationError: no depth image.
     """
-    depth = object_depth(np.asarray(depth, np.float64))
+    depth = object_depth(depth_image(depth).astype(np.float64, copy=False))
     seen = depth[depth > 0]
     counts = np.bincount(np.rint(seen / QUANTUM).astype(np.int64), minlength=1)
     counts[0] += depth.size - seen.size
@@ -36,7 +41,13 @@ def normalise_per_object(values: NDArray[np.floating]) -> NDArray[np.float32]:
 
     Returns:
         (..., V) float32.
+
+    Raises:
+        MeasureError: no such values.
     """
+    values = numbers(values, "the values of a measure")
+    if values.ndim == 0 or values.shape[-1] == 0:
+        raise MeasureError("a measure has a value for each view, and here is none")
     low = values.min(-1, keepdims=True)
     span = values.max(-1, keepdims=True) - low
     return np.where(span > 0, (values - low) / np.where(span > 0, span, 1), 0).astype(np.float32)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from nextview.depth import object_depth
 from nextview.errors import MeasureError
 from nextview.measures.surface import Surface
+from nextview.observation import depth_image
 
 GRAZING = 0.05
 """Where a surface turns farther from the camera than this cosine, it counts as turned so far: one row of pixels more or
@@ -28,6 +29,9 @@ class MeasuredView:
         intrinsics: pinhole matrix, (3, 3) float64, pixels, the first pixel's centre at 0.5.
         mesh: the surface that is seen; None where only the depth is known.
         face_ids: which face of it each pixel shows, (H, W) int32, -1 for none; see ``SimulatedCamera.face_ids``.
+
+    Raises:
+        ObservationError: no depth image.
     """
 
     depth: NDArray[np.floating]
@@ -37,7 +41,7 @@ class MeasuredView:
     face_ids: NDArray[np.int32] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "depth", object_depth(np.asarray(self.depth)))
+        object.__setattr__(self, "depth", object_depth(depth_image(self.depth)))
 
     @cached_property
     def box(self) -> tuple[slice, slice]:

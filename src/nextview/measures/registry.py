@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 from nextview.arguments import of_kind
@@ -22,6 +19,7 @@ from nextview.measures.measured_view import MeasuredView
 from nextview.measures.saliency import mesh_saliency
 from nextview.measures.semantic import above_preference, base_avoidance
 from nextview.measures.silhouette import silhouette_entropy, silhouette_length
+from nextview.own_code import import_own, own_code
 
 
 @dataclass(frozen=True)
@@ -86,14 +84,8 @@ def find_measure(name: str) -> Measure:
         return MEASURES[name]
     if ":" not in name:
         raise MeasureError(f"no measure is called {name!r}; there are {', '.join(MEASURES)}, or MODULE:FUNCTION")
-    module, _, attribute = name.partition(":")
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.insert(0, here)  # where a user's own measure lies
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (Exception, SystemExit) as error:  # whatever a user's module may raise
-        raise MeasureError(f"measure {name} cannot be imported ({type(error).__name__}: {error})") from error
+    with own_code(lambda said: MeasureError(f"measure {name} cannot be imported ({said})")):
+        found = import_own(name)
     if not callable(found):
         raise MeasureError(f"measure {name} is no function of a view")
     return found if isinstance(found, Measure) else Measure(found)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from nextview.arguments import regular_file
+from nextview.arguments import a_path, regular_file
 from nextview.errors import ModelError
 from nextview.models.inference import MAPS, RECOGNISER
 from nextview.models.model_card import find_card, read_card
@@ -37,7 +37,7 @@ def find_models(models: str | Path) -> Collection:
     bundled = {name: find_card(card).path.with_suffix(".json") for name, card in MAPS.items()}
     if str(models) == RECOGNISER.removeprefix("recogniser-"):
         return Collection(find_card(RECOGNISER).path.with_suffix(".json"), bundled, {})
-    folder = Path(models)
+    folder = a_path(models, "a folder with models", ModelError)
     if not folder.is_dir():
         name = RECOGNISER.removeprefix("recogniser-")
         raise ModelError(f"{folder}: is neither a folder with models nor the name of bundled ones ({name})")

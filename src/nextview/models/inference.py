@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 from nextview.errors import ModelError
 from nextview.models.model_card import ModelCard, find_card
 from nextview.models.network_input import from_observations
-from nextview.models.onnx_file import check_end, open_onnx
+from nextview.models.onnx_file import check_end, check_input, open_onnx, run_onnx
 from nextview.novelty import novelty_path, read_novelty
 from nextview.observation import Observation
 from nextview.occupancy import shown_share
 from nextview.policies.base import Evidence, maps_among
 
 RECOGNISER = "recogniser-modelnet10"
+INPUT = "input"
+"""The name of what a recogniser takes in its ONNX file."""
 BINS_OUTPUT = "sides"
 """The name that the azimuth bins have in a recogniser's ONNX file."""
 FEATURES_OUTPUT = "features"
@@ -51,8 +53,7 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
             shapes[FEATURES_OUTPUT] = (None,)
     else:
         shapes = {"map": (None, 3)} | ({"sphere": (None, None)} if card.output == "sphere" else {})
-    for end in session.get_inputs():
-        check_end(card.path, end, kind, card.input.shape)
+    check_input(card.path, session, INPUT if card.is_recogniser else None, kind, card.input.shape)
     for name, shape in shapes.items():
         if name not in ends:
             raise ModelError(f"{card.path}: gives no {name}, which its card promises")
@@ -97,7 +98,7 @@ class Recogniser:
     def from_inputs(self, inputs: NDArray[Any]) -> Evidence:
         """The same by what is seen alone, see ``network_input``."""
         names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins) + [FEATURES_OUTPUT] * (self.novelty is not None)
-        found = dict(zip(names, self._session.run(names, {"input": inputs}), strict=True))
+        found = dict(zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True))
         novelty = None if self.novelty is None else self.novelty.scores(found[FEATURES_OUTPUT])
         return Evidence(found["logits"], azimuth_bins=found.get(BINS_OUTPUT), novelty=novelty)
 
@@ -109,7 +110,7 @@ class Recogniser:
         """
         if FEATURES_OUTPUT not in [end.name for end in self._session.get_outputs()]:
             raise ModelError(f"{self.card.path}: gives no {FEATURES_OUTPUT}; export the recogniser again")
-        return self._session.run([FEATURES_OUTPUT], {"input": inputs})[0]
+        return run_onnx(self.card.path, self._session, [FEATURES_OUTPUT], inputs)[0]
 
 
 class MapNetwork:
@@ -143,7 +144,7 @@ class MapNetwork:
         names = {"map": self.card.kind} | (
             {"sphere": f"{self.card.kind}-sphere"} if self.card.output == "sphere" else {}
         )
-        found = self._session.run(list(names), {self._session.get_inputs()[0].name: inputs})
+        found = run_onnx(self.card.path, self._session, list(names), inputs)
         return dict(zip(names.values(), found, strict=True))
 
 

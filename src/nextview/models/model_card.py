@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from nextview.arguments import a_path, takes_paths
 from nextview.belief import PLAIN_SUM, Calibration
 from nextview.errors import ModelError
 from nextview.json_file import Fields, read_object
@@ -230,6 +231,7 @@ def _by_name(fields: Fields, name: str, kind: type[Any]) -> dict[str, Any]:
     return values
 
 
+@takes_paths("path")
 def read_card(path: Path) -> ModelCard:
     """Read a card; the weights are the file beside it with the same name.
 
@@ -263,17 +265,20 @@ def find_card(model: str | Path) -> ModelCard:
     cards = bundled_cards()
     if str(model) in cards:
         return cards[str(model)]
-    if Path(model).suffix != ".json":
+    path = a_path(model, "the card of a model", ModelError)
+    if path.suffix != ".json":
         raise ModelError(f"no bundled model is called {str(model)!r}; there are {', '.join(cards)}")
-    return read_card(Path(model))
+    return read_card(path)
 
 
+@takes_paths("path")
 def write_card(path: Path, card: ModelCard) -> None:
     """Write a card, aside and then renamed."""
     with written_whole(path) as part:
         part.write_text(json.dumps(card.to_dict(), indent=1, allow_nan=False) + "\n")
 
 
+@takes_paths("path")
 def file_hash(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal."""
     with path.open("rb") as file:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import number, of_kind, places
+from nextview.errors import UsageError
 from nextview.observation import SceneView
 from nextview.occupancy.voxel_grid import OBJECT, OCCLUDER, UNSEEN, Occupancy, VoxelGrid
 
@@ -116,7 +118,15 @@ def expected_visibility(
 
     Returns:
         Of each position; 1 where nothing is known of the object at all.
+
+    Raises:
+        UsageError: no scene, no positions, or numbers below 0.
     """
+    of_kind(seen, SeenScene, "what is known is a SeenScene")
+    positions = places(positions, "the positions of cameras")
+    for share, what in ((density, "how often unseen space is filled"), (unseen_part, "what unseen voxels count for")):
+        if not 0 <= number(share, what) <= SOLID:
+            raise UsageError(f"{what} is a number from 0 to {SOLID:g}, not {share}")
     lines = sight_lines(seen.occupancy.grid, np.asarray(positions, np.float64).tobytes())
     return lines.visibility(seen, density, unseen_part)
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.occupancy.voxel_grid import OCCLUDER, UNSEEN, Occupancy
+from nextview.arguments import number, of_kind, places
+from nextview.errors import UsageError
+from nextview.occupancy.voxel_grid import OCCLUDER, UNSEEN, Occupancy, region_of
 
 
 def visible_share(
@@ -30,7 +32,15 @@ def visible_share(
 
     Returns:
         (V,) float64, 0 to 1; NaN if there are no points.
+
+    Raises:
+        UsageError: these are no points, no positions, no density or no region.
     """
+    of_kind(occupancy, Occupancy, "what is known is an Occupancy")
+    points, positions = places(points, "what is looked at"), places(positions, "the positions of cameras")
+    if not number(density, "how often unseen space is filled") >= 0:
+        raise UsageError(f"how often unseen space is filled is a number from 0 on, not {density}")
+    own = None if own is None else region_of(occupancy.grid, own)
     grid, cells = occupancy.grid, occupancy.cells.reshape(-1)
     # What a step through a voxel takes off the logarithm of the chance to be seen. None outside of the grid: the last.
     cost = np.zeros(len(cells) + 1, np.float32)

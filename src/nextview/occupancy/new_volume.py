@@ -11,10 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import of_kind, places
 from nextview.errors import UsageError
-from nextview.occupancy.voxel_grid import FREE, OCCLUDER, UNSEEN, Occupancy
+from nextview.occupancy.voxel_grid import FREE, OCCLUDER, UNSEEN, Occupancy, VoxelGrid, region_of
 
 Float = NDArray[np.float32]
+TOGETHER = 100_000
+"""Voxels that are drawn at once, in the pictures of several cameras."""
 
 
 def new_volume(
@@ -35,19 +38,21 @@ def new_volume(
         (V,) float64, cubes of the grid's unit.
 
     Raises:
-        UsageError: a camera stands within the region.
+        UsageError: a camera stands within the region, or these are no cameras and no region.
     """
+    of_kind(occupancy, Occupancy, "what is known is an Occupancy")
+    positions = places(positions, "the positions of cameras")
     grid, cells = occupancy.grid, occupancy.cells.reshape(-1)
-    counts = (cells == UNSEEN) & (grid.ball if region is None else region).reshape(-1)
-    asked, blockers = grid.middles[:, counts], grid.middles[:, cells >= OCCLUDER]
-    found = np.zeros(len(positions))
-    for at, eye in enumerate(_eyes(asked, positions, grid.pitch)):
-        u, v, z = eye.project(asked)
-        corner, shape = _frame(u, v)
-        buffer = eye.z_buffer(blockers, corner, shape)
-        pixel = (v - corner[1]).astype(np.int32) * np.int32(shape[1]) + (u - corner[0]).astype(np.int32)
-        found[at] = np.count_nonzero(z <= buffer.take(pixel) + np.float32(grid.pitch))
-    return found * grid.pitch**3
+    counts = (cells == UNSEEN) & region_of(grid, region).reshape(-1)
+    asked, blockers = _middles(grid, counts), _middles(grid, cells >= OCCLUDER)
+    found = []
+    for eyes in _eyes(asked, blockers, positions, grid.pitch):
+        u, v, z = eyes.project(asked)
+        frame = _Frame.around(u, v)
+        reach = eyes.hidden(blockers, frame) + np.float32(grid.pitch)
+        pixels = _pixels(v - frame.top, u - frame.left, np.arange(len(u))[:, None], frame.shape)
+        found += np.count_nonzero(z <= reach.take(pixels), axis=1).tolist()
+    return np.array(found or [0] * len(positions)) * grid.pitch**3
 
 
 def new_surface(
@@ -70,17 +75,27 @@ def new_surface(
     Raises:
         UsageError: a camera stands within the region.
     """
+    of_kind(occupancy, Occupancy, "what is known is an Occupancy")
+    positions = places(positions, "the positions of cameras")
     grid, cells = occupancy.grid, occupancy.cells
-    solid = (cells != FREE) & (grid.ball if region is None else region) | (cells >= OCCLUDER)
+    solid = (cells != FREE) & region_of(grid, region) | (cells >= OCCLUDER)
     border = (solid & ~_enclosed(solid)).reshape(-1)
     unseen = border & (cells.reshape(-1) == UNSEEN)
-    asked, blockers = grid.middles[:, unseen], grid.middles[:, border & ~unseen]
-    found = np.zeros(len(positions))
-    for at, eye in enumerate(_eyes(asked, positions, grid.pitch)):
-        corner, shape = _frame(*eye.project(asked)[:2])
-        nearest = eye.z_buffer(asked, corner, shape)
-        found[at] = np.count_nonzero(np.isfinite(nearest) & (nearest < eye.z_buffer(blockers, corner, shape)))
-    return found * grid.pitch**2
+    asked, blockers = _middles(grid, unseen), _middles(grid, border & ~unseen)
+    found = []
+    for eyes in _eyes(asked, blockers, positions, grid.pitch):
+        u, v, z = eyes.project(asked)
+        frame = _Frame.around(u, v)
+        nearest = eyes.z_buffer(u, v, z, frame)
+        hidden = eyes.hidden(blockers, frame)
+        shows = np.isfinite(nearest) & (nearest < hidden) & frame.inside
+        found += np.count_nonzero(shows, axis=(1, 2)).tolist()
+    return np.array(found or [0] * len(positions)) * grid.pitch**2
+
+
+def _middles(grid: VoxelGrid, cells: NDArray[np.bool_]) -> Float:
+    """Of some voxels, (n^3,) bool, (3, P)."""
+    return grid.middles.take(np.flatnonzero(cells), axis=1)
 
 
 def _enclosed(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -91,63 +106,134 @@ def _enclosed(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
-class _Eye:
-    """A camera that looks at the middle of what it is asked about; there a pixel is as wide as a voxel.
+class _Frame:
+    """The part of its picture that each of E cameras is asked about.
 
     Attributes:
-        position: (3,).
-        axes: right, down and ahead as rows, the first two in pixels, (3, 3).
-        distance: to that middle.
+        left, top: pixel coordinates of its corner, (E, 1) each.
+        rows, columns: of each, (E, 1) int64 each.
+        shape: rows and columns of pictures that hold them all.
+    """
+
+    left: Float
+    top: Float
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    shape: tuple[int, int]
+
+    @classmethod
+    def around(cls, u: Float, v: Float) -> _Frame:
+        """Those that hold points at some pixel coordinates, (E, P) each, and a pixel beside them."""
+        left, top = (c.min(1, keepdims=True) - 1 for c in (u, v))
+        rows, columns = ((c.max(1, keepdims=True) - c0).astype(np.int64) + 2 for c, c0 in ((v, top), (u, left)))
+        return cls(left, top, rows, columns, (int(rows.max()), int(columns.max())))
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Pixels of pictures of that shape that belong to each, (E, rows, columns)."""
+        rows, columns = (np.arange(side) < own for side, own in zip(self.shape, (self.rows, self.columns), strict=True))
+        return rows[:, :, None] & columns[:, None]
+
+
+@dataclass(frozen=True)
+class _Eyes:
+    """E cameras that look at the middle of what they are asked about; there a pixel is as wide as a voxel.
+
+    Attributes:
+        positions: (E, 3).
+        axes: right, down and ahead as rows, the first two in pixels, (E, 3, 3).
+        distances: to that middle, (E,).
         pitch: side of a voxel.
     """
 
-    position: Float
+    positions: Float
     axes: Float
-    distance: float
+    distances: Float
     pitch: float
 
     def project(self, points: Float) -> tuple[Float, Float, Float]:
-        """Pixel coordinates and depth of points that lie ahead, (3, P), each (P,)."""
-        x, y, z = self.axes @ points - (self.axes @ self.position)[:, None]
+        """Pixel coordinates and depth of points that lie ahead, (3, P), each (E, P).
+
+        Raises:
+            UsageError: one does not lie ahead.
+        """
+        x, y, z = self._turned(points)
         if z.min(initial=np.inf) < self.pitch / 2:
             raise UsageError("a camera stands among the voxels that it is asked about")
-        return x / z, y / z, z
+        return np.divide(x, z, out=x), np.divide(y, z, out=y), z
 
-    def z_buffer(self, blockers: Float, corner: tuple[float, float], shape: tuple[int, int]) -> Float:
-        """Depth of the nearest voxel at each pixel, infinity for none.
+    def hidden(self, blockers: Float, frame: _Frame) -> Float:
+        """Depth of the nearest of some voxels, (3, Q), at each pixel; those that do not lie ahead are left out."""
+        x, y, z = self._turned(blockers)
+        z[z <= np.float32(self.pitch)] = np.inf
+        return self.z_buffer(np.divide(x, z, out=x), np.divide(y, z, out=y), z, frame)
+
+    def z_buffer(self, u: Float, v: Float, z: Float, frame: _Frame) -> Float:
+        """Depth of the nearest of voxels that were projected at each pixel, infinity for none, (E, rows, columns).
 
         Each is drawn over the four pixels around its middle, so that walls have no holes: the middles of the voxels of
         a wall are at most sqrt(2) sides apart, and these are less than two pixels. Nearer ones, which are farther apart
         in the picture, are drawn in pixels of twice the width, or four times, and so on.
-
-        Args:
-            blockers: middles of voxels, (3, Q); those that do not lie ahead are left out.
-            corner: pixel coordinates of the picture's corner.
-            shape: of the picture, rows and columns.
         """
-        found = np.full(shape, np.inf, np.float32)
-        ahead = self.axes[2] @ blockers > self.axes[2] @ self.position + np.float32(self.pitch)
-        u, v, z = self.project(blockers[:, ahead])
-        level = np.ceil(np.log2(np.maximum(np.sqrt(0.5) * self.distance / z, 1))).astype(np.int64)
-        for coarse in range(int(level.max(initial=0)) + 1):
-            here, width = level == coarse, 2**coarse
-            rows, columns = (side // width + 3 for side in shape)
-            # Row i of ``nearest`` stands for the line between the pixels i - 1 and i.
-            i, j = ((c[here] - corner[k]) / width + np.float32(0.5) for k, c in ((1, v), (0, u)))
-            inside = (i >= 0) & (i < rows - 1) & (j >= 0) & (j < columns - 1)
-            nearest = np.full((rows, columns), np.inf, np.float32)
-            pixel = i[inside].astype(np.int32) * np.int32(columns) + j[inside].astype(np.int32)
-            np.minimum.at(nearest.reshape(-1), pixel, z[here][inside])
-            nearest = np.minimum(nearest[:-1], nearest[1:])
-            nearest = np.minimum(nearest[:, :-1], nearest[:, 1:])
-            if coarse:
-                nearest = nearest.repeat(width, 0).repeat(width, 1)
-            np.minimum(found, nearest[: shape[0], : shape[1]], out=found)
+        u, v, picture = u - frame.left, v - frame.top, np.arange(len(u))[:, None]
+        shape = (len(u), *frame.shape)
+        wide = np.sqrt(0.5) * self.distances.astype(np.float64)[:, None]  # what is nearer is drawn wider
+        widest = (wide[:, 0] / z.min(1, initial=np.inf)).max()
+        far = np.where(z < wide, np.float32(np.inf), z) if widest > 1 else z
+        found = _drawn(u, v, far, picture, shape, 1)
+        width = 2
+        while width < 2 * widest:
+            near = np.nonzero((width * z >= wide) & (width * z < 2 * wide))
+            u_near, v_near = (c[near] / np.float32(width) for c in (u, v))
+            coarse = _drawn(u_near, v_near, z[near], near[0], shape, width)
+            np.minimum(found, coarse, out=found)
+            width *= 2
         return found
 
+    def _turned(self, points: Float) -> tuple[Float, Float, Float]:
+        """Points, (3, P), along right, down and ahead from each camera, each (E, P)."""
+        found = (self.axes.reshape(-1, 3) @ points).reshape(len(self.axes), 3, -1)
+        found -= self.axes @ self.positions[:, :, None]
+        return found[:, 0], found[:, 1], found[:, 2]
 
-def _eyes(asked: Float, positions: NDArray[np.floating], pitch: float) -> Iterator[_Eye]:
-    """Cameras at some positions, (V, 3), that look at the middle of points, (3, P); none if there are no points."""
+
+def _drawn(u: Float, v: Float, z: Float, picture: NDArray[np.int64], shape: tuple[int, int, int], width: int) -> Float:
+    """Pictures of the nearest depths of points, (E, rows, columns), drawn in pixels of some width.
+
+    Args:
+        u, v: where they are drawn, in pixels of that width, counted from the corner of their picture.
+        z: their depth.
+        picture: which it is.
+        shape: pictures, and rows and columns of each in pixels of width 1.
+        width: in these.
+    """
+    # Row i of ``nearest`` stands for the line between the pixels i - 1 and i.
+    i, j = v + np.float32(0.5), u + np.float32(0.5)
+    rows, columns = (side // width + 3 for side in shape[1:])
+    inside = (i >= 0) & (i < rows - 1) & (j >= 0) & (j < columns - 1)
+    nearest = np.full((shape[0], rows, columns), np.inf, np.float32)
+    np.minimum.at(nearest.reshape(-1), _pixels(i, j, picture, (rows, columns))[inside], z[inside])
+    nearest = np.minimum(nearest[:, :-1], nearest[:, 1:])
+    nearest = np.minimum(nearest[:, :, :-1], nearest[:, :, 1:])
+    if width > 1:
+        nearest = nearest.repeat(width, 1).repeat(width, 2)
+    return nearest[:, : shape[1], : shape[2]]
+
+
+def _pixels(i: Float, j: Float, picture: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.int32]:
+    """Indices of rows and columns of pictures of a shape that lie in memory one after the other."""
+    rows, columns = shape
+    pixels = i.astype(np.int32) * np.int32(columns)
+    pixels += j.astype(np.int32)
+    pixels += picture.astype(np.int32) * np.int32(rows * columns)
+    return pixels
+
+
+def _eyes(asked: Float, blockers: Float, positions: NDArray[np.floating], pitch: float) -> Iterator[_Eyes]:
+    """Cameras at some positions, (V, 3), that look at the middle of points, (3, P); none if there are no points.
+
+    They come in groups, the larger the fewer points there are.
+    """
     if asked.size == 0:
         return
     eyes = np.asarray(positions, np.float32)
@@ -156,12 +242,9 @@ def _eyes(asked: Float, positions: NDArray[np.floating], pitch: float) -> Iterat
     ahead = towards / distances[:, None]
     right = np.cross(ahead, np.eye(3, dtype=np.float32)[np.abs(ahead).argmin(1)])
     right /= np.maximum(np.linalg.norm(right, axis=1, keepdims=True), np.float32(1e-9))
-    for eye, x, y, z, distance in zip(eyes, right, np.cross(ahead, right), ahead, distances, strict=True):
-        pixels = distance / np.float32(pitch)
-        yield _Eye(eye, np.stack([x * pixels, y * pixels, z]), float(distance), pitch)
-
-
-def _frame(u: Float, v: Float) -> tuple[tuple[float, float], tuple[int, int]]:
-    """Corner and shape of a picture that holds points at these pixel coordinates, and a pixel beside them."""
-    corner = u.min() - 1, v.min() - 1
-    return corner, (int(v.max() - corner[1]) + 2, int(u.max() - corner[0]) + 2)
+    pixels = (distances / np.float32(pitch))[:, None]
+    axes = np.stack([right * pixels, np.cross(ahead, right) * pixels, ahead], 1)
+    together = max(TOGETHER // max(asked.shape[1], blockers.shape[1]), 1)
+    for at in range(0, len(eyes), together):
+        some = slice(at, at + together)
+        yield _Eyes(eyes[some], axes[some], distances[some], pitch)

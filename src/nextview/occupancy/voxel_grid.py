@@ -8,11 +8,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import as_line, number, of_kind, places, whole
 from nextview.depth import FARTHEST
 from nextview.errors import ObservationError, UsageError
+from nextview.observation import array_of, checked_intrinsics, numbers
 
 UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)
 """What a voxel can be. Of what several frames say of it the largest counts, in whatever order they come."""
+MOST = 1024
+"""Voxels along a side."""
+LEAST, LARGEST = 1e-6, 1e6
+"""Of half a side, in the grid's unit."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +43,14 @@ class VoxelGrid:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not (2 <= self.n <= 1024 and 0 < self.half < np.inf and np.isfinite(self.centre).all()):
-            raise UsageError(f"a voxel grid has 2 to 1024 voxels a side and a positive size, not {self}")
+        whole(self.n, "the number of voxels along a side of a voxel grid", 2, MOST)
+        if not LEAST <= number(self.half, "half the side of a voxel grid") <= LARGEST:
+            raise UsageError(f"half the side of a voxel grid is from {LEAST:g} to {LARGEST:g}, not {self.half}")
+        try:
+            places([self.centre], "centres")
+        except UsageError:
+            where = as_line(self.centre)
+            raise UsageError(f"the centre of a voxel grid is three finite numbers, not {where}") from None
 
     @property
     def pitch(self) -> float:
@@ -95,7 +107,10 @@ class Occupancy:
     @classmethod
     def unseen(cls, grid: VoxelGrid, region: NDArray[np.bool_] | None = None) -> Occupancy:
         """Before the first frame; outside of a region, (n, n, n) bool, if one is given, all is known to be free."""
-        return cls(grid, np.full((grid.n,) * 3, UNSEEN) if region is None else np.where(region, UNSEEN, FREE))
+        of_kind(grid, VoxelGrid, "voxels are those of a VoxelGrid")
+        if region is None:
+            return cls(grid, np.full((grid.n,) * 3, UNSEEN))
+        return cls(grid, np.where(region_of(grid, region), UNSEEN, FREE))
 
     def seen(
         self,
@@ -120,19 +135,24 @@ class Occupancy:
                 of an object without occluders. False for a sensor that measures nothing on what is black or shiny.
 
         Raises:
-            ObservationError: depth and mask are no images of one shape.
+            ObservationError: depth and mask are no images of one shape, or pose and intrinsics none of a camera.
         """
-        depth = np.asarray(depth, np.float32)
-        shape = depth.shape if object_mask is None else np.shape(object_mask)
+        depth = numbers(depth, "the depth").astype(np.float32, copy=False)
+        object_mask = None if object_mask is None else array_of(object_mask, "the mask")
+        shape = depth.shape if object_mask is None else object_mask.shape
         if depth.ndim != 2 or shape != depth.shape:
             raise ObservationError(f"depth and mask are images of one shape, not {depth.shape} and {shape}")
+        pose = numbers(pose, "the pose")
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ObservationError(f"the pose is a camera-to-world matrix, (4, 4) finite numbers, not {as_line(pose)}")
+        checked_intrinsics(intrinsics, depth.shape)
         grid, cells = self.grid, self.cells.copy().reshape(-1)
         unseen = np.flatnonzero(cells == UNSEEN)  # what was free before is so without being looked at again
         reach = np.where(depth > 0, depth, FARTHEST if background_free else 0).astype(np.float32)
         cells[unseen[_in_front(grid.middles[:, unseen], reach, pose, intrinsics)]] = FREE
         rows, columns = np.nonzero(depth)
         at, inside = grid.cell_of(_unproject(depth[rows, columns], rows, columns, pose, intrinsics))
-        mine = np.ones(len(at), bool) if object_mask is None else np.asarray(object_mask)[rows, columns]
+        mine = np.ones(len(at), bool) if object_mask is None else object_mask[rows, columns]
         for what in (OCCLUDER, OBJECT):
             hit = at[inside & (mine == (what == OBJECT))]
             cells[hit] = np.maximum(cells[hit], what)
@@ -141,6 +161,20 @@ class Occupancy:
     def and_also(self, other: Occupancy) -> Occupancy:
         """What both say together, of one grid."""
         return Occupancy(self.grid, np.maximum(self.cells, other.cells))
+
+
+def region_of(grid: VoxelGrid, region: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """Voxels that count, (n, n, n) bool: those of a region, or of the ball that the grid holds.
+
+    Raises:
+        UsageError: there is no such region.
+    """
+    if region is None:
+        return grid.ball
+    of_kind(region, np.ndarray, "a region of voxels is an array")
+    if region.shape != (grid.n,) * 3 or region.dtype != bool:
+        raise UsageError(f"a region is {(grid.n,) * 3} truths, one for each voxel, not {region.shape} {region.dtype}")
+    return region
 
 
 def _unproject(

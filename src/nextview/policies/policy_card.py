@@ -10,6 +10,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from nextview.arguments import takes_paths
 from nextview.errors import ModelError, OtherUseError, PolicyError
 from nextview.json_file import Fields, read_object
 from nextview.outputs import written_whole
@@ -173,12 +174,14 @@ def bundled_policies() -> dict[str, Path]:
     return {path.stem: path for path in sorted(BUNDLED.glob("*.json"))}
 
 
+@takes_paths("path")
 def write_policy_card(path: Path, card: PolicyCard) -> None:
     """Write a card aside, then rename it."""
     with written_whole(path) as part:
         part.write_text(json.dumps(card.to_dict(), allow_nan=False) + "\n")
 
 
+@takes_paths("path")
 def read_policy_card(path: Path) -> PolicyCard:
     """Read a card.
 
@@ -197,6 +200,7 @@ def read_policy_card(path: Path) -> PolicyCard:
         raise PolicyError(f"{path}: not a policy card ({error})") from None
 
 
+@takes_paths("path")
 def read_policy(path: Path, sphere: Viewpoints, classes: Sequence[str] | None = None) -> Policy:
     """Make the policy that a card describes.
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +12,7 @@ import numpy as np
 from nextview.arguments import as_line, of_kind
 from nextview.errors import PolicyError
 from nextview.occupancy import new_surface, new_volume
+from nextview.own_code import import_own, own_code
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
 from nextview.policies.gain import Gain
@@ -149,14 +148,9 @@ def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
 
 
 def _import_policy(path: str, sphere: Viewpoints) -> Policy:
-    module, _, attribute = path.partition(":")
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.insert(0, here)  # where a user's own policy lies
-    try:
-        policy = getattr(importlib.import_module(module), attribute)(sphere)
-    except (Exception, SystemExit) as error:  # whatever a user's module may raise
-        raise PolicyError(f"policy {path} cannot be made ({type(error).__name__}: {error})") from error
+    with own_code(lambda said: PolicyError(f"policy {path} cannot be made ({said})")):
+        policy = import_own(path)(sphere)
+        getattr(policy, "needs", None)  # may be code, too
     for part in ("next_views", "needs"):
         if not hasattr(policy, part):
             raise PolicyError(f"policy {path} has no {part}; see nextview.policies.base.Policy")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,13 +29,24 @@ def occupancy_of(observations: Sequence[Observation], grid: VoxelGrid) -> Occupa
     Observations without their scene show the object alone: what is no object in them is taken to be free, as is all
     beyond its radius. With their scene everything beside the object is an occluder, and unseen before it was seen.
     """
-    scenes = [seen.scene for seen in observations if seen.scene is not None]
+    scenes = [seen for seen in observations if seen.scene is not None]
     if scenes:
-        return SeenScene.of(scenes, replace(grid, half=SCENE_SIZE * grid.half)).occupancy
-    found = Occupancy.unseen(grid, grid.ball)
-    for seen in observations:
-        found = found.seen(seen.depth, seen.pose, seen.intrinsics)
-    return found
+        observations, grid = scenes, replace(grid, half=SCENE_SIZE * grid.half)
+    return reduce(Occupancy.and_also, [_told(seen, grid) for seen in observations])
+
+
+@lru_cache(maxsize=64)
+def _told(seen: Observation, grid: VoxelGrid) -> Occupancy:
+    """What one view tells. Kept, because what it tells does not depend on the others, and it is asked at each step."""
+    if seen.scene is not None:
+        return SeenScene.unseen(grid).seen(seen.scene).occupancy
+    return Occupancy.unseen(grid, _ball(grid, grid.half)).seen(seen.depth, seen.pose, seen.intrinsics)
+
+
+@lru_cache(maxsize=4)
+def _ball(grid: VoxelGrid, radius: float) -> NDArray[np.bool_]:
+    """Voxels within the radius, (n, n, n)."""
+    return grid.within(radius)
 
 
 @dataclass(frozen=True)
@@ -67,9 +79,13 @@ class Volumetric:
         """Unseen volume or surface that comes into view, cubes or squares of the object radius, (B, V)."""
         if state.observations is None:
             raise PolicyError("this policy needs the depth that was seen")
-        positions = self.sphere.poses[:, :3, 3]
-        known = [occupancy_of(views, self.grid) for views in state.observations]
-        return np.stack([self.gain(each, positions, each.grid.within(self.grid.half)) for each in known])
+        positions, found = self.sphere.poses[:, :3, 3], dict[frozenset[int], NDArray[np.float64]]()
+        sets = [frozenset(map(id, views)) for views in state.observations]  # their order makes no difference
+        for key, views in zip(sets, state.observations, strict=True):
+            if key not in found:
+                known = occupancy_of(views, self.grid)
+                found[key] = self.gain(known, positions, _ball(known.grid, self.grid.half))
+        return np.stack([found[key] for key in sets])
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""

@@ -14,22 +14,22 @@ from nextview.benchmark.results import Results
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import DEFAULT, POLICIES
 from nextview.report.diagrams import confusion_matrix, draw_reliability, reliability_figure
-from nextview.report.style import INK, legend, new_figure, percent_axis
+from nextview.report.style import ACCENT, BLUE, GREY, INK, LIGHT_BLUE, legend, new_figure, percent_axis
 
 COLOURS = {
-    "random": "#8a949e",
+    "random": GREY,
     "gain": "#b5179e",
     "random-all": "#4a5560",
     "furthest": "#d99000",
-    "unidirectional": "#38a0d9",
-    "lem": "#0b5fa5",
+    "unidirectional": LIGHT_BLUE,
+    "lem": BLUE,
     "lem-peak": "#7a6fd0",
     "lcm": "#00805a",
     "lcm-peak": "#5bb98c",
-    "oracle-valley": "#d1495b",
-    "true-lem": "#0b5fa5",
+    "oracle-valley": ACCENT,
+    "true-lem": BLUE,
     "true-lem-peak": "#7a6fd0",
-    "true-oracle-valley": "#d1495b",
+    "true-oracle-valley": ACCENT,
     "true-lcm": "#00805a",
     "oracle-gain": "#111111",
     "oracle-gain-all": "#777777",

@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from mpl_toolkits.mplot3d import Axes3D
 
+from nextview.arguments import takes_paths
 from nextview.errors import UsageError
-from nextview.report.style import PlainFigure
+from nextview.report.style import ACCENT, FAINT, INK, PlainFigure
 from nextview.session import Recognition, View
-from nextview.viewsphere import Viewpoints, ViewSphere
-
-INK, ACCENT, FAINT = "#22313f", "#d1495b", "#c9d2da"
+from nextview.viewsphere import Viewpoints, ViewSphere, great_circle
 
 
+@takes_paths("path")
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure into a PNG, PDF or SVG file.
 
@@ -53,7 +53,8 @@ def draw_episode(result: Recognition, title: str = "") -> Figure:
 def _draw_image(axis: Axes, view: View, step: int) -> None:
     elevation, azimuth = view.angles
     axis.imshow(view.observation.picture, cmap="gray", vmin=0, vmax=255)
-    axis.set_title(f"step {step}: view {view.index}\n{elevation:.0f}° up, {azimuth:.0f}° round", color=INK, fontsize=10)
+    where = f"{elevation:.0f}° up, {round(azimuth) % 360}° round"
+    axis.set_title(f"step {step}: view {view.index}\n{where}", color=INK, fontsize=10)
     axis.axis("off")
 
 
@@ -135,8 +136,7 @@ def _draw_path(axis: Axes3D, views: tuple[View, ...], sphere: Viewpoints) -> Non
     axis.scatter(*cloud.T, s=1, color=INK, alpha=0.35, depthshade=False)
     path = np.array([view.direction for view in views])
     for a, b in itertools.pairwise(path):
-        arc = _great_circle(a, b)
-        axis.plot(*arc.T, color=ACCENT, linewidth=2)
+        axis.plot(*great_circle(a, b).T, color=ACCENT, linewidth=2)
     axis.scatter(*path.T, s=46, color=ACCENT, depthshade=False)
     for step, place in enumerate(path, 1):
         axis.text(*(place * 1.16), str(step), color=ACCENT, fontsize=12, weight="bold", ha="center")
@@ -147,9 +147,3 @@ def _draw_path(axis: Axes3D, views: tuple[View, ...], sphere: Viewpoints) -> Non
     axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-0.5, 1))
     axis.set_axis_off()
     axis.set_title("where it looked from, and the points it saw", fontsize=10, color=INK)
-
-
-def _great_circle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Points on the arc from one unit vector to another, (24, 3)."""
-    line = a + np.linspace(0, 1, 24)[:, None] * (b - a)
-    return line / np.linalg.norm(line, axis=1, keepdims=True)

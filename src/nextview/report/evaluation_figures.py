@@ -17,10 +17,21 @@ from nextview.benchmark.evaluation import Evaluation, judged_objects
 from nextview.benchmark.true_maps import true_map
 from nextview.data.predictions import Predictions
 from nextview.report.diagrams import confusion_matrix, draw_reliability, reliability_figure
-from nextview.report.style import INK, STYLE, PlainFigure, legend, new_figure, percent_axis
+from nextview.report.style import (
+    ACCENT,
+    BLUE,
+    GREY,
+    INK,
+    LIGHT_BLUE,
+    STYLE,
+    PlainFigure,
+    legend,
+    new_figure,
+    percent_axis,
+)
 
-ONE, ALL, PUBLISHED, FAINT_INK = "#38a0d9", "#0b5fa5", "#d1495b", "#8a949e"
-BLUES = ("#7cc4ec", "#38a0d9", "#0b5fa5", "#1f2933")
+ONE, ALL, PUBLISHED = LIGHT_BLUE, BLUE, ACCENT
+BLUES = ("#7cc4ec", LIGHT_BLUE, BLUE, INK)
 MEASURES = {
     "mse": "mean squared error",
     "d0": "peak exact (d = 0)",
@@ -125,7 +136,7 @@ def map_classes(e: Evaluation, name: str, measure: str) -> Figure:
     figure, axes = _class_figure(series, list(rows.index))
     y = np.arange(len(rows))
     baseline = table[table["by"] == "mean map of the class"].set_index("label").loc[rows.index, "value"]
-    axes.plot(baseline, y, "|", color=FAINT_INK, markersize=11, markeredgewidth=1.8, label="mean map of the class")
+    axes.plot(baseline, y, "|", color=GREY, markersize=11, markeredgewidth=1.8, label="mean map of the class")
     if rows["published"].notna().any():
         axes.plot(rows["published"], y, "D", color=PUBLISHED, markersize=4.5, label="published")
     axes.set_xlabel(MEASURES[measure])

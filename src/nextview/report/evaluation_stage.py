@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nextview.arguments import takes_paths
 from nextview.benchmark.evaluation import Evaluation, evaluate, scores_for_card
 from nextview.data.predictions import Predictions
 from nextview.errors import UsageError
@@ -17,6 +18,7 @@ from nextview.report.evaluation_page import KIND, all_figures, save
 from nextview.tracking import Track, silently
 
 
+@takes_paths("predictions", "out")
 def write_evaluation(
     predictions: Path,
     out: Path,

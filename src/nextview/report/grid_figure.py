@@ -7,9 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from nextview.report.style import legend, new_figure, percent_axis
-
-OURS, PUBLISHED = "#0b5fa5", "#d1495b"
+from nextview.report.style import ACCENT, BLUE, legend, new_figure, percent_axis
 
 
 def grid_figure(rows: Sequence[dict[str, Any]]) -> Figure:
@@ -23,10 +21,10 @@ def grid_figure(rows: Sequence[dict[str, Any]]) -> Figure:
     line = {network: y for y, network in enumerate(networks)}
     figure, axes = new_figure(4.6, 0.9 + 0.3 * len(networks))
     ours = {line[row["depth"], row["batch_size"]]: row["accuracy"] for row in rows}
-    axes.plot(list(ours.values()), list(ours), "o", color=OURS, markersize=6, label="ours")
+    axes.plot(list(ours.values()), list(ours), "o", color=BLUE, markersize=6, label="ours")
     published = [(row["published"], line[row["depth"], row["batch_size"]]) for row in rows if row["published"]]
     if published:
-        axes.plot(*zip(*published, strict=True), "D", color=PUBLISHED, markersize=5, label="published")
+        axes.plot(*zip(*published, strict=True), "D", color=ACCENT, markersize=5, label="published")
     axes.set_yticks(range(len(networks)), [f"ResNet-{depth}, batch {batch}" for depth, batch in networks])
     axes.set_ylim(len(networks) - 0.5, -0.5)
     axes.tick_params(axis="y", length=0)

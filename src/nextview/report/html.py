@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from nextview.arguments import takes_paths
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold, nothing_differs, too_few
 from nextview.benchmark.results import KIND, Results
@@ -32,6 +33,7 @@ PAGE = "report.html"
 """Beside the results that it shows."""
 
 
+@takes_paths("path")
 def write_report(results: Results, path: Path, pictures: Pictures) -> None:
     """Write the page, whole or not at all. In the folder of the results it counts as one of their files.
 
@@ -52,6 +54,7 @@ def write_report(results: Results, path: Path, pictures: Pictures) -> None:
         part.write_text(text, encoding="utf-8")
 
 
+@takes_paths("path", "results")
 def check_page(path: Path, results: Path) -> None:
     """See, before any work is done, that a page can be written; nothing is touched.
 

@@ -12,12 +12,11 @@ import rerun.blueprint as rrb
 
 from nextview.arguments import of_kind
 from nextview.errors import UsageError
-from nextview.report.style import heat
+from nextview.report.style import ACCENT, INK, heat, rgb
 
 if TYPE_CHECKING:
     from nextview.session import Session, View
 
-ACCENT, INK = (209, 73, 91), (34, 49, 63)
 TIMELINE = "step"
 """On which all is recorded: views taken so far."""
 
@@ -95,7 +94,7 @@ class Recorder:
         for name in (f"world/views/{step}", "world/camera"):
             self._stream.log(name, pose, pinhole)
         points = observation.points if observation.seen else np.zeros((0, 3), np.float32)
-        self._stream.log(f"world/seen/{step}", rr.Points3D(points, colors=ACCENT, radii=0.006))
+        self._stream.log(f"world/seen/{step}", rr.Points3D(points, colors=rgb(ACCENT), radii=0.006))
         self._stream.log("world/camera/depth", rr.DepthImage(observation.depth, meter=1.0))
         self._stream.log("world/camera/image", rr.Image(observation.picture, color_model="L"))
 
@@ -117,7 +116,7 @@ class Recorder:
         places, visited = session.sphere.poses[:, :3, 3], [earlier.index for earlier in session.views]
         values = np.full(len(places), np.nan) if view.values is None else view.values
         colours = heat(values)
-        colours[visited] = INK
+        colours[visited] = rgb(INK)
         names = [f"view {k}" for k in range(len(places))]
         candidates = rr.Points3D(places, colors=colours, radii=0.07, labels=names, show_labels=False)
         self._stream.log("world/candidates", candidates)
@@ -125,7 +124,7 @@ class Recorder:
         self._stream.log("values", rr.BarChart(values[considered], abscissa=considered))
         best, to = int(view.belief.argmax()), view.next_view
         chosen = places[[] if to is None else [to]]
-        self._stream.log("world/next", rr.Points3D(chosen, colors=ACCENT, radii=0.1))
+        self._stream.log("world/next", rr.Points3D(chosen, colors=rgb(ACCENT), radii=0.1))
         onward = "the end" if to is None else f"next view {to}"
         believed = f"{session.models.classes[best]} {view.belief[best]:.3f}"
         self._log_text(f"step {step}: view {view.index}, {believed}, {view.travel:.2f} cells of travel, {onward}")

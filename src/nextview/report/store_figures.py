@@ -10,18 +10,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.data.store import RENDERED, ViewStore
 from nextview.outputs import written_whole
-from nextview.report.style import PlainFigure
+from nextview.report.style import BLUE, GREY, PlainFigure
 from nextview.viewsphere import ViewSphere
 
-BLUE, ORANGE, GREY = "#2f6db3", "#e08a2e", "#8a8a8a"
+ORANGE = "#e08a2e"
 MAPS_ACROSS = 6
 """Maps of measures side by side; more go into further rows."""
 CELL = 112
 """Largest side of one view in a mosaic, pixels."""
 
 
+@takes_paths("path")
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG or whatever the suffix says, aside and then renamed."""
     with written_whole(path) as part:

@@ -16,7 +16,11 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-INK, FAINT = "#1f2933", "#d5dbe1"
+INK, GREY, FAINT = "#1f2933", "#8a949e", "#d5dbe1"
+BLUE, LIGHT_BLUE, ACCENT = "#0b5fa5", "#38a0d9", "#d1495b"
+"""The colours of lines and texts, in all figures; policies have their own, ``curves.COLOURS``."""
+SERIES = ("#0b6e99", "#c4532d", "#4b8b3b", "#7a5195", "#b8860b", "#555555")
+"""Of several things of one kind, in turn."""
 UNKNOWN = 201, 210, 218
 """The colour of what has no value."""
 STYLE = {
@@ -25,7 +29,7 @@ STYLE = {
     "font.size": 9.5,
     "text.color": INK,
     "axes.labelcolor": INK,
-    "axes.edgecolor": "#8a949e",
+    "axes.edgecolor": GREY,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
@@ -70,6 +74,12 @@ def legend(axes: Axes, title: str | None = None) -> None:
     """A legend in two columns below the axes."""
     with matplotlib.rc_context(STYLE):
         axes.legend(loc="upper center", bbox_to_anchor=(0.45, -0.17), ncols=2, title=title, title_fontsize=8.5)
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """A colour as three numbers from 0 to 255."""
+    red, green, blue = (round(255 * part) for part in matplotlib.colors.to_rgb(colour))
+    return red, green, blue
 
 
 def heat(values: NDArray[np.floating]) -> NDArray[np.uint8]:

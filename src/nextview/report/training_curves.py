@@ -9,14 +9,16 @@ import matplotlib
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from nextview.report.style import INK, STYLE, PlainFigure
+from nextview.arguments import takes_paths
+from nextview.report.style import ACCENT, INK, LIGHT_BLUE, STYLE, PlainFigure
 
-TRAINING, VALIDATION = "#38a0d9", "#d1495b"
+TRAINING, VALIDATION = LIGHT_BLUE, ACCENT
 SELECTED = {"class_accuracy": max, "validation_mse": min}
 """By which score, and which way, the kept epoch was chosen: the first that a log has."""
 WORDS = {"class_accuracy": "class mean accuracy", "mse": "mean squared error", "rate": "learning rate"}
 
 
+@takes_paths("run")
 def read_log(run: Path) -> dict[str, list[float]]:
     """The log of a training run, its columns by name, a value for every epoch."""
     with (run / "log/metrics.csv").open(newline="") as file:

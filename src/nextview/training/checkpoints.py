@@ -12,6 +12,7 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor, nn
 
+from nextview.arguments import takes_paths
 from nextview.errors import ModelError
 from nextview.models.inference import open_weights
 from nextview.models.model_card import ModelCard, find_card
@@ -31,6 +32,7 @@ LITE_NAMES = {
 """What ports of EfficientNet to PyTorch call the parts of a ``LiteNet``, as patterns, and what it calls them."""
 
 
+@takes_paths("run")
 def load_run(network: N, run: Path) -> N:
     """Give a network the parameters of a finished run: the network, in evaluation mode. Nothing in it is executed.
 
@@ -100,6 +102,7 @@ def _of_lite(name: str) -> str:
     return name
 
 
+@takes_paths("card")
 def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet | LiteNet]:
     """The networks of an exported recogniser, one or several that it averages, in evaluation mode.
 
@@ -130,6 +133,7 @@ def exported_networks(card: Path, channels: int, views: Tensor) -> list[ResNet |
     return networks
 
 
+@takes_paths("card")
 def load_exported(
     network: ResNet | LiteNet,
     card: Path,

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.command_line import command_line
 from nextview.data.predictions import Predictions
 from nextview.data.splits import deduplicate, split_training
@@ -53,6 +54,7 @@ class Exported:
     difference: float
 
 
+@takes_paths("store", "out", many=("runs",))
 def export_recogniser(
     runs: Sequence[Path],
     store: Path,
@@ -130,6 +132,7 @@ def export_recogniser(
     return Exported(card, difference)
 
 
+@takes_paths("run", "store", "out", "predictions")
 def export_map(
     run: Path,
     store: Path,

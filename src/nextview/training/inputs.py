@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nextview.arguments import takes_paths
 from nextview.data.lock import only_one
 from nextview.data.pool import WorkerDied, each
 from nextview.data.store import ViewStore
@@ -20,9 +22,11 @@ from nextview.training.packed import PackedViews, load_packed, pack, save_packed
 
 def inputs_path(store: Path, size: int, kind: InputKind = "geometry") -> Path:
     """The folder where the inputs of a store are kept."""
+    store = Path(os.path.realpath(store)) if store.name in ("", "..") else store  # "." has no name
     return store.with_name(f"{store.name}.{'inputs' if kind == 'geometry' else kind}{size}")
 
 
+@takes_paths("path")
 def prepare_inputs(path: Path, size: int, kind: InputKind = "geometry", workers: int | None = None) -> Iterator[int]:
     """Compute the inputs of every object, (N, V, C, size, size) uint8, unless they are there.
 

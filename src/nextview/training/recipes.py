@@ -5,9 +5,10 @@ A recipe that makes no sense is refused when it is made, with a ``UsageError`` t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+from nextview.arguments import as_line, number, of_kind, whole
 from nextview.errors import UsageError
 
 PolicyInput = Literal["belief", "view", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "azimuth_bin"]
@@ -16,9 +17,54 @@ POLICY_INPUTS: tuple[PolicyInput, ...] = ("belief", "view", "place", "lem-sphere
 """By default."""
 
 
+MOST = {
+    "size": 4096,
+    "epochs": 1_000_000,
+    "views": 10_000,
+    "batch": 1_000_000,
+    "points": 1024,  # cloud.POINTS, which takes SciPy to import: all that a cloud has
+    "hidden": 65_536,
+    "networks": 1000,
+    "walks": 10_000,
+    "n_views": 10_000,
+    "envs": 1_000_000,
+    "rollout": 1_000_000,
+    "updates": 100_000,
+    "evaluations": 100_000,
+    "holdout": 1000,
+    "seed": 2**32 - 1,
+    "ensemble_seed": 2**32 - 1,
+    "lr": 100,
+    "sharpness": 1e6,
+}
+"""Of options: with more, nothing is learned, and memory or time has no end. All other numbers are below a million,
+or a million million where they are whole."""
+
+
+def _check_types(recipe: Any) -> None:
+    """See that each option of a recipe is of the type that it is declared with, and not too large."""
+    declared = get_type_hints(type(recipe))
+    for field in fields(recipe):
+        value, kind, option = getattr(recipe, field.name), declared[field.name], _option(field.name)
+        if kind is bool:
+            of_kind(value, bool, f"{option} is true or false")
+        elif kind is int:
+            whole(value, option, 0, int(MOST.get(field.name, 10**12)))
+        elif kind is float:
+            if abs(number(value, option)) > MOST.get(field.name, 1e6):
+                raise UsageError(f"{option} is a number of at most {MOST.get(field.name, 1e6):g}, not {value}")
+        elif kind is str:
+            of_kind(value, str, f"{option} is a name")
+        elif get_origin(kind) is Literal:
+            if not isinstance(value, str | int) or value not in get_args(kind):
+                raise UsageError(f"{option} is {', '.join(map(str, get_args(kind)))}, not {as_line(value)}")
+        else:
+            of_kind(value, tuple | list, f"{option} are several")
+
+
 def _at_least(least: int, **options: float) -> None:
     for name, value in options.items():
-        if not least <= value < float("inf"):
+        if not least <= value:
             raise UsageError(f"{_option(name)} is at least {least}, not {value}")
 
 
@@ -26,6 +72,13 @@ def _share(**options: float) -> None:
     for name, value in options.items():
         if not 0 <= value < 1:
             raise UsageError(f"{_option(name)} is 0 or more and less than 1, not {value}")
+
+
+def _check_inputs(inputs: tuple[str, ...], *more: str) -> None:
+    known = (*get_args(PolicyInput), *more)
+    for name in inputs:
+        if not isinstance(name, str) or name not in known:
+            raise UsageError(f"--inputs are some of {', '.join(known)}, not {as_line(name)}")
 
 
 def _option(name: str) -> str:
@@ -57,8 +110,8 @@ class RecogniserRecipe:
         ensemble_seed: which network of an ensemble this is: the seed's objects validate all of them, but each has first
             weights and draws of its own.
         input: what the network sees: the geometry that a depth camera sees, or the shaded image.
-        augment: vary what is seen; see ``recogniser.augment``.
-        balanced: draw rare classes more often; otherwise every view comes once before any comes again.
+        augment: whether what is seen is varied; see ``recogniser.augment``.
+        balanced: whether rare classes are drawn more often; otherwise every view comes once before any comes again.
         schedule: of the learning rate: up and down once, or halved every fifth epoch from the peak.
         patience: stop after so many epochs without a better class mean on validation; 0 never stops early.
         way: in the end, how much of the way the parameters go from those that training began with to those it found.
@@ -89,6 +142,7 @@ class RecogniserRecipe:
     way: float = 1.0
 
     def __post_init__(self) -> None:
+        _check_types(self)
         if self.network != "resnet" and self.depth != RecogniserRecipe.depth:
             raise UsageError(f"only a ResNet has a --depth: {self.network} is as deep as it is")
         if self.network == "resnet" and self.dropout:
@@ -149,7 +203,7 @@ class MapRecipe:
         sharpness: see ``peak``.
         reach: 0 if only the highest cell itself counts for ``peak``, 1 if its neighbours above, below, left and right
             do as well: what is within one cell.
-        mirror: exchange left and right in half of the views, in the map too.
+        mirror: whether left and right are exchanged in half of the views, in the map too.
         schedule: of the learning rate: up and down once, or a tenth every fifth epoch from the peak.
         validation: part of the training split held out for validation.
         seed: decides everything random.
@@ -178,12 +232,11 @@ class MapRecipe:
     patience: int = 0
 
     def __post_init__(self) -> None:
+        _check_types(self)
         _at_least(1, size=self.size, points=self.points, epochs=self.epochs, views=self.views, batch=self.batch)
         _at_least(0, lr=self.lr, weight_decay=self.weight_decay, regular=self.regular, peak=self.peak)
         _at_least(0, reach=self.reach, seed=self.seed, patience=self.patience)
         _share(validation=self.validation)
-        if self.points > 1024:  # cloud.POINTS, which takes SciPy to import
-            raise UsageError(f"--points is 1024 at most, all that a cloud has, not {self.points}")
         if not self.sharpness > 0:
             raise UsageError(f"--sharpness is more than 0, not {self.sharpness}")
 
@@ -240,8 +293,10 @@ class GainRecipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        _check_types(self)
         if not self.inputs:
             raise UsageError("--inputs names at least one input of the networks")
+        _check_inputs(self.inputs, "visibility")
         _at_least(2, n_views=self.n_views)
         _at_least(1, hidden=self.hidden, networks=self.networks, epochs=self.epochs, walks=self.walks, batch=self.batch)
         _at_least(0, lr=self.lr, weight_decay=self.weight_decay, seed=self.seed)
@@ -298,19 +353,21 @@ class AgentRecipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        _check_types(self)
         if not self.inputs:
             raise UsageError("--inputs names at least one input of the network")
+        _check_inputs(self.inputs)
         _at_least(2, n_views=self.n_views, holdout=self.holdout)
         _at_least(1, hidden=self.hidden, steps=self.steps, envs=self.envs, rollout=self.rollout, batch=self.batch)
         _at_least(1, updates=self.updates, evaluations=self.evaluations)
         _at_least(0, lr=self.lr, entropy=self.entropy, view_price=self.view_price, travel_price=self.travel_price)
         _at_least(0, seed=self.seed)
-        if self.seed >= 2**32:
-            raise UsageError(f"--seed is below {2**32}, not {self.seed}")
-        if self.algorithm == "ppo" and self.envs * self.rollout < 2:
-            raise UsageError("--envs times --rollout is at least 2")
-        if not all(0 <= share <= 1 for share in (self.discount, *self.exploration)):
-            raise UsageError("--discount and --exploration are numbers from 0 to 1")
+        least = 2 if self.algorithm == "ppo" else 1
+        if not least <= self.envs * self.rollout <= 10_000_000:
+            raise UsageError(f"--envs times --rollout is from {least} to 10,000,000, not {self.envs * self.rollout:,}")
+        shares = [number(share, "each of --discount and --exploration") for share in (self.discount, *self.exploration)]
+        if len(shares) != 3 or not all(0 <= share <= 1 for share in shares):
+            raise UsageError("--discount and the two numbers of --exploration are from 0 to 1")
 
 
 MVSELECT = AgentRecipe(

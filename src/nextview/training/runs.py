@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from torch import nn
 
+from nextview.arguments import takes_paths
 from nextview.data.lock import only_one, writing
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
@@ -96,11 +97,13 @@ def read_commands(run: Path) -> tuple[str, ...]:
         raise ModelError(f"{noted}: cannot be read ({type(error).__name__}); remove it") from None
 
 
+@takes_paths("run")
 def is_done(run: Path) -> bool:
     """Whether a run has its network."""
     return (run / "network.pt").exists()
 
 
+@takes_paths("run")
 def read_recipe(run: Path, kind: type[Recipe]) -> Recipe:
     """The recipe of a run that is done.
 

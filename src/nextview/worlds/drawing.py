@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import a_path, as_line, of_kind, whole
 from nextview.cameras.ray_caster import RayCaster
 from nextview.cameras.sensors.boxes_around import FOOTPRINT, HEIGHT
 from nextview.cameras.simulated import SimulatedCamera
-from nextview.errors import DatasetError, MeshError
+from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.mesh import Mesh
 from nextview.viewsphere import ViewSphere
 from nextview.worlds.footprint import footprint, separation
@@ -62,10 +63,18 @@ class Meshes:
     Attributes:
         folder: below which they are.
         files: relative to it, with forward slashes, sorted: any may stand around a target.
+
+    Raises:
+        UsageError: these are none.
     """
 
     folder: Path
     files: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "folder", a_path(self.folder, "a folder of meshes"))
+        if not isinstance(self.files, tuple | list) or not all(isinstance(file, str) for file in self.files):
+            raise UsageError(f"the files of meshes are a tuple of names, not {as_line(self.files)}")
 
 
 def draw_world(target: str, meshes: Meshes, level: str, seed: int, name: str) -> World:
@@ -81,7 +90,14 @@ def draw_world(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
     Raises:
         MeshError: the target cannot be used.
         DatasetError: no layout shows as much of it as the level wants; or a file cannot be read.
+        UsageError: no meshes, level, seed or name.
     """
+    for text, what in ((target, "a target is the name of a mesh file"), (name, "the name of a world is a text")):
+        of_kind(text, str, what)
+    of_kind(meshes, Meshes, "what may stand around a target are Meshes")
+    if not isinstance(level, str) or level not in LEVELS:
+        raise UsageError(f"the level of a world is {', '.join(LEVELS)}, not {as_line(level)}")
+    whole(seed, "a seed")
     rng = np.random.default_rng([seed, *name.encode()])
     mesh = cached_mesh(meshes.folder / target)
     others = [file for file in meshes.files if file != target]

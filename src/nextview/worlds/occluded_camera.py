@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import as_line, of_kind, whole
 from nextview.cameras.ray_caster import RayCaster, pixel_rays
-from nextview.cameras.simulated import SimulatedCamera
-from nextview.observation import Observation, pinhole
+from nextview.cameras.simulated import LARGEST, SimulatedCamera
+from nextview.errors import UsageError
+from nextview.observation import Observation, checked_intrinsics, checked_pose, pinhole
 from nextview.viewsphere import DISTANCE
 from nextview.worlds.scene import Scene
 
@@ -28,9 +30,14 @@ class OccludedCamera:
         scene: the world.
         size: side of the square image, pixels.
         distance: at which the unit sphere just fills the image, object radii.
+
+    Raises:
+        UsageError: no scene, or no size of an image.
+        ObservationError: the camera stands in the object.
     """
 
     def __init__(self, scene: Scene, size: int = 224, distance: float = DISTANCE) -> None:
+        of_kind(scene, Scene, "what is looked at is a Scene")
         self.scene = scene
         self._target = SimulatedCamera(scene.target, size, distance)
         others = [scene.table] if scene.around is None else [scene.table, scene.around]
@@ -67,21 +74,34 @@ class SceneCamera:
         scene: the world.
         intrinsics: pinhole matrix, (3, 3), pixels, the first pixel's centre at 0.5.
         shape: height and width of the image.
+
+    Raises:
+        UsageError: no scene, or no shape of an image.
+        ObservationError: a matrix that no pinhole has.
     """
 
     def __init__(self, scene: Scene, intrinsics: NDArray[np.float64], shape: tuple[int, int]) -> None:
+        of_kind(scene, Scene, "what is looked at is a Scene")
+        if not (isinstance(shape, tuple | list) and len(shape) == 2):
+            raise UsageError(f"the shape of an image is its height and its width, not {as_line(shape)}")
+        height, width = (whole(side, "a side of the image", 1, LARGEST) for side in shape)
+        intrinsics = checked_intrinsics(intrinsics, (height, width))
         meshes = [scene.target, scene.table] if scene.around is None else [scene.target, scene.table, scene.around]
         self._caster = RayCaster([(mesh.vertices, mesh.faces) for mesh in meshes])
-        self._rays = pixel_rays(intrinsics, shape)
+        self._rays = pixel_rays(intrinsics, (height, width))
         self._owners = np.array([TARGET, TABLE_TOP, OTHER, NOTHING])
 
     def look(self, pose: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """What is there from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii.
 
+        Raises:
+            ObservationError: it is no pose.
+
         Returns:
             Depth along the optical axis, (H, W) float32, object radii, 0 = nothing; and NOTHING, TARGET, OTHER or
             TABLE_TOP for each pixel, (H, W) uint8.
         """
+        pose = checked_pose(pose)
         rays = self._rays.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32)
         depth, which = self._caster.cast(pose[:3, 3].astype(np.float32), rays)
         shape = self._rays.shape[:2]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.arguments import of_kind, regular_file, whole
+from nextview.arguments import of_kind, places, regular_file, takes_paths, whole
 from nextview.cameras.sensors.boxes_around import upright_boxes
 from nextview.errors import DatasetError, MeshError
 from nextview.mesh import Mesh, load_mesh
@@ -88,7 +88,11 @@ class Scene:
 
         Returns:
             (V,) float64, object radii; 0 inside of an item, negative below the table.
+
+        Raises:
+            UsageError: these are no positions.
         """
+        positions = places(positions, "the positions of cameras")
         found = positions[:, 2] - self.floor
         for item in self.items:
             above = np.maximum(positions[:, 2] - item.top, 0)
@@ -101,6 +105,7 @@ class Scene:
         Not into an item or below the table, or nearer than CLEARANCE; nor to where, seen from above, a wall stands
         between it and the target, however low that is.
         """
+        positions = places(positions, "the positions of cameras")
         free = self.clearance(positions) >= CLEARANCE
         for wall in (item.footprint for item in self.items if item.wall):
             free &= [separation(np.array([p, (0.0, 0.0)]), wall) > 0 for p in positions[:, :2]]
@@ -163,6 +168,7 @@ def cached_mesh(path: Path, max_faces: int = MAX_FACES) -> Mesh:
     return load_mesh(path, max_faces=max_faces)
 
 
+@takes_paths("path")
 @lru_cache(maxsize=4096)
 def mesh_hash(path: Path) -> str:
     """SHA-256 of a mesh file in hexadecimal.

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nextview.arguments import of_kind
+from nextview.arguments import of_kind, takes_paths
 from nextview.errors import DatasetError, ModelError
 from nextview.json_file import Fields, read_object
 from nextview.outputs import written_whole
@@ -138,12 +138,14 @@ class World:
             raise DatasetError(str(error)) from None
         return world
 
+    @takes_paths("path")
     def save(self, path: Path) -> None:
         """Write its file, whole or not at all. The same world makes the same bytes."""
         with written_whole(path) as part:
             part.write_text(json.dumps(self.to_dict(), indent=1) + "\n")
 
     @classmethod
+    @takes_paths("path")
     def load(cls, path: str | Path) -> World:
         """Read what ``save`` wrote.
 

@@ -13,7 +13,7 @@ from nextview.cameras.sensors import SensedCamera, Sensor, SensorMix, sensor_nam
 from nextview.errors import NoViewLeftError, ObservationError, UsageError
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.object_frame import Box, ObjectFrame
-from nextview.viewsphere import DISTANCE, Viewpoints, ViewSphere, angle_between, direction_of, look_at_origin
+from nextview.viewsphere import DISTANCE, Viewpoints, ViewSphere, angle_between, direction_of, level_pose
 from nextview.worlds.scene import TABLE, Scene
 
 Float = NDArray[np.float64]
@@ -123,7 +123,7 @@ class WorldCamera:
         asked = direction_of(self._truth.pose_in_object(believed.pose_in_world(pose)))
         order = np.argsort(angle_between(np.broadcast_to(asked, self._directions.shape), self._directions))
         for direction in (asked, *self._directions[order]):
-            there = _looking_from(direction)
+            there = level_pose(direction)
             tried = self._refused if direction is asked else [*self._refused, *self._taken]
             used = any(angle_between(direction, other) < SAME for other in tried)
             if used or not self.scene.reachable(there[None, :3, 3])[0]:
@@ -138,8 +138,3 @@ class WorldCamera:
     def refused(self, error: ObservationError) -> None:
         """The target is not found in the last frame: no other one is taken from there."""
         self._refused.append(self._taken.pop())
-
-
-def _looking_from(direction: Float) -> Float:
-    elevation = np.arctan2(direction[2], np.hypot(direction[0], direction[1]))
-    return look_at_origin(elevation, np.arctan2(direction[1], direction[0]))

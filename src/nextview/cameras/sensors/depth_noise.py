@@ -10,6 +10,8 @@ from scipy.special import ndtr
 from nextview.cameras.sensors.surface_angle import STEEPEST
 
 Image = NDArray[np.float64]
+NO_GRAIN = 0.1
+"""Pixels: a window so narrow holds one pixel."""
 
 
 def kinect_axial(depth: NDArray[np.floating], angle: NDArray[np.floating]) -> Image:
@@ -47,7 +49,7 @@ def normal_field(rng: np.random.Generator, shape: tuple[int, int], grain: float)
         grain: standard deviation of the window, pixels; 0 for numbers that have nothing to do with each other.
     """
     white = rng.standard_normal(shape)
-    if grain == 0:
+    if grain < NO_GRAIN:
         return white
     impulse = np.zeros(8 * int(np.ceil(grain)) + 17)
     impulse[len(impulse) // 2] = 1

@@ -6,11 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.cameras.sensors.surface_angle import STEP, Image, slopes
+from nextview.errors import UsageError
 
 LEAST = 1.0
 """Width of the narrowest shadow, pixels."""
 WIDEST = 8
 """Projector columns that two neighbouring pixels of one surface may lie apart."""
+
+MOST = 2**26
+"""Projector columns in all rows together."""
 
 
 def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
@@ -24,11 +28,18 @@ def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
         q: inverse depth, (H, W), 1/metres, 0 where there is nothing.
         focal: along x, pixels.
         baseline: metres.
+
+    Raises:
+        UsageError: it is so wide that no memory is enough.
     """
     height, width = q.shape
     disparity = focal * baseline * q
     column = np.arange(width) - disparity
     offset = int(np.ceil(abs(disparity).max(initial=0.0))) + 1
+    if height * 2 * offset > MOST:
+        raise UsageError(
+            f"a shadow of {baseline} m at this focal length reaches {offset:,} pixels, more than can be drawn"
+        )
     lit = np.zeros((height, width + 2 * offset + 2))  # the largest disparity in each column of the projector
     row = np.broadcast_to(np.arange(height)[:, None], q.shape)
     seen = q > 0

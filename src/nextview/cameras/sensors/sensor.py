@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.arguments import number
+from nextview.arguments import number, of_kind, whole
 from nextview.cameras.sensors.depth_noise import kinect_axial, kinect_lateral, normal_field, uniform_field
 from nextview.cameras.sensors.projector_shadow import in_shadow
 from nextview.cameras.sensors.surface_angle import across_edges, incidence, inverse_depth, slopes
@@ -16,6 +16,19 @@ from nextview.errors import UsageError
 
 STRONGEST = 100
 """How many times as strong errors can be made: of what is left at 10 nothing can be made."""
+LIMITS = {
+    "height": (1, 4096),
+    "width": (1, 4096),
+    "focal": (1, 100_000),
+    "baseline": (0.0001, 100),
+    "grain": (0, 100),
+    "nearest": (0, 1000),
+    "farthest": (0.001, 1000),
+    "distance": (0.001, 1000),
+    "radius": (0.001, 1000),
+}
+LARGEST = 10_000
+"""Of all other numbers, the errors: what is beyond is no sensor, and takes memory or time without end."""
 MARGIN = 16
 """How far beside what there is a pixel may show it, pixels."""
 
@@ -91,13 +104,13 @@ class Sensor:
     boxes: float = 0.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name != "name" and not 0 <= number(value, f"sensor {self.name}: {field.name}") < np.inf:
-                raise UsageError(f"sensor {self.name}: {field.name} is a finite number of at least 0, not {value}")
-        for positive in ("height", "width", "focal", "baseline", "radius"):
-            if not getattr(self, positive) > 0:
-                raise UsageError(f"sensor {self.name}: {positive} is greater than 0")
+        of_kind(self.name, str, "the name of a sensor is a text")
+        for name in (field.name for field in fields(self) if field.name != "name"):
+            what, (least, most) = f"sensor {self.name}: {name}", LIMITS.get(name, (0, LARGEST))
+            if name in ("height", "width"):
+                whole(getattr(self, name), what, int(least), int(most))
+            elif not least <= number(getattr(self, name), what) <= most:
+                raise UsageError(f"{what} is a number from {least} to {most}, not {getattr(self, name)}")
         if not self.distance > self.radius:
             raise UsageError(f"sensor {self.name}: at {self.distance} m it stands inside an object of {self.radius} m")
 

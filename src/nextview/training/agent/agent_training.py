@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.calibration.fitting_set import FittingSet
 from nextview.calibration.rollout import ReplayTable, Value, judge, rollout
 from nextview.command_line import command_line
@@ -49,6 +50,7 @@ class TrainedAgent:
     steps: int
 
 
+@takes_paths("predictions", "card")
 def train_agent(
     predictions: Path, card: Path, recipe: AgentRecipe = AgentRecipe(), *, track: Track = silently
 ) -> TrainedAgent:

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from nextview.envs.vector_env import TaskVectorEnv
+from nextview.errors import ModelError
 from nextview.training.gain.perceptrons import Layers
 from nextview.training.recipes import AgentRecipe
 
@@ -84,12 +85,26 @@ def learner(env: TaskVectorEnv, recipe: AgentRecipe) -> BaseAlgorithm:
 
 
 def learn(model: BaseAlgorithm, recipe: AgentRecipe) -> Iterator[Layers]:
-    """Go on learning; after each of ``recipe.evaluations`` parts, the network as it then is."""
+    """Go on learning; after each of ``recipe.evaluations`` parts, the network as it then is.
+
+    Raises:
+        ModelError: its numbers grew beyond all bounds.
+    """
     for k in range(1, recipe.evaluations + 1):
         missing = recipe.steps * k // recipe.evaluations - model.num_timesteps
-        if missing > 0:
-            model.learn(missing, reset_num_timesteps=False)
+        try:
+            if missing > 0:
+                model.learn(missing, reset_num_timesteps=False)
+        except ValueError as error:  # torch draws no action from what is not a number
+            _refuse_infinite(model, error)
+            raise
+        _refuse_infinite(model)
         yield layers_of(model)
+
+
+def _refuse_infinite(model: BaseAlgorithm, cause: Exception | None = None) -> None:
+    if not all(bool(numbers.isfinite().all()) for numbers in model.policy.parameters()):
+        raise ModelError("the numbers of the agent's network grew beyond all bounds: take a smaller --lr") from cause
 
 
 def layers_of(model: BaseAlgorithm) -> Layers:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.calibration.fitting_set import load_sensed
 from nextview.calibration.rollout import ReplayTable, Value, fit_travel_weight
 from nextview.command_line import command_line
@@ -48,6 +49,7 @@ class TrainedGain:
     difference: float
 
 
+@takes_paths("predictions", "card", "validation", many=("sensed",))
 def train_gain(
     predictions: Path,
     card: Path,

@@ -7,6 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.command_line import command_line
 from nextview.data.predictions import Predictions
 from nextview.data.splits import check_any, deduplicate, split_training
@@ -22,6 +23,7 @@ from nextview.training.recipes import MapRecipe
 from nextview.training.runs import begin, finish, is_done, training_commands
 
 
+@takes_paths("store", "out", "predictions", "weights")
 def train_map(
     store: Path,
     out: Path,

@@ -14,10 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from nextview.arguments import takes_paths
 from nextview.benchmark.published import published_recognisers, read_rows
 from nextview.data.splits import test_objects
 from nextview.data.store import ViewStore
-from nextview.errors import UsageError
+from nextview.errors import ResultsError, UsageError
 from nextview.outputs import added_file, begin_folder, check_added, written_whole
 from nextview.tracking import Track, silently
 from nextview.training.hardware import Hardware
@@ -33,6 +34,7 @@ KIND = "grid"
 TABLE, FIGURE = "grid.csv", "grid.png"
 
 
+@takes_paths("store", "out")
 def train_grid(
     store: Path,
     out: Path,
@@ -96,12 +98,20 @@ def train_grid(
     return out / TABLE
 
 
+@takes_paths("table")
 def read_grid(table: Path) -> list[dict[str, Any]]:
-    """The rows of a table that ``train_grid`` made; what is not published is None."""
-    with table.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    """The rows of a table that ``train_grid`` made; what is not published is None.
+
+    Raises:
+        ResultsError: it is another file.
+    """
     whole = ("depth", "batch_size")
-    return [{name: int(x) if name in whole else float(x) if x else None for name, x in row.items()} for row in rows]
+    try:
+        with table.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        return [{name: int(x) if name in whole else float(x) if x else None for name, x in row.items()} for row in rows]
+    except (ValueError, TypeError, csv.Error):
+        raise ResultsError(f"{table}: is no table that nextview train grid has written") from None
 
 
 def published_cells(classes: tuple[str, ...], views: int) -> dict[tuple[int, int], list[float]]:

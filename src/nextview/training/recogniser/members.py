@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.data.splits import split_training
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError
@@ -43,6 +44,7 @@ class Member:
     commands: list[str]
 
 
+@takes_paths("source")
 def member(source: Path, views: ViewStore) -> Member:
     """What is known of a run (a folder), or of an exported recogniser (its card, NAME.json).
 

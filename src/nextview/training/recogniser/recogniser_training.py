@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.arguments import takes_paths
 from nextview.command_line import command_line
 from nextview.data.splits import check_any, deduplicate, split_training
 from nextview.data.store import ViewStore
@@ -25,6 +26,7 @@ from nextview.training.recogniser.recogniser_module import Source, fit_recognise
 from nextview.training.runs import begin, finish, is_done, training_commands
 
 
+@takes_paths("store", "out", "weights", many=("deformed",))
 def train_recogniser(
     store: Path,
     out: Path,
