@@ -285,8 +285,9 @@ def shares(
                     reachable = reachable[reachable != view]
                     for a, b in np.ndindex(found.shape[3:]):
                         says = expected_visibility(seen, positions, densities[a], unseen_parts[b]).expected[reachable]
-                        if np.ptp(says) > 0 and np.ptp(truth[i, reachable]) > 0:
-                            found[i, walk, k, a, b] = np.corrcoef(says, truth[i, reachable])[0, 1]
+                        if np.ptp(truth[i, reachable]) > 0:  # to expect the same everywhere is to know nothing: 0
+                            pair = says, truth[i, reachable]
+                            found[i, walk, k, a, b] = np.corrcoef(*pair)[0, 1] if np.ptp(says) > 0 else 0
             yield i + 1
 
     track(run(), len(opened), "expecting")

@@ -1,7 +1,7 @@
 """Choose and judge policies in worlds: objects among others, half hidden.
 
     python benchmarks/worlds.py choose learning.npz [--policies random-all visibility@0 visible-gain@0]
-    python benchmarks/worlds.py judge worlds.npz --ours visible-gain [--policies ...] [--out worlds_travel.png]
+    python benchmarks/worlds.py judge worlds.npz ... --ours visible-gain [--policies ...] [--out worlds_travel.png]
 
 ``choose``: what policies reach on worlds for learning, classes weighted evenly: the mean log-belief in the truth and
 the accuracy after 2 to 5 views, by which ``nextview train gain`` judges as well. ``judge``: by level the accuracy and
@@ -13,22 +13,22 @@ foresight gains is had; and, as a figure, accuracy against travel in cells, and 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, fields
+from itertools import product
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pandas as pd
 import tyro
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.experiment import Grid, run_grid
-from nextview.benchmark.levels import by_level, levels_of
-from nextview.benchmark.replay import Trajectories, make_specs
-from nextview.benchmark.statistics import holm
+from nextview.benchmark.levels import ORDER, grid_mean, levels_of
+from nextview.benchmark.replay import make_specs
+from nextview.benchmark.statistics import bootstrap_p, holm, interval, resample
 from nextview.calibration.rollout import ReplayTable
 from nextview.calibration.rollout import judge as follow
 from nextview.cli.ending import orderly_end
@@ -65,13 +65,39 @@ def choose(
         print(f"{name:24}{logs} ({reached[0].mean.mean():.4f})   {right}   {reached[1].travel[-1]:.2f}")
 
 
+@dataclass(frozen=True)
+class Reached:
+    """What a policy reaches in worlds of one level after 1 to K views, means over the first views of each world.
+
+    Attributes:
+        right: how often its answer is right, (N, K).
+        cells: of travel until then, (N, K).
+        seconds: the same of a robot, (N, K).
+    """
+
+    right: np.ndarray
+    cells: np.ndarray
+    seconds: np.ndarray
+
+
+def reached_in(grid: Grid, name: str) -> Reached:
+    """That of all worlds of a grid, in their order."""
+    path, most = grid.paths[name], max(COUNTS)
+    last = np.minimum((path.views >= 0).sum(1)[:, None], np.arange(1, most + 1)) - 1  # some end before: no view is free
+    rows = np.arange(len(last))[:, None]
+    right = path.answers[rows, last] == grid.specs.labels[:, None]
+    travel = path.travel[rows, last], SECONDS * last + TURN * path.arc[rows, last]
+    return Reached(*(grid_mean(grid, np.asarray(values, np.float64)) for values in (right, *travel)))
+
+
 def judge(
-    predictions: tyro.conf.Positional[Path],
+    predictions: tyro.conf.Positional[tuple[Path, ...]],
     ours: str,
     policies: tuple[str, ...] = POLICIES,
     rivals: tuple[str, ...] = ("visibility", "gain"),
     thrifty: tuple[float, ...] = (),
     out: Path | None = None,
+    table: Path | None = None,
     runs: int = 10,
     samples: int = 10000,
     seed: int = 0,
@@ -79,81 +105,101 @@ def judge(
     """Print the tables, and draw the figure.
 
     Args:
-        predictions: of worlds of the test split.
+        predictions: of worlds of the test split; several stores of them are put together.
         ours: the policy that is compared with the rivals.
         policies: that are compared with random.
         rivals: some of them.
         thrifty: travel weights of ours and of visibility, for the figure alone.
         out: the figure.
+        table: the comparisons, with p before and after the correction, as CSV.
         runs: first views of each world.
         samples: of the bootstrap.
         seed: of all that is random.
     """
-    p = Predictions.load(predictions)
-    grid = Grid(make_specs(p, runs, seed), runs, (1.0,), max(COUNTS), seed)
     names = list(dict.fromkeys([REFERENCE, *policies, ours, *CEILINGS]))
-    extra = [f"{name}@{weight:g}" for weight in thrifty for name in ("visibility", ours)]
-    track(run_grid(grid, [*names, *extra]), len(names) + len(extra), "going")
-    for name, why in grid.failures.items():
-        print(f"{name}: {why}")
-    judged = replace(grid, paths={name: grid.paths[name] for name in names})
-    rng = np.random.default_rng([seed, 1])
-    table = by_level(judged, REFERENCE, samples, rng)
-    against = []
-    for rival in rivals:
-        two = replace(grid, paths={name: grid.paths[name] for name in (ours, rival)})
-        against.append(by_level(two, rival, samples, rng).query("policy == @ours").assign(rival=rival))
-    table = pd.concat([table.assign(rival=REFERENCE), *against], ignore_index=True)
-    known = table["policy"].map(is_oracle).to_numpy()
-    table["p_holm"] = holm(np.where(known, np.nan, table["p"].to_numpy(np.float64)))
-    show(table, ours)
+    names += [f"{name}@{weight:g}" for weight in thrifty for name in ("visibility", ours)]
+    found: dict[str, dict[str, list[Reached]]] = {level: {} for level in ORDER}
+    for path in predictions:
+        p = Predictions.load(path)
+        grid = Grid(make_specs(p, runs, seed), runs, (1.0,), max(COUNTS), seed)
+        track(run_grid(grid, names), len(names), f"going through {path.name}")
+        for name, why in grid.failures.items():
+            print(f"{name}: {why}")
+        of = levels_of(p.names)
+        for level, name in product(sorted({*of}), grid.paths):
+            mine, every = of == level, reached_in(grid, name)
+            part = Reached(*(getattr(every, f.name)[mine] for f in fields(Reached)))
+            found[level].setdefault(name, []).append(part)
+    worlds = {
+        level: {
+            name: Reached(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Reached)))
+            for name, parts in by_name.items()
+        }
+        for level, by_name in found.items()
+        if by_name
+    }
+    judged = {level: {name: of[name] for name in of if "@" not in name} for level, of in worlds.items()}
+    comparisons = compared(judged, ours, rivals, samples, np.random.default_rng([seed, 1]))
+    show(judged, comparisons, ours)
+    if table is not None:
+        comparisons.to_csv(table, index=False)
     if out is not None:
-        draw(grid, [name for name in grid.paths if name in (*names, *extra)], out)
+        draw(worlds, out)
 
 
-def show(table: pd.DataFrame, ours: str) -> None:
+def compared(
+    worlds: dict[str, dict[str, Reached]], ours: str, rivals: tuple[str, ...], samples: int, rng: np.random.Generator
+) -> pd.DataFrame:
+    """All with random, and ours with its rivals: points, interval, p, and p after Holm; ceilings are not tested."""
+    rows = []
+    for level, of in worlds.items():
+        weights = resample(len(of[REFERENCE].right), samples, rng) / len(of[REFERENCE].right)
+        pairs = [(name, REFERENCE) for name in of if name != REFERENCE] + [(ours, rival) for rival in rivals]
+        for name, other in pairs:
+            against = (of[name].right - of[other].right)[:, np.array(COUNTS) - 1]
+            mean, drawn = against.mean(0), weights @ against
+            p = np.where(is_oracle(name), np.nan, bootstrap_p(mean, drawn))
+            rows += [(level, name, other, *row) for row in zip(COUNTS, mean, *interval(drawn), p, strict=True)]
+    table = pd.DataFrame(rows, columns=["level", "policy", "other", "views", "points", "low", "high", "p"])
+    return table.assign(p_holm=holm(table["p"].to_numpy(np.float64)))
+
+
+def show(worlds: dict[str, dict[str, Reached]], table: pd.DataFrame, ours: str) -> None:
     """Print the tables."""
-    print(f"{np.count_nonzero(~np.isnan(table['p_holm']))} comparisons, one correction")
-    for (rival, level), rows in table.groupby(["rival", "level"], sort=False):
-        print(f"\n{level} clutter, {rows['worlds'].iloc[0]} worlds, against {rival}\n")
-        print("| policy | " + " | ".join(f"after {k}: accuracy, cells | points, p" for k in COUNTS) + " |")
-        print("|---" * (1 + 2 * len(COUNTS)) + "|")
-        for name in rows["policy"].unique():
+    print(f"{int(table['p'].notna().sum())} comparisons, one correction")
+    for level, of in worlds.items():
+        print(f"\n{level} clutter, {len(of[REFERENCE].right)} worlds\n")
+        print("| policy | against | " + " | ".join(f"after {k} (cells) | points (95 %), p" for k in COUNTS) + " |")
+        print("|---" * (2 + 2 * len(COUNTS)) + "|")
+        known = {name: means(reached) for name, reached in of.items()}
+        print(f"| {REFERENCE} | | " + " | ".join(f"{known[REFERENCE][k]} | " for k in COUNTS) + " |")
+        for (name, other), rows in table[table["level"] == level].groupby(["policy", "other"], sort=False):
             cells = []
-            for k in COUNTS:
-                row = rows[(rows["policy"] == name) & (rows["n_views"] == k)].iloc[0]
-                cells.append(f"{row['accuracy']:.3f}, {row['travel']:.2f}")
-                points = [100 * row[f"difference{end}"] for end in ("", "_low", "_high")]
-                tested = "" if np.isnan(row["p_holm"]) else f", {row['p_holm']:.2g}"
-                cells.append(
-                    "" if np.isnan(points[0]) else f"{points[0]:+.1f} ({points[1]:+.1f} to {points[2]:+.1f}){tested}"
-                )
-            print(f"| {name} | " + " | ".join(cells) + " |")
-    print(f"\nShare of what one step of foresight gains over {REFERENCE} that {ours} has:")
-    wide = table[table["rival"] == REFERENCE].pivot_table("accuracy", ["level", "n_views"], "policy", sort=False)
-    for (level, k), row in wide.iterrows():
-        if k in COUNTS:
-            had, all_of_it = row[ours] - row[REFERENCE], row["oracle-gain-all"] - row[REFERENCE]
-            print(f"{level}, {k} views: {had / all_of_it:.2f} of {100 * all_of_it:.1f} points")
+            for row in rows.itertuples():
+                points = f"{100 * row.points:+.1f} ({100 * row.low:+.1f} to {100 * row.high:+.1f})"
+                cells += [known[name][row.views], points + ("" if np.isnan(row.p_holm) else f", {row.p_holm:.2g}")]
+            print(f"| {name} | {other} | " + " | ".join(cells) + " |")
+        for k in COUNTS:
+            had, most = ((of[name].right - of[REFERENCE].right)[:, k - 1].mean() for name in (ours, CEILINGS[-1]))
+            print(f"\n{ours} after {k}: {had / most:.0%} of the {100 * most:.1f} points of one step of foresight")
 
 
-def travelled(path: Trajectories, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """What each episode travelled until view k, or its last one: cells, and seconds."""
-    last = np.minimum((path.views >= 0).sum(1), k) - 1
-    rows = np.arange(len(last))
-    return path.travel[rows, last], SECONDS * last + TURN * path.arc[rows, last]
+def means(reached: Reached) -> dict[int, str]:
+    """Accuracy and travel after so many views."""
+    return {k: f"{reached.right[:, k - 1].mean():.3f} ({reached.cells[:, k - 1].mean():.2f})" for k in COUNTS}
 
 
-def draw(grid: Grid, names: list[str], out: Path) -> None:
-    """Accuracy after 1 to 5 views against the travel until then, by level."""
-    of = levels_of(grid.specs.predictions.names)[grid.specs.objects]
-    levels = [level for level in ("light", "medium", "heavy") if level in of]
+def draw(worlds: dict[str, dict[str, Reached]], out: Path) -> None:
+    """Accuracy after 1 to 5 views against the travel until then, in cells and in seconds, by level."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure((3.2 * len(levels), 6.2), layout="constrained")
-        axes = figure.subplots(2, len(levels), sharey="col", squeeze=False)
-        for column, level in zip(axes.T, levels, strict=True):
-            for name, colour in zip(names, COLOURS * 2, strict=False):
-                line(column, grid.paths[name], of == level, grid.specs.labels, name, colour)
+        figure = Figure((3.2 * len(worlds), 6.4), layout="constrained")
+        axes = figure.subplots(2, len(worlds), sharey="col", squeeze=False)
+        for column, (level, of) in zip(axes.T, worlds.items(), strict=True):
+            for (name, reached), colour in zip(of.items(), COLOURS * 2, strict=False):
+                line = ":" if is_oracle(name) else "--" if "@" in name else "-"
+                for axis, travel in zip(column, (reached.cells, reached.seconds), strict=True):
+                    right = reached.right.mean(0)
+                    axis.plot(travel.mean(0), right, line, color=colour, marker="o", markersize=3, label=name)
             column[0].set_title(f"{level} clutter", fontsize=10)
             column[0].set_xlabel("travel (cells)")
             column[1].set_xlabel("travel (s)")
@@ -162,20 +208,6 @@ def draw(grid: Grid, names: list[str], out: Path) -> None:
             row[0].set_ylabel("accuracy after 1 to 5 views")
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
         figure.savefig(out, dpi=110, facecolor="white")
-
-
-def line(axes: np.ndarray, path: Trajectories, mine: np.ndarray, labels: np.ndarray, name: str, colour: str) -> None:
-    """One policy, in cells above and in seconds below."""
-    taken, points = (path.views >= 0).sum(1), []
-    for k in range(1, max(COUNTS) + 1):
-        answers = path.answers[np.arange(len(taken)), np.minimum(taken, k) - 1]
-        cells, seconds = (values[mine].mean() for values in travelled(path, k))
-        points.append((cells, seconds, (answers == labels)[mine].mean()))
-    cells, seconds, right = np.array(points).T
-    axis: Axes
-    for axis, travel in zip(axes, (cells, seconds), strict=True):
-        axis.plot(travel, right, ":" if is_oracle(name) else "--" if "@" in name else "-", color=colour, marker="o",
-                  markersize=3, label=name)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -268,7 +268,8 @@ def test_no_policy_goes_where_no_camera_can(predictions, store):  # noqa: F811
     specs = make_specs(predictions, 2, 0)
     reachable = specs.worlds.reachable
     assert not reachable.all()
-    for name in ("random-all", "random", "visibility", OWN, "true-visible_share-all", "oracle-gain-all"):
+    entries = "random-all", "random", "visibility", "visibility@0.05"
+    for name in (*entries, OWN, "true-visible_share-all", "oracle-gain-all"):
         views = replay(name, specs, 4, 0).views
         assert reachable[specs.objects[:, None], views].all(), name
     entries = default_entries(specs)

@@ -148,7 +148,7 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
     by_map = None if name in POLICIES or card in bundled_policies() else _map_policy(name, specs)
     if by_map is not None:
         return by_map
-    if name in POLICIES or card in bundled_policies() or card.endswith(".json") or ":" in name:
+    if name.partition("@")[0] in POLICIES or card in bundled_policies() or card.endswith(".json") or ":" in name:
         return make_policy(name, p.sphere, specs.valley_classes(name.removesuffix("-peak")), p.classes)
     names = [*POLICIES, *bundled_policies(), *ORACLES, "true-MEASURE-all", *(f"{kind}-K" for kind in FIXED)]
     raise EntryError(f"no policy is called {name!r}; there are {', '.join(names)}")

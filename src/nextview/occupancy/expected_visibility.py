@@ -22,8 +22,11 @@ GRID = VoxelGrid(64, 2.0)
 """Around the object, in object radii: what stands beside it has a place there."""
 BLOCK = 4
 """Voxels along the side of the blocks that stand for parts of the object."""
-UNSEEN_PART = 0.1
-"""What an unseen voxel of the object's unit ball counts for as a part of it, where one that was seen counts for 1."""
+UNSEEN_PART = 0.01
+"""What an unseen voxel of the object's unit ball counts for as a part of it, where one that was seen counts for 1: next
+to nothing, but before anything of the object was seen they are all there is."""
+HIDDEN_PART = 0.1
+"""The same where a frame is asked how much of the object it shows: what it does not show counts there."""
 DENSITY = 0.2
 """How often unseen space is filled, per object radius: between the two bounds."""
 SOLID = 1e3
@@ -135,7 +138,8 @@ def shown_share(view: SceneView) -> float:
 
 def shown_in(seen: SeenScene, position: NDArray[np.floating]) -> float:
     """The same, of what the frame says, and of where its camera stood, (3,)."""
-    return float(expected_visibility(seen, np.asarray(position, np.float64)[None]).expected[0])
+    eye = np.asarray(position, np.float64)[None]
+    return float(expected_visibility(seen, eye, unseen_part=HIDDEN_PART).expected[0])
 
 
 @lru_cache(maxsize=64)
