@@ -453,7 +453,17 @@ def test_boxes_that_are_none_are_refused(text, said, tmp_path):
 
 
 def test_capture_writes_what_recognise_reads(tmp_path, capsys):
-    arguments = ["samples/monitor.off", tmp_path / "new", "--layout", "tum", "--views", "12", "--unit", "cm", "--table"]
+    arguments = [
+        "samples/monitor.off",
+        tmp_path / "new",
+        "--layout",
+        "tum",
+        "--viewpoints",
+        "12",
+        "--unit",
+        "cm",
+        "--table",
+    ]
     main(["capture", *map(str, arguments)])
     err = capsys.readouterr().err
     assert "12/12" in err

@@ -76,10 +76,16 @@ def test_a_signal_ends_rendering_in_one_line_and_it_resumes(tmp_path, meshes, nu
 
 def test_ctrl_c_while_everything_is_imported_is_quiet(tmp_path):
     began = tmp_path / "began"
-    code = (
-        "import sys, pathlib; sys.argv = ['nextview', 'models']; import nextview_command;"
-        f"pathlib.Path({str(began)!r}).touch(); nextview_command.main()"
-    )
+    code = f"""
+import sys, pathlib, nextview_command
+class Began:
+    def find_spec(self, name, *rest):
+        if name == "nextview":
+            pathlib.Path({str(began)!r}).touch()
+sys.argv = ["nextview", "models"]
+sys.meta_path.insert(0, Began())
+nextview_command.main()
+"""
     for wait in (0, 0.05, 0.15):
 
         def ready(wait: float = wait) -> bool:

@@ -195,7 +195,7 @@ def test_the_objects_of_a_store_are_seen_as_they_were_rendered(tmp_path):
 
 
 def test_a_first_view_that_is_none_is_refused():
-    with pytest.raises(UsageError, match="no view 40, only 0 to 39"):
+    with pytest.raises(UsageError, match="the first view is a whole number from 0 to 39, not 40"):
         Exploration(shown_objects(), start=40, threads=1)
     with pytest.raises(UsageError, match="the seed is a whole number"):
         Exploration(shown_objects(), seed=-1, threads=1)

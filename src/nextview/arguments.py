@@ -132,7 +132,7 @@ def takes_paths(*names: str, many: tuple[str, ...] = ()) -> Callable[[Callable[P
         @wraps(function)
         def checked(*args: P.args, **kwargs: P.kwargs) -> R:
             given = signature.bind(*args, **kwargs)
-            for name in given.arguments.keys() & {*names, *many}:
+            for name in (name for name in (*names, *many) if name in given.arguments):
                 value, left_out = given.arguments[name], signature.parameters[name].default
                 if value is None and left_out is None:
                     continue
