@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from nextview.cli.extra import require
 
@@ -156,11 +157,17 @@ def markdown(table: pd.DataFrame, n_views: tuple[int, ...]) -> str:
             cells += [f"{100 * found[name, quantity].value:.0f} %" for quantity in AGREEMENT]
         cells.append(", ".join(f"{found[name, f'accuracy_{k}'].value:.3f}" for k in n_views))
         over = [found[name, f"over_random_{k}"] for k in n_views] if name != RANDOM else []
-        cells.append(", ".join(f"{round(100 * r.value, 1) + 0.0:+.1f}{'*' * (r.p_holm < 0.05)}" for r in over))
+        cells.append(", ".join(map(points, over)))
         cells.append(", ".join(f"{found[name, f'travel_{k}'].value:.2f}" for k in n_views))
         cells.append("" if r is None else found[name, "valleys"].label or "none")
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join([*lines, "", "\\* p < 0.05 after Holm's correction."]) + "\n"
+
+
+def points(row: Any) -> str:
+    """A difference of shares in points, with its interval; a star where it is significant."""
+    value, low, high = (f"{round(100 * x, 1) + 0.0:+.1f}" for x in (row.value, row.low, row.high))
+    return f"{value}{'*' * (row.p_holm < 0.05)} ({low} to {high})"
 
 
 def ordered(table: pd.DataFrame) -> list[str]:
@@ -195,7 +202,7 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
 
     of_class = table[(table["quantity"] == "correlation") & (table["label"] != "")]
     cells = of_class.pivot(index="measure", columns="label", values="value").loc[names, classes]
-    reach = max(float(np.abs(cells.to_numpy()).max()), 1e-9)
+    reach = max(float(np.abs(cells.drop(index=CONFIDENCE, errors="ignore").to_numpy()).max(initial=0)), 1e-9)
     shown = middle.imshow(cells, cmap="RdBu_r", vmin=-reach, vmax=reach, aspect="auto", origin="lower")
     for (i, j), value in np.ndenumerate(cells.to_numpy()):
         faint = abs(value) > 0.6 * reach
@@ -212,7 +219,7 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
         right.plot(100 * over["value"], at, "o", color=colour, markersize=4, label=f"{k} views")
     right.axvline(0, color=INK, linewidth=0.8)
     right.set_xlabel("accuracy of the policy that climbs the true map,\npoints over a random view of the window")
-    right.legend(loc="lower right")
+    right.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(n_views))
     return made
 
 
