@@ -94,6 +94,7 @@ WRONG = {
     "transposed, or with a skew": {"intrinsics": INTRINSICS.T},
     "have to be positive": {"intrinsics": with_focal(-500.0)},
     "in pixels, not in millimetres": {"intrinsics": with_focal(3.6, 3.6)},
+    "a focal length of 1e-30 is too short": {"intrinsics": with_focal(500.0, 1e-30)},
     "another resolution": {"intrinsics": np.array([[520, 0, 1500], [0, 520, 900], [0, 0, 1.0]])},
     "a (4, 4) matrix": {"pose": POSE[:3]},
     "finite numbers": {"pose": np.full((4, 4), np.nan)},
