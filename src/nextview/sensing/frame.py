@@ -157,9 +157,10 @@ def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[
     height, width = shape
     if not (k[0, 0] > 0 and k[1, 1] > 0):
         raise ObservationError("the focal lengths have to be positive: an image that is flipped?")
-    if min(k[0, 0], k[1, 1]) < 0.1 * max(shape):
+    focal = min(k[0, 0], k[1, 1])
+    if focal < 0.1 * max(shape):
         raise ObservationError(
-            f"a focal length of {min(k[0, 0], k[1, 1]):.3g} is too short for an image of {width} x {height}: it is expected in "
+            f"a focal length of {focal:.3g} is too short for an image of {width} x {height}: it is expected in "
             "pixels, not in millimetres or parts of the image"
         )
     if not (-width < k[0, 2] < 2 * width and -height < k[1, 2] < 2 * height):
