@@ -26,7 +26,7 @@ from nextview.episode import Episodes, run_episodes
 from nextview.errors import DatasetError, EntryError, UsageError
 from nextview.mesh import make_mesh
 from nextview.observation import Observation
-from nextview.occupancy import VoxelGrid, new_surface, new_volume
+from nextview.occupancy import UNSEEN, VoxelGrid, new_surface, new_volume
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.maps import SpherePeak, sphere_peaks
 from nextview.policies.oracle import OracleMeasure
@@ -71,6 +71,10 @@ def test_after_one_view_of_a_ball_the_other_side_is_most_new(gain):
     for row, view in enumerate((8, 12)):  # each row by itself
         alone = replace(state_of(SPHERE, [view]), observations=[state.observations[row]])
         np.testing.assert_array_equal(policy.view_values(alone)[0], values[row])
+
+
+def test_before_the_first_view_all_of_the_ball_is_unseen():
+    np.testing.assert_array_equal(occupancy_of([], SMALL).cells == UNSEEN, SMALL.ball)
 
 
 def test_where_nothing_is_new_the_nearest_free_view_is_taken():
