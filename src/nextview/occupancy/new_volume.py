@@ -42,7 +42,7 @@ def new_volume(
     grid, cells = occupancy.grid, occupancy.cells.reshape(-1)
     counts = (cells == UNSEEN) & (grid.ball if region is None else region).reshape(-1)
     asked, blockers = _middles(grid, counts), _middles(grid, cells >= OCCLUDER)
-    found = []
+    found: list[int] = []
     for eyes in _eyes(asked, blockers, positions, grid.pitch):
         u, v, z = eyes.project(asked)
         frame = _Frame.around(u, v)
@@ -77,7 +77,7 @@ def new_surface(
     border = (solid & ~_enclosed(solid)).reshape(-1)
     unseen = border & (cells.reshape(-1) == UNSEEN)
     asked, blockers = _middles(grid, unseen), _middles(grid, border & ~unseen)
-    found = []
+    found: list[int] = []
     for eyes in _eyes(asked, blockers, positions, grid.pitch):
         u, v, z = eyes.project(asked)
         frame = _Frame.around(u, v)
