@@ -32,8 +32,8 @@ def occupancy_of(observations: Sequence[Observation], grid: VoxelGrid) -> Occupa
     scenes = [seen for seen in observations if seen.scene is not None]
     if scenes:
         observations, grid = scenes, replace(grid, half=SCENE_SIZE * grid.half)
-    before = Occupancy.unseen(grid, None if scenes else _ball(grid, grid.half))
-    return reduce(Occupancy.and_also, [_told(seen, grid) for seen in observations], before)
+    told = [_told(seen, grid) for seen in observations]
+    return reduce(Occupancy.and_also, told) if told else Occupancy.unseen(grid, _ball(grid, grid.half))
 
 
 @lru_cache(maxsize=64)
