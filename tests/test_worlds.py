@@ -228,16 +228,6 @@ def test_a_world_is_read_as_it_was_written(worlds, tmp_path):
     assert World.load(tmp_path / "copy.json") == world
 
 
-@pytest.mark.parametrize(
-    "change", [{"schema": 2}, {"blocks": [{"x": 1}]}, {"objects": 3}, {"target": {}}, {"visible": "all"}, {"more": 1}]
-)
-def test_what_is_no_world_is_refused(worlds, tmp_path, change):
-    values = json.loads(sorted(worlds.rglob("*.json"))[0].read_text())
-    (tmp_path / "w.json").write_text(json.dumps(values | change))
-    with pytest.raises(DatasetError, match=r"w\.json"):
-        World.load(tmp_path / "w.json")
-
-
 HERE = {"mesh": "a.off", "sha256": "0" * 64, "x": 0, "y": 0, "turn": 0, "radius": 1}
 BLOCK = {"x": 1, "y": 1, "turn": 0, "width": 1, "depth": 1, "height": 1}
 
@@ -245,6 +235,12 @@ BLOCK = {"x": 1, "y": 1, "turn": 0, "width": 1, "depth": 1, "height": 1}
 @pytest.mark.parametrize(
     "change",
     [
+        {"schema": 2},
+        {"blocks": [{"x": 1}]},
+        {"objects": 3},
+        {"target": {}},
+        {"visible": "all"},
+        {"more": 1},
         *(
             {"target": {"mesh": mesh, "sha256": "0" * 64}}
             for mesh in ("/etc/passwd", "../a.off", "a/../../b", "C:\\a.off")
@@ -260,8 +256,11 @@ BLOCK = {"x": 1, "y": 1, "turn": 0, "width": 1, "depth": 1, "height": 1}
         {"unreachable": [0.5]},
     ],
 )
-def test_a_world_that_cannot_be_is_refused(worlds, tmp_path, change):
-    test_what_is_no_world_is_refused(worlds, tmp_path, change)
+def test_what_is_no_world_or_cannot_be_is_refused(worlds, tmp_path, change):
+    values = json.loads(sorted(worlds.rglob("*.json"))[0].read_text())
+    (tmp_path / "w.json").write_text(json.dumps(values | change))
+    with pytest.raises(DatasetError, match=r"w\.json"):
+        World.load(tmp_path / "w.json")
 
 
 def test_a_world_reads_mesh_files_alone_and_no_more_triangles_than_are_allowed(worlds, meshes, tmp_path):
