@@ -89,9 +89,10 @@ def test_peaks_come_first_and_each_group_by_value(cells):
 
 
 def policies(sphere, rng):
-    yield from (make_policy(name, sphere, (1,)) for name in POLICIES if name not in plannable())
+    by_map = ("lem", "lem-peak", "lcm", "lem-sphere-peak")
+    yield from (make_policy(name, sphere, (1,)) for name in (*POLICIES, *by_map) if name not in plannable())
     labels, objects = rng.integers(0, 2, 50), np.arange(50)
-    yield OracleValley(sphere, labels, (1,))
+    yield OracleValley(sphere, labels, (1,), "lem")
     log_evidence = rng.normal(size=(50, len(sphere), 2 * 9))
     yield OracleGain(sphere, log_evidence, 2, labels, objects)
     yield OracleGain(sphere, log_evidence, 2, labels, objects, "global", calibration=Calibration(bin_correlation=0.1))
@@ -355,7 +356,7 @@ HILLS = [[0.1, 0.9, 0.1], [0.2, 0.3, 0.2], [0.4, 0.2, 0.1], [0.5, 0.3, 0.2], [0.
 
 
 def test_map_peak_goes_from_peak_to_peak_then_to_the_highest_rest():
-    policy, state = MapPeak(SPHERE), state_of(SPHERE, 11, lem=[HILLS])
+    policy, state = MapPeak(SPHERE, "lem"), state_of(SPHERE, 11, lem=[HILLS])
     taken = []
     for _ in range(4):
         chosen = policy.next_views(state, np.random.default_rng(0))
@@ -373,7 +374,7 @@ def test_map_peak_is_the_highest_free_peak_of_scikit_image(seed):
     state = random_state(SPHERE, rng, 20)
     cells = rng.random((20, 5, 3))
     state = replace(state, evidence=Evidence(np.zeros((20, 2)), {"lem": cells}))
-    chosen = MapPeak(SPHERE).next_views(state, rng)
+    chosen = MapPeak(SPHERE, "lem").next_views(state, rng)
     for row, window in enumerate(SPHERE.windows[state.current]):
         free = ~state.visited[row, window]
         peaks = peak_local_max(cells[row], min_distance=1, threshold_abs=-1, exclude_border=False)
@@ -384,13 +385,13 @@ def test_map_peak_is_the_highest_free_peak_of_scikit_image(seed):
 
 def test_a_valley_is_chosen_by_the_believed_class():
     state = state_of(SPHERE, [11, 11], belief=[[0.9, 0.1], [0.2, 0.8]], lem=[HILLS, HILLS])
-    policy = MapPeak(SPHERE, valley_classes=(1,))
+    policy = MapPeak(SPHERE, "lem", valley_classes=(1,))
     peak, valley = policy.next_views(state, np.random.default_rng(0))
     assert peak == 3
     assert HILLS[SPHERE.ring[valley]][[2, 3, 4].index(SPHERE.azimuth_index[valley])] == 0.1
-    both = MapPeak(SPHERE, valley_classes=(0, 1)).next_views(state, np.random.default_rng(0))
+    both = MapPeak(SPHERE, "lem", valley_classes=(0, 1)).next_views(state, np.random.default_rng(0))
     assert both.tolist() == [valley, valley]
-    assert MapPeak(SPHERE).next_views(state, np.random.default_rng(0)).tolist() == [3, 3]
+    assert MapPeak(SPHERE, "lem").next_views(state, np.random.default_rng(0)).tolist() == [3, 3]
 
 
 @given(st.integers(0, 2**32))
@@ -398,8 +399,8 @@ def test_a_valley_is_a_peak_of_the_negated_map(seed):
     rng = np.random.default_rng(seed)
     state = random_state(SPHERE, rng)
     turned = replace(state, evidence=Evidence(np.zeros((50, 2)), {"lem": -state.evidence.maps["lem"]}))
-    valleys = MapPeak(SPHERE, valley_classes=(0, 1)).next_views(state, rng)
-    np.testing.assert_array_equal(valleys, MapPeak(SPHERE).next_views(turned, rng))
+    valleys = MapPeak(SPHERE, "lem", valley_classes=(0, 1)).next_views(state, rng)
+    np.testing.assert_array_equal(valleys, MapPeak(SPHERE, "lem").next_views(turned, rng))
 
 
 def test_a_map_of_another_name():
@@ -410,7 +411,7 @@ def test_a_map_of_another_name():
 
 def test_the_oracle_valley_goes_by_the_true_class():
     state = state_of(SPHERE, [11, 11], belief=[[0.9, 0.1], [0.9, 0.1]], lem=[HILLS, HILLS])
-    chosen = OracleValley(SPHERE, np.array([0, 1]), (1,)).next_views(state, np.random.default_rng(0))
+    chosen = OracleValley(SPHERE, np.array([0, 1]), (1,), "lem").next_views(state, np.random.default_rng(0))
     assert chosen[0] == 3
     assert HILLS[SPHERE.ring[chosen[1]]][[2, 3, 4].index(SPHERE.azimuth_index[chosen[1]])] == 0.1
 
