@@ -13,7 +13,9 @@ from scipy.special import log_softmax
 from test_fitting import SMALL, telling
 from test_policies import SPHERE, state_of
 from test_predictions import some_predictions
+from tiny_models import make_map_network, make_recogniser
 
+import nextview
 from nextview.belief import PLAIN_SUM, Calibration, reorient
 from nextview.benchmark import results
 from nextview.calibration.rollout import (
@@ -27,12 +29,15 @@ from nextview.calibration.rollout import (
 )
 from nextview.cli.main import main
 from nextview.data.predictions import Predictions
-from nextview.errors import PolicyError
+from nextview.data.samples import sample_mesh
+from nextview.errors import ModelError, PolicyError, SessionError
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.gain import Gain, features, mirrored, mirrored_features
+from nextview.policies.maps import SpherePeak
 from nextview.policies.policy_card import PolicyCard, bundled_policies
 from nextview.policies.registry import make_policy
+from nextview.session import Session
 from nextview.training.gain.perceptrons import Perceptrons
 from nextview.training.recipes import GainRecipe
 
@@ -321,6 +326,24 @@ def test_the_file_chooses_as_the_networks_do(scope, inputs, tmp_path):
     np.testing.assert_allclose(other.score(seen.astype(np.float32)), policy.score(seen), atol=1e-5)
     random = np.random.default_rng(0)
     np.testing.assert_array_equal(other.next_views(state, random), policy.next_views(state, random))
+
+
+def test_a_map_of_another_measure_is_predicted_live_where_a_network_of_the_folder_predicts_it(tmp_path):
+    make_recogniser(tmp_path, ["a", "b", "c", "d"])
+    make_map_network(tmp_path, "view_area")
+    write_card(tmp_path / "mine.json", some_gain(inputs=("place", "view_area")))
+    system = nextview.load(tmp_path, policy="mine", threshold=1.0, max_views=3)
+    assert system.policy.needs == ("view_area",)
+    views = system.recognise(sample_mesh("chair"), start=9).views
+    assert [len(view.maps["view_area"]) for view in views] == [5, 5, 5]
+    for inputs in (["place", "view_area-sphere"], ["place", "mine:clutter"]):  # the network knows no whole sphere
+        write_card(tmp_path / "mine.json", some_gain(inputs=tuple(inputs)))
+        said = f"no network predicts the map '{inputs[1]}'; there are lem, lem-sphere, lcm, lcm-sphere, view_area$"
+        with pytest.raises(ModelError, match=said):
+            nextview.load(tmp_path, policy="mine")
+    system = nextview.load(tmp_path, policy="view_area")
+    with pytest.raises(SessionError, match="needs the map 'view_area-sphere'"):
+        Session(system.models, SpherePeak(SPHERE, "view_area-sphere"), SPHERE)
 
 
 def test_networks_that_single_precision_cannot_hold_are_not_written(tmp_path):

@@ -15,10 +15,11 @@ from nextview.belief import Calibration, FixedLength
 from nextview.data.planning import plannable
 from nextview.episode import run_episodes
 from nextview.errors import PolicyError
+from nextview.measures.map_names import in_order
 from nextview.policies.base import EpisodeState, Evidence, best_in_window
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence, cells_from, cells_to
-from nextview.policies.maps import MapPeak, local_peaks, peaks_first
+from nextview.policies.maps import MapPeak, SpherePeak, local_peaks, peaks_first
 from nextview.policies.oracle import OracleGain, OracleValley
 from nextview.policies.registry import POLICIES, make_policy
 from nextview.policies.spread import Spread
@@ -426,6 +427,24 @@ def test_policies_by_name():
     assert make_policy("lem-peak", SPHERE, [1, 3]) == MapPeak(SPHERE, "lem")
     with pytest.raises(ValueError, match=r"no policy is called 'best'.*random"):
         make_policy("best", SPHERE)
+
+
+@pytest.mark.parametrize(("name", "maps"), [("lem", ()), ("lcm", ()), ("view_area", ["view_area"]), ("a:b", ["a:b"])])
+def test_every_map_has_policies_by_one_rule(name, maps):
+    assert make_policy(name, SPHERE, [1], maps=maps) == MapPeak(SPHERE, name, (1,))
+    assert make_policy(f"{name}-peak", SPHERE, [1], maps=maps) == MapPeak(SPHERE, name)
+    assert make_policy(f"{name}-sphere-peak", SPHERE, [1], maps=maps) == SpherePeak(SPHERE, f"{name}-sphere")
+    with pytest.raises(PolicyError, match=f"there are random, .*lem, .*{name}-sphere-peak, .*gain"):
+        make_policy("best", SPHERE, maps=maps)
+    for wrong in (f"{name}-sphere", f"{name}-sphere-sphere-peak", f"{name}-peak-peak"):
+        with pytest.raises(PolicyError, match=rf"no policy is called|policy {wrong} cannot be made"):
+            make_policy(wrong, SPHERE, maps=maps)
+
+
+def test_maps_stand_in_one_order():
+    names = ["view_area-sphere", "lcm", "a:b", "lcm-sphere", "view_area", "lem", "lem-sphere", "lem"]
+    expected = ["lem", "lcm", "a:b", "view_area", "lem-sphere", "lcm-sphere", "view_area-sphere"]
+    assert in_order(names) == in_order(expected[::-1]) == expected
 
 
 @pytest.mark.parametrize("name", ["nowhere:Policy", "nextview.policies.maps:Nothing", "builtins:len", ":", "math:sqrt"])

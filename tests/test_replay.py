@@ -268,6 +268,10 @@ def test_the_contestants_are_those_that_the_predictions_allow(specs):
     p = specs.predictions
     with_lcm = make_specs(replace(p, maps={**p.maps, "lcm": p.maps["lem"]}), 1, 0)
     assert {"lcm", "lcm-peak", "lcm-oracle-valley"} <= set(default_entries(with_lcm))
+    other = make_specs(replace(p, maps={"view_area": p.maps["lem"]}), 4, 0)  # of no valley classes
+    assert [name for name in default_entries(other) if "view_area" in name] == ["view_area", "view_area-peak"]
+    for name, same in (("view_area", "lem-peak"), ("view_area-oracle-valley", "lem-peak")):
+        np.testing.assert_array_equal(replay(name, other, 3, 0).views, replay(same, specs, 3, 0).views)
     without = make_specs(replace(p, maps={}), 1, 0)
     assert not {"lem", "lem-peak", "oracle-valley"} & set(default_entries(without))
     for name in default_entries(with_lcm):
