@@ -75,7 +75,7 @@ def with_networks(meshes: list[Path], n_views: int = 40) -> float:
     from nextview.mesh import load_mesh
     from nextview.models.inference import load_models
 
-    models, sphere = load_models(), ViewSphere.named("40")
+    models, sphere = load_models(("lem",)), ViewSphere.named("40")
     cameras = [SimulatedCamera(load_mesh(path), 224, sphere.distance) for path in meshes]
     models.evidence([cameras[0].observe(sphere.poses[0])])
     began = time.perf_counter()

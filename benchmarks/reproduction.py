@@ -113,7 +113,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         f"The predictions (SHA-256 `{file_hash(predictions)[:16]}...`) come from `nextview predict modelnet10.zarr "
         "predictions.npz --split test`; models: "
         + ", ".join(f"{kind} {name} (`{sha[:12]}...`)" for kind, (name, sha) in table.models.items())
-        + f". Valley classes: {named(specs.valley_classes())} (LEM), {named(specs.valley_classes('lcm'))} (LCM), "
+        + f". Valley classes: {named(specs.valley_classes('lem'))} (LEM), {named(specs.valley_classes('lcm'))} (LCM), "
         "chosen on validation objects. Single views are right "
         f"{100 * (table.logits.argmax(2) == table.labels[:, None]).mean():.1f} % of the time (published: 87.1 %).",
         "",

@@ -206,7 +206,12 @@ def test_every_class_is_drawn_equally_often_where_that_is_asked_for():
 @pytest.mark.parametrize(
     ("options", "error", "sentence"),
     [
-        ({"inputs": ("belief", "smell")}, UsageError, "not 'smell'"),
+        (
+            {"inputs": ("belief", "smell")},
+            PredictionsError,
+            "no map 'smell'; inputs are some of belief, view, .*, lem$",
+        ),
+        ({"inputs": ("visibility",)}, UsageError, "not 'visibility'"),
         ({"inputs": ()}, UsageError, "not nothing"),
         ({"objective": "joy"}, UsageError, "not 'joy'"),
         ({"max_views": 1}, UsageError, "at least two views"),

@@ -64,7 +64,7 @@ def run(table, policy, starts, stopping, sphere=SPHERE, seed=0, calibration=PLAI
     st.integers(0, 1000),
     st.sampled_from([0.0, 0.5, 0.8, 0.97, 1.0]),
     st.integers(1, 7),
-    st.sampled_from([Unidirectional(SPHERE), MapPeak(SPHERE), MapPeak(SPHERE, valley_classes=(0, 2))]),
+    st.sampled_from([Unidirectional(SPHERE), MapPeak(SPHERE, "lem"), MapPeak(SPHERE, "lem", valley_classes=(0, 2))]),
     st.sampled_from([PLAIN_SUM, Calibration(0.7, 0.4)]),
 )
 def test_many_episodes_at_once_are_each_episode_alone(seed, threshold, max_views, policy, calibration):
@@ -86,7 +86,7 @@ def test_many_episodes_at_once_are_each_episode_alone(seed, threshold, max_views
 
 
 def test_the_steps_tell_the_same_story_as_the_outcome():
-    table, policy, starts = Table.random(30), MapPeak(SPHERE), np.arange(30)
+    table, policy, starts = Table.random(30), MapPeak(SPHERE, "lem"), np.arange(30)
     episodes = run(table, policy, starts, Stopping(0.9, 5))
     assert episodes.steps[0].episodes.tolist() == list(range(30))
     for k, step in enumerate(episodes.steps):
@@ -108,7 +108,7 @@ def test_no_view_twice_and_every_view_where_nothing_is_certain():
 
 
 def test_a_threshold_of_zero_takes_one_look():
-    end = run(Table.random(10), MapPeak(SPHERE), np.arange(10), Stopping(0.0, 5)).outcome
+    end = run(Table.random(10), MapPeak(SPHERE, "lem"), np.arange(10), Stopping(0.0, 5)).outcome
     assert (end.n_views == 1).all()
     assert end.confident.all()
     assert (end.travel == 0).all()
@@ -122,7 +122,7 @@ def test_one_look_allowed_asks_no_policy():
 
 def test_confidence_counts_at_the_threshold_itself():
     logits = np.zeros((1, 40, 2))
-    end = run(Table(logits, Table.random(1).lem), MapPeak(SPHERE), np.array([0]), Stopping(0.5, 5)).outcome
+    end = run(Table(logits, Table.random(1).lem), MapPeak(SPHERE, "lem"), np.array([0]), Stopping(0.5, 5)).outcome
     assert end.n_views == 1
     assert end.confident
 
@@ -249,7 +249,7 @@ def test_a_map_that_is_missing_or_of_another_sphere():
         run(table, MapPeak(SPHERE, "lcm"), np.arange(3), Stopping(1.0))
     ring = ViewSphere.named("12")
     with pytest.raises(PolicyError, match="policy MapPeak raised PolicyError"):
-        run(table, MapPeak(ring), np.arange(3), Stopping(1.0), ring)
+        run(table, MapPeak(ring, "lem"), np.arange(3), Stopping(1.0), ring)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -257,18 +257,18 @@ def test_a_logit_that_is_not_finite_is_refused(bad):
     table = Table.random(5)
     table.logits[3, :, 1] = bad
     with pytest.raises(ValueError, match="something that is not a finite number"):
-        run(table, MapPeak(SPHERE), np.arange(5), Stopping())
+        run(table, MapPeak(SPHERE, "lem"), np.arange(5), Stopping())
 
 
 @pytest.mark.parametrize("start", [-1, 40])
 def test_a_start_off_the_sphere(start):
     with pytest.raises(ValueError, match="0 to 39"):
-        run(Table.random(2), MapPeak(SPHERE), np.array([0, start]), Stopping())
+        run(Table.random(2), MapPeak(SPHERE, "lem"), np.array([0, start]), Stopping())
 
 
 def test_no_outcome_before_the_end():
     table = Table.random(2)
-    episodes = Episodes(SPHERE, MapPeak(SPHERE), np.array([0, 1]), Stopping(1.0, 2), np.random.default_rng(0))
+    episodes = Episodes(SPHERE, MapPeak(SPHERE, "lem"), np.array([0, 1]), Stopping(1.0, 2), np.random.default_rng(0))
     with pytest.raises(ValueError, match="still running"):
         _ = episodes.outcome
     episodes.update(table.observe(episodes.running, episodes.current))

@@ -13,8 +13,11 @@ from scipy.special import log_softmax
 from test_fitting import SMALL, telling
 from test_policies import SPHERE, state_of
 from test_predictions import some_predictions
+from tiny_models import make_map_network, make_recogniser
 
+import nextview
 from nextview.belief import PLAIN_SUM, Calibration, reorient
+from nextview.benchmark import results
 from nextview.calibration.rollout import (
     OBJECTIVES,
     ReplayTable,
@@ -25,16 +28,23 @@ from nextview.calibration.rollout import (
     value_after,
 )
 from nextview.cli.main import main
-from nextview.errors import PolicyError
+from nextview.data.predictions import Predictions
+from nextview.data.samples import sample_mesh
+from nextview.errors import ModelError, PolicyError, SessionError
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Random, RandomAll
-from nextview.policies.gain import INPUTS, MAPS, Gain, features, mirrored, mirrored_features
+from nextview.policies.gain import Gain, features, mirrored, mirrored_features
+from nextview.policies.maps import SpherePeak
 from nextview.policies.policy_card import PolicyCard, bundled_policies
 from nextview.policies.registry import make_policy
+from nextview.session import Session
 from nextview.training.gain.perceptrons import Perceptrons
 from nextview.training.recipes import GainRecipe
 
 CLASSES = 4
+MAPS = ("lem", "lcm", "mine:clutter", "view_area", "lem-sphere", "lcm-sphere", "view_area-sphere")
+INPUTS = ("belief", "view", "place", *MAPS, "azimuth_bin")
+"""All that a network may take, of measures of all kinds; in the order that its weights are for."""
 
 
 def some_gain(sphere=SPHERE, inputs=INPUTS, networks=2, seed=0, frame="camera", **rest) -> Gain:
@@ -162,6 +172,24 @@ def test_an_object_and_its_mirror_image_are_alike(frame):
         features(SPHERE, other, INPUTS, frame),
         features(SPHERE, state, INPUTS, frame)[:, mirrored_features(SPHERE, CLASSES, INPUTS, frame)],
     )
+
+
+@pytest.mark.parametrize("frame", ["camera", "object"])
+def test_the_order_in_which_inputs_are_named_means_nothing(frame):
+    state, shuffled = some_state(), tuple(np.random.default_rng(0).permutation(INPUTS))
+    expected = np.concatenate([features(SPHERE, state, (name,), frame) for name in INPUTS], 1)
+    np.testing.assert_array_equal(features(SPHERE, state, shuffled, frame), expected)
+    flips = [mirrored_features(SPHERE, CLASSES, (name,), frame) for name in INPUTS]
+    begins = np.cumsum([0, *map(len, flips)])
+    expected = np.concatenate([begin + flip for begin, flip in zip(begins, flips, strict=False)])
+    np.testing.assert_array_equal(mirrored_features(SPHERE, CLASSES, shuffled, frame), expected)
+    assert some_gain(inputs=shuffled, frame="object").needs == (*MAPS, "azimuth_bins")
+
+
+@pytest.mark.parametrize("inputs", [(), ("belief", "observations"), ("azimuth_bins",)])
+def test_inputs_that_are_none_are_refused(inputs):
+    with pytest.raises(PolicyError, match=r"takes some of belief, .* and of the maps that are predicted, not "):
+        Gain(SPHERE, CLASSES, lambda seen: seen, inputs)
 
 
 def test_a_high_price_buys_the_nearest_view():
@@ -300,6 +328,24 @@ def test_the_file_chooses_as_the_networks_do(scope, inputs, tmp_path):
     np.testing.assert_array_equal(other.next_views(state, random), policy.next_views(state, random))
 
 
+def test_a_map_of_another_measure_is_predicted_live_where_a_network_of_the_folder_predicts_it(tmp_path):
+    make_recogniser(tmp_path, ["a", "b", "c", "d"])
+    make_map_network(tmp_path, "view_area")
+    write_card(tmp_path / "mine.json", some_gain(inputs=("place", "view_area")))
+    system = nextview.load(tmp_path, policy="mine", threshold=1.0, max_views=3)
+    assert system.policy.needs == ("view_area",)
+    views = system.recognise(sample_mesh("chair"), start=9).views
+    assert [len(view.maps["view_area"]) for view in views] == [5, 5, 5]
+    for inputs in (["place", "view_area-sphere"], ["place", "mine:clutter"]):  # the network knows no whole sphere
+        write_card(tmp_path / "mine.json", some_gain(inputs=tuple(inputs)))
+        said = f"no network predicts the map '{inputs[1]}'; there are lem, lem-sphere, lcm, lcm-sphere, view_area$"
+        with pytest.raises(ModelError, match=said):
+            nextview.load(tmp_path, policy="mine")
+    system = nextview.load(tmp_path, policy="view_area")
+    with pytest.raises(SessionError, match="needs the map 'view_area-sphere'"):
+        Session(system.models, SpherePeak(SPHERE, "view_area-sphere"), SPHERE)
+
+
 def test_networks_that_single_precision_cannot_hold_are_not_written(tmp_path):
     policy = some_gain()
     networks = [[(1e20 * weights, bias) for weights, bias in layers] for layers in policy.score.networks]
@@ -409,7 +455,7 @@ def test_what_ships_says_what_torch_says(tmp_path):
     for part in networks.parameters():
         part.data += 0.3 * torch.randn(part.shape, generator=torch.Generator().manual_seed(1))
     score = Perceptrons.of(SPHERE, CLASSES, INPUTS, networks.layers())
-    policy = shipped(tmp_path, Gain(SPHERE, CLASSES, score))
+    policy = shipped(tmp_path, Gain(SPHERE, CLASSES, score, INPUTS))
     state = some_state()
     other, flip = reflected(state)
     with torch.no_grad():
@@ -522,8 +568,6 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
 
 
 def test_it_learns_from_what_sensors_made_of_the_same_objects(unseen, tmp_path, capsys):
-    from nextview.data.predictions import Predictions
-
     p = Predictions.load(unseen)
     replace(p, logits=p.logits[:, ::-1]).of_objects(np.arange(90)[::-1]).save(tmp_path / "sensed.npz")
     sensed = Predictions.load(tmp_path / "sensed.npz").of_objects(np.arange(90)[::-1])
@@ -555,8 +599,6 @@ def test_it_learns_from_what_sensors_made_of_the_same_objects(unseen, tmp_path, 
 
 
 def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsys):
-    from nextview.data.predictions import Predictions
-
     p = Predictions.load(unseen)
     some = replace(
         p, logits=p.logits[:20], maps={n: m[:20] for n, m in p.maps.items()}, depth_entropy=p.depth_entropy[:20],
@@ -572,9 +614,69 @@ def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsy
         ([str(unseen), str(tmp_path / "mine")], "NAME.json"),
         ([str(tmp_path / "none.npz"), str(card)], "no such file"),
         ([str(unseen), str(card), "--inputs", "belief", "lcm"], "holds no map 'lcm'"),
+        (
+            [str(unseen), str(card), "--inputs", "beleif"],
+            "no map 'beleif'; predict it, or choose --inputs among belief, ",
+        ),
+        ([str(unseen), str(card), "--inputs", "beleif"], "azimuth_bin, visibility, lem, lem-sphere"),
         ([str(tmp_path / "sideless.npz"), str(card)], "holds no azimuth bins"),
     ]:
         with pytest.raises(SystemExit) as end:
             main(["train", "gain", *arguments])
         assert end.value.code == 2
         assert sentence in capsys.readouterr().err
+
+
+def ring_that_tells(n: int, seed: int, split: str) -> Predictions:
+    """Objects that only one ring tells, another one for each, and a map of one's own measure that shows which."""
+    rng = np.random.default_rng(seed)
+    labels, ring = np.arange(n) % 3, rng.integers(SMALL.rings, size=n)
+    logits = 0.1 * rng.normal(size=(n, len(SMALL), 3))
+    tells = SMALL.ring == ring[:, None]
+    logits[np.arange(n), :, labels] += 4 * tells
+    window = tells[:, SMALL.windows].astype(np.float32)
+    whole = np.broadcast_to(tells.reshape(n, 1, SMALL.rings, SMALL.azimuths), (n, len(SMALL), 3, 4)).astype(np.float32)
+    maps = {"mine:clutter": window, "mine:clutter-sphere": whole}
+    return Predictions(
+        logits.astype(np.float32), maps, rng.random((n, len(SMALL))).astype(np.float32),
+        tuple(f"{split}_{i}" for i in range(n)), labels, ("a", "b", "c"), np.array([split] * n), np.zeros(n, bool),
+        SMALL, {"recogniser": ("r", "0" * 64), "mine:clutter": ("m", "1" * 64)}, {"mine:clutter": ()},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("given", ["mine:clutter", "mine:clutter-sphere"])
+def test_a_map_of_a_measure_of_ones_own_leads_a_policy_to_the_views_that_it_shows(given, tmp_path, capsys):
+    """Trained from the command, and followed in the benchmark on objects that were not learned from."""
+    learned, fresh, card = tmp_path / "learn.npz", tmp_path / "test.npz", tmp_path / "mine.json"
+    ring_that_tells(120, 0, "train").save(learned)
+    p = ring_that_tells(60, 1, "test")
+    p.save(fresh)
+    quick = [
+        "--epochs",
+        "12",
+        "--folds",
+        "2",
+        "--lr",
+        "0.01",
+        "--batch",
+        "128",
+        "--n-views",
+        "2",
+        "--travel-weight",
+        "0",
+    ]
+    main(["train", "gain", str(learned), str(card), "--inputs", given, "place", "--frame", "camera", *quick])
+    assert json.loads(card.read_text())["table"]["inputs"] == [given, "place"]
+    run = ["benchmark", str(fresh), "--runs", "4", "--samples", "20", "--max-views", "2", "--thresholds", "0.999"]
+    main([*run, "--policies", str(card), "--out", str(tmp_path / "out")])
+    episodes = results.load(tmp_path / "out").episodes(str(card), 0.999)
+    rows = [p.names.index(name) for name in episodes["object"].astype(str)]
+    tells = p.maps["mine:clutter-sphere"][rows, 0].argmax(1)[:, 0]
+    first, second = (np.array([views[min(k, len(views) - 1)] for views in episodes["views"]]) for k in (0, 1))
+    going = SMALL.ring[first] != tells
+    assert 100 < going.sum() < 240
+    assert (SMALL.ring[second] == tells)[going].mean() > 0.95
+    replace(p, maps={}).save(fresh)
+    with pytest.raises(SystemExit):
+        main([*run, "--policies", str(card), "--reference", str(card), "--out", str(tmp_path / "none")])
+    assert f"needs the map '{given}', which these predictions lack" in " ".join(capsys.readouterr().err.split())

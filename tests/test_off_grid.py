@@ -22,6 +22,7 @@ CLASSES = 10
 LAYOUTS = ("40", "12", "rings:0,30,60x12", "fibonacci:60", "fibonacci:7")
 NAMES = (
     *(name for name in POLICIES if name not in plannable()),
+    *("lem", "lem-peak", "lcm", "lcm-peak", "lem-sphere-peak"),
     "gain",
     "visible-gain",
     "fixed-sequence",

@@ -15,10 +15,11 @@ from nextview.belief import Calibration, FixedLength
 from nextview.data.planning import plannable
 from nextview.episode import run_episodes
 from nextview.errors import PolicyError
+from nextview.measures.map_names import in_order
 from nextview.policies.base import EpisodeState, Evidence, best_in_window
 from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence, cells_from, cells_to
-from nextview.policies.maps import MapPeak, local_peaks, peaks_first
+from nextview.policies.maps import MapPeak, SpherePeak, local_peaks, peaks_first
 from nextview.policies.oracle import OracleGain, OracleValley
 from nextview.policies.registry import POLICIES, make_policy
 from nextview.policies.spread import Spread
@@ -89,9 +90,10 @@ def test_peaks_come_first_and_each_group_by_value(cells):
 
 
 def policies(sphere, rng):
-    yield from (make_policy(name, sphere, (1,)) for name in POLICIES if name not in plannable())
+    by_map = ("lem", "lem-peak", "lcm", "lem-sphere-peak")
+    yield from (make_policy(name, sphere, (1,)) for name in (*POLICIES, *by_map) if name not in plannable())
     labels, objects = rng.integers(0, 2, 50), np.arange(50)
-    yield OracleValley(sphere, labels, (1,))
+    yield OracleValley(sphere, labels, (1,), "lem")
     log_evidence = rng.normal(size=(50, len(sphere), 2 * 9))
     yield OracleGain(sphere, log_evidence, 2, labels, objects)
     yield OracleGain(sphere, log_evidence, 2, labels, objects, "global", calibration=Calibration(bin_correlation=0.1))
@@ -355,7 +357,7 @@ HILLS = [[0.1, 0.9, 0.1], [0.2, 0.3, 0.2], [0.4, 0.2, 0.1], [0.5, 0.3, 0.2], [0.
 
 
 def test_map_peak_goes_from_peak_to_peak_then_to_the_highest_rest():
-    policy, state = MapPeak(SPHERE), state_of(SPHERE, 11, lem=[HILLS])
+    policy, state = MapPeak(SPHERE, "lem"), state_of(SPHERE, 11, lem=[HILLS])
     taken = []
     for _ in range(4):
         chosen = policy.next_views(state, np.random.default_rng(0))
@@ -373,7 +375,7 @@ def test_map_peak_is_the_highest_free_peak_of_scikit_image(seed):
     state = random_state(SPHERE, rng, 20)
     cells = rng.random((20, 5, 3))
     state = replace(state, evidence=Evidence(np.zeros((20, 2)), {"lem": cells}))
-    chosen = MapPeak(SPHERE).next_views(state, rng)
+    chosen = MapPeak(SPHERE, "lem").next_views(state, rng)
     for row, window in enumerate(SPHERE.windows[state.current]):
         free = ~state.visited[row, window]
         peaks = peak_local_max(cells[row], min_distance=1, threshold_abs=-1, exclude_border=False)
@@ -384,13 +386,13 @@ def test_map_peak_is_the_highest_free_peak_of_scikit_image(seed):
 
 def test_a_valley_is_chosen_by_the_believed_class():
     state = state_of(SPHERE, [11, 11], belief=[[0.9, 0.1], [0.2, 0.8]], lem=[HILLS, HILLS])
-    policy = MapPeak(SPHERE, valley_classes=(1,))
+    policy = MapPeak(SPHERE, "lem", valley_classes=(1,))
     peak, valley = policy.next_views(state, np.random.default_rng(0))
     assert peak == 3
     assert HILLS[SPHERE.ring[valley]][[2, 3, 4].index(SPHERE.azimuth_index[valley])] == 0.1
-    both = MapPeak(SPHERE, valley_classes=(0, 1)).next_views(state, np.random.default_rng(0))
+    both = MapPeak(SPHERE, "lem", valley_classes=(0, 1)).next_views(state, np.random.default_rng(0))
     assert both.tolist() == [valley, valley]
-    assert MapPeak(SPHERE).next_views(state, np.random.default_rng(0)).tolist() == [3, 3]
+    assert MapPeak(SPHERE, "lem").next_views(state, np.random.default_rng(0)).tolist() == [3, 3]
 
 
 @given(st.integers(0, 2**32))
@@ -398,8 +400,8 @@ def test_a_valley_is_a_peak_of_the_negated_map(seed):
     rng = np.random.default_rng(seed)
     state = random_state(SPHERE, rng)
     turned = replace(state, evidence=Evidence(np.zeros((50, 2)), {"lem": -state.evidence.maps["lem"]}))
-    valleys = MapPeak(SPHERE, valley_classes=(0, 1)).next_views(state, rng)
-    np.testing.assert_array_equal(valleys, MapPeak(SPHERE).next_views(turned, rng))
+    valleys = MapPeak(SPHERE, "lem", valley_classes=(0, 1)).next_views(state, rng)
+    np.testing.assert_array_equal(valleys, MapPeak(SPHERE, "lem").next_views(turned, rng))
 
 
 def test_a_map_of_another_name():
@@ -410,7 +412,7 @@ def test_a_map_of_another_name():
 
 def test_the_oracle_valley_goes_by_the_true_class():
     state = state_of(SPHERE, [11, 11], belief=[[0.9, 0.1], [0.9, 0.1]], lem=[HILLS, HILLS])
-    chosen = OracleValley(SPHERE, np.array([0, 1]), (1,)).next_views(state, np.random.default_rng(0))
+    chosen = OracleValley(SPHERE, np.array([0, 1]), (1,), "lem").next_views(state, np.random.default_rng(0))
     assert chosen[0] == 3
     assert HILLS[SPHERE.ring[chosen[1]]][[2, 3, 4].index(SPHERE.azimuth_index[chosen[1]])] == 0.1
 
@@ -425,6 +427,24 @@ def test_policies_by_name():
     assert make_policy("lem-peak", SPHERE, [1, 3]) == MapPeak(SPHERE, "lem")
     with pytest.raises(ValueError, match=r"no policy is called 'best'.*random"):
         make_policy("best", SPHERE)
+
+
+@pytest.mark.parametrize(("name", "maps"), [("lem", ()), ("lcm", ()), ("view_area", ["view_area"]), ("a:b", ["a:b"])])
+def test_every_map_has_policies_by_one_rule(name, maps):
+    assert make_policy(name, SPHERE, [1], maps=maps) == MapPeak(SPHERE, name, (1,))
+    assert make_policy(f"{name}-peak", SPHERE, [1], maps=maps) == MapPeak(SPHERE, name)
+    assert make_policy(f"{name}-sphere-peak", SPHERE, [1], maps=maps) == SpherePeak(SPHERE, f"{name}-sphere")
+    with pytest.raises(PolicyError, match=f"there are random, .*lem, .*{name}-sphere-peak, .*gain"):
+        make_policy("best", SPHERE, maps=maps)
+    for wrong in (f"{name}-sphere", f"{name}-sphere-sphere-peak", f"{name}-peak-peak"):
+        with pytest.raises(PolicyError, match=rf"no policy is called|policy {wrong} cannot be made"):
+            make_policy(wrong, SPHERE, maps=maps)
+
+
+def test_maps_stand_in_one_order():
+    names = ["view_area-sphere", "lcm", "a:b", "lcm-sphere", "view_area", "lem", "lem-sphere", "lem"]
+    expected = ["lem", "lcm", "a:b", "view_area", "lem-sphere", "lcm-sphere", "view_area-sphere"]
+    assert in_order(names) == in_order(expected[::-1]) == expected
 
 
 @pytest.mark.parametrize("name", ["nowhere:Policy", "nextview.policies.maps:Nothing", "builtins:len", ":", "math:sqrt"])

@@ -13,6 +13,7 @@ import trimesh
 from tiny_models import make_map_network, make_recogniser
 
 from nextview.belief import Calibration, RiskBounds
+from nextview.cli.main import main
 from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import Deform, render
@@ -322,3 +323,23 @@ def test_a_card_that_was_calibrated_since_brings_predictions_up_to_date(shop):
     after = Predictions.load(out)
     assert (before.calibration, after.calibration) == (Calibration(), Calibration(0.5, 0.25))
     np.testing.assert_array_equal(after.logits, before.logits)
+
+
+def test_all_maps_that_the_models_predict_are_predicted_by_default(shop, tmp_path, monkeypatch):
+    """Whatever their measure: those of the folder, and of the bundled ones that it lacks."""
+    make_recogniser(tmp_path, CLASSES)
+    make_map_network(tmp_path)
+    make_map_network(tmp_path, "mine:clutter")
+    asked = []
+
+    def listen(*arguments):
+        asked.append(arguments[3])
+        return predict(*arguments[:3], {}, *arguments[4:])
+
+    monkeypatch.setattr("nextview.data.predicting.predict", listen)
+    command = ["predict", str(shop / "views.zarr"), str(tmp_path / "p.npz"), "--models", str(tmp_path)]
+    for given in ([], ["--maps"], ["--maps", "mine:clutter"]):
+        main([*command, *given, "--workers", "1"])
+    names = [[card.name for card in maps.values()] for maps in asked]
+    assert names == [["tiny-lem", "lcm-modelnet10", "tiny-mine:clutter"], [], ["tiny-mine:clutter"]]
+    assert [list(maps) for maps in asked[::2]] == [["lem", "lcm", "mine:clutter"], ["mine:clutter"]]

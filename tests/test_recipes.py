@@ -31,7 +31,7 @@ from nextview.training.recipes import AgentRecipe, GainRecipe, MapRecipe, Recogn
         (AgentRecipe, {"exploration": (0.9,)}, "the two numbers of --exploration are from 0 to 1"),
         (AgentRecipe, {"envs": 10**6, "rollout": 10**6}, "--envs times --rollout is from 2 to 10,000,000"),
         (AgentRecipe, {"seed": 2**32}, "--seed is a whole number from 0 to 4294967295"),
-        (GainRecipe, {"inputs": ("belief", "luck")}, "--inputs are some of belief, view, place"),
+        (GainRecipe, {"inputs": ("belief", 7)}, "--inputs are names, not 7"),
         (GainRecipe, {"n_views": 1}, "--n-views is at least 2, not 1"),
         (GainRecipe, {"inputs": ()}, "--inputs names at least one"),
     ],

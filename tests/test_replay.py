@@ -48,7 +48,7 @@ def evidence_of(predictions: Predictions, objects: np.ndarray):
 @pytest.mark.parametrize("name", ["lem", "lem-peak", "unidirectional"])
 def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(specs, name, threshold, threshold_decay):
     p = specs.predictions
-    policy = make_policy(name, p.sphere, specs.valley_classes())
+    policy = make_policy(name, p.sphere, specs.valley_classes("lem"))
     episodes = run_episodes(
         evidence_of(p, specs.objects),
         p.sphere,
@@ -121,11 +121,11 @@ def test_each_map_has_the_valley_classes_of_its_own_card():
     p = some_predictions(6)
     lcm = {"maps": p.maps | {"lcm": p.maps["lem"]}, "valley_classes": {"lem": p.classes[:1], "lcm": p.classes[1:2]}}
     specs = make_specs(replace(p, **lcm), 2, 0)
-    assert (specs.valley_classes(), specs.valley_classes("lcm")) == ((0,), (1,))
+    assert (specs.valley_classes("lem"), specs.valley_classes("lcm")) == ((0,), (1,))
     peak, valley = (replay(name, specs, 2, 0).views[:, 1] for name in ("lcm-peak", "lcm-oracle-valley"))
     assert {*np.flatnonzero(peak != valley)} == {*np.flatnonzero(specs.labels == 1)}
     given = make_specs(replace(p, **lcm), 2, 0, (2,))
-    assert given.valley_classes() == given.valley_classes("lcm") == (2,)
+    assert given.valley_classes("lem") == given.valley_classes("lcm") == (2,)
 
 
 def test_true_maps_are_the_truth_around_each_view():
@@ -268,6 +268,10 @@ def test_the_contestants_are_those_that_the_predictions_allow(specs):
     p = specs.predictions
     with_lcm = make_specs(replace(p, maps={**p.maps, "lcm": p.maps["lem"]}), 1, 0)
     assert {"lcm", "lcm-peak", "lcm-oracle-valley"} <= set(default_entries(with_lcm))
+    other = make_specs(replace(p, maps={"view_area": p.maps["lem"]}), 4, 0)  # of no valley classes
+    assert [name for name in default_entries(other) if "view_area" in name] == ["view_area", "view_area-peak"]
+    for name, same in (("view_area", "lem-peak"), ("view_area-oracle-valley", "lem-peak")):
+        np.testing.assert_array_equal(replay(name, other, 3, 0).views, replay(same, specs, 3, 0).views)
     without = make_specs(replace(p, maps={}), 1, 0)
     assert not {"lem", "lem-peak", "oracle-valley"} & set(default_entries(without))
     for name in default_entries(with_lcm):
@@ -334,7 +338,7 @@ def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(meshes, 
     # A threshold that some reach: the middle of all confidences after two views.
     threshold = float(np.median(replay("lem", specs, 2, 0).confidences[:, 1]))
     for name in ("lem", "lem-peak", "unidirectional", "test_replay:ToItsBack"):
-        policy = make_policy(name, sphere, specs.valley_classes())
+        policy = make_policy(name, sphere, specs.valley_classes("lem"))
         paths = replay(name, specs, 5, 0)
         ends = truncate(paths, threshold)
         for e, (i, start) in enumerate(zip(specs.objects, specs.starts, strict=True)):

@@ -49,7 +49,7 @@ def frame(pose, move=np.eye(4), scale=1.0, meshes=(TABLE, SOFA), masked=False, *
 
 
 def begin(models, policy=None, max_views=4, threshold=1.0, seed=0, sphere=SPHERE, **more) -> Session:
-    policy = policy or MapPeak(SPHERE)
+    policy = policy or MapPeak(SPHERE, "lem")
     stopping = Stopping(threshold, max_views)
     return Session(models, policy, sphere, 0, stopping, np.random.default_rng(seed), **({"distance": 0.7} | more))
 
@@ -294,7 +294,7 @@ def test_views_near_the_place_count_as_visited(tiny):
 @given(st.data(), st.sampled_from(["40", "fibonacci:30"]), st.sampled_from(["random-all", "spread", "lem"]))
 def test_failed_and_unreachable_views_never_come(tiny, data, layout, name):
     sphere = viewpoints_of(layout)
-    policy = MapPeak(SPHERE) if name == "lem" else make_policy(name, sphere)
+    policy = MapPeak(SPHERE, "lem") if name == "lem" else make_policy(name, sphere)
     camera = SimulatedCamera(sample_mesh("chair"), 16)
     session = begin(tiny, policy, sphere=sphere, max_views=6, distance=None, seed=data.draw(st.integers(0, 99)))
     mask = np.random.default_rng(data.draw(st.integers(0, 999))).random(len(sphere)) < data.draw(st.floats(0.05, 1))

@@ -128,12 +128,12 @@ def test_peaks_of_a_sphere_are_those_of_a_maximum_filter_that_wraps():
 def test_the_map_of_the_sphere_is_counted_from_the_view():
     values = np.random.default_rng(0).random((2, 5, 8))
     state = state_of(SPHERE, [11], [24], **{"lem-sphere": values})
-    on_sphere = SpherePeak(SPHERE).view_values(state)
+    on_sphere = SpherePeak(SPHERE, "lem-sphere").view_values(state)
     for row, azimuth in enumerate((3, 0)):
         for view in range(40):
             assert on_sphere[row, view] == values[row, view // 8, (view % 8 - azimuth) % 8]
-    chosen = SpherePeak(SPHERE).next_views(state, np.random.default_rng(0))
-    scores = SpherePeak(SPHERE).scores(state)
+    chosen = SpherePeak(SPHERE, "lem-sphere").next_views(state, np.random.default_rng(0))
+    scores = SpherePeak(SPHERE, "lem-sphere").scores(state)
     assert scores[[0, 1], chosen].tolist() == np.where(state.free, scores, -9).max(1).tolist()
 
 

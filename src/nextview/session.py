@@ -294,7 +294,7 @@ class Session:
             raise SessionError(
                 "this policy wants to know the azimuth bin that is seen, and the recogniser was not taught it"
             )
-        missing = [name for name in maps_among(policy.needs) if name.removesuffix("-sphere") not in models.maps]
+        missing = [name for name in maps_among(policy.needs) if name not in models.map_names]
         if missing:
             raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")
         if distance is not None and not 0 < number(distance, "the distance") < np.inf:

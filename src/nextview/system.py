@@ -19,11 +19,12 @@ from numpy.typing import ArrayLike
 from nextview.arguments import as_line, number, of_kind, takes_paths, whole
 from nextview.belief import Stopping
 from nextview.errors import MeshError, ModelError, OtherUseError, PolicyError, UsageError
+from nextview.measures.map_names import SPHERE
 from nextview.mesh import Mesh, load_mesh
 from nextview.models.collection import find_models
-from nextview.models.inference import MapNetwork, Models, Recogniser
+from nextview.models.inference import MapNetwork, Models, Recogniser, open_maps
 from nextview.observation import Camera
-from nextview.policies.base import Policy, maps_among
+from nextview.policies.base import Policy
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.registry import make_policy_anywhere, with_cards
 from nextview.session import FrameCamera, Recognition, Session
@@ -222,15 +223,11 @@ def load(
     else:
         name = with_cards(policy, found.policies)
         made = make_policy_anywhere(name, sphere, (), recogniser.classes, found.maps)
-    names = dict.fromkeys(name.removesuffix("-sphere") for name in maps_among(made.needs))
-    missing = [name for name in names if name not in found.maps]
-    if missing:
-        raise ModelError(f"policy {policy} needs the map {missing[0]!r}; there are {', '.join(found.maps)}")
-    opened = Models(recogniser, {name: MapNetwork(found.maps[name], threads) for name in names})
-    if policy in names:  # a map's own policy goes to the valley for some classes, which the map's card names
+    opened = Models(recogniser, open_maps(found.maps, made.needs, threads))
+    if policy in opened.maps:  # a map's own policy goes to the valley for some classes, which the map's card names
         made = make_policy_anywhere(policy, sphere, opened.valley_classes(policy), recogniser.classes, found.maps)
     if isinstance(made, MapPeak | SpherePeak):
-        made = replace(made, sphere=_grid_of(opened.maps[made.map_name.removesuffix("-sphere")], made.sphere))
+        made = replace(made, sphere=_grid_of(opened.maps[made.map_name.removesuffix(SPHERE)], made.sphere))
     stopping = Stopping.of(recogniser.calibration, threshold, risk, max_views)
     return System(opened, made, policy, sphere, stopping, unknown, given)
 

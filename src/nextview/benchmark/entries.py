@@ -15,12 +15,13 @@ from nextview.benchmark.true_maps import TRUE, known_maps, true_measure
 from nextview.data.predictions import Predictions
 from nextview.data.world_sight import WorldSight
 from nextview.errors import EntryError, OtherUseError
+from nextview.measures.map_names import LCM, LEM, SPHERE, in_order
 from nextview.policies.base import Policy, Scope
 from nextview.policies.fixed import ViewList, orbit, ranked
 from nextview.policies.maps import MapPeak
 from nextview.policies.oracle import OracleGain, OracleMeasure, OracleValley
 from nextview.policies.policy_card import bundled_policies
-from nextview.policies.registry import DEFAULT, POLICIES, VISIBLE, make_policy
+from nextview.policies.registry import DEFAULT, POLICIES, VISIBLE, make_policy, map_policy, map_policy_names
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class EpisodeSpecs:
         """True class of each episode's object, (E,) int64."""
         return self.predictions.labels[self.objects]
 
-    def valley_classes(self, map_name: str = "lem") -> tuple[int, ...]:
+    def valley_classes(self, map_name: str) -> tuple[int, ...]:
         """Classes (indices) for which the valley of a map is taken to be the better view."""
         if self.valleys is not None:
             return self.valleys
@@ -56,20 +57,25 @@ class EpisodeSpecs:
 
 
 ORACLES: dict[str, Callable[[EpisodeSpecs], Policy]] = {
-    "oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes()),
-    "true-lem": lambda t: MapPeak(t.predictions.sphere, "true-lem", t.valley_classes()),
-    "true-lem-peak": lambda t: MapPeak(t.predictions.sphere, "true-lem"),
-    "true-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes(), "true-lem"),
-    "lcm-oracle-valley": lambda t: OracleValley(t.predictions.sphere, t.labels, t.valley_classes("lcm"), "lcm"),
-    "true-lcm": lambda t: MapPeak(t.predictions.sphere, "true-lcm"),
+    "oracle-valley": lambda t: _oracle(t, "", LEM, "-oracle-valley"),
+    f"{TRUE}{LEM}": lambda t: _oracle(t, TRUE, LEM, ""),
+    f"{TRUE}{LEM}-peak": lambda t: _oracle(t, TRUE, LEM, "-peak"),
+    f"{TRUE}oracle-valley": lambda t: _oracle(t, TRUE, LEM, "-oracle-valley"),
+    f"{LCM}-oracle-valley": lambda t: _oracle(t, "", LCM, "-oracle-valley"),
+    f"{TRUE}{LCM}": lambda t: _oracle(t, TRUE, LCM, "-peak"),
     "oracle-gain": lambda t: _gain(t, "local"),
     "oracle-gain-all": lambda t: _gain(t, "global"),
 }
-"""Policies that are told the truth, or climb the true map. Every other map has such too, see ``MAP_ENTRY``."""
+"""Policies that are told the truth, or climb the true map, and are always compared: the thesis's, under its names, and
+the ceiling. Every map has such, see ``MAP_ORACLE``."""
 
-MAP_ENTRY = re.compile(r"(true-)?(.+?)(-peak|-oracle-valley)?")
-"""Names of entries that climb a map, the predicted or the true one: to its peak, or to its valley for some classes, by
-the belief or by the truth."""
+MAP_ORACLE = re.compile(r"(true-)?(.+?)(-peak|-oracle-valley)?")
+"""Oracles by a map. "true-MAP" climbs the true one: to its peaks, or to its valleys for some classes, by the belief;
+"true-MAP-peak" always to its peaks. With "-oracle-valley" the true class decides, of the predicted map too."""
+
+MORE = f"{LEM}{SPHERE}-peak"
+"""A rival from the literature, by Parisotto et al., see ``maps.SpherePeak``: the only one by a map of the whole sphere
+that is always compared."""
 
 FIXED = {
     "best": "the views in which the true class has the most confidence",
@@ -105,8 +111,8 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
     """All that these predictions allow. Fixed views do not ask what can be reached, so worlds have none."""
     sphere = specs.predictions.sphere
     n, v = sphere.azimuths, len(sphere)
-    maps = [name for name in specs.predictions.maps if name not in POLICIES and not name.endswith("-sphere")]
-    names = [*POLICIES, *(each for name in maps for each in (name, f"{name}-peak"))]
+    maps = [name for name in in_order(specs.predictions.maps) if not name.endswith(SPHERE)]
+    names = [*POLICIES, *(each for name in maps for each in (name, f"{name}-peak")), MORE]
     names = [*names, *(name for name in bundled_policies() if _fits(name, specs)), *ORACLES]
     among = [name for name in IN_WORLDS if not name.startswith(VISIBLE) or _fits(name, specs)]
     names = [*(name for name in names if name not in IN_WORLDS), *(among if specs.worlds is not None else [])]
@@ -144,29 +150,33 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
     if true := TRUE_MEASURE.fullmatch(name):
         values = true_measure(specs.predictions, true[1])[specs.objects].astype(np.float64)
         return OracleMeasure(specs.predictions.sphere, values, true[2] == "-peak")
-    card, p = name.partition("@")[0].removeprefix(VISIBLE), specs.predictions
-    by_map = None if name in POLICIES or card in bundled_policies() else _map_policy(name, specs)
+    p, plain = specs.predictions, name.partition("@")[0]
+    by_map = _map_oracle(name, specs)
     if by_map is not None:
         return by_map
-    if name.partition("@")[0] in POLICIES or card in bundled_policies() or card.endswith(".json") or ":" in name:
-        return make_policy(name, p.sphere, specs.valley_classes(name.removesuffix("-peak")), p.classes)
-    names = [*POLICIES, *bundled_policies(), *ORACLES, "true-MEASURE-all", *(f"{kind}-K" for kind in FIXED)]
+    known = plain in POLICIES or map_policy(plain, p.sphere, (), p.maps) is not None
+    card = plain.removeprefix(VISIBLE)
+    if known or card in bundled_policies() or card.endswith(".json") or ":" in name:
+        return make_policy(name, p.sphere, specs.valley_classes(plain), p.classes, p.maps)
+    names = [*POLICIES, *map_policy_names(p.maps), *bundled_policies(), *ORACLES]
+    names += ["true-MEASURE-all", *(f"{kind}-K" for kind in FIXED)]
     raise EntryError(f"no policy is called {name!r}; there are {', '.join(names)}")
 
 
-def _map_policy(name: str, specs: EpisodeSpecs) -> Policy | None:
-    """The policy that climbs a map which the predictions hold, or whose truth can be told; None if there is none."""
-    match = MAP_ENTRY.fullmatch(name)
-    if match is None:
-        return None
-    true, of, how = match.groups()
-    p = specs.predictions
-    if of not in (known_maps(p) if true else p.maps):
-        return None
-    climbed = f"{true or ''}{of}"
+def _map_oracle(name: str, specs: EpisodeSpecs) -> Policy | None:
+    """The oracle of that name, see ``MAP_ORACLE``; None if it is none, or its map is not known."""
+    match, p = MAP_ORACLE.fullmatch(name), specs.predictions
+    true, of, how = match.groups("") if match else ("", "", "")
+    predicted = [name for name in p.maps if how == "-oracle-valley" and not name.endswith(SPHERE)]
+    return _oracle(specs, true, of, how) if of in (known_maps(p) if true else predicted) else None
+
+
+def _oracle(t: EpisodeSpecs, true: str, of: str, how: str) -> Policy:
+    """The oracle by a map, the true one where ``true`` is TRUE; ``how`` ends its name."""
+    sphere, valleys = t.predictions.sphere, t.valley_classes(of)
     if how == "-oracle-valley":
-        return OracleValley(p.sphere, specs.labels, specs.valley_classes(of), climbed)
-    return MapPeak(p.sphere, climbed, () if how == "-peak" else specs.valley_classes(of))
+        return OracleValley(sphere, t.labels, valleys, true + of)
+    return MapPeak(sphere, true + of, () if how == "-peak" else valleys)
 
 
 def _ready(name: str, specs: EpisodeSpecs) -> bool:

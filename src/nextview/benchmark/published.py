@@ -8,12 +8,14 @@ from importlib.resources import files
 
 import numpy as np
 
+from nextview.measures.map_names import LCM, LEM
+
 COLUMNS = {
     "random": "random",
     "furthest": "furthest",
     "unidirectional": "unidirectional",
     "oracle-valley": "LEM10",  # the thesis takes peak or valley by the true class
-    "lcm-peak": "LCM10",
+    f"{LCM}-peak": "LCM10",
 }
 """Policies of tables 5, 8 to 11 under their published names."""
 
@@ -105,7 +107,7 @@ def published_map(name: str, measure: str, classes: tuple[str, ...], label: str 
     Table 4's peaks are means over table 7's classes, and its loss is the mean over objects; the text does not say so.
 
     Args:
-        name: of the map, "lem" or "lcm".
+        name: of the map; LEM and LCM have some.
         measure: "mse" (the published loss, which has 1e-4 of a regulariser in it), "d0", "d_le_1" or "d_lt_2", over
             objects or, with "class_" before it, over classes.
         classes: of the data.
@@ -120,7 +122,7 @@ def published_map(name: str, measure: str, classes: tuple[str, ...], label: str 
         for row in read_rows("table4_map_prediction"):
             if (row["model"].lower(), int(row["classes_train"]), int(row["classes_test"])) == (name, n, n):
                 return float(row[column])
-    if (name, n) == ("lem", 10) and (label is not None or over_classes):
+    if (name, n) == (LEM, 10) and (label is not None or over_classes):
         rows = read_table("table7_lem_per_class_modelnet10")
         return rows[label][column] if label is not None else float(np.mean([row[column] for row in rows.values()]))
     return None

@@ -17,6 +17,7 @@ from nextview.benchmark.replay import make_specs
 from nextview.benchmark.summary import summarise
 from nextview.data.predictions import Predictions
 from nextview.errors import EntryError, UsageError
+from nextview.measures.map_names import LEM
 from nextview.models.model_card import file_hash
 from nextview.outputs import check_folder, written_results
 from nextview.policies.registry import with_cards
@@ -126,7 +127,7 @@ def run_benchmark(
             "threshold_decay": threshold_decay,
             "runs": runs,
             "max_views": max_views,
-            "valley_classes": [table.classes[i] for i in specs.valley_classes()],
+            "valley_classes": [table.classes[i] for i in specs.valley_classes(LEM)],
             "samples": samples,
             "seed": seed,
         }

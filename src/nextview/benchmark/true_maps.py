@@ -13,7 +13,7 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.measures.confidence_map import confidence_maps
 from nextview.measures.depth_entropy import normalise_per_object
-from nextview.measures.map_names import map_name, measure_of
+from nextview.measures.map_names import CONFIDENCE, map_name, measure_of
 
 TRUE = "true-"
 """How the names of true maps begin."""
@@ -29,8 +29,9 @@ def true_lcm(p: Predictions) -> NDArray[np.float32]:
     return confidence_maps(p.logits, p.labels)[:, p.sphere.windows]
 
 
-IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {"lem": true_lem, "lcm": true_lcm}
-"""Maps whose truth the predictions themselves tell; that of others stands in the store that they were made from."""
+IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {"depth_entropy": true_lem, CONFIDENCE: true_lcm}
+"""Measures whose true maps the predictions themselves tell; those of others stand in the store that they were made
+from."""
 
 
 def true_map(p: Predictions, name: str) -> NDArray[np.float32]:
@@ -39,14 +40,15 @@ def true_map(p: Predictions, name: str) -> NDArray[np.float32]:
     Raises:
         EntryError: neither the predictions nor their store tell it.
     """
-    if name in IN_PREDICTIONS:
-        return IN_PREDICTIONS[name](p)
-    return normalise_per_object(true_measure(p, measure_of(name)))[:, p.sphere.windows]
+    measure = measure_of(name)
+    if measure in IN_PREDICTIONS:
+        return IN_PREDICTIONS[measure](p)
+    return normalise_per_object(true_measure(p, measure))[:, p.sphere.windows]
 
 
 def known_maps(p: Predictions) -> tuple[str, ...]:
     """Names of the maps whose truth can be told."""
-    return (*IN_PREDICTIONS, *(name for name in map(map_name, stored_measures(p.store)) if name not in IN_PREDICTIONS))
+    return tuple(map(map_name, dict.fromkeys((*IN_PREDICTIONS, *stored_measures(p.store)))))
 
 
 def stored_measures(store: str) -> tuple[str, ...]:

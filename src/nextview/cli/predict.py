@@ -18,7 +18,7 @@ def predict(
     models: str = "modelnet10",
     recogniser: tuple[str, ...] = (),
     held_out: bool = False,
-    maps: tuple[str, ...] = ("lem", "lcm"),
+    maps: tuple[str, ...] | None = None,
     by_shape: bool = False,
     batch: int = 8,
     workers: int | None = None,
@@ -34,7 +34,7 @@ def predict(
         recogniser: instead, name of a bundled model or path of a card. Several with --held-out.
         held_out: let each object be judged by a recogniser from whose training it was held out (nextview train
             recogniser --folds makes such), and leave out those that all were trained on.
-        maps: maps to predict with those models, or NAME=CARD for others.
+        maps: maps to predict with those models, or NAME=CARD for others; all that those models predict by default.
         by_shape: recognise by shape alone. By default the size of the objects counts too, where the store knows it
             (nextview render --unit) and the card of the recogniser says what sizes mean (nextview fit size).
         batch: views a call of the networks.
@@ -54,7 +54,7 @@ def predict(
     if out.suffix != ".npz":
         raise UsageError(f"{out}: predictions are one .npz file; end the name in .npz")
     found, cards = find_models(models), {}
-    for item in maps:
+    for item in found.maps if maps is None else maps:
         name, _, card = item.partition("=")
         if not card and name not in found.maps:
             raise ModelError(f"no network of {models} predicts the map {name!r}; there are {', '.join(found.maps)}")

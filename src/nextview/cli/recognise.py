@@ -55,8 +55,9 @@ def recognise(
         path: OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder of captured views.
         models: bundled models by name, or a folder with models of your own.
         policy: how the next view is chosen: gain (the predicted gain of a view less its weighted travel; the default),
-            lem, lem-peak, lcm, lcm-peak, random, random-all, furthest, unidirectional, spread, spread-local, another
-            learned one, the card of one (.json), or MODULE:CLASS for your own.
+            MAP, MAP-peak or MAP-sphere-peak for a map of the models (lem, lcm), random, random-all, furthest,
+            unidirectional, spread, spread-local, another learned one, the card of one (.json), or MODULE:CLASS for your
+            own.
         threshold: stop when the belief in one class reaches this after one view, less after several.
         risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
         max_views: stop after so many views.

@@ -30,7 +30,7 @@ from nextview.viewsphere import ViewSphere
 def plannable() -> list[str]:
     """The policies of the registry that need the depth that was seen, and nothing else."""
     grid = ViewSphere.named("40")
-    return [name for name, make in POLICIES.items() if tuple(make(grid, ()).needs) == ("observations",)]
+    return [name for name, make in POLICIES.items() if tuple(make(grid).needs) == ("observations",)]
 
 
 @takes_paths("path")

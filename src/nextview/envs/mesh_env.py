@@ -20,7 +20,7 @@ from nextview.envs.task import Rules, Split, Task
 from nextview.errors import DatasetError
 from nextview.mesh import Mesh, load_mesh
 from nextview.models.collection import find_models
-from nextview.models.inference import MapNetwork, Models, Recogniser
+from nextview.models.inference import Models, Recogniser, open_maps
 from nextview.observation import Observation
 from nextview.policies.base import Evidence
 from nextview.viewsphere import ViewSphere
@@ -64,8 +64,7 @@ class RecogniseMeshEnv(TaskEnv):
     ) -> None:
         whole(size, "the side of an image", 1, LARGEST)
         given, found, sphere = Rules(**rules), find_models(models), ViewSphere.named(viewpoints)
-        wanted = dict.fromkeys(name.removesuffix("-sphere") for name in given.maps)
-        networks = Models(Recogniser(found.recogniser), {name: MapNetwork(found.maps[name]) for name in wanted})
+        networks = Models(Recogniser(found.recogniser), open_maps(found.maps, given.maps))
         objects = _samples() if meshes is None else _of_folder(Path(meshes), split)
         unknown = [label for _, label, _ in objects if label not in networks.classes]
         if unknown:

@@ -9,6 +9,8 @@ from nextview.arguments import of_kind
 from nextview.data.predictions import Predictions
 from nextview.envs.task import Rules, Split, Task
 from nextview.errors import PredictionsError
+from nextview.measures.map_names import in_order
+from nextview.policies.gain import INPUTS
 
 
 def replayed(
@@ -35,7 +37,8 @@ def replayed(
     p = p.deduplicate() if split == "train" else p
     lacking = [name for name in rules.maps if name not in p.maps]
     if lacking:
-        raise PredictionsError(f"these predictions hold no map {lacking[0]!r}; there are {', '.join(p.maps) or 'none'}")
+        known = ", ".join((*INPUTS, *in_order(p.maps)))
+        raise PredictionsError(f"these predictions hold no map {lacking[0]!r}; inputs are some of {known}")
     if ("azimuth_bin" in rules.inputs or rules.frame == "object") and p.azimuth_bins is None:
         raise PredictionsError("these predictions hold no azimuth bins, which the inputs or the frame need")
     p = replace(p, maps={name: p.maps[name] for name in rules.maps})

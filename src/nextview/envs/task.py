@@ -16,7 +16,7 @@ from nextview.belief import Calibration, FixedLength, Stopping
 from nextview.calibration.rollout import OBJECTIVES
 from nextview.errors import UsageError
 from nextview.policies.base import Evidence
-from nextview.policies.gain import INPUTS, MAPS, Frame, mirrored_features
+from nextview.policies.gain import INPUTS, Frame, maps_of, mirrored_features, ordered
 from nextview.viewsphere import ViewSphere
 
 Split = Literal["train", "test"]
@@ -32,8 +32,8 @@ class Rules:
 
     Attributes:
         inputs: what an observation is made of, some of ``policies.gain.INPUTS``: "belief" over all views, "view", what
-            the last one alone says, "place", the ring and which views are visited, maps ("lem", "lem-sphere"), and
-            "azimuth_bin". None of it depends on the absolute azimuth.
+            the last one alone says, "place", the ring and which views are visited, "azimuth_bin"; and predicted maps by
+            name ("lem", "view_area-sphere"). None of it depends on the absolute azimuth.
         frame: from where the azimuths of actions and observations are counted: the camera's, or that at which the
             object is believed to show its azimuth bin 0.
         objective: what is paid: by how much a view changes "right", 1 where the most believed class is the true one, 0
@@ -63,7 +63,7 @@ class Rules:
         for word in (*self.inputs, self.frame, self.objective):
             of_kind(word, str, "inputs, frame and objective are names")
         for given, known, what in (
-            (self.inputs, INPUTS, "an observation"),
+            (self.inputs, (*INPUTS, *self.maps), "an observation"),
             ((self.frame,), get_args(Frame), "the frame"),
             ((self.objective,), OBJECTIVES, "the objective"),
         ):
@@ -83,7 +83,7 @@ class Rules:
     @property
     def maps(self) -> tuple[str, ...]:
         """The maps among the inputs."""
-        return tuple(name for name in MAPS if name in self.inputs)
+        return maps_of(self.inputs)
 
     def stopping(self, calibration: Calibration) -> Stopping:
         """The rule that ends episodes, with the decay that the calibration asks for."""
@@ -177,8 +177,8 @@ class Task:
     def observation_space(self) -> gymnasium.spaces.Box:
         """Of the numbers that ``policies.gain.features`` makes, (D,) float32; all but the maps from 0 to 1."""
         c, rules = len(self.classes), self.rules
-        widths = {name: len(mirrored_features(self.sphere, c, (name,), rules.frame)) for name in INPUTS}
-        high = np.concatenate([np.full(widths[n], FAR if n in MAPS else 1.0) for n in INPUTS if n in rules.inputs])
+        widths = {name: len(mirrored_features(self.sphere, c, (name,), rules.frame)) for name in ordered(rules.inputs)}
+        high = np.concatenate([np.full(wide, FAR if name in rules.maps else 1.0) for name, wide in widths.items()])
         return gymnasium.spaces.Box(np.where(high > 1, -FAR, 0).astype(np.float32), high.astype(np.float32))
 
     @property

@@ -21,8 +21,9 @@ from nextview.errors import NextviewError, UsageError
 from nextview.explorer.card import class_card, gallery, preview_card, walk_card
 from nextview.explorer.exploration import Exploration, Walk
 from nextview.explorer.walk_scene import WalkScene
+from nextview.models.collection import find_models
 from nextview.policies.policy_card import bundled_policies
-from nextview.policies.registry import POLICIES
+from nextview.policies.registry import POLICIES, map_policy_names
 
 NOTHING, CLEAN = "nothing", "clean renders"
 GALLERY = 6
@@ -92,7 +93,8 @@ class Page:
 
     def _controls(self, gui: viser.GuiApi) -> None:
         exploration = self.exploration
-        policies = list(dict.fromkeys([*exploration.policies, *bundled_policies(), *POLICIES]))
+        by_map = map_policy_names(find_models(exploration.systems[0].loaded["models"]).maps)
+        policies = list(dict.fromkeys([*exploration.policies, *bundled_policies(), *POLICIES, *by_map]))
         second = exploration.policies[1] if len(exploration.policies) > 1 else NOTHING
         gui.main_panel.dock_left()
         gui.add_markdown(HELP)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from nextview.errors import ModelError
+from nextview.measures.map_names import LCM, LEM, SPHERE
 from nextview.models.model_card import ModelCard, find_card
 from nextview.models.network_input import from_observations
 from nextview.models.onnx_file import check_end, check_input, open_onnx, run_onnx
@@ -27,7 +28,8 @@ BINS_OUTPUT = "sides"
 """The name that the azimuth bins have in a recogniser's ONNX file."""
 FEATURES_OUTPUT = "features"
 """The name there of what the last layers make the logits of, (B, F): only the novelty score needs it."""
-MAPS = {"lem": "lem-modelnet10", "lcm": "lcm-modelnet10"}
+MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}
+"""The map networks that are bundled, by the name of the map."""
 
 
 def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
@@ -141,11 +143,9 @@ class MapNetwork:
 
     def from_inputs(self, inputs: NDArray[Any]) -> dict[str, NDArray[np.float32]]:
         """The same from what the network takes, see ``network_input``."""
-        names = {"map": self.card.kind} | (
-            {"sphere": f"{self.card.kind}-sphere"} if self.card.output == "sphere" else {}
-        )
-        found = run_onnx(self.card.path, self._session, list(names), inputs)
-        return dict(zip(names.values(), found, strict=True))
+        names = self.card.maps
+        found = run_onnx(self.card.path, self._session, ["map", "sphere"][: len(names)], inputs)
+        return dict(zip(names, found, strict=True))
 
 
 @dataclass(frozen=True)
@@ -159,6 +159,11 @@ class Models:
     def classes(self) -> tuple[str, ...]:
         """Names of the classes, in the order of the logits."""
         return self.recogniser.classes
+
+    @property
+    def map_names(self) -> tuple[str, ...]:
+        """Names of the maps that the networks predict."""
+        return names_of(self.maps)
 
     def valley_classes(self, map_name: str) -> tuple[int, ...]:
         """Classes (indices) for which a map's valley is the better view, as its card says; none without that map."""
@@ -175,7 +180,33 @@ class Models:
         return replace(said, maps=maps, observations=observations, shown=shown)
 
 
-def load_models(maps: Sequence[str] = ("lem",), recogniser: str | Path = RECOGNISER, threads: int = 0) -> Models:
+def names_of(networks: Mapping[str, MapNetwork]) -> tuple[str, ...]:
+    """Names of the maps that some networks predict."""
+    return tuple(name for network in networks.values() for name in network.card.maps)
+
+
+def open_maps(cards: Mapping[str, str | Path], needs: Sequence[str], threads: int = 0) -> dict[str, MapNetwork]:
+    """The networks that predict the maps which are needed, by the name of the map of the local window.
+
+    Args:
+        cards: of map networks, by that name: names of bundled models, or paths of cards.
+        needs: a policy's; those that are no maps take no network.
+        threads: of ONNX Runtime, 0 for one on each core.
+
+    Raises:
+        ModelError: no network predicts one of the maps, or one is missing, damaged or of the wrong kind.
+    """
+    wanted = maps_among(needs)
+    names = dict.fromkeys(name.removesuffix(SPHERE) for name in wanted)
+    networks = {name: MapNetwork(cards[name], threads) for name in names if name in cards}
+    missing = [name for name in wanted if name not in names_of(networks)]
+    if missing:
+        known = (name for card in cards.values() for name in find_card(card).maps)
+        raise ModelError(f"no network predicts the map {missing[0]!r}; there are {', '.join(known)}")
+    return networks
+
+
+def load_models(maps: Sequence[str] = (), recogniser: str | Path = RECOGNISER, threads: int = 0) -> Models:
     """The bundled recogniser, or the one whose card is given, and the bundled map networks of the given names.
 
     The names may be a policy's needs: "azimuth_bins" takes no network beside the recogniser.
@@ -183,8 +214,4 @@ def load_models(maps: Sequence[str] = ("lem",), recogniser: str | Path = RECOGNI
     Raises:
         ModelError: a model is missing, damaged or of the wrong kind.
     """
-    names = list(dict.fromkeys(name.removesuffix("-sphere") for name in maps_among(maps)))
-    unknown = [name for name in names if name not in MAPS]
-    if unknown:
-        raise ModelError(f"no map is called {unknown[0]!r}; there are {', '.join(MAPS)}")
-    return Models(Recogniser(recogniser, threads), {name: MapNetwork(MAPS[name], threads) for name in names})
+    return Models(Recogniser(recogniser, threads), open_maps(MAPS, maps, threads))

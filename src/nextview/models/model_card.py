@@ -13,7 +13,7 @@ from nextview.arguments import a_path, takes_paths
 from nextview.belief import PLAIN_SUM, Calibration
 from nextview.errors import ModelError
 from nextview.json_file import Fields, read_object
-from nextview.measures.map_names import Good, measure_of
+from nextview.measures.map_names import SPHERE, Good, measure_of
 from nextview.models.network_input import InputSpec
 from nextview.models.size_evidence import SizeEvidence
 from nextview.outputs import written_whole
@@ -127,6 +127,11 @@ class ModelCard:
     def is_recogniser(self) -> bool:
         """Whether it is a recogniser, and not a map network."""
         return self.kind == "recogniser"
+
+    @property
+    def maps(self) -> tuple[str, ...]:
+        """Names of the maps that a map network predicts: of the local window and, if it knows it, of the sphere."""
+        return (self.kind, self.kind + SPHERE)[: 2 if self.output == "sphere" else 1]
 
     @classmethod
     def from_dict(cls, values: Any, path: Path) -> ModelCard:

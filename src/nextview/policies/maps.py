@@ -54,13 +54,13 @@ class MapPeak:
 
     Attributes:
         sphere: the viewpoints.
-        map_name: the map in the evidence, "lem".
+        map_name: the map in the evidence, (B, rings, 3).
         valley_classes: classes (indices) for which the lowest valley is the better view. What counts is the class
             *believed* at that moment; the true one is unknown to a robot.
     """
 
     sphere: ViewSphere
-    map_name: str = "lem"
+    map_name: str
     valley_classes: tuple[int, ...] = ()
 
     @property
@@ -95,12 +95,13 @@ class MapPeak:
 
 @dataclass(frozen=True)
 class SpherePeak:
-    """Go to the highest unvisited peak of a predicted entropy map of the whole sphere, then to the highest other view.
+    """Go to the highest unvisited peak of a predicted map of the whole sphere, then to the highest other view.
 
-    As in Parisotto, Mukherjee and Kasaei, "MORE: simultaneous multi-view 3D object recognition and pose estimation"
-    (Intelligent Service Robotics 16, 2023): a network predicts the depth-entropy of all views around the object from
-    one of them, and the map's local peaks are the views to take. Simplified: they settle the views after the first one,
-    on 60 viewpoints; here the map is predicted anew from each view, on the grid that the network was taught.
+    With the map of the entropy, as in Parisotto, Mukherjee and Kasaei, "MORE: simultaneous multi-view 3D object
+    recognition and pose estimation" (Intelligent Service Robotics 16, 2023): a network predicts the depth-entropy of
+    all views around the object from one of them, and the map's local peaks are the views to take. Simplified: they
+    settle the views after the first one, on 60 viewpoints; here the map is predicted anew from each view, on the grid
+    that the network was taught.
 
     Attributes:
         sphere: the viewpoints.
@@ -108,7 +109,7 @@ class SpherePeak:
     """
 
     sphere: ViewSphere
-    map_name: str = "lem-sphere"
+    map_name: str
     travel_weight = 0.0
 
     @property

@@ -27,7 +27,7 @@ class OracleValley:
     sphere: ViewSphere
     labels: NDArray[np.int64]
     valley_classes: tuple[int, ...]
-    map_name: str = "lem"
+    map_name: str
 
     @property
     def needs(self) -> tuple[str, ...]:

@@ -11,6 +11,8 @@ import numpy as np
 
 from nextview.arguments import as_line, of_kind
 from nextview.errors import PolicyError
+from nextview.measures.map_names import SPHERE, in_order
+from nextview.models.inference import MAPS
 from nextview.occupancy import new_surface, new_volume
 from nextview.own_code import import_own, own_code
 from nextview.policies.base import Policy
@@ -23,22 +25,18 @@ from nextview.policies.visibility import Visibility, VisibleGain
 from nextview.policies.volumetric import Volumetric
 from nextview.viewsphere import Viewpoints, ViewSphere
 
-POLICIES: dict[str, Callable[[Any, tuple[int, ...]], Policy]] = {
-    "random": lambda sphere, valleys: Random(sphere),
-    "random-all": lambda sphere, valleys: RandomAll(sphere),
-    "furthest": lambda sphere, valleys: Furthest(sphere),
-    "unidirectional": lambda sphere, valleys: Unidirectional(sphere),
-    "spread": lambda sphere, valleys: Spread(sphere),
-    "spread-local": lambda sphere, valleys: Spread(sphere, "local"),
-    "lem": lambda sphere, valleys: MapPeak(sphere, "lem", valleys),
-    "lem-peak": lambda sphere, valleys: MapPeak(sphere, "lem"),
-    "lcm": lambda sphere, valleys: MapPeak(sphere, "lcm", valleys),
-    "lcm-peak": lambda sphere, valleys: MapPeak(sphere, "lcm"),
-    "lem-sphere-peak": lambda sphere, valleys: SpherePeak(sphere, "lem-sphere"),
-    "volumetric": lambda sphere, valleys: Volumetric(sphere, new_volume),
-    "coverage": lambda sphere, valleys: Volumetric(sphere, new_surface),
-    "visibility": lambda sphere, valleys: Visibility(sphere),
+POLICIES: dict[str, Callable[[Any], Policy]] = {
+    "random": Random,
+    "random-all": RandomAll,
+    "furthest": Furthest,
+    "unidirectional": Unidirectional,
+    "spread": Spread,
+    "spread-local": lambda sphere: Spread(sphere, "local"),
+    "volumetric": lambda sphere: Volumetric(sphere, new_volume),
+    "coverage": lambda sphere: Volumetric(sphere, new_surface),
+    "visibility": Visibility,
 }
+"""Those that follow no map; every predicted map has its own, see ``map_policy``."""
 
 ANYWHERE = ("random-all", "spread", "volumetric", "coverage", "visibility")
 """Those that ask for no grid."""
@@ -60,14 +58,14 @@ def make_policy(
     """A policy by name.
 
     Args:
-        name: one of POLICIES, a map's name ("view_area": its peak, or its valley for the valley classes), the same with
-            "-peak" (always that), a learned one that is bundled, the path of a learned one's card (.json), the same
-            with "visible-" before it (a gain policy, times what shows), or "module:Class" for one of your own, which is
+        name: one of POLICIES, one by a map ("view_area", "view_area-peak", "view_area-sphere-peak", see
+            ``map_policy``), a learned one that is bundled, the path of a learned one's card (.json), the same with
+            "visible-" before it (a gain policy, times what shows), or "module:Class" for one of your own, which is
             called with the sphere alone. One that weighs travel takes another travel weight as NAME@WEIGHT.
         sphere: the viewpoints; a ``ViewSphere`` but for those of ANYWHERE and your own.
         valley_classes: classes (indices) whose believers go to the map's valley.
         classes: names of the recogniser's classes; a learned policy for others is refused.
-        maps: names of the maps that are predicted, beside those of POLICIES.
+        maps: names of the maps that are predicted, beside those of the bundled networks.
 
     Raises:
         PolicyError: there is no such policy, or it cannot be made.
@@ -87,17 +85,37 @@ def make_policy(
     if name in POLICIES:
         if name not in ANYWHERE and not isinstance(sphere, ViewSphere):
             raise PolicyError(f"policy {name} needs viewpoints on rings")
-        return POLICIES[name](sphere, tuple(valley_classes))
-    if name.removesuffix("-peak") in maps:
+        return POLICIES[name](sphere)
+    by_map = map_policy(name, sphere, valley_classes, maps)
+    if by_map is not None:
         if not isinstance(sphere, ViewSphere):
             raise PolicyError(f"policy {name} needs viewpoints on rings")
-        return MapPeak(sphere, name.removesuffix("-peak"), () if name.endswith("-peak") else tuple(valley_classes))
+        return by_map
     if name in learned or name.endswith(".json"):
         return read_policy(learned.get(name, Path(name)), sphere, classes)
     if ":" in name:
         return _import_policy(name, sphere)
-    known = [*POLICIES, *maps, *learned, f"{VISIBLE}{DEFAULT}"]
+    known = [*POLICIES, *map_policy_names(maps), *learned, f"{VISIBLE}{DEFAULT}"]
     raise PolicyError(f"no policy is called {name!r}; there are {', '.join(known)}")
+
+
+def map_policy(name: str, sphere: Any, valley_classes: Sequence[int], maps: Collection[str]) -> Policy | None:
+    """The policy that climbs a predicted map; None if the name is not that of one.
+
+    MAP goes to the peaks of the local window, and to its valleys for the valley classes; MAP-peak always to the peaks;
+    MAP-sphere-peak to those of the whole sphere. Arguments as for ``make_policy``.
+    """
+    of = name.removesuffix("-peak")
+    window, always = of.removesuffix(SPHERE), of != name
+    if window not in (*MAPS, *maps) or (of != window and not always):
+        return None
+    return MapPeak(sphere, of, () if always else tuple(valley_classes)) if of == window else SpherePeak(sphere, of)
+
+
+def map_policy_names(maps: Collection[str]) -> list[str]:
+    """Names of the policies that climb these maps and those of the bundled networks."""
+    windows = dict.fromkeys(name.removesuffix(SPHERE) for name in in_order((*MAPS, *maps)))
+    return [f"{name}{how}" for name in windows for how in ("", "-peak", f"{SPHERE}-peak")]
 
 
 def with_cards(name: str, cards: Mapping[str, Path]) -> str:
@@ -126,7 +144,7 @@ def make_policy_anywhere(
     if path is not None:
         about = read_policy_card(path)
         return make_policy(name, ViewSphere(about.elevations, about.azimuths), valley_classes, classes)
-    on_grid = (name in POLICIES and name not in ANYWHERE) or name.removesuffix("-peak") in maps
+    on_grid = (name in POLICIES and name not in ANYWHERE) or map_policy(name, viewpoints, (), maps) is not None
     if on_grid and not isinstance(viewpoints, ViewSphere):
         return make_policy(name, ViewSphere.named("40"), valley_classes, classes, maps)
     return make_policy(name, viewpoints, valley_classes, classes, maps)

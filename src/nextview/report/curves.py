@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold
 from nextview.benchmark.results import Results
+from nextview.measures.map_names import LCM, LEM
 from nextview.policies.policy_card import bundled_policies
-from nextview.policies.registry import DEFAULT, POLICIES
+from nextview.policies.registry import DEFAULT, POLICIES, map_policy_names
 from nextview.report.diagrams import confusion_matrix, draw_reliability, reliability_figure
 from nextview.report.style import ACCENT, BLUE, GREY, INK, LIGHT_BLUE, legend, new_figure, percent_axis
 
@@ -22,15 +23,15 @@ COLOURS = {
     "random-all": "#4a5560",
     "furthest": "#d99000",
     "unidirectional": LIGHT_BLUE,
-    "lem": BLUE,
-    "lem-peak": "#7a6fd0",
-    "lcm": "#00805a",
-    "lcm-peak": "#5bb98c",
+    LEM: BLUE,
+    f"{LEM}-peak": "#7a6fd0",
+    LCM: "#00805a",
+    f"{LCM}-peak": "#5bb98c",
     "oracle-valley": ACCENT,
-    "true-lem": BLUE,
-    "true-lem-peak": "#7a6fd0",
+    f"true-{LEM}": BLUE,
+    f"true-{LEM}-peak": "#7a6fd0",
     "true-oracle-valley": ACCENT,
-    "true-lcm": "#00805a",
+    f"true-{LCM}": "#00805a",
     "oracle-gain": "#111111",
     "oracle-gain-all": "#777777",
 }
@@ -50,7 +51,7 @@ def followed(results: Results) -> list[str]:
 
 def own_policies(results: Results) -> list[str]:
     """The user's own: a MODULE:CLASS, or a card that is not bundled."""
-    known = {*POLICIES, *bundled_policies()}
+    known = {*POLICIES, *map_policy_names(results.predictions.maps), *bundled_policies()}
     return [n for n in results.tables.sweep["policy"].unique() if not is_oracle(n) and n.split("@")[0] not in known]
 
 

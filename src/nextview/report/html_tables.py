@@ -10,6 +10,7 @@ from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.leaderboard import level_rows, promised_risks
 from nextview.benchmark.published import COLUMNS, published_threshold
 from nextview.benchmark.results import Results
+from nextview.measures.map_names import LEM
 from nextview.report.elements import NONE, Cell, Table, cell, label, numbers, percent
 
 KNOWING = ("best", "worst", "high", "low", "true")
@@ -125,7 +126,7 @@ def per_class(results: Results, measure: str, fallback: float) -> Table:
     thresholds = results.settings["thresholds"]
     ran = set(results.tables.sweep["policy"])
     at: dict[str, float] = {}
-    for name in ("lem", *COLUMNS):
+    for name in (LEM, *COLUMNS):
         wanted = published_threshold(name) or 0.99
         if name in ran:
             at[name] = wanted if wanted in thresholds else fallback

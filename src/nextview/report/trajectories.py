@@ -22,6 +22,7 @@ from nextview.data.store import ViewStore
 from nextview.data.world_views import world_views
 from nextview.errors import DatasetError, ResultsError
 from nextview.measures.depth_entropy import normalise_per_object
+from nextview.measures.map_names import LEM
 from nextview.shading import headlight
 
 CLOUD = 1500
@@ -181,7 +182,7 @@ def _thesis_paths(results: Results, row: dict[str, int]) -> dict[str, list[int]]
     p, seed = results.predictions, results.settings["seed"]
     valleys = tuple(p.classes.index(name) for name in results.settings["valley_classes"])
     specs = EpisodeSpecs(p, np.array([row[THESIS[0]]]), np.array([THESIS[1]]), valleys)
-    names = [name for name in (*COLUMNS, "lem") if name in set(results.tables.sweep["policy"])]
+    names = [name for name in (*COLUMNS, LEM) if name in set(results.tables.sweep["policy"])]
     paths = {}
     for name in names:
         path = replay(name, specs, results.settings["max_views"], seed)

@@ -11,11 +11,8 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from nextview.arguments import as_line, number, of_kind, whole
 from nextview.errors import UsageError
 
-PolicyInput = Literal["belief", "view", "place", "lem", "lcm", "lem-sphere", "lcm-sphere", "azimuth_bin"]
-"""What the network of a policy can be told; see ``policies.gain.INPUTS``."""
-POLICY_INPUTS: tuple[PolicyInput, ...] = ("belief", "view", "place", "lem-sphere", "azimuth_bin")
-"""By default."""
-
+POLICY_INPUTS = ("belief", "view", "place", "lem-sphere", "azimuth_bin")
+"""What the network of a policy is told by default; see ``policies.gain.INPUTS``."""
 
 MOST = {
     "size": 4096,
@@ -74,11 +71,12 @@ def _share(**options: float) -> None:
             raise UsageError(f"{_option(name)} is 0 or more and less than 1, not {value}")
 
 
-def _check_inputs(inputs: tuple[str, ...], *more: str) -> None:
-    known = (*get_args(PolicyInput), *more)
+def _check_inputs(inputs: tuple[str, ...]) -> None:
+    """See that there are some. Which maps there are, only the predictions know."""
+    if not inputs:
+        raise UsageError("--inputs names at least one input of the networks")
     for name in inputs:
-        if not isinstance(name, str) or name not in known:
-            raise UsageError(f"--inputs are some of {', '.join(known)}, not {as_line(name)}")
+        of_kind(name, str, "--inputs are names")
 
 
 def _option(name: str) -> str:
@@ -262,8 +260,8 @@ class GainRecipe:
     """How the gain policy is trained.
 
     Attributes:
-        inputs: of the networks; see ``policies.gain.INPUTS``; in worlds "visibility" too, the share of the object that
-            is expected to show from each view.
+        inputs: of the networks: belief, view, place, azimuth_bin (see ``policies.gain.INPUTS``) and any maps of the
+            predictions; in worlds visibility too, the share of the object that is expected to show from each view.
         frame: from where azimuths are counted: from the camera's, or from the one at which the object is believed to
             show its azimuth bin 0, which takes a recogniser that was taught the azimuth bins.
         objective: what a view is valued by: the belief in the true class after it, its logarithm, or whether the answer
@@ -279,7 +277,7 @@ class GainRecipe:
         seed: of everything random.
     """
 
-    inputs: tuple[PolicyInput | Literal["visibility"], ...] = POLICY_INPUTS
+    inputs: tuple[str, ...] = POLICY_INPUTS
     frame: Literal["camera", "object"] = "object"
     objective: Literal["belief", "log-belief", "right"] = "log-belief"
     n_views: int = 5
@@ -294,9 +292,7 @@ class GainRecipe:
 
     def __post_init__(self) -> None:
         _check_types(self)
-        if not self.inputs:
-            raise UsageError("--inputs names at least one input of the networks")
-        _check_inputs(self.inputs, "visibility")
+        _check_inputs(self.inputs)
         _at_least(2, n_views=self.n_views)
         _at_least(1, hidden=self.hidden, networks=self.networks, epochs=self.epochs, walks=self.walks, batch=self.batch)
         _at_least(0, lr=self.lr, weight_decay=self.weight_decay, seed=self.seed)
@@ -308,7 +304,8 @@ class AgentRecipe:
 
     Attributes:
         algorithm: of Stable-Baselines3: PPO (Schulman et al., 2017) or DQN (Mnih et al., Nature 518, 2015).
-        inputs: what the agent sees; see ``policies.gain.INPUTS``.
+        inputs: what the agent sees: belief, view, place, azimuth_bin (see ``policies.gain.INPUTS``) and any maps of the
+            predictions.
         frame: from where the azimuths of actions and observations are counted, see ``GainRecipe``.
         objective: what is paid: the change of "right" (1 if the most believed class is the true one), of the "belief"
             in the true class or of its "log-belief".
@@ -332,7 +329,7 @@ class AgentRecipe:
     """
 
     algorithm: Literal["ppo", "dqn"] = "ppo"
-    inputs: tuple[PolicyInput, ...] = POLICY_INPUTS
+    inputs: tuple[str, ...] = POLICY_INPUTS
     frame: Literal["camera", "object"] = "object"
     objective: Literal["belief", "log-belief", "right"] = "log-belief"
     n_views: int = 5
@@ -354,8 +351,6 @@ class AgentRecipe:
 
     def __post_init__(self) -> None:
         _check_types(self)
-        if not self.inputs:
-            raise UsageError("--inputs names at least one input of the network")
         _check_inputs(self.inputs)
         _at_least(2, n_views=self.n_views, holdout=self.holdout)
         _at_least(1, hidden=self.hidden, steps=self.steps, envs=self.envs, rollout=self.rollout, batch=self.batch)

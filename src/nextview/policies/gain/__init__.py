@@ -2,14 +2,18 @@
 
 from nextview.policies.gain.decision_features import (
     INPUTS,
-    MAPS,
     VISIBILITY,
     Frame,
     features,
+    maps_of,
     mirrored,
     mirrored_features,
+    ordered,
     origin,
 )
 from nextview.policies.gain.gain_policy import Gain
 
-__all__ = ["INPUTS", "MAPS", "VISIBILITY", "Frame", "Gain", "features", "mirrored", "mirrored_features", "origin"]
+__all__ = [
+    "INPUTS", "VISIBILITY", "Frame", "Gain", "features", "maps_of", "mirrored", "mirrored_features", "ordered",
+    "origin",
+]  # fmt: skip

@@ -14,19 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
+from nextview.measures.map_names import SPHERE, in_order
 from nextview.policies.base import EpisodeState, visibility_of
 from nextview.policies.learned_tables import cells_from
 from nextview.viewsphere import ViewSphere
 
 Float = NDArray[np.float64]
 
-MAPS = ("lem", "lcm", "lem-sphere", "lcm-sphere")
-"""Predicted maps that a network may take, of the local window or of the whole sphere."""
-
-INPUTS = ("belief", "view", "place", *MAPS, "azimuth_bin")
+INPUTS = ("belief", "view", "place", "azimuth_bin")
 """What a network may take: the belief over all views; what the last view alone says; the ring and the views that are
-visited; the maps that were predicted from the last view; and which azimuth bin of the object is seen, if it is of the
-class that is believed most, and over all classes."""
+visited; and which azimuth bin of the object is seen, if it is of the class that is believed most, and over all classes.
+Any other name is that of a map that was predicted from the last view: of the local window, or of the whole sphere where
+it ends in "-sphere"."""
 
 VISIBILITY = "visibility"
 """One more input, for worlds: the share of the object that is expected to show from each view."""
@@ -37,6 +36,17 @@ class that is believed most, in all likelihood shows its azimuth bin 0."""
 
 FLOOR = np.log(1e-4)
 """Beliefs below this are taken for it: nobody knows such small ones."""
+
+
+def maps_of(inputs: Sequence[str]) -> tuple[str, ...]:
+    """The predicted maps among some inputs, in the order of ``map_names.in_order``."""
+    return tuple(in_order(name for name in inputs if name not in (*INPUTS, VISIBILITY)))
+
+
+def ordered(inputs: Sequence[str]) -> tuple[str, ...]:
+    """Some inputs, each once, in the order of ``features``, whatever theirs: the maps stand behind the place."""
+    *before, azimuth_bin = INPUTS
+    return tuple(name for name in (*before, *maps_of(inputs), azimuth_bin, VISIBILITY) if name in inputs)
 
 
 def mirrored(sphere: ViewSphere) -> NDArray[np.int64]:
@@ -78,7 +88,7 @@ def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], fra
     Args:
         sphere: the viewpoints.
         state: the episodes.
-        inputs: some of INPUTS and VISIBILITY.
+        inputs: some of INPUTS, VISIBILITY and maps; their order does not matter, see ``ordered``.
         frame: in which cells are counted.
 
     Returns:
@@ -101,13 +111,12 @@ def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], fra
     if "place" in inputs:
         parts.append(np.eye(sphere.rings)[sphere.ring[state.current]])
         parts.append(state.visited[rows[:, None], cells_from(sphere)[start]])
-    for name in MAPS:
-        if name in inputs:
-            values = np.asarray(state.evidence.maps[name])
-            if name.endswith("-sphere"):  # its columns are counted from the camera
-                columns = (np.arange(n) - ahead[:, None]) % n
-                values = np.take_along_axis(values, columns[:, None], 2)
-            parts.append(values)
+    for name in maps_of(inputs):
+        values = np.asarray(state.evidence.maps[name])
+        if name.endswith(SPHERE):  # its columns are counted from the camera
+            columns = (np.arange(n) - ahead[:, None]) % n
+            values = np.take_along_axis(values, columns[:, None], 2)
+        parts.append(values)
     if "azimuth_bin" in inputs:
         parts += [np.eye(n)[ahead]] if frame == "object" else []
         azimuth_bins = _bin_belief(sphere, state)
@@ -135,12 +144,12 @@ def mirrored_features(
         "place": np.concatenate([np.arange(sphere.rings), sphere.rings + mirrored(sphere)]),
     }
     window = np.arange(sphere.rings * 3).reshape(-1, 3)[:, ::-1].ravel()
-    blocks |= {name: mirrored(sphere) if name.endswith("-sphere") else window for name in MAPS}
+    blocks |= {name: mirrored(sphere) if name.endswith(SPHERE) else window for name in maps_of(inputs)}
     n = sphere.azimuths
     blocks["azimuth_bin"] = np.concatenate([k * n + -np.arange(n) % n for k in range(2 if frame == "camera" else 3)])
     blocks[VISIBILITY] = mirrored(sphere)
     found, begin = [], 0
-    for name in [name for name in (*INPUTS, VISIBILITY) if name in inputs]:
+    for name in ordered(inputs):
         found.append(begin + blocks[name])
         begin += len(blocks[name])
     return np.concatenate(found)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
-from nextview.policies.base import EpisodeState, Scope, best_in_window, in_window, travel_from
-from nextview.policies.gain.decision_features import INPUTS, MAPS, VISIBILITY, Frame, features, origin
+from nextview.policies.base import EpisodeState, Scope, best_in_window, in_window, maps_among, travel_from
+from nextview.policies.gain.decision_features import INPUTS, VISIBILITY, Frame, features, maps_of, origin
 from nextview.policies.learned_tables import cells_to
 from nextview.viewsphere import ViewSphere
 
@@ -32,7 +32,7 @@ class Gain:
         classes: how many, C.
         score: from the features, (B, D) float32, to the value of each cell, (B, V) float32: the mean over some
             networks and over the object and its mirror image. Each row by itself, to the last bit.
-        inputs: what the features are made of, some of INPUTS and VISIBILITY.
+        inputs: what the features are made of: some of INPUTS, VISIBILITY and names of predicted maps.
         travel_weight: of a grid cell of travel, in the unit of the values: log-belief for the bundled one.
         scope: "global", among all views; or "local", among those of the local window.
         frame: in which cells are counted, "camera" or "object".
@@ -49,16 +49,17 @@ class Gain:
     sphere: ViewSphere
     classes: int
     score: Callable[[NDArray[np.float32]], NDArray[np.floating]]
-    inputs: tuple[str, ...] = INPUTS
+    inputs: tuple[str, ...]
     travel_weight: float = 0.0
     scope: Scope = "global"
     frame: Frame = "camera"
 
     def __post_init__(self) -> None:
-        known = (*INPUTS, VISIBILITY)
-        unknown = sorted(set(self.inputs) - set(known))
+        maps = maps_of(self.inputs)
+        unknown = [name for name in maps if name not in maps_among(maps)]  # other needs of policies
         if unknown or not self.inputs:
-            raise PolicyError(f"a gain policy takes some of {', '.join(known)}, not {', '.join(unknown) or 'nothing'}")
+            known, other = ", ".join((*INPUTS, VISIBILITY)), ", ".join(unknown) or "nothing"
+            raise PolicyError(f"a gain policy takes some of {known} and of the maps that are predicted, not {other}")
         if not np.isfinite(self.travel_weight) or self.travel_weight < 0:
             raise PolicyError(f"needs a travel weight that is not negative, not {self.travel_weight}")
         if self.frame not in get_args(Frame):
@@ -69,7 +70,7 @@ class Gain:
         """The maps that the features are made of, the azimuth bins, and what shows."""
         azimuth_bins = "azimuth_bin" in self.inputs or self.frame == "object"
         others = {"azimuth_bins": azimuth_bins, VISIBILITY: VISIBILITY in self.inputs}
-        return (*(name for name in MAPS if name in self.inputs), *(name for name, taken in others.items() if taken))
+        return (*maps_of(self.inputs), *(name for name, taken in others.items() if taken))
 
     def to_dict(self) -> dict[str, Any]:
         """What a card says of it beside the sphere, for JSON."""

@@ -16,8 +16,9 @@ from nextview.command_line import command_line
 from nextview.data.predictions import Predictions
 from nextview.data.world_sight import worlds_of
 from nextview.errors import PredictionsError, UsageError
+from nextview.measures.map_names import in_order
 from nextview.models.model_card import file_hash
-from nextview.policies.gain import MAPS, VISIBILITY, Gain
+from nextview.policies.gain import INPUTS, VISIBILITY, Gain, maps_of
 from nextview.policies.policy_card import LearnedFrom, PolicyCard
 from nextview.tracking import Track, silently
 from nextview.training.folds import hold_out
@@ -158,9 +159,10 @@ def _shapes(p: Predictions) -> NDArray[np.floating]:
 
 def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
     """Refuse predictions without what the policy is to take from them."""
-    lacking = [name for name in recipe.inputs if name in MAPS and name not in p.maps]
+    lacking = [name for name in maps_of(recipe.inputs) if name not in p.maps]
     if lacking:
-        raise PredictionsError(f"{path}: holds no map {lacking[0]!r}; predict it, or choose other --inputs")
+        known = ", ".join((*INPUTS, VISIBILITY, *in_order(p.maps)))
+        raise PredictionsError(f"{path}: holds no map {lacking[0]!r}; predict it, or choose --inputs among {known}")
     if VISIBILITY in recipe.inputs and worlds_of(p) is None:
         raise PredictionsError(f"{path}: is of no worlds, in which all would show; choose other --inputs")
     if p.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
