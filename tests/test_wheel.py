@@ -22,7 +22,7 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).parent.parent
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 EXAMPLES = {
-    "": "import nextview; assert nextview.recognise('samples/chair.off', start=3).answer == 'chair'",
+    "": "import nextview, contourpy; assert nextview.recognise('samples/chair.off', start=3).answer == 'chair'",
     "benchmark": "from nextview.benchmark.run import run_benchmark; from nextview.report.html import write_report",
     "cluster": "from distributed import LocalCluster; import nextview.data.pool",
     "train": "import lightning, torch; from nextview.training import export, loop, onnx_export",
@@ -31,7 +31,6 @@ EXAMPLES = {
     "explore": "import viser; from nextview.explorer.exploration import Exploration",
     "browser": "import playwright",
     "record": "import rerun; from nextview.report.recording import Recorder",
-    "measures": "import skimage; from nextview.measures.registry import MEASURES; assert len(MEASURES) == 17",
     "envs": "import gymnasium, nextview.envs; gymnasium.spec('nextview/Recognise-v0')",
     "ap-gym": "import ap_gym, nextview.envs",
     "rl": "import stable_baselines3; from nextview.training.agent import agent_training",
@@ -39,7 +38,7 @@ EXAMPLES = {
     "dev": "import hypothesis, mypy, pytest, ruff, skimage, trimesh",
 }
 """One line for each extra, and for none."""
-QUICK = ("", "benchmark", "cluster", "envs", "measures", "record")
+QUICK = ("", "benchmark", "cluster", "envs", "record")
 """Those that are tried always: the others import for seconds."""
 EMPTY_ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_TARGET"))}
 

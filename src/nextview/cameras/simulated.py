@@ -120,12 +120,14 @@ class SimulatedCamera:
         """
         pose = checked_pose(pose)
         where = self.observe(pose).depth > 0 if where is None else where
-        found = np.full(self.shape, -1, np.int32)
-        rays = self._rays[where] @ np.ascontiguousarray(pose[:3, :3].astype(np.float32).T)
-        if len(rays):
+        found = np.full(where.size, -1, np.int32)
+        pixels = np.flatnonzero(where)
+        if len(pixels):
+            rays = self._rays.reshape(-1, 3).take(pixels, 0)  # by a mask it takes four times as long
+            rays = rays @ np.ascontiguousarray(pose[:3, :3].astype(np.float32).T)
             origins = np.tile(pose[:3, 3].astype(np.float32), len(rays)).reshape(-1, 3)
-            found[where] = self._scene.run(origins, rays)  # the nearest face alone: distances and normals cost more
-        return found
+            found[pixels] = self._scene.run(origins, rays)  # the nearest face alone: distances and normals cost more
+        return found.reshape(self.shape)
 
     def _bound(self, rotation: NDArray[np.float32], origin: NDArray[np.float32]) -> tuple[slice, slice]:
         """Rows and columns that hold the projection of every vertex; the whole image if one is behind the camera."""

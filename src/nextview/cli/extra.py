@@ -11,7 +11,6 @@ EXTRAS = {
     "arm": ("gymnasium_robotics", "mink", "mujoco"),
     "benchmark": ("jinja2", "pandas", "pyarrow"),
     "cluster": ("dask", "distributed"),
-    "measures": ("skimage",),
     "explore": ("viser",),
     "record": ("rerun",),
     "envs": ("gymnasium",),

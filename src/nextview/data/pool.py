@@ -15,6 +15,8 @@ from multiprocessing import resource_tracker
 from types import FrameType
 from typing import TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from nextview.arguments import whole
 from nextview.errors import DatasetError
 
@@ -131,8 +133,9 @@ def _signals_wait() -> Iterator[None]:
 
 
 def _begin_worker() -> None:
-    """End when told to, and with the parent: a worker whose parent was killed would wait for work for ever."""
+    """Use one core; end when told to, and with the parent: a worker whose parent was killed would wait for ever."""
     signal.signal(signal.SIGTERM, _stop)
+    threadpool_limits(1, "blas")  # each core has a worker: the threads of BLAS would wait for each other
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -26,10 +26,14 @@ def depth_entropy(depth: NDArray[np.floating]) -> float:
         ObservationError: no depth image.
     """
     depth = object_depth(depth_image(depth).astype(np.float64, copy=False))
-    seen = depth[depth > 0]
+    return entropy_of_depths(depth[depth > 0], depth.size)
+
+
+def entropy_of_depths(seen: NDArray[np.float64], pixels: int) -> float:
+    """The same, of the depth where there is an object, (n,), and how many pixels the image has."""
     counts = np.bincount(np.rint(seen / QUANTUM).astype(np.int64), minlength=1)
-    counts[0] += depth.size - seen.size
-    share = counts[counts > 0] / depth.size
+    counts[0] += pixels - seen.size
+    share = counts[counts > 0] / pixels
     return float((share * np.log2(1 / share)).sum())
 
 

@@ -46,7 +46,8 @@ class MeasuredView:
     @cached_property
     def box(self) -> tuple[slice, slice]:
         """Rows and columns that hold the object, (H', W'); none of them where nothing is seen."""
-        rows, columns = (np.flatnonzero(self.depth.any(axis)) for axis in (1, 0))
+        seen = self.depth > 0
+        rows, columns = (np.flatnonzero(seen.any(axis)) for axis in (1, 0))
         if len(rows) == 0:
             return slice(0, 0), slice(0, 0)
         return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
@@ -98,21 +99,17 @@ class MeasuredView:
         """How much of each of these faces is seen, (k,), square object radii.
 
         A pixel shows z^2 / (fx fy |n . r|) of a face: z is its depth, n the face's unit normal, r the pixel's ray whose
-        z is 1. Pixels are samples: of a face smaller than one, more may be counted than there is, and of others none;
-        over many it evens out.
+        z is 1. z |n . r| is how far the camera is from the face's plane. Pixels are samples: of a face smaller than
+        one, more may be counted than there is, and of others none; over many it evens out.
         """
         faces, _ = self.pixels
-        normals = (self.surface.normals @ self.pose[:3, :3])[faces]
-        slot = np.zeros(int(faces[-1]) + 1 if len(faces) else 0, np.int64)
-        slot[faces] = np.arange(len(faces))
-        at, n = slot[self._ids], self._hits
-        x, y = self.rays
-        row, column = np.nonzero(self.seen)
-        a, b, c = normals.T[:, at]
-        across = np.abs(a * x[column[n]] + b * y[row[n]] + c)
+        corners = self.surface.vertices[self.surface.faces[faces, 0]]
+        apart = np.zeros(int(faces[-1]) + 1 if len(faces) else 0)
+        apart[faces] = np.abs(((corners - self.pose[:3, 3]) * self.surface.normals[faces]).sum(1))
+        z = self.depths[self._hits]
         focal = self.intrinsics[0, 0] * self.intrinsics[1, 1]
-        patches = self.depths[n] ** 2 / (focal * np.maximum(across, GRAZING))
-        return np.asarray(np.bincount(at, patches, len(faces)), np.float64)
+        patches = z**2 / (focal * np.maximum(apart[self._ids] / z, GRAZING))
+        return np.asarray(np.bincount(self._ids, patches)[faces], np.float64)
 
     @cached_property
     def seen_share(self) -> NDArray[np.float64]:
@@ -121,14 +118,18 @@ class MeasuredView:
         return np.divide(self.seen_area, areas, out=np.zeros(len(areas)), where=areas > 0)
 
     @cached_property
-    def _hits(self) -> NDArray[np.int64]:
-        """Which of the pixels that show the object show a face, indices into ``depths``."""
+    def _faces(self) -> NDArray[np.int32]:
+        """The face that each of the pixels shows which show the object, -1 for none."""
         assert self.face_ids is not None
-        return np.flatnonzero(self.face_ids[self.box][self.seen] >= 0)
+        return self.face_ids[self.box][self.seen]
+
+    @cached_property
+    def _hits(self) -> NDArray[np.bool_]:
+        """Which of these pixels show a face."""
+        return self._faces >= 0
 
     @cached_property
     def _ids(self) -> NDArray[np.int32]:
-        """The face of each of these pixels."""
+        """The face of each pixel that shows one."""
         self.surface  # noqa: B018  # says if there is none
-        assert self.face_ids is not None
-        return self.face_ids[self.box][self.seen][self._hits]
+        return self._faces[self._hits]

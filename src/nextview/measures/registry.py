@@ -10,7 +10,7 @@ from nextview.arguments import of_kind
 from nextview.errors import MeasureError
 from nextview.measures.area import surface_visibility, view_area, viewpoint_entropy, visible_area_ratio
 from nextview.measures.curvature import curvature_entropy, gaussian_curvature, mean_curvature
-from nextview.measures.depth_entropy import depth_entropy
+from nextview.measures.depth_entropy import entropy_of_depths
 from nextview.measures.depth_spread import depth_distribution, max_depth
 from nextview.measures.fused_descriptor import fused_descriptor
 from nextview.measures.gradient_entropy import gradient_entropy
@@ -49,7 +49,9 @@ class Measure:
 
 MEASURES: dict[str, Measure] = {
     "viewpoint_entropy": Measure(viewpoint_entropy, "mesh", "Vázquez et al. 2001; eq. 3"),
-    "depth_entropy": Measure(lambda view: depth_entropy(view.depth), "depth", "Parisotto et al.; eq. 3"),
+    "depth_entropy": Measure(
+        lambda view: entropy_of_depths(view.depths, view.depth.size), "depth", "Parisotto et al.; eq. 3"
+    ),
     "view_area": Measure(view_area, "depth", "Dutagaci et al. 2010"),
     "visible_area_ratio": Measure(visible_area_ratio, "mesh", "Polonsky et al. 2005"),
     "surface_visibility": Measure(surface_visibility, "mesh", "Secord et al. 2011"),

@@ -18,6 +18,8 @@ LONGEST = 0.07
 CELL = 0.02
 """Vertices in one cube of this side, object radii, are taken together where there are many."""
 MANY = 30_000
+BLOCK = 1000
+"""Points whose neighbours are looked at in one go."""
 
 
 def mesh_saliency(view: MeasuredView) -> float:
@@ -69,28 +71,39 @@ def _salient(
     Lee suppresses scales at which much is as salient as the maximum by the mean of the local maxima; here it is the
     mean over the surface, for how many maxima there are depends on how the faces are cut.
     """
-    from scipy.spatial import cKDTree
-
-    pairs = cKDTree(points).sparse_distance_matrix(
-        cKDTree(points), 4 * SCALES[-1] * UNIT, output_type="coo_matrix"
-    )  # the pairs of a point with itself are among them
-    i, j, square = pairs.row, pairs.col, pairs.data**2
-
-    def average(sigma: float) -> NDArray[np.float64]:
-        near = square <= (2 * sigma) ** 2
-        # Down to 0 at its end, so that no rounding decides about whole rows of points that lie just there.
-        weight = (np.exp(-square[near] / (2 * sigma**2)) - np.exp(-2)) * area[j[near]]
-        total = np.bincount(i[near], weight, len(points))
-        return np.divide(np.bincount(i[near], weight * curvature[j[near]], len(points)), total,
-                         out=np.zeros(len(points)), where=total > 0)  # fmt: skip
-
+    averages = _averages(points, area, curvature)
     found = np.zeros(len(points))
     for scale in SCALES:
-        salient = np.abs(average(scale * UNIT) - average(2 * scale * UNIT))
+        salient = np.abs(averages[scale] - averages[2 * scale])
         if salient.max() <= 0:
             continue
         others = (salient * area).sum() / area.sum() / salient.max()
         found += salient * (1 - others) ** 2
+    return found
+
+
+def _averages(
+    points: NDArray[np.float64], area: NDArray[np.float64], curvature: NDArray[np.float64]
+) -> dict[int, NDArray[np.float64]]:
+    """Average curvature around each point, weighted by area and a Gaussian, (n,), by the Gaussian's width in units."""
+    from scipy.spatial import cKDTree
+
+    widths = sorted({*SCALES, *(2 * scale for scale in SCALES)}, reverse=True)
+    found = {width: np.zeros(len(points)) for width in widths}
+    tree = cKDTree(points)
+    for block in np.array_split(tree.indices, -(-len(points) // BLOCK)):  # points near each other: less to remember
+        pairs = cKDTree(points[block]).sparse_distance_matrix(tree, 2 * widths[0] * UNIT, output_type="coo_matrix")
+        i, j, square = pairs.row, pairs.col, pairs.data**2  # the pairs of a point with itself are among them
+        own, bend = area[j], curvature[j]
+        for width in widths:
+            sigma = width * UNIT
+            near = np.flatnonzero(square <= (2 * sigma) ** 2)
+            i, square, own, bend = i[near], square[near], own[near], bend[near]
+            # Down to 0 at its end, so that no rounding decides about whole rows of points that lie just there.
+            weight = (np.exp(square * (-1 / (2 * sigma**2))) - np.exp(-2)) * own
+            total = np.bincount(i, weight, len(block))
+            whole = np.bincount(i, weight * bend, len(block))
+            found[width][block] = np.divide(whole, total, out=np.zeros(len(block)), where=total > 0)
     return found
 
 

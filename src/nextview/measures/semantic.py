@@ -46,6 +46,6 @@ def base_avoidance(view: MeasuredView) -> float:
     # A face's own normal may point either way; what counts is the side that the camera is on.
     towards = ((view.pose[:3, 3] - corners.mean(1)) * normals).sum(1)
     down = -normals[:, 2] * np.sign(towards)
-    low, high = surface.vertices[:, 2].min(), surface.vertices[:, 2].max()
+    low, high = surface.heights
     base = (down > DOWN) & (corners[:, :, 2].max(1) < low + BASE * (high - low))
     return float(1 - pixels[base].sum() / pixels.sum())

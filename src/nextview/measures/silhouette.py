@@ -5,7 +5,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from contourpy import LineType, contour_generator
 from numpy.typing import NDArray
+from scipy.fft import irfft, rfft
 
 from nextview.measures.area import bits
 from nextview.measures.measured_view import MeasuredView
@@ -48,33 +50,43 @@ def silhouette_entropy(view: MeasuredView) -> float:
     Returns:
         Bits; 0 for a circle, which turns everywhere alike, but for its pixels, and where nothing is seen.
     """
-    from skimage.measure import find_contours  # takes longer to import than all other measures
-
     if len(view.depths) == 0:
         return 0.0
     arm = ARM * max(view.depth.shape)
-    outlines = find_contours(np.pad(view.seen, 1).astype(np.float32), 0.5)
-    turns = np.concatenate([_turns(outline, arm) for outline in outlines])
+    seen = np.pad(view.seen, 1).astype(np.float64)
+    (points,), (offsets,) = contour_generator(z=seen, line_type=LineType.ChunkCombinedOffset).lines(0.5)
+    turns = _turns(points, offsets.astype(np.int64), arm)
     counts = np.bincount(np.rint((turns / (2 * np.pi) + 0.5) * CELLS).astype(np.int64) % CELLS, minlength=CELLS)
     blur, own = _blur()
-    return max(bits(blur @ (counts / counts.sum())) - own, 0.0)
+    spread = irfft(rfft(counts) * blur)
+    return max(bits(spread / spread.sum()) - own, 0.0)
 
 
 @lru_cache(maxsize=1)
-def _blur() -> tuple[NDArray[np.float64], float]:
-    """The blur of the histogram, as a matrix, and the entropy of a single cell that is blurred."""
-    apart = np.angle(np.exp(2j * np.pi / CELLS * np.subtract.outer(np.arange(CELLS), np.arange(CELLS))))
+def _blur() -> tuple[NDArray[np.complex128], float]:
+    """What the blur multiplies each frequency of the histogram by, and the entropy of a single cell that is blurred."""
+    apart = np.minimum(np.arange(CELLS), CELLS - np.arange(CELLS)) * 2 * np.pi / CELLS
     blur = np.exp(-((apart / ACCURACY) ** 2) / 2)
-    blur /= blur[0].sum()
-    return blur, bits(blur[0])
+    blur /= blur.sum()
+    return rfft(blur), bits(blur)
 
 
-def _turns(outline: NDArray[np.float64], arm: float) -> NDArray[np.float64]:
-    """Signed turns along a closed outline, (n,) radians, at every pixel's length of it."""
-    along = np.concatenate([[0], np.cumsum(np.sqrt((np.diff(outline, axis=0) ** 2).sum(1)))])
-    n = max(int(along[-1]), 8)
-    at = np.arange(n) * along[-1] / n
-    points = np.interp(at, along, outline[:, 0]) + 1j * np.interp(at, along, outline[:, 1])
+def _turns(points: NDArray[np.float64], offsets: NDArray[np.int64], arm: float) -> NDArray[np.float64]:
+    """Signed turns along closed outlines, (n,) radians, at every pixel's length of them.
+
+    Outline i has the points (P, 2) from offset i up to offset i + 1; its last is its first.
+    """
+    step = np.sqrt((np.diff(points, axis=0) ** 2).sum(1))
+    along = np.concatenate([[0], np.cumsum(step)])  # also from one outline to the next, where nobody looks
+    begin = along[offsets[:-1]]
+    length = along[offsets[1:] - 1] - begin
+    n = np.maximum(length.astype(np.int64), 8)
+    first = np.cumsum(n) - n
+    of = np.repeat(np.arange(len(n)), n)
+    i = np.arange(len(of)) - first[of]
+    at = begin[of] + i * (length / n)[of]
+    places = np.interp(at, along, points[:, 0]) + 1j * np.interp(at, along, points[:, 1])
     # Nothing is smaller than a few pixels: on a short outline the arms are a quarter of it.
-    k = max(min(round(arm), n // 4), 1)
-    return np.angle((np.roll(points, -k) - points) * np.conj(points - np.roll(points, k)))
+    k = np.clip(n // 4, 1, round(arm))[of]
+    ahead, behind = (places[first[of] + (i + way) % n[of]] for way in (k, -k))
+    return np.angle((ahead - places) * np.conj(places - behind))

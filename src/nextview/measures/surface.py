@@ -49,6 +49,11 @@ class Surface:
         return float(self.areas.sum())
 
     @cached_property
+    def heights(self) -> tuple[float, float]:
+        """Of the lowest and the highest vertex, object radii."""
+        return float(self.vertices[:, 2].min()), float(self.vertices[:, 2].max())
+
+    @cached_property
     def places(self) -> NDArray[np.int64]:
         """The faces by places instead of vertices, (F, 3) int64: vertices in one place count as one."""
         cell = np.rint((self.vertices - self.vertices.min(0)) / SAME).astype(np.int64)
