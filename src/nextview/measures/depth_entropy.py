@@ -29,7 +29,7 @@ def depth_entropy(depth: NDArray[np.floating]) -> float:
     return entropy_of_depths(depth[depth > 0], depth.size)
 
 
-def entropy_of_depths(seen: NDArray[np.float64], pixels: int) -> float:
+def entropy_of_depths(seen: NDArray[np.floating], pixels: int) -> float:
     """The same, of the depth where there is an object, (n,), and how many pixels the image has."""
     counts = np.bincount(np.rint(seen / QUANTUM).astype(np.int64), minlength=1)
     counts[0] += pixels - seen.size

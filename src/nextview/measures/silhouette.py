@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from contourpy import LineType, contour_generator
@@ -54,7 +55,8 @@ def silhouette_entropy(view: MeasuredView) -> float:
         return 0.0
     arm = ARM * max(view.depth.shape)
     seen = np.pad(view.seen, 1).astype(np.float64)
-    (points,), (offsets,) = contour_generator(z=seen, line_type=LineType.ChunkCombinedOffset).lines(0.5)
+    outlines: Any = contour_generator(z=seen, line_type=LineType.ChunkCombinedOffset).lines(0.5)
+    (points,), (offsets,) = outlines
     turns = _turns(points, offsets.astype(np.int64), arm)
     counts = np.bincount(np.rint((turns / (2 * np.pi) + 0.5) * CELLS).astype(np.int64) % CELLS, minlength=CELLS)
     blur, own = _blur()
