@@ -1,13 +1,14 @@
 """Choose and judge policies in worlds: objects among others, half hidden.
 
     python benchmarks/worlds.py choose learning.npz [--policies random-all visibility@0 visible-gain@0]
+    nextview plan worlds.zarr volumetric    # of the store that worlds.npz was predicted from
     python benchmarks/worlds.py judge worlds.npz ... --ours visible-gain [--policies ...] [--out worlds_travel.png]
 
 ``choose``: what policies reach on worlds for learning, classes weighted evenly: the mean log-belief in the truth and
 the accuracy after 2 to 5 views, by which ``nextview train gain`` judges as well. ``judge``: by level the accuracy and
 the travel after 2, 3 and 5 views, the points over random, and those of ours over each of its rivals, with 95 %
-bootstrap intervals over worlds and one Holm correction for all of it but the ceilings; how much of what one step of
-foresight gains is had; and, as a figure, accuracy against travel in cells, and in seconds of a robot that takes
+bootstrap intervals over worlds. Tested is what is claimed, ours against its rivals, with one Holm correction for all
+levels and numbers of views. Then how much of what one step of foresight gains is had; and, as a figure, accuracy against travel in cells, and in seconds of a robot that takes
 ``SECONDS`` for each view and ``TURN`` for a turn of the camera around the object by one radian.
 """
 
@@ -37,7 +38,8 @@ from nextview.data.predictions import Predictions
 from nextview.policies.registry import make_policy
 from nextview.report.style import STYLE
 
-POLICIES = ("random", "gain", "visibility", "visible-gain")
+POLICIES = ("random", "gain", "visibility", "volumetric", "visible-gain")
+RIVALS = ("random-all", "visibility", "volumetric", "gain")
 CEILINGS = ("true-visible_share-all", "oracle-gain-all")
 REFERENCE = "random-all"
 COUNTS = (2, 3, 5)
@@ -94,7 +96,7 @@ def judge(
     predictions: tyro.conf.Positional[tuple[Path, ...]],
     ours: str,
     policies: tuple[str, ...] = POLICIES,
-    rivals: tuple[str, ...] = ("visibility", "gain"),
+    rivals: tuple[str, ...] = RIVALS,
     thrifty: tuple[float, ...] = (),
     out: Path | None = None,
     table: Path | None = None,
@@ -106,9 +108,9 @@ def judge(
 
     Args:
         predictions: of worlds of the test split; several stores of them are put together.
-        ours: the policy that is compared with the rivals.
-        policies: that are compared with random.
-        rivals: some of them.
+        ours: the policy that is tested.
+        policies: that stand in the tables, with their points over random.
+        rivals: those that ours is tested against.
         thrifty: travel weights of ours and of visibility, for the figure alone.
         out: the figure.
         table: the comparisons, with p before and after the correction, as CSV.
@@ -150,15 +152,16 @@ def judge(
 def compared(
     worlds: dict[str, dict[str, Reached]], ours: str, rivals: tuple[str, ...], samples: int, rng: np.random.Generator
 ) -> pd.DataFrame:
-    """All with random, and ours with its rivals: points, interval, p, and p after Holm; ceilings are not tested."""
+    """All with random, and ours with its rivals: points and interval; of the latter p, and p after Holm."""
     rows = []
     for level, of in worlds.items():
         weights = resample(len(of[REFERENCE].right), samples, rng) / len(of[REFERENCE].right)
-        pairs = [(name, REFERENCE) for name in of if name != REFERENCE] + [(ours, rival) for rival in rivals]
+        pairs = [(name, REFERENCE) for name in of if name not in (REFERENCE, ours)]
+        pairs += [(ours, rival) for rival in rivals if rival in of]
         for name, other in pairs:
             against = (of[name].right - of[other].right)[:, np.array(COUNTS) - 1]
             mean, drawn = against.mean(0), weights @ against
-            p = np.where(is_oracle(name), np.nan, bootstrap_p(mean, drawn))
+            p = bootstrap_p(mean, drawn) if name == ours else np.full(len(COUNTS), np.nan)
             rows += [(level, name, other, *row) for row in zip(COUNTS, mean, *interval(drawn), p, strict=True)]
     table = pd.DataFrame(rows, columns=["level", "policy", "other", "views", "points", "low", "high", "p"])
     return table.assign(p_holm=holm(table["p"].to_numpy(np.float64)))
