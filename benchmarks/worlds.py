@@ -97,7 +97,6 @@ def judge(
     ours: str,
     policies: tuple[str, ...] = POLICIES,
     rivals: tuple[str, ...] = RIVALS,
-    thrifty: tuple[float, ...] = (),
     out: Path | None = None,
     table: Path | None = None,
     runs: int = 10,
@@ -111,7 +110,6 @@ def judge(
         ours: the policy that is tested.
         policies: that stand in the tables, with their points over random.
         rivals: those that ours is tested against.
-        thrifty: travel weights of ours and of visibility, for the figure alone.
         out: the figure.
         table: the comparisons, with p before and after the correction, as CSV.
         runs: first views of each world.
@@ -119,7 +117,6 @@ def judge(
         seed: of all that is random.
     """
     names = list(dict.fromkeys([REFERENCE, *policies, ours, *CEILINGS]))
-    names += [f"{name}@{weight:g}" for weight in thrifty for name in ("visibility", ours)]
     found: dict[str, dict[str, list[Reached]]] = {level: {} for level in ORDER}
     for path in predictions:
         p = Predictions.load(path)
@@ -140,9 +137,8 @@ def judge(
         for level, by_name in found.items()
         if by_name
     }
-    judged = {level: {name: of[name] for name in of if "@" not in name} for level, of in worlds.items()}
-    comparisons = compared(judged, ours, rivals, samples, np.random.default_rng([seed, 1]))
-    show(judged, comparisons, ours)
+    comparisons = compared(worlds, ours, rivals, samples, np.random.default_rng([seed, 1]))
+    show(worlds, comparisons, ours)
     if table is not None:
         comparisons.to_csv(table, index=False)
     if out is not None:
