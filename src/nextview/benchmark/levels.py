@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from nextview.benchmark import statistics as st
 from nextview.benchmark.experiment import Grid
+from nextview.worlds import LEVELS, level_of
 
 VIEWS = (2, 3, 5)
 """After so many views the policies are compared."""
-LEVEL = re.compile(r".*@(\w+)-\d+")
-"""Names of worlds."""
-ORDER = ("light", "medium", "heavy")
+ORDER = tuple(LEVELS)
 COLUMNS = [
     "level", "worlds", "policy", "n_views", "accuracy", "low", "high", "travel", "difference", "difference_low",
     "difference_high", "p", "p_holm",
@@ -24,7 +21,7 @@ COLUMNS = [
 
 def levels_of(names: tuple[str, ...]) -> NDArray[np.str_]:
     """The level of each world, by its name, (N,); "" for what is none."""
-    return np.array([match[1] if (match := LEVEL.fullmatch(name)) else "" for name in names])
+    return np.array([level_of(name) for name in names])
 
 
 def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator) -> pd.DataFrame:
