@@ -14,7 +14,7 @@ from nextview.benchmark import statistics as st
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.experiment import Grid
 from nextview.benchmark.levels import by_level
-from nextview.benchmark.published import published
+from nextview.benchmark.published import comparable_classes, published
 from nextview.benchmark.replay import Outcomes, truncate
 
 Float = NDArray[np.float64]
@@ -121,7 +121,7 @@ def _columns(grid: Grid, cells: list[Cell], names: tuple[str, ...] | None = None
 
 def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFrame, dict[tuple, Float]]:
     """The table, and the bootstrap samples (S,) behind each of its cells."""
-    labels, classes = grid.specs.predictions.labels, grid.specs.predictions.classes
+    labels, classes = grid.specs.predictions.labels, comparable_classes(grid.specs.predictions)
     duplicate_groups = np.ones((1, weights.shape[1]))
     keys, top, bottom = _columns(grid, cells)
     value, drawn = metrics.ratio(top, bottom, duplicate_groups)[0], metrics.ratio(top, bottom, weights)
@@ -146,7 +146,7 @@ def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFram
 
 
 def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
-    p = grid.specs.predictions
+    p, classes = grid.specs.predictions, comparable_classes(grid.specs.predictions)
     keys, top, bottom = _columns(grid, cells, ("accuracy", "travel_moved"))
     rows = []
     for index in np.unique(p.labels):
@@ -154,7 +154,7 @@ def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
         value = metrics.ratio(top[here], bottom[here], np.ones((1, int(here.sum()))))[0]
         low, high = st.interval(metrics.ratio(top[here], bottom[here], weights[:, here]))
         for i, (policy, threshold, measure) in enumerate(keys):
-            beside = published(policy, threshold, measure, p.classes, label)
+            beside = published(policy, threshold, measure, classes, label)
             rows.append((policy, threshold, label, measure, value[i], low[i], high[i], beside))
     return _frame(rows, ["policy", "threshold", "label", "measure", "value", "low", "high", "published"])
 
