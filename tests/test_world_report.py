@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from test_worlds import meshes, store, worlds  # noqa: F401
 from nextview.belief import Calibration
 from nextview.benchmark import results
 from nextview.benchmark.published import ACCURACY, comparable_classes, read_table
-from nextview.benchmark.replay import make_specs
+from nextview.benchmark.replay import make_specs, replay
 from nextview.cli.benchmark import benchmark
 from nextview.cli.report import report
 from nextview.data.predictions import Predictions
@@ -26,6 +27,7 @@ from nextview.errors import DatasetError
 from nextview.worlds import World, build_scene
 
 TEN = tuple(read_table(ACCURACY[10]))
+SCRIPT = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "worlds.py"))
 POLICIES = ("random-all", "visibility", "oracle-gain-all")
 
 
@@ -168,3 +170,62 @@ def test_the_viewer_draws_things_and_what_shows_in_a_browser(made, scenes):
     red, blue = map(int, re.search(r'id="said">(\d+) (\d+)<', browse(host)).groups())
     assert red > 300
     assert blue > 100
+
+
+# How far the belief can be trusted
+
+
+def test_what_the_script_judges_is_what_replay_believes(predictions):
+    specs = make_specs(predictions, 4, 0)
+    path = replay("random-all", specs, 4, 0)
+    assert (path.views >= 0).all()
+    shown = specs.worlds.all_shown()[specs.objects[:, None], path.views]
+    found = SCRIPT["Believed"].of(predictions, specs.objects, path.views, shown)
+    np.testing.assert_allclose(found.confidence, path.confidences, rtol=1e-6)
+    sure = found.confidence > 0.11  # else all classes are alike
+    np.testing.assert_array_equal(found.right[sure], (path.answers == specs.labels[:, None])[sure])
+    np.testing.assert_allclose(found.loss[found.right], -np.log(found.confidence[found.right]), rtol=1e-6)
+    assert (found.loss[~found.right] >= np.log(2)).all()
+
+
+def test_confident_nonsense_is_told_from_a_belief_that_is_right_as_often_as_it_says():
+    """Of 200 walks the worlds are 0.95 sure and right in half, and single objects 0.75 sure and right in three of four.
+
+    Their gaps are 45 and 0 points; the log-losses are those of a coin and of three in four.
+    """
+    of, rng = SCRIPT["Believed"], np.random.default_rng(0)
+    right = [np.arange(200)[:, None] % 2 == 0, np.arange(200)[:, None] % 4 > 0]
+    both = [
+        of(np.full((200, 1), c), r, -np.log(np.where(r, c, 1 - c))) for c, r in zip((0.95, 0.75), right, strict=True)
+    ]
+    targets = np.arange(200) // 10
+    accuracy, gap, error, loss, nonsense = SCRIPT["trusted"](both, np.ones(200, bool), 1, targets, 200, rng).split(
+        " | "
+    )
+    assert accuracy == "0.500, 0.750"
+    assert re.fullmatch(r"\+45.0 \(.*\), \+0.0 \(.*\)", gap)
+    assert error == "0.450, 0.000"
+    assert loss == f"{-np.log(0.95 * 0.05) / 2:.3f}, {-0.75 * np.log(0.75) - 0.25 * np.log(0.25):.3f}"
+    assert nonsense == "50.0 %, 0.0 %"
+
+
+def test_worlds_are_paired_with_their_targets_alone(predictions, tmp_path, capsys, monkeypatch):
+    """A target alone that says what it says in its world is believed as much: both numbers of each cell are equal."""
+    targets = [name.partition("@")[0] for name in predictions.names]
+    kinds = sorted({*targets})
+    first = np.array([targets.index(name) for name in kinds])
+    plain = replace(predictions, calibration=Calibration(1.0, 0.3))
+    replace(plain.of_objects(first), names=tuple(kinds), store="").save(tmp_path / "alone.npz")
+    rows = first[[kinds.index(name) for name in targets]]
+    replace(plain, logits=plain.logits[rows], labels=plain.labels[rows]).save(tmp_path / "worlds.npz")
+    monkeypatch.setitem(SCRIPT["calibration"].__globals__, "LEAST", 1)
+    SCRIPT["calibration"]((tmp_path / "worlds.npz",), (tmp_path / "alone.npz",), walks=20, samples=20)
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert {row[0].strip("| ") for row in rows} == {"light", "medium", "heavy", "any"}
+    for _, _, _, n, accuracy, _, error, loss, nonsense in rows:
+        assert int(n.split()[0]) > 0
+        for cell in (accuracy, error, loss, nonsense.strip(" |")):
+            ours, alone = cell.split(", ")
+            assert ours == alone
+    whole = [row for row in rows if row[0].strip("| ") == "any" and row[2] == "all"]
+    assert [row[3].split()[0] for row in whole] == ["120"] * 4
