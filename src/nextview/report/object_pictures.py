@@ -148,7 +148,7 @@ def _data_uri(image: NDArray[np.uint8]) -> str:
     return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
 
 
-def _thinned(world: WorldViews, owner: int) -> NDArray[np.float64]:
+def _thinned(world: WorldViews, owner: np.uint8) -> NDArray[np.float64]:
     """Points of what is seen of the target, or of the things around it, evenly spread, (n, 3) in object radii."""
     view, row, column = np.nonzero(world.owner == owner)
     z = world.depth[view, row, column].astype(np.float64)
