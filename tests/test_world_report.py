@@ -15,7 +15,8 @@ from test_report import browse
 from test_worlds import meshes, store, worlds  # noqa: F401
 
 from nextview.belief import Calibration
-from nextview.benchmark import results
+from nextview.benchmark import results, statistics
+from nextview.benchmark.levels import target_weights
 from nextview.benchmark.published import ACCURACY, comparable_classes, read_table
 from nextview.benchmark.replay import make_specs, replay
 from nextview.cli.benchmark import benchmark
@@ -120,6 +121,17 @@ def test_nothing_published_stands_beside_worlds(made, predictions):
     assert comparable_classes(predictions) == ()
     alone = replace(predictions, names=tuple(f"thing_{i}" for i in range(len(predictions))))
     assert comparable_classes(alone) == TEN
+
+
+def test_worlds_around_one_target_are_drawn_together():
+    names = ("a@light-0", "b@light-0", "a@heavy-0", "c@heavy-0", "a@heavy-1")
+    weights = target_weights(names, 200, np.random.default_rng(0))
+    for same in (2, 4):
+        np.testing.assert_array_equal(weights[:, 0], weights[:, same])
+    np.testing.assert_array_equal(weights[:, [0, 1, 3]].sum(1), 3)  # as many targets as there are
+    alone = tuple("abcde")
+    plain = statistics.resample(5, 200, np.random.default_rng(0))
+    np.testing.assert_array_equal(target_weights(alone, 200, np.random.default_rng(0)), plain)
 
 
 def test_the_terminal_tells_levels_in_80_columns(made, capsys):

@@ -13,7 +13,7 @@ from nextview import metrics
 from nextview.benchmark import statistics as st
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.experiment import Grid
-from nextview.benchmark.levels import by_level
+from nextview.benchmark.levels import by_level, target_weights
 from nextview.benchmark.published import comparable_classes, published
 from nextview.benchmark.replay import Outcomes, truncate
 
@@ -75,7 +75,7 @@ def summarise(
         rng: draws them; the same ones for all policies, which pairs the differences.
         promised: the threshold for each error rate that the calibration promises, among those of the grid.
     """
-    weights = st.resample(len(grid.specs.predictions), samples, rng)
+    weights = target_weights(grid.specs.predictions.names, samples, rng)
     cells = list(grid.cells())
     summary, drawn = _summary(grid, cells, weights)
     sweep, areas = _areas(grid, reference, weights[:500])
@@ -190,7 +190,7 @@ def _areas(grid: Grid, reference: str, weights: Float) -> tuple[pd.DataFrame, pd
         if not paths.fixed:
             _, top, _ = _columns(grid, [(name, t, truncate(paths, t, grid.threshold_decay)) for t in SWEEP], measures)
             points[name] = top.mean(0).reshape(len(SWEEP), -1)
-            drawn[name] = (weights @ top / len(top)).reshape(len(weights), len(SWEEP), -1)
+            drawn[name] = (weights @ top / weights.sum(1, keepdims=True)).reshape(len(weights), len(SWEEP), -1)
     rows = [(name, t, *values) for name, curve in points.items() for t, values in zip(SWEEP, curve, strict=True)]
     sweep = _frame(rows, ["policy", "threshold", *measures])
     reach = {"n_views": (1.0, float(grid.max_views)), "travel_all": (0.0, float(sweep["travel_all"].max()))}
