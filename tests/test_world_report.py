@@ -16,6 +16,7 @@ from test_worlds import meshes, store, worlds  # noqa: F401
 
 from nextview.belief import Calibration
 from nextview.benchmark import results, statistics
+from nextview.benchmark.leaderboard import level_differences
 from nextview.benchmark.levels import target_weights
 from nextview.benchmark.published import ACCURACY, comparable_classes, read_table
 from nextview.benchmark.replay import make_specs, replay
@@ -114,6 +115,17 @@ def test_the_page_speaks_of_worlds(made):
     table = text[text.index("Heavy clutter, 2 worlds") :]
     first, second = re.search(r'scope="row">visibility</th><td>(.*?)</td><td>(.*?)</td>', table).groups()
     assert (first.count("<small>"), second.count("<small>")) == (1, 3)  # after one view nothing is chosen
+
+
+def test_the_page_says_which_policies_differ_after_a_number_of_views(made):
+    tables = results.load(made).tables
+    table = tables.levels.assign(p_holm=1.0)
+    assert level_differences(replace(tables, levels=table), "random") is None
+    table.loc[(table["level"] == "heavy") & (table["n_views"] == 3), ["p_holm", "difference"]] = 0.04, 0.1234
+    told = level_differences(replace(tables, levels=table), "random")
+    assert "visibility by +12.3 points after 3 views under heavy clutter" in told
+    assert "oracle" not in told  # no robot can follow it
+    assert "medium" not in told
 
 
 def test_nothing_published_stands_beside_worlds(made, predictions):

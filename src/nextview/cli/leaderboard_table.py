@@ -80,13 +80,13 @@ def _level(rows: list[LevelRow], reference: str) -> Table:
     worlds = f"{rows[0].worlds} world{'s' * (rows[0].worlds > 1)}"
     table = _table(f"{rows[0].level} clutter, {worlds}: accuracy, and points over {reference}")
     for k in counts:
-        table.add_column(f"{k} view{'s' * (k > 1)}", justify="right", no_wrap=True)
+        table.add_column(f"{k} view{'s' * (k > 1)}", no_wrap=True, min_width=12 if k > 1 else None)
     for row in rows:
         cells = []
         for k, cell in row.cells:
             compared = k > 1 and cell.difference == cell.difference  # after one view nothing is chosen
             over = f" {round(100 * cell.difference, 1) + 0.0:+5.1f}" if compared else ""
-            cells.append(f"{cell.accuracy:.3f}{over}{'*' if cell.p_holm < SIGNIFICANT else ' ' * (k > 1)}")
+            cells.append(f"{cell.accuracy:.3f}{over}{'*' * (cell.p_holm < SIGNIFICANT)}")
         table.add_row(row.policy, *cells, style="dim" if is_oracle(row.policy) else None)
     return table
 

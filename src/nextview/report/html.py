@@ -10,7 +10,7 @@ import numpy as np
 
 from nextview.arguments import takes_paths
 from nextview.benchmark.entries import is_oracle
-from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold, nothing_differs, too_few
+from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold, level_differences, nothing_differs, too_few
 from nextview.benchmark.results import KIND, Results
 from nextview.errors import ResultsError
 from nextview.outputs import added_file, check_added, check_file, written_whole
@@ -95,6 +95,7 @@ def page(results: Results, pictures: Pictures) -> str:
         "report.html",
         title=title,
         difference=difference,
+        in_worlds=level_differences(results.tables, results.settings["reference"]),
         best=best,
         reference=reference,
         runs=settings["runs"],
