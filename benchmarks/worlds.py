@@ -3,19 +3,23 @@
     python benchmarks/worlds.py choose learning.npz [--policies random-all visibility@0 visible-gain@0]
     nextview plan worlds.zarr volumetric    # of the store that worlds.npz was predicted from
     python benchmarks/worlds.py judge worlds.npz ... --ours visible-gain [--policies ...] [--out worlds_travel.png]
+    python benchmarks/worlds.py calibration worlds.npz ... --alone single-objects.npz ...
 
 ``choose``: what policies reach on worlds for learning, classes weighted evenly: the mean log-belief in the truth and
 the accuracy after 2 to 5 views, by which ``nextview train gain`` judges as well. ``judge``: by level the accuracy and
 the travel after 2, 3 and 5 views, the points over random, and those of ours over each of its rivals, with 95 %
 bootstrap intervals over worlds. Tested is what is claimed, ours against its rivals, with one Holm correction for all
-levels and numbers of views. Then how much of what one step of foresight gains is had; and, as a figure, accuracy against travel in cells, and in seconds of a robot that takes
-``SECONDS`` for each view and ``TURN`` for a turn of the camera around the object by one radian.
+levels and numbers of views. Then how much of what one step of foresight gains is had; and, as a figure, accuracy
+against travel in cells, and in seconds of a robot that takes ``SECONDS`` for each view and ``TURN`` for a turn of the
+camera around the object by one radian. ``calibration``: how far the belief after 1, 2, 3 and 5 random views can be
+trusted, by level and by how much of the target those views show, beside the belief after the very same views of the
+target alone.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 
 import matplotlib
@@ -25,6 +29,7 @@ import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from nextview.belief import of_true_class
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.experiment import Grid, run_grid
 from nextview.benchmark.levels import ORDER, grid_mean, levels_of
@@ -35,6 +40,9 @@ from nextview.calibration.rollout import judge as follow
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.predictions import Predictions
+from nextview.data.world_sight import worlds_of
+from nextview.errors import UsageError
+from nextview.metrics import calibration_error
 from nextview.policies.registry import make_policy
 from nextview.report.style import STYLE
 
@@ -45,6 +53,12 @@ REFERENCE = "random-all"
 COUNTS = (2, 3, 5)
 SECONDS, TURN = 1.0, 2.0
 """Of a robot: for each view, and for a turn by a radian."""
+SURE = 0.9
+"""Whoever is at least so sure and wrong is so confidently."""
+SHARES = (0.0, 0.1, 0.3, 0.6, 1.0)
+"""Ends of the bins of the mean share of the target that the views show; where nothing was seen yet, in none."""
+LEAST = 10
+"""Targets of which a row of the table tells."""
 COLOURS = ("#4a5560", "#d99000", "#0b5fa5", "#00805a", "#b5179e", "#d1495b", "#7a6fd0", "#38a0d9")
 
 
@@ -209,6 +223,100 @@ def draw(worlds: dict[str, dict[str, Reached]], out: Path) -> None:
         figure.savefig(out, dpi=110, facecolor="white")
 
 
+@dataclass(frozen=True)
+class Believed:
+    """What is believed after 1 to K views of each of E walks: belief in the answer, whether it is right, and minus the
+    logarithm of the belief in the truth; (E, K) each."""
+
+    confidence: np.ndarray
+    right: np.ndarray
+    loss: np.ndarray
+
+    @classmethod
+    def of(cls, p: Predictions, rows: np.ndarray, views: np.ndarray, shown: np.ndarray | None = None) -> Believed:
+        """Of walks through views, (E, K), around objects, (E,); shown, (E, K), where that is to count."""
+        weights = p.seen[rows[:, None], views] * np.asarray(p.calibration.weights(shown))
+        total = (weights[..., None] * p.log_evidence[rows[:, None], views].astype(np.float64)).cumsum(1)
+        logs = p.calibration.log_belief(total, np.maximum(weights.cumsum(1), 1), len(p.classes))
+        answers, labels = logs.argmax(-1), p.labels[rows]
+        sure = np.exp(np.stack([of_true_class(step, answer) for step, answer in zip(logs, answers, strict=True)]))
+        return cls(sure, answers == labels[:, None], -of_true_class(logs, labels))
+
+
+def calibration(
+    predictions: tyro.conf.Positional[tuple[Path, ...]],
+    alone: tuple[Path, ...],
+    walks: int = 10,
+    samples: int = 2000,
+    seed: int = 0,
+) -> None:
+    """Print how far the belief can be trusted, as a table in Markdown.
+
+    Args:
+        predictions: of worlds.
+        alone: of single objects, among them the targets of these worlds.
+        walks: of random views that can be reached, of each world; the same ones of the target alone.
+        samples: of the bootstrap over targets.
+        seed: of all that is random.
+    """
+    singles, parts = [Predictions.load(path) for path in alone], []
+    for path in predictions:
+        p, rng = Predictions.load(path), np.random.default_rng(seed)
+        worlds = worlds_of(p)
+        if worlds is None:
+            raise UsageError(f"{path}: holds single objects, no worlds")
+        rows = np.repeat(np.arange(len(p)), walks)
+        draws = np.where(worlds.reachable[rows], rng.random((len(rows), len(p.sphere))), -1)
+        views = np.argsort(-draws, axis=1)[:, : max(COUNTS)]
+        targets = np.array([name.partition("@")[0] for name in p.names])
+        single = next((single for single in singles if {*targets} <= {*single.names}), None)
+        if single is None:
+            raise UsageError(f"{path}: no predictions of single objects hold all targets of these worlds")
+        same = np.array([single.names.index(name) for name in targets])[rows]
+        share = np.stack([worlds.store.read("measures/visible_share", row) for row in worlds.rows])[
+            rows[:, None], views
+        ]
+        shown = worlds.all_shown()[rows[:, None], views] if p.calibration.visibility else None
+        nothing = ~p.seen[rows[:, None], views].cumsum(1).astype(bool)
+        show = np.where(nothing, np.nan, share.cumsum(1) / np.arange(1, max(COUNTS) + 1))
+        ours, bare = Believed.of(p, rows, views, shown), Believed.of(single, same, views)
+        parts.append((levels_of(p.names)[rows], targets[rows], show, *(vars(of) for of in (ours, bare))))
+    level, target, show = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    both = [Believed(*(np.concatenate([part[i][f.name] for part in parts]) for f in fields(Believed))) for i in (3, 4)]
+    print("| clutter | views | show | walks (targets) | accuracy, alone | surer than right, points (95 %), alone "
+          f"| calibration error, alone | log-loss, alone | at least {SURE} sure and wrong, alone |")  # fmt: skip
+    print("|---" * 9 + "|")
+    rng = np.random.default_rng([seed, 1])
+    for name, k in product((*(name for name in ORDER if name in level), "any"), (1, *COUNTS)):
+        mine, share = (level == name) | (name == "any"), show[:, k - 1]
+        kept = {"all": mine} | {
+            f"{low:g} to {high:g}": mine & (share >= low) & (share < high + (high == 1))
+            for low, high in pairwise(SHARES)
+        }
+        for bin_, here in kept.items():
+            if len(n := {*target[here]}) >= LEAST:
+                cells = trusted(both, here, k, target[here], samples, rng)
+                print(f"| {name} | {k} | {bin_} | {here.sum()} ({len(n)}) | {cells} |")
+
+
+def trusted(
+    both: list[Believed], here: np.ndarray, k: int, targets: np.ndarray, samples: int, rng: np.random.Generator
+) -> str:
+    """The cells of the table after k views of some walks; in each that of the targets alone stands behind."""
+    _, at = np.unique(targets, return_inverse=True)
+    weights, cells = resample(int(at.max()) + 1, samples, rng)[:, at], []
+    for of in both:
+        sure, right, loss = (getattr(of, f.name)[here, k - 1] for f in fields(of))
+        gap = 100 * (sure - right)
+        low, high = interval(((weights @ gap) / weights.sum(1))[:, None])
+        sure_and_wrong = ((sure >= SURE) & ~right).mean()
+        cells.append((
+            f"{right.mean():.3f}", f"{gap.mean():+.1f} ({low[0]:+.1f} to {high[0]:+.1f})",
+            f"{calibration_error(sure, right):.3f}", f"{loss.mean():.3f}", f"{100 * sure_and_wrong:.1f} %",
+        ))  # fmt: skip
+    return " | ".join(map(", ".join, zip(*cells, strict=True)))
+
+
 if __name__ == "__main__":
     with orderly_end("run it again"):
-        tyro.extras.subcommand_cli_from_dict({"choose": choose, "judge": judge})
+        tyro.extras.subcommand_cli_from_dict({"choose": choose, "judge": judge, "calibration": calibration})

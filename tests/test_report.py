@@ -19,7 +19,7 @@ from nextview.data.store import DONE, ViewStore
 from nextview.errors import EntryError, ResultsError
 from nextview.report import curves
 from nextview.report.html import headline_policy, write_report
-from nextview.report.trajectories import Pictures
+from nextview.report.object_pictures import Pictures
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 

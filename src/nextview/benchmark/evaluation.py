@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nextview import metrics
 from nextview.belief import Calibration
 from nextview.benchmark import statistics as st
-from nextview.benchmark.published import published_map, published_recognisers
+from nextview.benchmark.published import comparable_classes, published_map, published_recognisers
 from nextview.benchmark.true_maps import known_maps, true_map
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError
@@ -156,7 +156,7 @@ def _means(
 def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.DataFrame:
     one, clean = np.ones(len(p)), np.where(p.conflicting, 0.0, 1.0)
     by_shape = {} if p.of_size is None else _judged(p.by_shape())
-    best = published_recognisers(p.classes, len(p.sphere))
+    best = published_recognisers(comparable_classes(p), len(p.sphere))
     rows = []
     for n_views, logits in judged.items():
         scored = {"accuracy": logits, "clean_accuracy": logits}
@@ -256,7 +256,7 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
                 for i, measure in enumerate(errors):
                     beside = None
                     if by == "network":
-                        beside = published_map(name, over + measure, p.classes, label or None)
+                        beside = published_map(name, over + measure, comparable_classes(p), label or None)
                     rows.append((name, by, label, over + measure, value[i], low[i], high[i], beside))
     columns = ["map", "by", "label", "measure", "value", "low", "high", "published"]
     return pd.DataFrame(rows, columns=columns).astype({"published": "float64"}), left_out

@@ -111,6 +111,18 @@ def level_rows(tables: Tables) -> list[list[LevelRow]]:
     return found
 
 
+def level_differences(tables: Tables, reference: str) -> str | None:
+    """A sentence that names the policies of a robot that differ in worlds after so many views; None if none does."""
+    found = [
+        f"{row.policy} by {100 * cell.difference:+.1f} points after {n_views} views under {row.level} clutter"
+        for rows in level_rows(tables)
+        for row in rows
+        for n_views, cell in row.cells
+        if not is_oracle(row.policy) and cell.p_holm < SIGNIFICANT
+    ]
+    return f"With no threshold, significantly different from {reference}: {'; '.join(found)}." if found else None
+
+
 def nothing_differs(tables: Tables, threshold: float, reference: str) -> str | None:
     """A sentence where no policy that a robot could follow differs from the reference in accuracy; else None."""
     tests = _robot_tests(tables, threshold)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from nextview.benchmark import statistics as st
 from nextview.benchmark.experiment import Grid
+from nextview.worlds import LEVELS, level_of
 
 VIEWS = (2, 3, 5)
 """After so many views the policies are compared."""
-LEVEL = re.compile(r".*@(\w+)-\d+")
-"""Names of worlds."""
-ORDER = ("light", "medium", "heavy")
+ORDER = tuple(LEVELS)
 COLUMNS = [
     "level", "worlds", "policy", "n_views", "accuracy", "low", "high", "travel", "difference", "difference_low",
     "difference_high", "p", "p_holm",
@@ -24,7 +23,17 @@ COLUMNS = [
 
 def levels_of(names: tuple[str, ...]) -> NDArray[np.str_]:
     """The level of each world, by its name, (N,); "" for what is none."""
-    return np.array([match[1] if (match := LEVEL.fullmatch(name)) else "" for name in names])
+    return np.array([level_of(name) for name in names])
+
+
+def target_weights(names: Sequence[str], samples: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Bootstrap weights, (samples, N), in which worlds around one target are drawn together: they are no two witnesses.
+
+    Of single objects ``statistics.resample``.
+    """
+    targets = [name.rpartition("@")[0] if level_of(name) else name for name in names]
+    place = {target: i for i, target in enumerate(dict.fromkeys(targets))}
+    return st.resample(len(place), samples, rng)[:, [place[target] for target in targets]]
 
 
 def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator) -> pd.DataFrame:
@@ -33,7 +42,7 @@ def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator)
     Args:
         grid: what was run.
         reference: the policy that the others are compared with, over the same worlds and first views.
-        samples: of the bootstrap over worlds.
+        samples: of the bootstrap over targets.
         rng: draws them.
 
     Returns:
@@ -41,12 +50,14 @@ def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator)
         reference, difference_low, difference_high, p (paired bootstrap), p_holm (one correction for all of them).
         Empty where the objects are no worlds. Fixed views are left out.
     """
-    of, rows = levels_of(grid.specs.predictions.names), []
+    names: tuple[str, ...] = grid.specs.predictions.names
+    of, rows = levels_of(names), []
     paths = {name: paths for name, paths in grid.paths.items() if not paths.fixed}
     counts = [k for k in (1, *VIEWS) if k <= grid.max_views]
     for level in sorted({*of} - {""}, key=lambda name: (ORDER.index(name) if name in ORDER else len(ORDER), name)):
         mine = np.flatnonzero(of == level)
-        weights = st.resample(len(mine), samples, rng) / len(mine)
+        weights = target_weights([names[i] for i in mine], samples, rng)
+        weights /= weights.sum(1, keepdims=True)
         right = {name: _after(grid, path.answers, path.views, counts)[mine] for name, path in paths.items()}
         for name, path in paths.items():
             spread = weights @ right[name]

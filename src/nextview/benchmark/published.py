@@ -8,7 +8,9 @@ from importlib.resources import files
 
 import numpy as np
 
+from nextview.data.predictions import Predictions
 from nextview.measures.map_names import LCM, LEM
+from nextview.worlds import level_of
 
 COLUMNS = {
     "random": "random",
@@ -49,6 +51,14 @@ def published_classes(classes: tuple[str, ...]) -> int | None:
     """10 or 40 for the classes of ModelNet10 or ModelNet40, in any order; None for others."""
     n = len(classes)
     return n if n in ACCURACY and set(classes) == set(read_table(ACCURACY[n])) else None
+
+
+def comparable_classes(p: Predictions) -> tuple[str, ...]:
+    """The classes by which published numbers are found beside predictions.
+
+    None for those of worlds: what was published is of objects that stand alone.
+    """
+    return () if any(map(level_of, p.names)) else p.classes
 
 
 def published_threshold(policy: str) -> float | None:

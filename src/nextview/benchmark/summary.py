@@ -13,8 +13,8 @@ from nextview import metrics
 from nextview.benchmark import statistics as st
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.experiment import Grid
-from nextview.benchmark.levels import by_level
-from nextview.benchmark.published import published
+from nextview.benchmark.levels import by_level, target_weights
+from nextview.benchmark.published import comparable_classes, published
 from nextview.benchmark.replay import Outcomes, truncate
 
 Float = NDArray[np.float64]
@@ -75,7 +75,7 @@ def summarise(
         rng: draws them; the same ones for all policies, which pairs the differences.
         promised: the threshold for each error rate that the calibration promises, among those of the grid.
     """
-    weights = st.resample(len(grid.specs.predictions), samples, rng)
+    weights = target_weights(grid.specs.predictions.names, samples, rng)
     cells = list(grid.cells())
     summary, drawn = _summary(grid, cells, weights)
     sweep, areas = _areas(grid, reference, weights[:500])
@@ -121,7 +121,7 @@ def _columns(grid: Grid, cells: list[Cell], names: tuple[str, ...] | None = None
 
 def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFrame, dict[tuple, Float]]:
     """The table, and the bootstrap samples (S,) behind each of its cells."""
-    labels, classes = grid.specs.predictions.labels, grid.specs.predictions.classes
+    labels, classes = grid.specs.predictions.labels, comparable_classes(grid.specs.predictions)
     duplicate_groups = np.ones((1, weights.shape[1]))
     keys, top, bottom = _columns(grid, cells)
     value, drawn = metrics.ratio(top, bottom, duplicate_groups)[0], metrics.ratio(top, bottom, weights)
@@ -146,7 +146,7 @@ def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFram
 
 
 def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
-    p = grid.specs.predictions
+    p, classes = grid.specs.predictions, comparable_classes(grid.specs.predictions)
     keys, top, bottom = _columns(grid, cells, ("accuracy", "travel_moved"))
     rows = []
     for index in np.unique(p.labels):
@@ -154,7 +154,7 @@ def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
         value = metrics.ratio(top[here], bottom[here], np.ones((1, int(here.sum()))))[0]
         low, high = st.interval(metrics.ratio(top[here], bottom[here], weights[:, here]))
         for i, (policy, threshold, measure) in enumerate(keys):
-            beside = published(policy, threshold, measure, p.classes, label)
+            beside = published(policy, threshold, measure, classes, label)
             rows.append((policy, threshold, label, measure, value[i], low[i], high[i], beside))
     return _frame(rows, ["policy", "threshold", "label", "measure", "value", "low", "high", "published"])
 
@@ -190,7 +190,7 @@ def _areas(grid: Grid, reference: str, weights: Float) -> tuple[pd.DataFrame, pd
         if not paths.fixed:
             _, top, _ = _columns(grid, [(name, t, truncate(paths, t, grid.threshold_decay)) for t in SWEEP], measures)
             points[name] = top.mean(0).reshape(len(SWEEP), -1)
-            drawn[name] = (weights @ top / len(top)).reshape(len(weights), len(SWEEP), -1)
+            drawn[name] = (weights @ top / weights.sum(1, keepdims=True)).reshape(len(weights), len(SWEEP), -1)
     rows = [(name, t, *values) for name, curve in points.items() for t, values in zip(SWEEP, curve, strict=True)]
     sweep = _frame(rows, ["policy", "threshold", *measures])
     reach = {"n_views": (1.0, float(grid.max_views)), "travel_all": (0.0, float(sweep["travel_all"].max()))}

@@ -33,8 +33,11 @@ def print_leaderboard(results: Results) -> None:
         for sentence in (nothing_differs(tables, at, reference), too_few(tables, at, len(results.predictions))):
             if sentence:
                 console.print(sentence)
-    for level in level_rows(tables):
+    levels = level_rows(tables)
+    for level in levels:
         console.print(_level(level, reference))
+    if levels:
+        console.print(f"* differs from {reference}: p after one correction for all of these is below {SIGNIFICANT}")
     if promised := promised_risks(tables):
         console.print(_risks(promised))
 
@@ -74,15 +77,16 @@ def _policies(board: list[Standing], threshold: float, reference: str) -> Table:
 
 def _level(rows: list[LevelRow], reference: str) -> Table:
     counts = [n_views for n_views, _ in rows[0].cells]
-    title = f"{rows[0].level}: {rows[0].worlds} worlds, accuracy after so many views; points over {reference}"
-    table = _table(title)
+    worlds = f"{rows[0].worlds} world{'s' * (rows[0].worlds > 1)}"
+    table = _table(f"{rows[0].level} clutter, {worlds}: accuracy, and points over {reference}")
     for k in counts:
-        table.add_column(f"{k}", justify="right", no_wrap=True)
+        table.add_column(f"{k} view{'s' * (k > 1)}", no_wrap=True, min_width=12 if k > 1 else None)
     for row in rows:
         cells = []
-        for _, cell in row.cells:
-            over = "" if cell.difference != cell.difference else f" {round(100 * cell.difference, 1) + 0.0:+.1f}"
-            cells.append(f"{cell.accuracy:.3f}{over}{'*' if cell.p_holm < SIGNIFICANT else ' '}")
+        for k, cell in row.cells:
+            compared = k > 1 and cell.difference == cell.difference  # after one view nothing is chosen
+            over = f" {round(100 * cell.difference, 1) + 0.0:+5.1f}" if compared else ""
+            cells.append(f"{cell.accuracy:.3f}{over}{'*' * (cell.p_holm < SIGNIFICANT)}")
         table.add_row(row.policy, *cells, style="dim" if is_oracle(row.policy) else None)
     return table
 

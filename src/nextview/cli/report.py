@@ -24,7 +24,7 @@ def report(
     from nextview.benchmark.results import load
     from nextview.cli.progress import console
     from nextview.report.html import PAGE, check_page, write_report
-    from nextview.report.trajectories import Pictures
+    from nextview.report.object_pictures import Pictures
 
     target = out or results / PAGE
     check_page(target, results)

@@ -17,6 +17,7 @@ from nextview.errors import DatasetError
 from nextview.occupancy import Occupancy, SeenScene, expected_visibility
 from nextview.occupancy.expected_visibility import GRID, shown_in, sight_lines
 from nextview.policies.base import EpisodeState
+from nextview.worlds import level_of
 
 Constrain = Callable[[EpisodeState], EpisodeState]
 
@@ -42,18 +43,22 @@ def sight_of(worlds: WorldSight | None, objects: NDArray[np.int64]) -> tuple[Con
 
 
 def worlds_of(p: Predictions) -> WorldSight | None:
-    """The worlds that predictions are of; None if they are of single objects, or their store is not there.
+    """The worlds that predictions are of; None if they are of single objects, whose store need not be there.
 
     Raises:
-        DatasetError: the store lacks one of them, or is damaged.
+        DatasetError: the store is not there and the names are those of worlds: without it nobody knows what hides them
+            and where a camera cannot be. Or it lacks one of them, or is damaged.
     """
-    if not p.store:
-        return None
     try:
-        store = ViewStore.open(p.store)
+        store = ViewStore.open(p.store) if p.store else None
     except DatasetError:
-        return None
-    return WorldSight.of(store, p.names)
+        store = None
+    if store is not None:
+        return WorldSight.of(store, p.names)
+    if any(map(level_of, p.names)):
+        lost = f"there is no view store at {p.store} any more; put it back, or" if p.store else "name no view store;"
+        raise DatasetError(f"these predictions are of worlds, and {lost} predict again")
+    return None
 
 
 @dataclass(frozen=True)

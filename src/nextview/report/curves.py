@@ -46,7 +46,13 @@ CROWD, BEST = 12, 8
 def followed(results: Results) -> list[str]:
     """The policies that a robot could follow, then the published one and the ceiling."""
     names = list(results.tables.sweep["policy"].unique())
-    return [n for n in names if not is_oracle(n)] + [n for n in ("oracle-valley", "oracle-gain") if n in names]
+    return [n for n in names if not is_oracle(n)] + [n for n in ("oracle-valley", *ceiling(results)) if n in names]
+
+
+def ceiling(results: Results) -> list[str]:
+    """One step of foresight, in the window if it was run there, else over all views; empty if it was not run."""
+    ran = set(results.tables.sweep["policy"])
+    return [name for name in ("oracle-gain", "oracle-gain-all") if name in ran][:1]
 
 
 def own_policies(results: Results) -> list[str]:
@@ -172,7 +178,7 @@ def class_differences(results: Results, threshold: float) -> Figure:
     reference = results.settings["reference"]
     table = results.tables.per_class.query("measure == 'accuracy' and threshold == @threshold")
     table = table.pivot(index="label", columns="policy", values="value")
-    names = [name for name in compared(results) if name in table and name not in (reference, "oracle-gain")]
+    names = [name for name in compared(results) if name in table and name not in (reference, *ceiling(results))]
     values = np.round(100 * (table[names].to_numpy() - table[[reference]].to_numpy()).T, 1) + 0.0  # no minus zero
     figure, axes = new_figure(4.9, 0.9 + 0.3 * len(names))
     reach = max(1.0, float(np.abs(values).max()))

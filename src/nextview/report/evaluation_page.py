@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from nextview.benchmark.evaluation import Evaluation
-from nextview.benchmark.published import published_recognisers
+from nextview.benchmark.published import comparable_classes, published_recognisers
 from nextview.data.predictions import Predictions
 from nextview.measures.map_names import CONFIDENCE, measure_of
 from nextview.report import evaluation_figures as drawn
@@ -164,8 +164,8 @@ def _accuracy_table(e: Evaluation, p: Predictions) -> Table:
 
 
 def _published_table(e: Evaluation, p: Predictions) -> Table | None:
-    """Beside the published recognisers; None if there are none for these classes."""
-    published = published_recognisers(p.classes, len(p.sphere))
+    """Beside the published recognisers; None if there are none for these objects."""
+    published = published_recognisers(comparable_classes(p), len(p.sphere))
     if not published:
         return None
     ours = _accuracies(e)[1, "", "accuracy"]

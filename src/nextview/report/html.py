@@ -10,7 +10,7 @@ import numpy as np
 
 from nextview.arguments import takes_paths
 from nextview.benchmark.entries import is_oracle
-from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold, nothing_differs, too_few
+from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold, level_differences, nothing_differs, too_few
 from nextview.benchmark.results import KIND, Results
 from nextview.errors import ResultsError
 from nextview.outputs import added_file, check_added, check_file, written_whole
@@ -18,7 +18,8 @@ from nextview.policies.registry import DEFAULT
 from nextview.report import curves
 from nextview.report import html_tables as tables
 from nextview.report.elements import GENERATOR, NONE, Card, Picture, numbers, percent, picture, render
-from nextview.report.trajectories import Pictures, gains, trajectories, worst_failures
+from nextview.report.object_pictures import Pictures
+from nextview.report.trajectories import gains, trajectories, worst_failures
 
 
 def headline_policy(results: Results, threshold: float) -> str:
@@ -94,12 +95,13 @@ def page(results: Results, pictures: Pictures) -> str:
         "report.html",
         title=title,
         difference=difference,
+        in_worlds=level_differences(results.tables, results.settings["reference"]),
         best=best,
         reference=reference,
         runs=settings["runs"],
         warning=too_few(results.tables, at, len(p)),
         verdict=nothing_differs(results.tables, at, reference),
-        facts=f"{len(p):,} objects of {len(set(p.labels.tolist()))} classes, {settings['runs']} first views each, "
+        facts=f"{_objects(results)} of {len(set(p.labels.tolist()))} classes, {settings['runs']} first views each, "
         f"threshold {at:g}, at most {settings['max_views']} views.",
         headline=_cards(results, best, at),
         scenes=_scenes(results, best, at, failures.values.tolist(), pictures),
@@ -126,7 +128,7 @@ def _cards(results: Results, best: str, at: float) -> list[Card]:
     first = results.tables.sweep.query("policy == @reference or policy == @best").iloc[0]
     ran = set(results.tables.sweep["policy"])
     cards = [Card("one view", percent(first["accuracy"]), "no travel")]
-    for policy in dict.fromkeys((reference, best, DEFAULT, *curves.own_policies(results), "oracle-gain")):
+    for policy in dict.fromkeys((reference, best, DEFAULT, *curves.own_policies(results), *curves.ceiling(results))):
         if policy in ran:
             n = found[policy, at, "accuracy"]
             n_views, travel = found[policy, at, "n_views"].value, found[policy, at, "travel_all"].value
@@ -146,11 +148,21 @@ def _verdict(results: Results, best: str, at: float) -> tuple[str, str]:
         f"{best} is {100 * abs(difference):.1f} points {'more' if difference > 0 else 'less'} accurate than {reference}"
     )
     if p >= SIGNIFICANT:
-        title = f"No policy that a robot could follow is clearly more accurate than {reference}"
+        title = f"No policy that a robot could follow is clearly more accurate than {reference} at threshold {at:g}"
     return title, (
-        f"{100 * difference:+.1f} points, 95\u00a0% interval {100 * low:+.1f} to {100 * high:+.1f}, "
+        f"{tables.points(difference)} points, 95\u00a0% interval {tables.points(low)} to {tables.points(high)}, "
         f"p after Holm's correction {tables.p_value(p).replace('< ', 'under ')}"
     )
+
+
+def _objects(results: Results) -> str:
+    """How many there are; of worlds, also at which levels."""
+    levels = list(results.tables.levels["level"].unique())
+    n = len(results.predictions)
+    if not levels:
+        return f"{n:,} objects"
+    listed = " and ".join([", ".join(levels[:-1]), levels[-1]] if levels[1:] else levels)
+    return f"{n:,} world{'s' * (n > 1)} of {listed} clutter around objects"
 
 
 def _spoken(results: Results, policies: Sequence[str], at: float, measure: str) -> str:
@@ -184,11 +196,13 @@ def _differences(results: Results, at: float) -> list[Picture]:
 
 def _curves(results: Results, at: float) -> list[Picture]:
     names = curves.compared(results)
+    as_published = ", as figures 15 and 18" if results.tables.levels.empty else ""
+    oracles = "; oracles broken" if any(map(is_oracle, names)) else ""
     figures = [
         picture(
             curves.threshold_curve(results, measure),
             f"{what} against threshold. " + _spoken(results, names, at, measure),
-            f"{what} against threshold, as figures 15 and 18.{_others(results)}",
+            f"{what} against threshold{as_published}.{_others(results)}",
         )
         for measure, what in (("class_accuracy", "Mean class accuracy"), ("accuracy", "Accuracy over objects"))
     ]
@@ -198,7 +212,7 @@ def _curves(results: Results, at: float) -> list[Picture]:
                 picture(
                     curves.budget_curve(results, budget),
                     f"Accuracy against mean {what}. " + _spoken(results, names, at, budget),
-                    f"Accuracy against mean {what}; oracles broken.{_others(results)}",
+                    f"Accuracy against mean {what}{oracles}.{_others(results)}",
                 )
             )
     return figures
@@ -206,7 +220,7 @@ def _curves(results: Results, at: float) -> list[Picture]:
 
 def _reliability(results: Results, best: str, at: float) -> list[Picture]:
     ran = set(results.tables.sweep["policy"])
-    policies = [n for n in dict.fromkeys((results.settings["reference"], best, "oracle-gain")) if n in ran]
+    policies = [n for n in dict.fromkeys((results.settings["reference"], best, *curves.ceiling(results))) if n in ran]
     return [
         picture(
             curves.reliability_diagram(results, policies, at),
@@ -227,7 +241,7 @@ def _classes(results: Results, best: str, at: float) -> list[Picture]:
         for name in dict.fromkeys((reference, best))
         if name in ran
     ]
-    if reference in ran and len(set(curves.compared(results)) - {"oracle-gain"}) > 1:
+    if reference in ran and len(set(curves.compared(results)) - set(curves.ceiling(results))) > 1:
         figures.append(
             picture(
                 curves.class_differences(results, at),

@@ -22,6 +22,11 @@ def p_value(p: float) -> str:
     return NONE if np.isnan(p) else "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
+def points(difference: float) -> str:
+    """A difference in percentage points, never minus zero."""
+    return f"{round(100 * difference, 1) + 0.0:+.1f}"
+
+
 def named(policy: str, *small: str) -> Cell:
     """A policy's name, marked if it knows what a robot cannot."""
     return Cell(policy, small, oracle=is_oracle(policy) or policy.split("-")[0] in KNOWING)
@@ -46,7 +51,7 @@ def overview(results: Results, threshold: float) -> Table:
         row += [cell(found[policy, threshold, measure], digits) for measure, digits in measures.items()]
         if policy in tested:
             difference, low, high, p, paired = tested[policy]
-            row.append(Cell(f"{100 * difference:+.1f}", (f"{100 * low:+.1f} … {100 * high:+.1f}",)))
+            row.append(Cell(points(difference), (f"{points(low)} … {points(high)}",)))
             row += [p_value(p), p_value(paired)]
         else:
             row += ["reference", NONE, NONE]
@@ -96,37 +101,41 @@ def levels(results: Results) -> list[Table]:
     found = []
     for rows in level_rows(results.tables):
         counts = [n_views for n_views, _ in rows[0].cells]
-        head = ["policy", *(f"{k} view{'s' * (k > 1)}" for k in counts), *(f"travel, {k}" for k in counts if k > 1)]
+        head = ["policy", *(f"{k} view{'s' * (k > 1)}" for k in counts)]
+        head += [f"travel, {k} views" for k in counts if k > 1]
         body: list[list[Cell | str]] = []
         for row in rows:
             line: list[Cell | str] = [named(row.policy)]
-            for _, at in row.cells:
-                small = [f"{at.low:.3f} … {at.high:.3f}"]
-                if not np.isnan(at.difference):
-                    small.append(
-                        f"{100 * at.difference:+.1f} ({100 * at.difference_low:+.1f} … {100 * at.difference_high:+.1f})"
-                    )
-                if not np.isnan(at.p_holm):
-                    small.append(f"p {p_value(at.p_holm)}")
+            for k, at in row.cells:
+                small = [f"{at.low:.3f} {NONE} {at.high:.3f}"]
+                if k > 1 and not np.isnan(at.difference):  # after one view nothing is chosen
+                    around = f"{points(at.difference_low)} … {points(at.difference_high)}"
+                    p = p_value(at.p_holm)
+                    small += [f"{points(at.difference)} ({around})", f"p {p}"]
                 line.append(Cell(f"{at.accuracy:.3f}", tuple(small)))
             body.append([*line, *(f"{at.travel:.2f}" for k, at in row.cells if k > 1)])
         caption = (
-            f"Clutter {rows[0].level}, {rows[0].worlds} worlds: accuracy after a fixed number of views. Small print: "
-            f"95\u00a0% intervals, points over {results.settings['reference']} with theirs, and p-values with one Holm "
-            "correction for all levels, policies and numbers of views."
+            f"{rows[0].level.capitalize()} clutter, {rows[0].worlds} worlds: accuracy after a fixed number of views, "
+            "whatever is believed. Small print: 95\u00a0% intervals, points over "
+            f"{results.settings['reference']} with theirs, and p-values with one Holm correction for all levels, "
+            "policies and numbers of views. Travel is in grid cells."
         )
         found.append(Table(head, body, caption))
     return found
 
 
 def per_class(results: Results, measure: str, fallback: float) -> Table:
-    """Tables 8 and 9 (40 classes: 10 and 11), each policy at the threshold of its published column."""
+    """Tables 8 and 9 (40 classes: 10 and 11), each policy at the threshold of its published column.
+
+    Of worlds nothing is published; there all policies that a robot could follow are at the same threshold.
+    """
     found = numbers(results.tables.per_class, "policy", "threshold", "label", "measure")
     overall = numbers(results.tables.summary, "policy", "threshold", "measure")
     thresholds = results.settings["thresholds"]
     ran = set(results.tables.sweep["policy"])
-    at: dict[str, float] = {}
-    for name in (LEM, *COLUMNS):
+    worlds = not results.tables.levels.empty
+    at = {name: fallback for name in results.tables.sweep["policy"].unique() if worlds and not is_oracle(name)}
+    for name in () if worlds else (LEM, *COLUMNS):
         wanted = published_threshold(name) or 0.99
         if name in ran:
             at[name] = wanted if wanted in thresholds else fallback
@@ -139,9 +148,11 @@ def per_class(results: Results, measure: str, fallback: float) -> Table:
     for heading, of in (("mean of classes", f"class_{measure}"), (f"mean of {over}", measure)):
         rows.append([heading, *(cell(overall.get((name, t, of)), digits) for name, t in at.items())])
     head: list[Cell | str] = ["class", *(named(name, f"at {t:g}") for name, t in at.items())]
+    what = "Accuracy" if measure == "accuracy" else "Travel in grid cells, over the episodes that moved,"
+    if worlds:
+        return Table(head, rows, f"{what} by class.")
     ten = len(results.predictions.classes) <= 10
     number = {"accuracy": 8 if ten else 10, "travel_moved": 9 if ten else 11}[measure]
-    what = "Accuracy" if measure == "accuracy" else "Travel in grid cells, over the episodes that moved,"
     return Table(head, rows, f"{what} by class, as table {number} of the thesis, whose numbers stand last in a cell.")
 
 

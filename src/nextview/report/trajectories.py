@@ -2,121 +2,22 @@
 
 from __future__ import annotations
 
-import base64
-from dataclasses import dataclass
-from io import BytesIO
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from PIL import Image
 
 from nextview.benchmark.entries import EpisodeSpecs
 from nextview.benchmark.published import COLUMNS
 from nextview.benchmark.replay import replay, truncate
 from nextview.benchmark.results import Results
-from nextview.data.predictions import Predictions
-from nextview.data.store import ViewStore
-from nextview.data.world_views import world_views
-from nextview.errors import DatasetError, ResultsError
 from nextview.measures.depth_entropy import normalise_per_object
 from nextview.measures.map_names import LEM
-from nextview.shading import headlight
+from nextview.report.object_pictures import Pictures
+from nextview.worlds import level_of
 
-CLOUD = 1500
-"""Points of an object in the viewer."""
-PICTURE = 112
-"""Side of a view's picture, pixels."""
 THESIS = ("table_0444", 13)
 """Object and first view of the thesis's figures 16, 17 and 29 to 31."""
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """What the objects look like, from the store they were rendered into.
-
-    Attributes:
-        store: None if there are no pictures.
-        why_not: a sentence that says why there are none; empty if there are.
-    """
-
-    store: ViewStore | None
-    why_not: str = ""
-
-    @classmethod
-    def of(cls, predictions: Predictions, store: Path | None = None) -> Pictures:
-        """Pictures of the objects of some predictions.
-
-        Args:
-            predictions: they name the store that they were made from, and hold the depth-entropy of each of its views,
-                by which it is known again.
-            store: take this one instead, as it is.
-
-        Raises:
-            DatasetError: the store that was given cannot be read.
-            ResultsError: it holds none of the objects, or other views of them.
-        """
-        if store is not None:
-            given = ViewStore.open(store)
-            if given.sphere != predictions.sphere or not set(given.names) & set(predictions.names):
-                raise ResultsError(f"{store}: holds no views of these objects from these viewpoints")
-            return cls(given)
-        remedy = "give it with --store"
-        if not predictions.store:
-            return cls(None, f"No pictures: the predictions do not name the view store they were made from; {remedy}.")
-        try:
-            named = ViewStore.open(predictions.store)
-            row = {name: i for i, name in enumerate(named.names)}
-            rows = [row.get(name, -1) for name in predictions.names]
-            same = named.sphere == predictions.sphere and -1 not in rows
-            same = same and np.array_equal(named.measure()[rows], predictions.depth_entropy)
-        except DatasetError:
-            return cls(None, f"No pictures: there is no view store at {predictions.store} any more; {remedy}.")
-        if not same:
-            return cls(None, f"No pictures: the view store {predictions.store} has changed since; {remedy}.")
-        return cls(named)
-
-    def row(self, name: str) -> int | None:
-        """Where an object is in the store."""
-        if self.store is None or name not in self.store.names:
-            return None
-        return self.store.names.index(name)
-
-    def cloud(self, name: str) -> str | None:
-        """Points of all views together, (CLOUD, 3) int8 in 1/127 radii, base64."""
-        row = self.row(name)
-        if row is None or self.store is None:
-            return None
-        points = self.store.points(row).reshape(-1, 3)
-        points = points[np.random.default_rng(0).choice(len(points), CLOUD, replace=False)]
-        return base64.b64encode(np.rint(127 * points.clip(-1, 1)).astype(np.int8).tobytes()).decode()
-
-    def views(self, name: str, views: list[int]) -> dict[int, str]:
-        """Shaded images of some views, as data URIs."""
-        row = self.row(name)
-        if row is None or self.store is None:
-            return {}
-        images = self.store.image(row) if "scene" not in self.store.group.attrs else _scenes(self.store, row)
-        return {view: _data_uri(images[view]) for view in views}
-
-
-OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])
-"""Colours of nothing, the target, other things and the table."""
-
-
-def _scenes(store: ViewStore, row: int) -> NDArray[np.uint8]:
-    """A world as it looks from all views, the target told from all else by its colour, (V, S, S, 3) uint8."""
-    world = world_views(store, row)
-    shade = np.stack([headlight(depth, world.intrinsics) for depth in world.depth])[..., None] / 255
-    return np.where(world.owner[..., None] > 0, OWNERS[world.owner] * (0.35 + 0.65 * shade), 255).astype(np.uint8)
-
-
-def _data_uri(image: NDArray[np.uint8]) -> str:
-    file = BytesIO()
-    Image.fromarray(image).resize((PICTURE, PICTURE), Image.Resampling.LANCZOS).save(file, "WEBP", quality=70)
-    return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
 
 
 def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:
@@ -156,6 +57,8 @@ def trajectories(
     p = results.predictions
     row = {name: i for i, name in enumerate(p.names)}
     scenes = []
+    if p.calibration.visibility is not None and any(map(level_of, p.names)) and pictures.store is None:
+        wanted = []  # what was believed depends on what shows, and that is not known any more
     if THESIS[0] in row and len(p.sphere) == 40:
         scenes.append(
             _scene(results, *THESIS, "the thesis's figures 16, 17, 29-31", _thesis_paths(results, row), pictures)
@@ -203,15 +106,19 @@ def _scene(
         "why": why,
         "entropy": normalise_per_object(p.depth_entropy[i]).round(3).tolist(),
         "cloud": pictures.cloud(name),
+        "world": pictures.world(name),
         "pictures": pictures.views(name, seen),
-        "episodes": [_episode(results, i, policy, views) for policy, views in paths.items()],
+        "episodes": [_episode(results, i, policy, views, pictures) for policy, views in paths.items()],
     }
 
 
-def _episode(results: Results, i: int, policy: str, views: list[int]) -> dict[str, Any]:
+def _episode(results: Results, i: int, policy: str, views: list[int], pictures: Pictures) -> dict[str, Any]:
+    """What was believed after each view, as ``nextview.episode`` adds it up."""
     p = results.predictions
-    log_evidence = p.log_evidence[i, views].astype(np.float64).cumsum(0)
-    beliefs = p.calibration.belief(log_evidence, np.arange(1, len(views) + 1), len(p.classes))
+    shown = None if p.calibration.visibility is None else pictures.shown(p.names[i], views)
+    weights = p.seen[i, views] * np.asarray(p.calibration.weights(shown))
+    total = (weights[:, None] * p.log_evidence[i, views].astype(np.float64)).cumsum(0)
+    beliefs = p.calibration.belief(total, np.maximum(weights.cumsum(), 1), len(p.classes))
     top = [np.argsort(-belief, kind="stable")[:3] for belief in beliefs]
     travel = [0.0, *np.cumsum(p.sphere.travel[views[:-1], views[1:]])]
     return {

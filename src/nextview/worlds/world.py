@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -17,6 +18,8 @@ from nextview.outputs import written_whole
 SCHEMA = 1
 LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}
 """Share of the target that shows, on the average over the 40 views."""
+NAMED = re.compile(r".*@(\w+)-\d+")
+"""Names of worlds that were drawn: target, level and number."""
 SUFFIX = ".json"
 VIEWS = 40
 """Of which a world says how much of the target they show."""
@@ -24,6 +27,12 @@ FARTHEST = 1000.0
 """Every length, place and angle of a world is at most this: what is computed with more has no precision left."""
 THINGS = 1000
 """Objects and blocks around a target at most."""
+
+
+def level_of(name: str) -> str:
+    """The level of a world by its name; "" for what is none, such as a single object."""
+    match = NAMED.fullmatch(name)
+    return match[1] if match else ""
 
 
 @dataclass(frozen=True)

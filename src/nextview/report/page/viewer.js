@@ -10,11 +10,8 @@
   const scene = () => data.scenes[state.scene];
   const episode = () => scene().episodes.find((e) => e.policy === state.policy) || scene().episodes[0];
 
-  const clouds = data.scenes.map((s) => {
-    if (!s.cloud) return null;
-    const bytes = Uint8Array.from(atob(s.cloud), (c) => c.charCodeAt(0));
-    return new Int8Array(bytes.buffer);
-  });
+  const decoded = (text) => text ? new Int8Array(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer) : [];
+  const clouds = data.scenes.map((s) => ({ object: decoded(s.cloud), things: decoded(s.world && s.world.things) }));
 
   function project([x, y, z], size) {
     const cy = Math.cos(state.yaw), sy = Math.sin(state.yaw), cp = Math.cos(state.pitch), sp = Math.sin(state.pitch);
@@ -50,6 +47,13 @@
     if (ring) { pen.strokeStyle = ring; pen.lineWidth = Math.max(1.5, radius / 4); pen.stroke(); }
   }
 
+  function cross(at, radius) {
+    pen.strokeStyle = "#8b97a3"; pen.lineWidth = 1.6;
+    pen.beginPath();
+    for (const way of [-1, 1]) { pen.moveTo(at[0] - radius, at[1] - way * radius); pen.lineTo(at[0] + radius, at[1] + way * radius); }
+    pen.stroke();
+  }
+
   function draw() {
     const size = canvas.clientWidth || 400, ratio = window.devicePixelRatio || 1;
     if (canvas.width !== Math.round(size * ratio)) canvas.width = canvas.height = Math.round(size * ratio);
@@ -63,22 +67,22 @@
       });
       line(ring, size, "#2c3742", 1);
     }
-    const cloud = clouds[state.scene];
-    if (cloud) {
-      const points = [];
+    const world = scene().world, object = world ? world.scale : OBJECT; // among others all is as large as it is
+    const points = [];
+    for (const [cloud, scale, thing] of [[clouds[state.scene].object, object, false], [clouds[state.scene].things, 1, true]])
       for (let i = 0; i < cloud.length; i += 3)
-        points.push(project([0, 1, 2].map((k) => (OBJECT * cloud[i + k]) / 127), size));
-      points.sort((a, b) => a[2] - b[2]);
-      for (const [x, y, near] of points) {
-        const light = Math.round(150 + 95 * near / OBJECT);
-        pen.fillStyle = `rgb(${light - 30},${light - 10},${light})`;
-        pen.fillRect(x - 1.1, y - 1.1, 2.2, 2.2);
-      }
+        points.push([...project([0, 1, 2].map((k) => (scale * cloud[i + k]) / 127), size), thing]);
+    points.sort((a, b) => a[2] - b[2]);
+    for (const [x, y, near, thing] of points) {
+      const light = Math.round(150 + 95 * Math.min(1, Math.max(-1, near / (world ? 0.8 : OBJECT))));
+      pen.fillStyle = thing ? `rgb(${light - 10},${light >> 1},${light >> 1})` : `rgb(${light - 30},${light - 10},${light})`;
+      pen.fillRect(x - 1.1, y - 1.1, 2.2, 2.2);
     }
-    d.forEach((direction, v) => { // the views, the lighter the more depth-entropy they have
-      const at = project(direction, size), e = scene().entropy[v];
+    d.forEach((direction, v) => { // the views, the lighter the more depth-entropy they have, or the more they show
+      const at = project(direction, size), e = world ? world.shows[v] : scene().entropy[v];
       pen.globalAlpha = at[2] > -0.2 ? 1 : 0.4;
-      dot(at, 4.2, `rgb(${Math.round(60 + 190 * e)},${Math.round(80 + 130 * e)},${Math.round(130 - 30 * e)})`);
+      if (world && world.unreachable.includes(v)) cross(at, 4.2);
+      else dot(at, 4.2, `rgb(${Math.round(60 + 190 * e)},${Math.round(80 + 130 * e)},${Math.round(130 - 30 * e)})`);
       pen.globalAlpha = 1;
     });
     const views = shown.views.slice(0, state.step + 1);
@@ -114,7 +118,8 @@
           element("span", { textContent: pretty(data.classes[c]) }), element("div", {}, bar),
           element("em", { textContent: `${(100 * p).toFixed(1)} %` }));
       });
-      const title = element("div", { className: "where", textContent: `${k + 1}: view ${v}, ${where(v)}` });
+      const shows = s.world ? `, ${Math.round(100 * s.world.shows[v])} % shows` : "";
+      const title = element("div", { className: "where", textContent: `${k + 1}: view ${v}, ${where(v)}${shows}` });
       const className = (k > state.step ? "ahead" : "") + (picture.length ? "" : " plain");
       const item = element("li", { className, onclick: () => go({ step: k }) },
         ...picture, element("div", {}, title, ...bars));
