@@ -60,6 +60,7 @@ SHARES = (0.0, 0.1, 0.3, 0.6, 1.0)
 LEAST = 10
 """Targets of which a row of the table tells."""
 COLOURS = ("#4a5560", "#d99000", "#0b5fa5", "#00805a", "#b5179e", "#d1495b", "#7a6fd0", "#38a0d9")
+CEILING = dict(zip(CEILINGS, [("--", "#8a939b"), (":", "#8a939b")], strict=True))
 
 
 def choose(
@@ -111,6 +112,7 @@ def judge(
     ours: str,
     policies: tuple[str, ...] = POLICIES,
     rivals: tuple[str, ...] = RIVALS,
+    known: tuple[Path, ...] = (),
     out: Path | None = None,
     table: Path | None = None,
     runs: int = 10,
@@ -124,6 +126,7 @@ def judge(
         ours: the policy that is tested.
         policies: that stand in the tables, with their points over random.
         rivals: those that ours is tested against.
+        known: predictions of worlds that were looked at before; those around the same targets are left out.
         out: the figure.
         table: the comparisons, with p before and after the correction, as CSV.
         runs: first views of each world.
@@ -132,8 +135,10 @@ def judge(
     """
     names = list(dict.fromkeys([REFERENCE, *policies, ours, *CEILINGS]))
     found: dict[str, dict[str, list[Reached]]] = {level: {} for level in ORDER}
+    looked_at = {name.rpartition("@")[0] for path in known for name in Predictions.load(path).names}
     for path in predictions:
         p = Predictions.load(path)
+        p = p.of_objects(np.array([i for i, name in enumerate(p.names) if name.rpartition("@")[0] not in looked_at]))
         grid = Grid(make_specs(p, runs, seed), runs, (1.0,), max(COUNTS), seed)
         track(run_grid(grid, names), len(names), f"going through {path.name}")
         for name, why in grid.failures.items():
@@ -208,8 +213,10 @@ def draw(worlds: dict[str, dict[str, Reached]], out: Path) -> None:
         figure = Figure((3.2 * len(worlds), 6.4), layout="constrained")
         axes = figure.subplots(2, len(worlds), sharey="col", squeeze=False)
         for column, (level, of) in zip(axes.T, worlds.items(), strict=True):
-            for (name, reached), colour in zip(of.items(), COLOURS * 2, strict=False):
-                line = ":" if is_oracle(name) else "--" if "@" in name else "-"
+            shown = {name: reached for name, reached in of.items() if "@" not in name}
+            followed = [name for name in shown if not is_oracle(name)]
+            for name, reached in shown.items():
+                line, colour = ("-", COLOURS[followed.index(name)]) if name in followed else CEILING[name]
                 for axis, travel in zip(column, (reached.cells, reached.seconds), strict=True):
                     right = reached.right.mean(0)
                     axis.plot(travel.mean(0), right, line, color=colour, marker="o", markersize=3, label=name)
