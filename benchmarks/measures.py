@@ -60,7 +60,7 @@ def main(modelnet10: tyro.conf.Positional[Path], meshes: int = 100, seed: int = 
                 list(measure(Path(folder, "s.zarr"), names, 0, meshes=link.parents[1], cost=cost))
             store = ViewStore.open(Path(folder, "s.zarr"))
             mesh, depth = load_mesh(link), store.depth(0)[21].astype(np.float64)
-            ids = SimulatedCamera(mesh).face_ids(sphere.poses[21], depth > 0)
+            ids = SimulatedCamera(mesh).face_ids(sphere.poses[21], depth)
             for name, function in MEASURES.items():
                 surface = Surface(mesh.vertices, mesh.faces)
                 tracemalloc.start()

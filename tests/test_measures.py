@@ -222,14 +222,25 @@ def test_face_ids_are_those_of_rays_cast_by_trimesh_geometry():
     assert np.abs(triangle - points).max() < 1e-3
 
 
-def test_what_is_asked_for_is_answered_and_no_more():
-    where = np.zeros((64, 64), bool)
-    where[30:34, :] = True
-    camera = SimulatedCamera(CUBE, 64)
-    ids = camera.face_ids(CORNER, where)
-    np.testing.assert_array_equal(ids[where], camera.face_ids(CORNER)[where])
-    assert (ids[~where] == -1).all()
-    assert (camera.face_ids(CORNER, np.zeros((64, 64), bool)) == -1).all()
+@pytest.mark.parametrize("gap", [0.001, 0.1])
+@pytest.mark.parametrize("aside", [0, 0.012, 0.024, 0.036])  # a pixel each: the wire stands in every column of four
+def test_a_wire_before_a_wall_is_seen_in_each_pixel_that_it_fills(gap, aside):
+    """As wide as one pixel, so that the pixels on both sides of it show one face of the wall."""
+    wall = np.array([[-0.6, -0.6, 0], [0.6, -0.6, 0], [0.6, 0.6, 0], [-0.6, 0.6, 0]])
+    wire = wall * [0.012, 0.9, 0] + [aside, 0, gap]
+    corners = np.concatenate([wall, wire])[:, [2, 0, 1]]  # they face x, where the camera is
+    mesh = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]), 1.0, "wire")
+    camera = SimulatedCamera(mesh, 224)
+    for azimuth in (0, 0.5):
+        pose = look_at_origin(0.2, azimuth, 3.0)
+        seen = camera.observe(pose).depth
+        row, column = np.nonzero(seen)
+        ids = camera.face_ids(pose, np.rint(seen * 1e4) / 1e4)[row, column]
+        x, y = column + 0.5, row + 0.5
+        points = (np.stack([x, y, np.ones(len(x))], 1) @ np.linalg.inv(camera.intrinsics).T) * seen[row, column, None]
+        before = (points @ pose[:3, :3].T + pose[:3, 3])[:, 0] > gap / 2
+        assert before.sum() > 50
+        np.testing.assert_array_equal(ids >= 2, before)
 
 
 # What they must not depend on

@@ -138,7 +138,7 @@ def _measure(names: tuple[str, ...], meshes: Path | None, max_faces: int, store:
         began = now
 
     measures = {name: find_measure(name) for name in names}
-    depths = store.read("depth", i) * DEPTH_UNIT  # float64, as when it was rendered
+    depths = store.read("depth", i)
     lap(READING)
     surface = camera = None
     if meshes is not None:
@@ -152,7 +152,8 @@ def _measure(names: tuple[str, ...], meshes: Path | None, max_faces: int, store:
         lap(CASTING)
     values = {name: np.empty(len(depths), np.float32) for name in names}
     for k, (depth, pose) in enumerate(zip(depths, store.sphere.poses, strict=True)):
-        faces = None if camera is None else camera.face_ids(pose, depth > 0)
+        depth = depth * DEPTH_UNIT  # float64, as when it was rendered
+        faces = None if camera is None else camera.face_ids(pose, depth)
         view = MeasuredView(depth, pose, store.intrinsics, surface, faces)
         lap(READING if camera is None else CASTING)
         for name, function in measures.items():

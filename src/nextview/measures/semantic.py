@@ -41,11 +41,10 @@ def base_avoidance(view: MeasuredView) -> float:
     surface, (faces, pixels) = view.surface, view.pixels
     if len(faces) == 0:
         return 0.0
-    corners = surface.vertices[surface.faces[faces]]
     normals = surface.normals[faces]
     # A face's own normal may point either way; what counts is the side that the camera is on.
-    towards = ((view.pose[:3, 3] - corners.mean(1)) * normals).sum(1)
+    towards = ((view.pose[:3, 3] - surface.centres[faces]) * normals).sum(1)
     down = -normals[:, 2] * np.sign(towards)
     low, high = surface.heights
-    base = (down > DOWN) & (corners[:, :, 2].max(1) < low + BASE * (high - low))
+    base = (down > DOWN) & (surface.tops[faces] < low + BASE * (high - low))
     return float(1 - pixels[base].sum() / pixels.sum())

@@ -54,6 +54,16 @@ class Surface:
         return float(self.vertices[:, 2].min()), float(self.vertices[:, 2].max())
 
     @cached_property
+    def centres(self) -> NDArray[np.float64]:
+        """Of the faces, (F, 3) float64, object radii."""
+        return self.vertices[self.faces].mean(1)
+
+    @cached_property
+    def tops(self) -> NDArray[np.float64]:
+        """Of the faces' highest corners, the height, (F,) float64, object radii."""
+        return self.vertices[:, 2][self.faces].max(1)
+
+    @cached_property
     def places(self) -> NDArray[np.int64]:
         """The faces by places instead of vertices, (F, 3) int64: vertices in one place count as one."""
         cell = np.rint((self.vertices - self.vertices.min(0)) / SAME).astype(np.int64)
