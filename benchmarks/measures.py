@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from threadpoolctl import threadpool_limits
 
 CURVED = ("curvature_entropy", "mean_curvature", "gaussian_curvature", "mesh_saliency")
 """The measures that are made of a mesh's curvature."""
@@ -41,6 +42,7 @@ def main(modelnet10: tyro.conf.Positional[Path], meshes: int = 100, seed: int = 
     from nextview.mesh import load_mesh
     from nextview.viewsphere import ViewSphere
 
+    threadpool_limits(1)  # as in each of several processes
     sphere, entries = ViewSphere.named("40"), list_dataset(modelnet10)
     chosen = np.random.default_rng(seed).choice(len(entries), min(meshes, len(entries)), replace=False)
     rendering, cost, memory = 0.0, Cost(), Counter()
