@@ -209,7 +209,8 @@ def measures(stage: Path) -> Iterator[str]:
     """Which measure of a view serves recognition."""
     yield "[measures.md](measures.md) says what each is. `measures.csv`."
     yield ""
-    yield (stage / "measures.md").read_text()
+    yield (stage / "measures.md").read_text().rstrip()
+    yield ""
     yield "![Correlation of every measure with recognition, and what its policy gains](images/measures.png)"
     yield ""
 
