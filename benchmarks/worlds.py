@@ -138,7 +138,7 @@ def judge(
     looked_at = {name.rpartition("@")[0] for path in known for name in Predictions.load(path).names}
     for path in predictions:
         p = Predictions.load(path)
-        p = p.of_objects(np.array([i for i, name in enumerate(p.names) if name.rpartition("@")[0] not in looked_at]))
+        p = p.of_objects(np.flatnonzero([name.rpartition("@")[0] not in looked_at for name in p.names]))
         grid = Grid(make_specs(p, runs, seed), runs, (1.0,), max(COUNTS), seed)
         track(run_grid(grid, names), len(names), f"going through {path.name}")
         for name, why in grid.failures.items():
@@ -216,7 +216,8 @@ def draw(worlds: dict[str, dict[str, Reached]], out: Path) -> None:
             shown = {name: reached for name, reached in of.items() if "@" not in name}
             followed = [name for name in shown if not is_oracle(name)]
             for name, reached in shown.items():
-                line, colour = ("-", COLOURS[followed.index(name)]) if name in followed else CEILING[name]
+                drawn = ("-", COLOURS[followed.index(name) % len(COLOURS)]) if name in followed else CEILING.get(name)
+                line, colour = drawn or ("-.", "#8a939b")
                 for axis, travel in zip(column, (reached.cells, reached.seconds), strict=True):
                     right = reached.right.mean(0)
                     axis.plot(travel.mean(0), right, line, color=colour, marker="o", markersize=3, label=name)

@@ -243,6 +243,13 @@ def test_a_wire_before_a_wall_is_seen_in_each_pixel_that_it_fills(gap, aside):
         np.testing.assert_array_equal(ids >= 2, before)
 
 
+@pytest.mark.parametrize("size", range(1, 12))
+def test_every_pixel_of_the_smallest_images_shows_a_face(size):
+    camera = SimulatedCamera(load_mesh(SAMPLES / "chair.off"), size)
+    np.testing.assert_array_equal(camera.face_ids(CORNER) >= 0, camera.observe(CORNER).depth > 0)
+    assert np.isfinite([measure(view_of(CUBE, CORNER, size)) for measure in MEASURES.values()]).all()
+
+
 # What they must not depend on
 
 

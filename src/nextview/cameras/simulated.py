@@ -33,11 +33,11 @@ def _fill(found: NDArray[np.int32], z: NDArray[np.float32], step: int) -> None:
 
     The inverse depth of a plane changes evenly over the picture.
     """
-    width = (found.shape[1] - 1) // (2 * step) * 2 * step + 1  # up to the last column that was asked
-    left, middle, right = (slice(begin, width - 2 * step + begin, 2 * step) for begin in (0, step, 2 * step))
-    one, far, near = found[:, left], z[:, left], z[:, right]
-    both = far + near
-    off = np.abs(z[:, middle] * both - 2 * far * near)
+    reach = (found.shape[1] - 1) // (2 * step) * 2 * step  # the last column that was asked
+    left, middle, right = (slice(begin, begin + reach, 2 * step) for begin in (0, step, 2 * step))
+    one, before, after = found[:, left], z[:, left], z[:, right]
+    both = before + after
+    off = np.abs(z[:, middle] * both - 2 * before * after)
     same = (one == found[:, right]) & (one >= 0) & (off < LEVEL * both)
     np.copyto(found[:, middle], one, where=same)
 

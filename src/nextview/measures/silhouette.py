@@ -89,6 +89,6 @@ def _turns(points: NDArray[np.float64], offsets: NDArray[np.int64], arm: float) 
     at = begin[of] + i * (length / n)[of]
     places = np.interp(at, along, points[:, 0]) + 1j * np.interp(at, along, points[:, 1])
     # Nothing is smaller than a few pixels: on a short outline the arms are a quarter of it.
-    k = np.clip(n // 4, 1, round(arm))[of]
+    k = np.maximum(np.minimum(n // 4, round(arm)), 1)[of]
     ahead, behind = (places[first[of] + (i + way) % n[of]] for way in (k, -k))
     return np.angle((ahead - places) * np.conj(places - behind))
