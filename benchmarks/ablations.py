@@ -22,17 +22,17 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from nextview.belief import Calibration
 from nextview.benchmark.evaluation import fused_views
 from nextview.benchmark.statistics import interval, resample
-from nextview.calibration.fitting_set import FittingSet
-from nextview.calibration.temperature import fit_temperature
 from nextview.cli.ending import orderly_end
+from nextview.data.metrics import mean_over_classes, ratio
 from nextview.data.predictions import Predictions
 from nextview.data.splits import split_training
 from nextview.data.store import ViewStore
 from nextview.errors import PredictionsError
-from nextview.metrics import mean_over_classes, ratio
+from nextview.learning.card_fits import fit_temperature
+from nextview.learning.fitting_set import FittingSet
+from nextview.recognition.belief import Calibration
 
 Float = NDArray[np.float64]
 VIEWS = (1, 2, 3, 5, 8, 15, 40)
@@ -68,7 +68,7 @@ def bins_told(p: Predictions, store: ViewStore) -> tuple[float, float]:
         p: of a recogniser that tells azimuth bins.
         store: that they are of. The planes from which bins are counted come from its training split.
     """
-    from nextview.training.recogniser.azimuth_bins import azimuth_bins, mirror_planes
+    from nextview.learning.recogniser_training import azimuth_bins, mirror_planes
 
     if p.azimuth_bins is None:
         raise PredictionsError("these predictions tell no azimuth bins: their recogniser was not taught them")

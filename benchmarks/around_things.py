@@ -17,17 +17,20 @@ import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
-from world_pictures import COLOURS, SIZE, picture
+from scene_pictures import COLOURS, SIZE, picture
 
 import nextview
-from nextview.belief import FixedLength
 from nextview.data.folders import list_dataset
 from nextview.errors import UsageError
-from nextview.report.style import BLUE, STYLE
-from nextview.session import Recognition, Session
-from nextview.viewsphere import ViewSphere, look_at_origin
-from nextview.worlds import OTHER, TARGET, Meshes, Scene, WorldCamera, build_scene, draw_world
-from nextview.worlds.footprint import footprint
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.recognition.belief import FixedLength
+from nextview.session.recognition import Recognition
+from nextview.session.session import Session
+from nextview.session.style import BLUE, STYLE
+from nextview.simulation.robot_camera import RobotCamera
+from nextview.simulation.scene import Scene, build_scene, footprint
+from nextview.simulation.scene_drawing import Meshes, draw_scene
+from nextview.simulation.simulated import OTHER, TARGET
 
 SHOWS = 0.15
 """Share of the target that the first view shows at least."""
@@ -37,7 +40,7 @@ SPHERE = ViewSphere.named("40")
 def session(scene: Scene, policy: str, models: str, start: int, views: int, seed: int) -> Recognition:
     """What a policy makes of a scene."""
     system = nextview.load(models, policy=policy)
-    camera, rng = WorldCamera(scene, named="box"), np.random.default_rng(seed)
+    camera, rng = RobotCamera(scene, named="box"), np.random.default_rng(seed)
     rule = FixedLength(max_views=views)
     made = Session(system.models, system.policy, system.sphere, start, rule, rng, camera.object)
     made.reachable = camera.reachable
@@ -71,11 +74,11 @@ def main(
     files = {e.name: e.path.relative_to(dataset).as_posix() for e in list_dataset(dataset) if e.split == split}
     if target not in files:
         raise UsageError(f"{dataset}: no object of the split {split} is called {target}")
-    world = draw_world(
+    layout = draw_scene(
         files[target], Meshes(dataset, tuple(sorted(files.values()))), level, seed, f"{target}@{level}-0"
     )
-    scene, shows = build_scene(world, dataset), np.array(world.visible)
-    may = (shows >= SHOWS) & ~np.isin(np.arange(len(shows)), world.unreachable)
+    scene, shows = build_scene(layout, dataset), np.array(layout.visible)
+    may = (shows >= SHOWS) & ~np.isin(np.arange(len(shows)), layout.unreachable)
     start = int(np.where(may, shows, np.inf).argmin())
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
         figure = Figure((2.1 * (views + 1), 2.4 * len(policies)))

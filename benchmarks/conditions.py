@@ -24,14 +24,14 @@ from scipy.stats import binomtest
 
 import nextview
 from nextview import Camera, Mesh, System, load_mesh
-from nextview.cameras.sensors import SensedCamera, sensor_named
-from nextview.cameras.sensors.sensor_mix import RENDER
-from nextview.cameras.simulated import SimulatedCamera
 from nextview.cli.progress import track
 from nextview.data.folders import Entry, list_dataset
+from nextview.data.metrics import calibration_error
 from nextview.data.pool import WorkerDied, each
-from nextview.metrics import calibration_error
 from nextview.sensing import ObjectFrame
+from nextview.simulation.sensed_camera import SensedCamera
+from nextview.simulation.sensor import RENDER, sensor_named
+from nextview.simulation.simulated import SimulatedCamera
 
 BOXES = 15.5
 """So many boxes on average leave about 57 % of an object visible; chosen on held-out training objects."""
@@ -170,7 +170,7 @@ def draw(table: dict[str, dict[str, tuple[float, float, float]]], path: Path) ->
     import matplotlib
     from matplotlib.figure import Figure
 
-    from nextview.report.style import SERIES, STYLE, to_png
+    from nextview.session.style import SERIES, STYLE, to_png
 
     with matplotlib.rc_context(STYLE):
         figure = Figure((6.4, 4.6))

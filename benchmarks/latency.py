@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, shape_inference
 
 from nextview.cli.ending import orderly_end
-from nextview.models.inference import open_weights
-from nextview.models.model_card import ModelCard, bundled_cards, find_card
+from nextview.recognition.inference import open_weights
+from nextview.recognition.model_card import ModelCard, bundled_cards, find_card
 
 SIDE = 2048
 """Of the matrices of the baselines."""

@@ -66,8 +66,8 @@ def read(path: str) -> tuple[np.ndarray, np.ndarray]:
 
 def embree(files: list[str], bounded: bool = False) -> Cost:
     """The casts alone: rays ready in memory, nothing kept. With ``bounded``, those inside the object's bound."""
-    from nextview.cameras.simulated import SimulatedCamera
-    from nextview.mesh import load_mesh
+    from nextview.geometry.mesh import load_mesh
+    from nextview.simulation.simulated import SimulatedCamera
 
     seconds, count = np.zeros(2), 0
     for file in files:
@@ -90,10 +90,10 @@ def embree_bounded(files: list[str]) -> Cost:
 
 def one_process(files: list[str]) -> Cost:
     """nextview's work on each object, mesh file to arrays in memory."""
-    from nextview.cameras.simulated import SimulatedCamera
     from nextview.data.rendering import render_object
-    from nextview.mesh import load_mesh
-    from nextview.viewsphere import ViewSphere
+    from nextview.geometry.mesh import load_mesh
+    from nextview.geometry.viewsphere import ViewSphere
+    from nextview.simulation.simulated import SimulatedCamera
 
     began = now()
     for file in files:
@@ -230,7 +230,7 @@ def end_to_end(files: list[str], workers: int) -> tuple[np.ndarray, float, float
     The processes' starting is in both.
     """
     from nextview.data.rendering import render
-    from nextview.viewsphere import ViewSphere
+    from nextview.geometry.viewsphere import ViewSphere
 
     with tempfile.TemporaryDirectory() as folder:
         for file in files:

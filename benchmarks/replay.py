@@ -20,14 +20,13 @@ require("benchmark")
 import numpy as np
 import tyro
 
-from nextview.belief import Calibration
 from nextview.benchmark.entries import default_entries
-from nextview.benchmark.experiment import THRESHOLDS, Grid, run_grid
-from nextview.benchmark.replay import make_specs
+from nextview.benchmark.replay import THRESHOLDS, Grid, make_specs, run_grid
 from nextview.benchmark.summary import summarise
 from nextview.cli.ending import orderly_end
 from nextview.data.predictions import Predictions
-from nextview.viewsphere import ViewSphere
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.recognition.belief import Calibration
 
 TEN = ["random", "random-all", "furthest", "unidirectional", "lem", "lem-peak"]
 TEN += ["oracle-valley", "true-lem", "true-lcm", "oracle-gain"]
@@ -71,9 +70,9 @@ def run(source: Path | tuple[int, int], names: list[str] | None, max_views: int 
 
 def with_networks(meshes: list[Path], n_views: int = 40) -> float:
     """Seconds a view with the simulated camera and the bundled networks, one view of a time, as live."""
-    from nextview.cameras.simulated import SimulatedCamera
-    from nextview.mesh import load_mesh
-    from nextview.models.inference import load_models
+    from nextview.geometry.mesh import load_mesh
+    from nextview.recognition.inference import load_models
+    from nextview.simulation.simulated import SimulatedCamera
 
     models, sphere = load_models(("lem",)), ViewSphere.named("40")
     cameras = [SimulatedCamera(load_mesh(path), 224, sphere.distance) for path in meshes]

@@ -24,8 +24,8 @@ from embreex.rtcore_scene import EmbreeScene
 
 import nextview
 from nextview.data.samples import sample_mesh
+from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing import Frame, ObservedObject, observed_object
-from nextview.viewsphere import look_at_origin
 
 INTRINSICS = np.array([[520.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]])
 SHAPE = 480, 640

@@ -22,12 +22,13 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from nextview.belief import log_evidence_of
 from nextview.benchmark.statistics import interval, resample
 from nextview.cli.progress import track
 from nextview.data.store import ViewStore
-from nextview.models.inference import RECOGNISER, Recogniser
-from nextview.models.network_input import from_store
+from nextview.recognition.belief import log_evidence_of
+from nextview.recognition.inference import Recogniser
+from nextview.recognition.model_card import RECOGNISER
+from nextview.recognition.network_input import from_store
 
 VIEWS = (1, 2, 3, 5)
 RATES = (0.01, 0.05, 0.1)
@@ -64,7 +65,7 @@ def judge(store: Path, split: str | None, objects: int | None, recogniser: Recog
         for k, i in enumerate(chosen):
             found = recogniser.from_inputs(from_store(recogniser.card.input, views, int(i), drawn[k]))
             scores.append(found.novelty)
-            evidence.append(log_evidence_of(found.logits, found.azimuth_bins, views.sphere.turn[drawn[k]]))
+            evidence.append(log_evidence_of(found.logits, found.azimuth_bins, views.sphere.azimuth[drawn[k]]))
             yield k + 1
 
     track(work(), len(chosen), f"views of {views.path.name}")
@@ -164,8 +165,8 @@ def draw(path: Path, ours: Judged, others: Judged, ones: tuple[NDArray, NDArray]
     """ROC curves after one, two, three and five views."""
     from matplotlib.figure import Figure
 
-    from nextview.report.episode_figure import save_figure
-    from nextview.report.style import INK
+    from nextview.session.episode_figure import save_figure
+    from nextview.session.style import INK
 
     canvas = Figure(figsize=(5, 4.4), layout="constrained")
     axis = canvas.add_subplot()

@@ -37,18 +37,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from matplotlib.transforms import Bbox
 
-from nextview.benchmark.entries import EpisodeSpecs, entry_policy
-from nextview.benchmark.experiment import Grid, run_grid
-from nextview.benchmark.replay import Outcomes, Trajectories, make_specs, truncate
+from nextview.benchmark.entries import EpisodeSpecs, entry_policy, is_oracle
+from nextview.benchmark.figures import COLOURS, OWN
+from nextview.benchmark.replay import Grid, Outcomes, Trajectories, make_specs, run_grid, truncate
+from nextview.benchmark.report import KNOWING
 from nextview.benchmark.statistics import holm, interval, mcnemar, resample
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
+from nextview.data.metrics import ratio
 from nextview.data.predictions import Predictions
 from nextview.errors import UsageError
-from nextview.metrics import ratio
-from nextview.report.curves import COLOURS, OWN, is_oracle
-from nextview.report.html_tables import KNOWING
-from nextview.report.style import GREY, STYLE, to_png
+from nextview.session.style import GREY, STYLE, to_png
 
 POLICIES = (
     "random",

@@ -13,8 +13,8 @@ import tyro
 from simulated_sensor import INTRINSICS, look, square
 
 import nextview
+from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing import Frame, ObservedObject
-from nextview.viewsphere import look_at_origin
 
 BASE, REACH, CLEARANCE = np.array([-0.55, 0.0, 0.0]), 1.1, 0.08
 """Where the arm stands, how far it reaches, and how near to the table it goes; metres."""

@@ -1,6 +1,6 @@
 """A simulated Panda looks at an object on a table until it is sure, and moves only as an arm can.
 
-pip install 'nextview[arm]'
+pip install './research[arm]'
 python examples/panda.py samples/chair.off [--seed 0] [--film episode.gif]
 """
 
@@ -11,8 +11,8 @@ import tyro
 from panda_film import Film
 
 import nextview
-from nextview.cameras.arm import Arm, first_joints
 from nextview.sensing import ObservedObject
+from research.arm import Arm, first_joints
 
 
 def recognise(arm: Arm, looked=lambda session: None, threshold: float = 0.97) -> nextview.Recognition:

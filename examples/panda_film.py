@@ -4,10 +4,10 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from nextview.cameras.arm import along, seconds_of
-from nextview.cameras.ray_caster import RayCaster
-from nextview.shading import headlight
-from nextview.viewsphere import look_at_origin
+from nextview.geometry.depth import headlight
+from nextview.geometry.ray_caster import RayCaster
+from nextview.geometry.viewsphere import look_at_origin
+from research.arm import along, seconds_of
 
 SIZE, SIDE = (440, 400), 200
 """Of the scene, and the width of what is shown beside it, pixels."""

@@ -13,8 +13,8 @@ import tyro
 from simulated_sensor import INTRINSICS, disc, look
 
 import nextview
+from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing import Frame, ObservedObject
-from nextview.viewsphere import look_at_origin
 
 ELEVATION, DISTANCE, SPEED = 30.0, 0.7, 45.0
 """Of the camera, degrees over the plate and metres from its middle; and of the plate, degrees a second."""

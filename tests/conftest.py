@@ -1,14 +1,22 @@
-"""Hypothesis without deadlines: on a machine that trains or renders beside the tests, slow is not wrong.
+"""Fixtures that all tests share: one tiny pipeline, built once per run, also by several pytest-xdist workers.
 
-And the order of the files; and the tests that take minutes, which run where NEXTVIEW_TESTS=all.
+A test that alters a file of it copies the file first. And: the order of the files; Hypothesis without deadlines (slow
+is not wrong); tests that take minutes run where NEXTVIEW_TESTS=all.
 """
 
+import json
 import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import pytest
+from filelock import FileLock
 from hypothesis import settings
+from pipeline import FURNITURE, SPHERE, make_map_network, make_recogniser, some_predictions, write_furniture
 
-LONG = ("test_workflow.py", "test_training.py", "test_train_recogniser.py")
+LONG = ("test_workflow.py", "test_training.py")
 """Files that take longest: begun first, no process is left alone with one at the end."""
 
 settings.register_profile("nextview", deadline=None)
@@ -20,3 +28,127 @@ def pytest_collection_modifyitems(items):
         if item.get_closest_marker("long"):
             item.add_marker(pytest.mark.skip(reason="takes minutes: NEXTVIEW_TESTS=all runs it"))
     items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """``shared(name, make)``: a folder that ``make(folder)`` fills, once for all workers."""
+    root = tmp_path_factory.getbasetemp()
+    root = (root.parent if "PYTEST_XDIST_WORKER" in os.environ else root) / "shared"
+    root.mkdir(exist_ok=True)
+
+    def folder(name: str, make: Callable[[Path], object]) -> Path:
+        with FileLock(root / f"{name}.lock"):
+            if not (root / name).exists():
+                part = root / f"{name}.part"
+                shutil.rmtree(part, ignore_errors=True)
+                part.mkdir()
+                make(part)
+                part.rename(root / name)
+        return root / name
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def furniture(shared) -> Path:
+    """Meshes of boxes: FURNITURE's 3 classes, 4 for training and 2 for tests of each, CLASS/SPLIT/CLASS_K.off."""
+    return shared("furniture", write_furniture)
+
+
+@pytest.fixture(scope="session")
+def views(shared, furniture) -> Path:
+    """A store of ``furniture``: 18 objects, 40 views, 32 pixels, with depth-entropy."""
+    from nextview.data.rendering import render
+
+    def make(folder: Path) -> None:
+        list(render(furniture, folder / "views.zarr", SPHERE, 32, workers=0))
+
+    return shared("views", make) / "views.zarr"
+
+
+@pytest.fixture(scope="session")
+def noisy_views(shared, furniture) -> Path:
+    """A store of the test half of ``furniture`` as a Kinect sees it: 6 objects, 12 views, 224 pixels."""
+    from nextview.data.rendering import RenderOptions, render
+    from nextview.geometry.viewsphere import ViewSphere
+
+    def make(folder: Path) -> None:
+        list(
+            render(
+                furniture,
+                folder / "views.zarr",
+                ViewSphere.named("12"),
+                workers=0,
+                options=RenderOptions(split="test", sensor="kinect"),
+            )
+        )
+
+    return shared("noisy_views", make) / "views.zarr"
+
+
+@pytest.fixture(scope="session")
+def models(shared) -> Path:
+    """A folder of tiny networks for FURNITURE: tiny.json (recogniser, 8 azimuth bins, calibrated), tiny-lem.json."""
+
+    def make(folder: Path) -> None:
+        card = make_recogniser(folder, FURNITURE, size=32, azimuth_bins=8)
+        values = json.loads(card.read_text())
+        values["calibration"] = {"temperature": 0.8, "correlation": 0.3, "bin_correlation": 0.2}
+        values["held_out"] = [f"{label}_{k}" for label in FURNITURE for k in (2, 3)]
+        card.write_text(json.dumps(values))
+        make_map_network(folder, valleys=("table",))
+
+    return shared("models", make)
+
+
+@pytest.fixture(scope="session")
+def predictions(shared, views, models) -> Path:
+    """The predictions of ``models`` for all of ``views``, train and test."""
+    from nextview.data.predicting import predict
+    from nextview.recognition.model_card import read_card
+
+    def make(folder: Path) -> None:
+        recogniser, lem = (read_card(models / name) for name in ("tiny.json", "tiny-lem.json"))
+        list(predict(views, folder / "predictions.npz", [recogniser], {"lem": lem}, workers=0))
+
+    return shared("predictions", make) / "predictions.npz"
+
+
+@pytest.fixture(scope="session")
+def results(shared) -> Path:
+    """A benchmark of ``some_predictions(40, seed=2)``: p.npz and the folder out. Two objects are conflicting."""
+    pytest.importorskip("pandas")
+    from dataclasses import replace
+
+    from nextview.benchmark.run import BenchmarkSettings, run_benchmark
+
+    def make(folder: Path) -> None:
+        conflicting = np.isin(np.arange(40), (3, 8))
+        replace(some_predictions(40, seed=2), conflicting=conflicting).save(folder / "p.npz")
+        settings = BenchmarkSettings(thresholds=(0.7, 0.9), runs=3, samples=200)
+        run_benchmark(folder / "p.npz", folder / "out", settings)
+
+    return shared("results", make)
+
+
+@pytest.fixture(scope="session")
+def cluttered(shared, furniture) -> Path:
+    """A folder of six cluttered scenes with objects of ``furniture``: one of each split at each level."""
+    from nextview.data.scene_drawing import draw_scenes
+
+    def make(folder: Path) -> None:
+        list(draw_scenes(furniture, folder / "scenes", scenes=1, seed=3, workers=0))
+
+    return shared("cluttered", make) / "scenes"
+
+
+@pytest.fixture(scope="session")
+def cluttered_views(shared, cluttered, furniture) -> Path:
+    """A store of ``cluttered``: 40 views, 48 pixels."""
+    from nextview.data.rendering import RenderOptions, render
+
+    def make(folder: Path) -> None:
+        list(render(cluttered, folder / "views.zarr", SPHERE, 48, workers=0, options=RenderOptions(meshes=furniture)))
+
+    return shared("cluttered_views", make) / "views.zarr"

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_predictions import some_predictions
+from pipeline import some_predictions
 
 from nextview.data.folders import Entry
-from nextview.data.store import DONE, ViewStore
+from nextview.data.store import DONE, ViewStore, describe
 from nextview.errors import PredictionsError
 
 ABLATIONS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "ablations.py"))
@@ -46,7 +46,7 @@ def test_azimuth_bins_are_right_exactly_or_up_to_a_half_turn(tmp_path):
     pytest.importorskip("torch")
     p = some_predictions(10)
     entries = [Entry(tmp_path / f"{n}.off", n, p.classes[c], "train") for n, c in zip(p.names, p.labels, strict=True)]
-    store = ViewStore.create(tmp_path / "views.zarr", entries, p.sphere, 16, {})
+    store = ViewStore.create(tmp_path / "views.zarr", describe(entries, p.sphere, 16, {}))
     store.group["measures/depth_entropy"][:] = np.tile(np.cos(np.pi / 4 * p.sphere.azimuth_index), (10, 1))
     store.group["status"][:] = DONE
     features = np.repeat(p.sphere.azimuth_index[None], 10, axis=0)

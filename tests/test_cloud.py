@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from nextview.cloud import POINTS, pixel_order, visible_points
-from nextview.models.cloud_input import cloud_input
-from nextview.observation import pinhole
-from nextview.viewsphere import ViewSphere, look_at_origin
+from nextview.geometry.depth import POINTS, pixel_order, visible_points
+from nextview.geometry.observation import pinhole
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.recognition.network_input import cloud_input
 
 POSES = ViewSphere.named("40").poses
 

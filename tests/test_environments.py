@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_predictions import some_predictions
+from pipeline import some_predictions
 
 gymnasium = pytest.importorskip("gymnasium")
 
-from gymnasium.utils.env_checker import check_env  # noqa: E402
+from gymnasium.utils.env_checker import check_env
 
-import nextview.envs  # noqa: E402, F401
-from nextview.belief import Calibration, Stopping, of_true_class  # noqa: E402
-from nextview.data.predictions import Predictions  # noqa: E402
-from nextview.episode import run_episodes  # noqa: E402
-from nextview.errors import DatasetError, NextviewError, PredictionsError, SessionError, UsageError  # noqa: E402
-from nextview.policies.learned_tables import cells_to  # noqa: E402
-from nextview.policies.spread import Spread  # noqa: E402
+import nextview.benchmark.environments  # noqa: F401
+from nextview.data.predictions import Predictions
+from nextview.errors import DatasetError
+from nextview.policies.baselines import Spread
+from nextview.policies.learned_tables import cells_to
+from nextview.recognition.belief import Calibration, Stopping
+from nextview.session.episode import run_episodes
 
 RECOGNISE = "nextview/Recognise-v0"
 INPUTS = ("belief", "view", "place", "lem", "azimuth_bin")
@@ -69,18 +69,6 @@ def played(env, seed: int, n: int = 60):
         if ended:
             observation, _ = env.reset()
     return found
-
-
-def test_a_seed_decides_everything(file):
-    def same(a, b):
-        return all(
-            np.array_equal(x, y) for one, other in zip(a, b, strict=True) for x, y in zip(one, other, strict=True)
-        )
-
-    options = {"predictions": str(file), "threshold": 0.7}
-    first, again, other = (played(gymnasium.make(RECOGNISE, **options), seed) for seed in (3, 3, 4))
-    assert same(first, again)
-    assert not same(first, other)
 
 
 @pytest.mark.parametrize("options", [{}, {"threshold": 0.7, "travel_price": 0.02, "frame": "object", "inputs": INPUTS}])
@@ -143,133 +131,10 @@ def test_an_episode_is_the_loop_of_a_robot():
             assert np.isclose(info["travel"], expected.outcome.travel[0])
 
 
-def test_rewards_are_what_a_view_changes_less_its_prices():
-    p = learnable()
-    prices = {"view_price": 0.25, "travel_price": 0.125}
-    env = gymnasium.make(RECOGNISE, predictions=p, objective="log-belief", **prices)
-    for k in range(5):
-        _, info = env.reset(seed=k)
-        first, row, views, total, ended = info["view"], info["object"], [info["view"]], 0.0, False
-        while not ended:
-            _, reward, ended, _, info = env.step(env.action_space.sample())
-            views.append(info["view"])
-            total += reward
-        assert len(set(views)) == 5
-        logs = [
-            p.calibration.log_belief(p.log_evidence[row, taken].astype(np.float64).sum(0), len(taken), 3)
-            for taken in ([first], views)
-        ]
-        change = np.subtract(*[of_true_class(one[None], p.labels[[row]])[0] for one in logs[::-1]])
-        travel = sum(p.sphere.travel[a, b] for a, b in pairwise(views))
-        assert np.isclose(total, change - 4 * 0.25 - 0.125 * travel)
-
-
-def test_an_action_that_leads_to_a_view_taken_goes_to_the_nearest_other():
-    p = learnable()
-    env = gymnasium.make(RECOGNISE, predictions=p)
-    _, info = env.reset(options={"object": 0, "start": 19})
-    own = 2 * 8  # the ring of view 19, no step ahead
-    assert info["action_mask"][own] == 0
-    assert info["action_mask"].sum() == 39
-    _, _, _, _, info = env.step(own)
-    assert p.sphere.travel[19, info["view"]] == 1
-
-
-def test_training_and_test_objects_stay_apart(tmp_path):
-    train, test = learnable(9), learnable(6, 5, "test")
-    names = tuple(f"test_{name}" for name in test.names)
-    both = replace(
-        train, names=train.names + names, logits=np.concatenate([train.logits, test.logits]),
-        maps={"lem": np.concatenate([train.maps["lem"], test.maps["lem"]])},
-        depth_entropy=np.concatenate([train.depth_entropy, test.depth_entropy]),
-        labels=np.concatenate([train.labels, test.labels]), splits=np.concatenate([train.splits, test.splits]),
-        conflicting=np.zeros(15, bool), azimuth_bins=np.concatenate([train.azimuth_bins, test.azimuth_bins]),
-    )  # fmt: skip
-    for split, expected in (("train", train.names), ("test", names), (None, both.names)):
-        env = gymnasium.make(RECOGNISE, predictions=both, split=split).unwrapped
-        assert env.task.names == expected
-    with pytest.raises(PredictionsError, match="no objects of the split 'test'"):
-        gymnasium.make(RECOGNISE, predictions=train, split="test")
-
-
-def test_every_class_is_drawn_equally_often_where_that_is_asked_for():
-    p = replace(learnable(30), labels=np.array([0] * 27 + [1] * 2 + [2]))
-    drawn = {}
-    for balanced in (False, True):
-        task = gymnasium.make(RECOGNISE, predictions=p, balanced=balanced).unwrapped.task
-        objects, _ = task.draw(3000, np.random.default_rng(0))
-        drawn[balanced] = np.bincount(p.labels[objects], minlength=3)
-    assert drawn[False][0] > 2600
-    assert (np.abs(drawn[True] - 1000) < 130).all()  # five standard deviations
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "sentence"),
-    [
-        (
-            {"inputs": ("belief", "smell")},
-            PredictionsError,
-            "no map 'smell'; inputs are some of belief, view, .*, lem$",
-        ),
-        ({"inputs": ("visibility",)}, UsageError, "not 'visibility'"),
-        ({"inputs": ()}, UsageError, "not nothing"),
-        ({"objective": "joy"}, UsageError, "not 'joy'"),
-        ({"max_views": 1}, UsageError, "at least two views"),
-        ({"max_views": 41}, UsageError, "40 views"),
-        ({"travel_price": -1.0}, UsageError, "travel_price"),
-        ({"threshold": 2.0}, UsageError, "probability"),
-        ({"inputs": ("lcm",)}, PredictionsError, "no map 'lcm'"),
-    ],
-)
-def test_what_makes_no_sense_is_refused_in_a_sentence(file, options, error, sentence):
-    with pytest.raises(error, match=sentence):
-        gymnasium.make(RECOGNISE, predictions=str(file), **options)
-
-
-JUNK = {
-    "None": None, "-1": -1, "a half": 2.5, "NaN": np.nan, "huge": 10**40, "a word": "a", "uneven lists": [[1, 2], [3]],
-    "an object": object(), "no array": np.zeros(0), "zeros": np.zeros((4, 4)), "a path": Path("/no/such/file"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("junk", JUNK)
-def test_wrong_arguments_are_one_sentence(file, junk):
-    single = gymnasium.make(RECOGNISE, predictions=str(file)).unwrapped
-    many = gymnasium.make_vec(RECOGNISE, num_envs=3, predictions=str(file))
-    single.reset(seed=0)
-    many.reset(seed=0)
-    doors = [
-        *(lambda junk, env=env: env.step(junk) for env in (single, many)),
-        *(lambda junk, env=env: env.reset(options={"object": junk}) for env in (single, many)),
-        *(lambda junk, env=env: env.reset(options={"start": junk}) for env in (single, many)),
-        lambda junk: gymnasium.make_vec(RECOGNISE, num_envs=junk, predictions=str(file)),
-        *(
-            lambda junk, name=name: gymnasium.make(RECOGNISE, **{"predictions": str(file), name: junk})
-            for name in ("predictions", "inputs", "frame", "objective", "max_views")
-        ),
-    ]
-    for door in doors:
-        with pytest.raises(NextviewError):
-            door(JUNK[junk])
-    for name in ("view_price", "travel_price") if junk not in ("a half", "huge") else ():
-        with pytest.raises(NextviewError):
-            gymnasium.make(RECOGNISE, predictions=str(file), **{name: JUNK[junk]})
-    if junk != "None":
-        for door in (single.reset, many.reset):
-            with pytest.raises(NextviewError):
-                door(options=JUNK[junk])
-
-
-def test_a_step_without_an_episode_is_refused(file):
-    env = gymnasium.make(RECOGNISE, predictions=str(file)).unwrapped
-    with pytest.raises(SessionError, match="call reset"):
-        env.step(0)
-
-
 @pytest.mark.filterwarnings("error")
 def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
-    from nextview.session import Session
-    from nextview.system import load, simulated
+    from nextview.session.session import Session
+    from nextview.session.system import load, simulated
 
     options = {"depth": True, "size": 112, "inputs": ("belief", "place", "lem-sphere")}
     env = gymnasium.make("nextview/RecogniseMesh-v0", **options)
@@ -296,38 +161,6 @@ def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
         gymnasium.make("nextview/RecogniseMesh-v0", meshes=str(tmp_path))
     with pytest.raises(DatasetError, match="no meshes of the split 'test'"):
         gymnasium.make("nextview/RecogniseMesh-v0", meshes=str(tmp_path), split="test")
-
-
-def test_ap_gym_takes_it_for_one_of_its_own():
-    """Rewards are its own normalised cross-entropy, by its own loss, and our prices."""
-    ap_gym = pytest.importorskip("ap_gym")
-    from scipy.special import log_softmax
-
-    p = learnable()
-    env = gymnasium.make("nextview/ActiveRecognise-v0", predictions=p, travel_price=0.5).unwrapped
-    assert isinstance(env, ap_gym.ActiveClassificationEnv)
-    assert ap_gym.ensure_active_perception_env(env) is env
-    env.action_space.seed(0)
-    _, info = env.reset(seed=0)
-    here = info["view"]
-    for _ in range(4):
-        action = env.action_space.sample()
-        _, reward, ended, _, info = env.step(action)
-        target = info["prediction"]["target"]
-        loss = -log_softmax(action["prediction"])[target] / np.log(3)
-        assert np.isclose(reward, info["base_reward"] - loss, atol=1e-5)
-        assert info["base_reward"] <= -0.5
-    assert ended
-    assert 0 <= here < 40
-    many = gymnasium.make_vec("nextview/ActiveRecognise-v0", num_envs=5, predictions=p, max_views=3)
-    many.action_space.seed(0)
-    _, begun = many.reset(seed=0)
-    targets = [begun["prediction_target"]]
-    for _ in range(4):
-        _, rewards, ended, _, info = many.step(many.action_space.sample())
-        np.testing.assert_array_equal(info["prediction"]["target"], targets[-1])
-        targets.append(info["prediction_target"])
-    assert rewards.shape == (5,)
 
 
 def test_the_page_does_what_it_says(tmp_path, monkeypatch):

@@ -9,14 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import softmax
 
-from nextview.belief import PLAIN_SUM, Calibration, FixedLength, Stopping
-from nextview.episode import Episodes, run_episodes
 from nextview.errors import PolicyError
+from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, Evidence
-from nextview.policies.baselines import Random, RandomAll, Unidirectional
-from nextview.policies.fixed import ViewList
+from nextview.policies.baselines import Random, RandomAll, Unidirectional, ViewList
 from nextview.policies.maps import MapPeak
-from nextview.viewsphere import ViewSphere
+from nextview.recognition.belief import PLAIN_SUM, Calibration, FixedLength, Stopping
+from nextview.session.episode import Episodes, run_episodes
 
 SPHERE = ViewSphere.named("40")
 CLASSES = 4
@@ -85,46 +84,11 @@ def test_many_episodes_at_once_are_each_episode_alone(seed, threshold, max_views
         assert end.arc[e] == pytest.approx(sum(SPHERE.arc[leg] for leg in legs), abs=1e-12)
 
 
-def test_the_steps_tell_the_same_story_as_the_outcome():
-    table, policy, starts = Table.random(30), MapPeak(SPHERE, "lem"), np.arange(30)
-    episodes = run(table, policy, starts, Stopping(0.9, 5))
-    assert episodes.steps[0].episodes.tolist() == list(range(30))
-    for k, step in enumerate(episodes.steps):
-        np.testing.assert_array_equal(episodes.outcome.views[step.episodes, k], step.views)
-        np.testing.assert_array_equal(step.evidence.logits, table.logits[step.episodes, step.views])
-        np.testing.assert_array_equal(step.stopped, step.next_views == -1)
-        if k + 1 < len(episodes.steps):
-            following = episodes.steps[k + 1]
-            np.testing.assert_array_equal(following.episodes, step.episodes[~step.stopped])
-            np.testing.assert_array_equal(following.views, step.next_views[~step.stopped])
-    assert episodes.steps[-1].stopped.all()
-
-
 def test_no_view_twice_and_every_view_where_nothing_is_certain():
     table = Table(np.zeros((5, 40, CLASSES)), Table.random(5).lem)
     end = run(table, Random(SPHERE), np.arange(5), Stopping(0.99, 1000)).outcome
     np.testing.assert_array_equal(np.sort(end.views, axis=1), np.tile(np.arange(40), (5, 1)))
     assert not end.confident.any()
-
-
-def test_a_threshold_of_zero_takes_one_look():
-    end = run(Table.random(10), MapPeak(SPHERE, "lem"), np.arange(10), Stopping(0.0, 5)).outcome
-    assert (end.n_views == 1).all()
-    assert end.confident.all()
-    assert (end.travel == 0).all()
-    assert (end.arc == 0).all()
-
-
-def test_one_look_allowed_asks_no_policy():
-    end = run(Table.random(10), Broken("raises"), np.arange(10), Stopping(1.0, 1)).outcome
-    assert (end.n_views == 1).all()
-
-
-def test_confidence_counts_at_the_threshold_itself():
-    logits = np.zeros((1, 40, 2))
-    end = run(Table(logits, Table.random(1).lem), MapPeak(SPHERE, "lem"), np.array([0]), Stopping(0.5, 5)).outcome
-    assert end.n_views == 1
-    assert end.confident
 
 
 class Turning:
@@ -169,26 +133,6 @@ def test_the_same_seed_gives_the_same_episodes():
     runs = [run(Table.random(40), Random(SPHERE), np.arange(40), Stopping(), seed=s).outcome.views for s in (1, 1, 2)]
     np.testing.assert_array_equal(runs[0], runs[1])
     assert runs[0].shape != runs[2].shape or (runs[0] != runs[2]).any()
-
-
-def test_another_sphere():
-    ring = ViewSphere.named("12")
-    table, stopping = Table.random(12, ring), Stopping(0.99, 12)
-    end = run(table, Unidirectional(ring), np.arange(12), stopping, ring).outcome
-    for e in range(12):
-        assert end.views[e, : end.n_views[e]].tolist() == [(e + k) % 12 for k in range(end.n_views[e])]
-    np.testing.assert_allclose(end.travel, end.n_views - 1)
-
-
-def test_select_keeps_rows_of_everything():
-    evidence = Table.random(6).observe(np.arange(6), np.arange(6))
-    evidence = replace(evidence, azimuth_bins=np.random.default_rng(1).normal(size=(6, CLASSES, 8)))
-    keep = np.array([True, False, True, True, False, False])
-    kept = evidence.of(keep)
-    np.testing.assert_array_equal(kept.logits, evidence.logits[[0, 2, 3]])
-    np.testing.assert_array_equal(kept.maps["lem"], evidence.maps["lem"][[0, 2, 3]])
-    np.testing.assert_array_equal(kept.azimuth_bins, evidence.azimuth_bins[[0, 2, 3]])
-    assert Evidence(evidence.logits).of(keep).azimuth_bins is None
 
 
 # Refusing
@@ -243,41 +187,6 @@ def test_a_policy_that_misbehaves_is_named(fault, part, episode):
     assert refusal.value.episode == episode
 
 
-def test_a_map_that_is_missing_or_of_another_sphere():
-    table = Table.random(3)
-    with pytest.raises(PolicyError, match="policy MapPeak raised KeyError: 'lcm'"):
-        run(table, MapPeak(SPHERE, "lcm"), np.arange(3), Stopping(1.0))
-    ring = ViewSphere.named("12")
-    with pytest.raises(PolicyError, match="policy MapPeak raised PolicyError"):
-        run(table, MapPeak(ring, "lem"), np.arange(3), Stopping(1.0), ring)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_logit_that_is_not_finite_is_refused(bad):
-    table = Table.random(5)
-    table.logits[3, :, 1] = bad
-    with pytest.raises(ValueError, match="something that is not a finite number"):
-        run(table, MapPeak(SPHERE, "lem"), np.arange(5), Stopping())
-
-
-@pytest.mark.parametrize("start", [-1, 40])
-def test_a_start_off_the_sphere(start):
-    with pytest.raises(ValueError, match="0 to 39"):
-        run(Table.random(2), MapPeak(SPHERE, "lem"), np.array([0, start]), Stopping())
-
-
-def test_no_outcome_before_the_end():
-    table = Table.random(2)
-    episodes = Episodes(SPHERE, MapPeak(SPHERE, "lem"), np.array([0, 1]), Stopping(1.0, 2), np.random.default_rng(0))
-    with pytest.raises(ValueError, match="still running"):
-        _ = episodes.outcome
-    episodes.update(table.observe(episodes.running, episodes.current))
-    with pytest.raises(ValueError, match="still running"):
-        _ = episodes.outcome
-    episodes.update(table.observe(episodes.running, episodes.current))
-    assert (episodes.outcome.n_views == 2).all()
-
-
 def test_a_look_that_fails_is_not_taken_in():
     class Moody:
         needs = ()
@@ -308,7 +217,7 @@ def test_an_episode_of_fixed_length_goes_on_however_sure_it_is():
     views = np.array([[3, 1, 2], [0, 7, 4], [5, 6, 1], [2, 0, 3]])
     sphere = ViewSphere.named("40")
     done = run_episodes(
-        lambda episodes, _: sure.of(np.isin(np.arange(4), episodes)),
+        lambda episodes, _: sure.select(np.isin(np.arange(4), episodes)),
         sphere, ViewList(views), views[:, 0], FixedLength(max_views=3), np.random.default_rng(0),
     )  # fmt: skip
     np.testing.assert_array_equal(done.outcome.views, views)

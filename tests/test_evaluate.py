@@ -5,33 +5,16 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from pipeline import some_predictions
 from scipy.special import softmax
 from scipy.stats import bootstrap
-from test_predictions import some_predictions
 
-from nextview.belief import Calibration
-from nextview.benchmark.evaluation import baselines, evaluate, fused_views
+from nextview.benchmark.evaluation import evaluate, fused_views
 from nextview.benchmark.published import published_map, published_recognisers, read_table
-from nextview.errors import ResultsError
-from nextview.viewsphere import ViewSphere
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.recognition.belief import Calibration
 
 TEN = tuple(read_table("table8_accuracy_per_class_modelnet10"))
-TESTED = dict(zip(TEN, (50, 100, 100, 86, 86, 100, 86, 100, 100, 100), strict=True))
-"""Objects of each class in ModelNet10's test split."""
-
-
-@pytest.mark.parametrize("measure", ["d0", "d_le_1", "d_lt_2"])
-def test_table_4_prints_peaks_over_classes(measure):
-    rows = [published_map("lem", measure, TEN, name) for name in TEN]
-    assert published_map("lem", f"class_{measure}", TEN) == pytest.approx(sum(rows) / 10, abs=1e-4)
-    assert published_map("lem", measure, TEN) is None
-
-
-def test_table_4_prints_the_loss_over_objects():
-    rows = {name: published_map("lem", "mse", TEN, name) for name in TEN}
-    over_objects = sum(TESTED[name] * rows[name] for name in TEN) / sum(TESTED.values())
-    assert published_map("lem", "mse", TEN) == pytest.approx(over_objects, abs=5e-5)
-    assert published_map("lem", "class_mse", TEN) == pytest.approx(sum(rows.values()) / 10)
 
 
 def test_published_scores_stand_only_beside_what_they_were_published_for():
@@ -127,15 +110,6 @@ def test_fusing_random_views_against_every_combination():
         assert confidence[k - 1].mean() == pytest.approx(belief.max(2).mean())
 
 
-def test_one_and_all_views_fused_are_the_two_accuracies():
-    found = evaluate(some_predictions(31, seed=4), 50, np.random.default_rng(7))
-    assert list(found.fusion["n_views"]) == list(range(1, 41))
-    for n_views in (1, 40):
-        row = score(found.fusion, n_views=n_views)
-        for ours, measure in ((row.accuracy, "accuracy"), (row.class_accuracy, "class_accuracy")):
-            assert ours == pytest.approx(score(found.accuracy, n_views=n_views, label="", measure=measure).value)
-
-
 def test_intervals_are_scipys():
     p = some_predictions(60, seed=3)
     found = evaluate(p, 4000, np.random.default_rng(0))
@@ -185,38 +159,3 @@ def test_lcm_leaves_out_what_is_never_recognised():
     # confidences 0.9 where right: (.9, .9, .9), (.9, 0, 0), (.9, .9, 0); each cell stands in every column once
     off = [1.63] * 3 + [0.81 + 1] * 2 + [0.01] + [1.62 + 1, 0.81 + 0.01, 0.81 + 0.01]
     assert score(lcm, by="network", label="", measure="mse").value == pytest.approx(sum(off) / 27)
-
-
-def test_a_perfect_map_network_is_perfect():
-    p = some_predictions(9, seed=6)
-    p = replace(p, maps={"lem": true_windows(p).astype(np.float32), "gain": p.maps["lem"]})
-    found = evaluate(p, 20, np.random.default_rng(0))
-    values = found.maps[(found.maps["by"] == "network") & (found.maps["label"] == "")].set_index("measure")["value"]
-    assert values["mse"] == pytest.approx(0, abs=1e-12)
-    assert values["regret"] == values["class_regret"] == 0
-    assert values["d0"] == values["class_d_le_1"] == values["d_lt_2"] == 1
-    assert "not known" in found.left_out["gain"]
-
-
-def test_the_mean_map_has_the_least_squared_error_of_all_constant_maps():
-    true = np.random.default_rng(0).random((5, 8, 2, 3))
-    mean = baselines(true, np.zeros(5, int))["mean map"]
-    for step in (-0.01, 0.01):
-        assert ((mean - true) ** 2).mean() < ((mean + step - true) ** 2).mean()
-    assert ((mean - true) ** 2).mean() == pytest.approx(true.reshape(40, 6).var(0).mean())
-
-
-def test_what_cannot_be_judged_says_so():
-    p = some_predictions(4)
-    alone = replace(p, logits=p.logits[:, :, :1], classes=("ball",), labels=np.zeros(4, int), maps={})
-    with pytest.raises(ResultsError, match="one class only, ball"):
-        evaluate(alone, 10, np.random.default_rng(0))
-    with pytest.raises(ResultsError, match="at least one sample"):
-        evaluate(p, 0, np.random.default_rng(0))
-    always_next = np.zeros_like(p.logits)
-    always_next[np.arange(4), :, (p.labels + 1) % 3] = 1
-    found = evaluate(replace(p, logits=always_next, maps={"lcm": p.maps["lem"]}), 10, np.random.default_rng(0))
-    assert found.left_out == {"lcm": "no object is recognised from any view"}
-    assert found.maps.empty
-    found = evaluate(replace(p, maps={}), 10, np.random.default_rng(0))
-    assert found.left_out == {"maps": "these predictions hold none"}

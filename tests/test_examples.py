@@ -37,7 +37,7 @@ def test_a_turntable(examples, sample):
     result = example.recognise(example.Turntable(mesh, np.random.default_rng(1)))
     assert result.answer == sample
     assert result.confident
-    assert not any(view.doubts for view in result.views)
+    assert not any(view.warnings for view in result.views)
 
 
 @pytest.mark.parametrize("name", ["arm_over_table", "turntable"])

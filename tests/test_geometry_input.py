@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nextview.cameras.simulated import SimulatedCamera
 from nextview.data.samples import sample_mesh
-from nextview.models.geometry_input import CHANNELS, geometry_input
-from nextview.observation import Observation, pinhole
-from nextview.viewsphere import ViewSphere, look_at_origin
+from nextview.geometry.observation import pinhole
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.recognition.network_input import CHANNELS, geometry_input
+from nextview.simulation.simulated import SimulatedCamera
 
 SIZE = 224
 DISTANCE = 3.0
@@ -98,26 +98,6 @@ def test_a_plane_at_any_slant(elevation, azimuth, tilt, turn, offset):
         np.testing.assert_allclose(found[name][inside], expected[name][inside], atol=limit, err_msg=name)
 
 
-@pytest.mark.parametrize(("tilt", "turn"), [(0.0, 0.7), (0.7, 0.0), (-0.5, 0.6)])
-@pytest.mark.parametrize("squeeze", [0.5, 0.8, 1.25, 2.0])
-def test_a_camera_whose_pixels_are_not_square(tilt, turn, squeeze):
-    intrinsics = INTRINSICS.copy()
-    intrinsics[1] = [0, squeeze * INTRINSICS[0, 0], 100.0]
-    pose = look_at_origin(0.4, 1.0)
-    slant = np.array([np.sin(tilt), np.sin(turn) * np.cos(tilt), -np.cos(turn) * np.cos(tilt)])
-    normal = pose[:3, :3] @ slant
-    depth = plane_depth(pose, np.zeros(3), normal, intrinsics)
-    expected = expected_channels(depth, pose, normal, intrinsics)
-    found = channels_of(depth, pose, intrinsics=intrinsics)
-    for name in CHANNELS:
-        inside = (depth > 0) & (np.abs(expected[name]) <= 1)
-        if name in ("facing", "up"):
-            inside &= expected["facing"] > 0.3
-        assert inside.mean() > 0.3
-        limit = 0.5 * STEP + (1e-4 if name in ("height", "nearness") else 0.02)
-        np.testing.assert_allclose(found[name][inside], expected[name][inside], atol=limit, err_msg=name)
-
-
 def as_the_bundled_models_were_trained(depth, poses, focal, centre):
     """The formula of the bundled models' training, for square pixels: what they are given must not change by a bit."""
     rotation, origin = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
@@ -154,41 +134,6 @@ def test_a_render_is_coded_as_the_bundled_models_know_it(name):
     np.testing.assert_array_equal(found, as_the_bundled_models_were_trained(depth, poses, INTRINSICS[0, 0], SIZE / 2))
 
 
-NOTHING = [np.nan, np.inf, -np.inf, -0.001, -3.0, 65535.0, 3e38]
-"""What depth cameras give where they measured nothing."""
-
-
-@pytest.mark.parametrize("nothing", NOTHING)
-def test_what_a_sensor_gives_for_nothing_is_background(nothing):
-    clean = plane_depth(POSES[13], np.zeros(3), -POSES[13][:3, 2]).astype(np.float32)
-    clean[np.random.default_rng(0).random(clean.shape) < 0.2] = 0
-    sensed = np.where(clean > 0, clean, np.float32(nothing))
-    expected = geometry_input(clean[None], POSES[[13]], INTRINSICS, 112)
-    np.testing.assert_array_equal(geometry_input(sensed[None], POSES[[13]], INTRINSICS, 112), expected)
-    observation = Observation(sensed, POSES[13], INTRINSICS)
-    np.testing.assert_array_equal(observation.depth, clean)
-    assert observation.depth.dtype == np.float32
-    assert Observation(clean, POSES[13], INTRINSICS).depth is clean  # nothing is copied
-
-
-def test_a_floor_a_wall_and_a_ceiling():
-    level = ViewSphere.named("40").poses[0]
-    wall = channels_of(plane_depth(level, np.zeros(3), np.array([1.0, 0, 0])), level)
-    middle = SIZE // 2
-    assert wall["facing"][middle, middle] == pytest.approx(1, abs=STEP)
-    assert wall["up"][middle, middle] == pytest.approx(0, abs=STEP)
-    np.testing.assert_allclose(wall["nearness"], 0, atol=STEP)
-    assert wall["height"][0, middle] > 0 > wall["height"][-1, middle]  # row 0 is the top
-    above = look_at_origin(np.pi / 3, 0.0)
-    floor = channels_of(plane_depth(above, np.zeros(3), np.array([0, 0, 1.0])), above)
-    np.testing.assert_allclose(floor["up"], 1, atol=2 * STEP)
-    np.testing.assert_allclose(floor["height"], 0, atol=STEP)
-    below = look_at_origin(-np.pi / 3, 0.0)
-    np.testing.assert_allclose(
-        channels_of(plane_depth(below, np.zeros(3), np.array([0, 0, 1.0])), below)["up"], -1, atol=2 * STEP
-    )
-
-
 def test_background_is_zero_and_the_object_never_is():
     rng = np.random.default_rng(0)
     depth = rng.uniform(0.1, 8, (3, SIZE, SIZE)).astype(np.float32)  # far beyond what the channels hold
@@ -197,41 +142,3 @@ def test_background_is_zero_and_the_object_never_is():
     assert coded.dtype == np.uint8
     for channel in range(4):
         np.testing.assert_array_equal(coded[:, channel] > 0, depth > 0)
-
-
-def test_a_lone_pixel_faces_along_the_axis():
-    depth = np.zeros((SIZE, SIZE))
-    depth[100, 120] = 3.0
-    ray = rays()[100, 120]
-    found = channels_of(depth, POSES[0])
-    assert found["facing"][100, 120] == pytest.approx(1 / np.linalg.norm(ray), abs=STEP)
-
-
-def test_a_step_does_not_bend_the_normals_beside_it():
-    depth = np.full((SIZE, SIZE), 2.5)
-    depth[:, SIZE // 2 :] = 3.5
-    expected = 1 / np.linalg.norm(rays(), axis=-1)  # both halves face the camera squarely
-    np.testing.assert_allclose(channels_of(depth, POSES[0])["facing"], expected, atol=STEP)
-
-
-@pytest.mark.parametrize("size", [112, 56, 32])
-def test_thinning_takes_every_kth_pixel(size):
-    depth = plane_depth(POSES[13], np.zeros(3), POSES[13][:3, 2] * -1)
-    depth[:, :40] = 0
-    whole = geometry_input(depth[None].astype(np.float32), POSES[[13]], INTRINSICS, SIZE)
-    thin = geometry_input(depth[None].astype(np.float32), POSES[[13]], INTRINSICS, size)
-    np.testing.assert_array_equal(thin, whole[:, :, :: SIZE // size, :: SIZE // size])
-
-
-def test_images_in_a_batch_do_not_mix():
-    rng = np.random.default_rng(0)
-    depth = rng.uniform(2, 4, (3, SIZE, SIZE)).astype(np.float32)
-    together = geometry_input(depth, POSES[[3, 17, 38]], INTRINSICS, 112)
-    for row, view in enumerate((3, 17, 38)):
-        np.testing.assert_array_equal(together[[row]], geometry_input(depth[[row]], POSES[[view]], INTRINSICS, 112))
-
-
-@pytest.mark.parametrize(("shape", "size"), [((224, 224), 100), ((224, 112), 112), ((64, 64), 224)])
-def test_an_image_that_cannot_be_thinned(shape, size):
-    with pytest.raises(ValueError, match="cannot be thinned"):
-        geometry_input(np.zeros((1, *shape), np.float32), POSES[:1], INTRINSICS, size)

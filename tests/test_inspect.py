@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from nextview.cli.inspect import inspect
 from nextview.cli.main import main
+from nextview.cli.pictures import inspect
 from nextview.data.measuring import measure
 from nextview.data.rendering import render
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError
-from nextview.report.store_figures import disk_use, median_radii, object_figure, store_figure, summary
-from nextview.viewsphere import ViewSphere
+from nextview.errors import DatasetError, ResultsError, UsageError
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.viewers.store_figures import median_radii, object_figure, store_figure, summary
 
 SPHERE = ViewSphere.named("40")
 
@@ -35,9 +35,6 @@ def test_summary_counts(views):
     assert (facts["rendered"], facts["left out"], facts["not rendered yet"]) == ("5", "1", "0")
     assert facts["views"].startswith("200 ")
     assert facts["byte-identical copies"] == "1  (0 with several labels)"  # the two balls
-    assert sum(disk_use(ViewStore.open(views)).values()) == sum(
-        p.stat().st_size for p in views.rglob("*") if p.is_file()
-    )
 
 
 def test_sizes_are_told_where_the_unit_is_known(views, tmp_path, capsys):
@@ -75,9 +72,11 @@ def test_the_command_draws_or_says_why_not(views, tmp_path):
     assert (tmp_path / "store.png").read_bytes().startswith(b"\x89PNG")
     assert b"<svg" in (tmp_path / "thing.svg").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["store.png", "thing.svg"]
+    with pytest.raises(ResultsError, match="exists"):
+        inspect(views, tmp_path / "store.png")
     with pytest.raises(DatasetError, match="has no object 'thin'; there are thing_"):
         inspect(views, tmp_path / "x.png", object="thin")
     with pytest.raises(DatasetError, match="broken is not rendered"):
         inspect(views, tmp_path / "x.png", object="broken")
-    with pytest.raises(DatasetError, match=r"\.png, \.pdf or \.svg"):
+    with pytest.raises(UsageError, match=r"\.png or \.pdf or \.svg"):
         inspect(views, tmp_path / "x.txt")

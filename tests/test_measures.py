@@ -1,410 +1,99 @@
-"""Measures of a mesh against closed forms and trimesh; what they must not depend on; meshes as files have them."""
-
-import os
-from pathlib import Path
+"""Depth-entropy against closed forms and scikit-image."""
 
 import numpy as np
 import pytest
-import trimesh
-from scenes import of_depth, view_of
-from scipy.spatial.transform import Rotation
-
-from nextview.cameras.simulated import SimulatedCamera
-from nextview.cli.main import main
-from nextview.data.folders import list_dataset
-from nextview.depth import object_depth
-from nextview.errors import MeasureError
-from nextview.measures.area import bits
-from nextview.measures.gradient_entropy import gradient_entropy, visible_normals
-from nextview.measures.measured_view import MeasuredView
-from nextview.measures.registry import MEASURES, Measure, find_measure
-from nextview.measures.saliency import saliency_of
-from nextview.measures.semantic import base_avoidance
-from nextview.measures.surface import Surface
-from nextview.mesh import Mesh, load_mesh, make_mesh
-from nextview.viewsphere import ViewSphere, look_at_origin
-
-SPHERE = ViewSphere.named("40")
-SAMPLES = Path(__file__).parents[1] / "samples"
-SEEN_FROM_3 = (1 - 1 / 3) / 2
-"""Share of a sphere that is seen from three radii."""
-
-
-def mesh_of(found: trimesh.Trimesh) -> Mesh:
-    return make_mesh(found.vertices, found.faces)
-
-
-def surface_of(found: trimesh.Trimesh) -> Surface:
-    return Surface(np.asarray(found.vertices), np.asarray(found.faces))
-
-
-BALL = mesh_of(trimesh.creation.icosphere(4))
-CUBE = mesh_of(trimesh.creation.box([1, 1, 1]))
-SIDE = 2 / np.sqrt(3)
-"""Of the cube in the sphere of radius 1."""
-CORNER = look_at_origin(np.radians(30), np.radians(40), 3)
-"""From where three sides of it are seen."""
-
-
-def measured(name, mesh, pose=CORNER, size=224):
-    return MEASURES[name](view_of(mesh, pose, size))
-
-
-# Closed forms
-
-
-def test_a_ball():
-    view = view_of(BALL, CORNER)
-    # Pixels at the rim are few and show much: 4 % of the area seen is lost there.
-    assert MEASURES["visible_area_ratio"](view) == pytest.approx(SEEN_FROM_3, rel=0.04)
-    assert MEASURES["surface_visibility"](view) == pytest.approx(SEEN_FROM_3, rel=0.06)
-    for name in ("mean_curvature", "gaussian_curvature"):  # 1 all over
-        assert MEASURES[name](view) == pytest.approx(4 * np.pi * SEEN_FROM_3, rel=0.04)
-    assert MEASURES["curvature_entropy"](view) < 0.1
-    assert MEASURES["silhouette_entropy"](view) < 0.4  # of the pixels of a circle
-    # Its facets are as large as the finest scales.
-    assert measured("mesh_saliency", BALL) < 0.2 * measured("mesh_saliency", CUBE)
-    assert MEASURES["base_avoidance"](view) == 1
-
-
-def test_a_cube():
-    view = view_of(CUBE, CORNER)
-    assert MEASURES["visible_area_ratio"](view) == pytest.approx(0.5, rel=0.01)
-    assert MEASURES["surface_visibility"](view) == pytest.approx(0.5)
-    # 12 edges that bend by a right angle, of which half the curvature lies on the three sides; 8 corners alike.
-    assert MEASURES["mean_curvature"](view) == pytest.approx(12 * SIDE * (np.pi / 2) / 2 / 2, rel=0.01)
-    assert MEASURES["gaussian_curvature"](view) == pytest.approx(8 * (np.pi / 2) / 2, rel=0.02)
-    assert MEASURES["viewpoint_entropy"](view) == pytest.approx(np.log2(6), abs=0.2)  # six triangles, unequal
-    assert MEASURES["gradient_entropy"](view) == pytest.approx(np.log2(3), abs=0.2)  # three directions, unequal
-
-
-def test_one_side_of_a_cube():
-    facing = look_at_origin(0, 0, 3)
-    view = view_of(CUBE, facing)
-    share = view.pixels[1] / view.pixels[1].sum()
-    np.testing.assert_allclose(share, 0.5, atol=0.01)
-    assert MEASURES["viewpoint_entropy"](view) == pytest.approx(1, abs=1e-3)
-    assert MEASURES["gradient_entropy"](view) == pytest.approx(0, abs=0.01)
-    assert MEASURES["visible_area_ratio"](view) == pytest.approx(1 / 6, rel=0.02)
-
-
-def test_the_side_of_a_cylinder_bends_one_way_only():
-    sections, height = 64, 2.0
-    surface = surface_of(trimesh.creation.cylinder(1, height, sections=sections))
-    side = np.abs(surface.normals[:, 2]) < 0.5
-    # Mean curvature 1/(2r) on the side, half of the bend of the rims besides.
-    rims = 2 * (2 * sections * np.sin(np.pi / sections)) * (np.pi / 2) / 4
-    along = sections * height * (2 * np.pi / sections) / 2
-    assert surface.mean_of_faces[side].sum() == pytest.approx(along + rims, rel=1e-6)
-    assert along == pytest.approx(2 * np.pi * height / 2)  # the integral of 1/2
-    assert surface.gaussian_of_faces.sum() == pytest.approx(4 * np.pi, rel=1e-6)  # all of it at the rims
-
-
-def test_a_flat_square_does_not_bend():
-    grid = trimesh.creation.box([1, 1, 1]).subdivide().subdivide()
-    top = grid.submesh([np.flatnonzero(grid.face_normals[:, 2] > 0.5)], append=True)
-    surface = surface_of(top)
-    assert surface.mean_of_faces.sum() == pytest.approx(0, abs=1e-9)
-    corners = np.isclose(np.abs(surface.deficits), np.pi / 2)
-    assert corners.sum() == 4  # of the open square; along its edges and inside nothing turns
-    assert np.abs(surface.deficits[~corners]).max() < 1e-9
-
-
-def test_views_from_above_and_of_the_base():
-    elevations = np.array([-60, -20, 0, 22.5, 45, 90])
-    poses = [look_at_origin(np.radians(e), 0.3, 3) for e in elevations]
-    values = [measured("above_preference", CUBE, pose, 64) for pose in poses]
-    np.testing.assert_allclose(values, np.exp(-(((elevations - 22.5) / 45) ** 2) / 2), atol=1e-6)
-    avoided = [measured("base_avoidance", CUBE, pose, 64) for pose in poses]
-    assert avoided[2:] == [1] * 4
-    below = view_of(CUBE, look_at_origin(np.radians(-90), 0, 3))
-    assert base_avoidance(below) == 0
-    assert 0 < avoided[0] < avoided[1] < 1
-
-
-def test_the_fused_descriptor_of_half_an_image():
-    depth = np.zeros((10, 10))
-    depth[:5] = 2.5
-    # All at the nearest point: 1 over half of the image. Of F4's products, each row loses one neighbour.
-    variance, entropy, vollath = 1.0, 1 / 8, (5 * 9 - 5 * 8) / 50
-    assert MEASURES["fused_descriptor"](of_depth(depth)) == pytest.approx((variance + entropy + vollath) / 3)
-
-
-def test_entropy_of_shares():
-    assert bits(np.array([0.5, 0.25, 0.25, 0])) == 1.5
-    assert bits(np.array([])) == 0
-
-
-# The measure that no slant can raise
-
-
-def plane(slant, azimuth=0.0, size=224, depth=3.0, half=0.9):
-    """A square part of the image in which a plane is seen, turned away from the camera by an angle, degrees."""
-    view = of_depth(np.zeros((size, size)))
-    at = (np.arange(size) + 0.5 - size / 2) / view.intrinsics[0, 0]
-    tilt = np.tan(np.radians(slant)) * np.array([np.cos(azimuth), np.sin(azimuth)])
-    seen = np.maximum(np.abs(at[:, None]), np.abs(at[None])) < half * at.max()
-    inverse = (1 - at[None] * tilt[0] - at[:, None] * tilt[1]) / depth
-    return of_depth(np.where(seen, 1 / inverse, 0))
-
-
-@pytest.mark.parametrize("azimuth", [0, 0.4, np.pi / 2, 4])
-def test_a_slanted_plane_tells_no_more_than_a_frontal_one(azimuth):
-    frontal = plane(0)
-    for slant in (10, 18, 33, 45, 60):
-        slanted = plane(slant, azimuth)
-        assert np.ptp(visible_normals(slanted), axis=1).max() < 1e-4
-        assert gradient_entropy(slanted) == pytest.approx(gradient_entropy(frontal), abs=0.1)
-        assert MEASURES["depth_entropy"](slanted) > MEASURES["depth_entropy"](frontal) + 2
-    assert gradient_entropy(frontal) == pytest.approx(0, abs=1e-9)
-
-
-def test_stored_depth_does_as_well():
-    """In steps of 1e-4 object radii."""
-    rough = plane(45, 0.4)
-    stored = of_depth(np.rint(rough.depth / 1e-4) * 1e-4)
-    assert gradient_entropy(stored) == pytest.approx(gradient_entropy(rough), abs=0.1)
-
-
-def test_directions_of_a_ball():
-    """Seen from far away its pixels are its normals, and those are spread by the cosine: log2(pi sqrt(e)) bits."""
-    far = 20.0
-    view = view_of(BALL, look_at_origin(0.3, 0.5, far), 448, far)
-    own = np.log2(2 * np.pi * np.e * 0.1**2)  # of the blur
-    assert gradient_entropy(view) == pytest.approx(np.log2(np.pi * np.sqrt(np.e)) - own, abs=0.15)
-
-
-def test_a_table_is_seen_best_where_its_legs_are():
-    """From straight above its top is a rectangle; the depth-entropy is highest from 72 degrees up."""
-    table = load_mesh(SAMPLES / "table.off")
-    values = np.array([measured("gradient_entropy", table, pose, 112) for pose in SPHERE.poses[::4]])
-    top = measured("gradient_entropy", table, look_at_origin(np.radians(89.9), 0, 3), 112)
-    assert top < 0.25 * values.max()
-
-
-# Independent implementations
-
-
-@pytest.mark.parametrize(
-    "solid",
-    [trimesh.creation.icosphere(2), trimesh.creation.box([1, 2, 3]), trimesh.creation.torus(1, 0.3)],
-    ids=["ball", "box", "torus"],
-)
-def test_trimesh_agrees(solid):
-    surface = surface_of(solid)
-    np.testing.assert_allclose(surface.areas, solid.area_faces)
-    np.testing.assert_allclose(surface.normals, solid.face_normals, atol=1e-9)
-    np.testing.assert_allclose(surface.angles, solid.face_angles, atol=1e-7)
-    place = np.zeros(len(solid.vertices), int)
-    place[solid.faces.ravel()] = surface.corners.ravel()
-    np.testing.assert_allclose(surface.deficits[place], solid.vertex_defects, atol=1e-6)
-    # Trimesh's has the sign of the edge, convex or not.
-    signed = np.where(solid.face_adjacency_convex, 1, -1) * solid.face_adjacency_angles
-    lengths = np.linalg.norm(np.diff(solid.vertices[solid.face_adjacency_edges], axis=1)[:, 0], axis=1)
-    assert surface.mean_of_faces.sum() == pytest.approx((np.abs(signed) * lengths).sum() / 2, rel=1e-4)
-    if solid.is_convex:
-        assert surface.mean_of_faces.sum() == pytest.approx(solid.integral_mean_curvature, rel=1e-4)
-
-
-def test_face_ids_are_those_of_rays_cast_by_trimesh_geometry():
-    """The point that depth and pose give lies on the face that the pixel is said to show."""
-    mesh = load_mesh(SAMPLES / "chair.off")
-    view = view_of(mesh, CORNER, 96)
-    row, column = np.nonzero(view.depth)
-    ids = view.face_ids[row, column]
-    assert (ids >= 0).all()
-    assert (view.face_ids[view.depth == 0] == -1).all()
-    rays = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], 1) @ np.linalg.inv(view.intrinsics).T
-    points = (rays * view.depth[row, column, None]) @ CORNER[:3, :3].T + CORNER[:3, 3]
-    barycentric = trimesh.triangles.points_to_barycentric(mesh.vertices[mesh.faces[ids]], points)
-    assert barycentric.min() > -1e-3
-    triangle = trimesh.triangles.barycentric_to_points(mesh.vertices[mesh.faces[ids]], barycentric)
-    assert np.abs(triangle - points).max() < 1e-3
-
-
-@pytest.mark.parametrize("gap", [0.001, 0.1])
-@pytest.mark.parametrize("aside", [0, 0.012, 0.024, 0.036])  # a pixel each: the wire stands in every column of four
-def test_a_wire_before_a_wall_is_seen_in_each_pixel_that_it_fills(gap, aside):
-    """As wide as one pixel, so that the pixels on both sides of it show one face of the wall."""
-    wall = np.array([[-0.6, -0.6, 0], [0.6, -0.6, 0], [0.6, 0.6, 0], [-0.6, 0.6, 0]])
-    wire = wall * [0.012, 0.9, 0] + [aside, 0, gap]
-    corners = np.concatenate([wall, wire])[:, [2, 0, 1]]  # they face x, where the camera is
-    mesh = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]), 1.0, "wire")
-    camera = SimulatedCamera(mesh, 224)
-    for azimuth in (0, 0.5):
-        pose = look_at_origin(0.2, azimuth, 3.0)
-        seen = camera.observe(pose).depth
-        row, column = np.nonzero(seen)
-        ids = camera.face_ids(pose, np.rint(seen * 1e4) / 1e4)[row, column]
-        x, y = column + 0.5, row + 0.5
-        points = (np.stack([x, y, np.ones(len(x))], 1) @ np.linalg.inv(camera.intrinsics).T) * seen[row, column, None]
-        before = (points @ pose[:3, :3].T + pose[:3, 3])[:, 0] > gap / 2
-        assert before.sum() > 50
-        np.testing.assert_array_equal(ids >= 2, before)
-
-
-@pytest.mark.parametrize("size", range(1, 12))
-def test_every_pixel_of_the_smallest_images_shows_a_face(size):
-    camera = SimulatedCamera(load_mesh(SAMPLES / "chair.off"), size)
-    np.testing.assert_array_equal(camera.face_ids(CORNER) >= 0, camera.observe(CORNER).depth > 0)
-    assert np.isfinite([measure(view_of(CUBE, CORNER, size)) for measure in MEASURES.values()]).all()
-
-
-# What they must not depend on
-
-
-@pytest.mark.parametrize("name", MEASURES)
-def test_nothing_depends_on_where_object_and_camera_are_together(name):
-    """Turned about the vertical and moved; for those who do not know up and down, turned any way."""
-    mesh = load_mesh(SAMPLES / "chair.off")
-    still = measured(name, mesh, CORNER, 96)
-    upright = name in ("above_preference", "base_avoidance")
-    turn = Rotation.from_euler("z", 77, degrees=True) if upright else Rotation.from_euler("xyz", [40, 110, 200])
-    move = np.eye(4)
-    move[:3, :3], move[:3, 3] = turn.as_matrix(), (0, 0, 0) if upright else (0.3, -0.2, 0.1)
-    moved = Mesh(mesh.vertices @ move[:3, :3].T + move[:3, 3], mesh.faces, mesh.centre, mesh.radius)
-    # A few pixels at edges fall to the other side.
-    assert measured(name, moved, move @ CORNER, 96) == pytest.approx(still, rel=0.03, abs=0.03)
-
-
-REMESHED = {
-    "visible_area_ratio": 0.01,
-    "surface_visibility": 0.2,
-    "mean_curvature": 0.1,
-    "gaussian_curvature": 0.2,
-    "mesh_saliency": 0.15,
-    "base_avoidance": 0.01,
-}
-"""How much a measure may differ, as a share of its value, when each face of a chair is cut into four. A half hidden
-face has half of the curvature of its edges, and its parts more or less."""
-
-
-@pytest.mark.parametrize("name", REMESHED)
-def test_cutting_faces_changes_little(name):
-    mesh = load_mesh(SAMPLES / "chair.off")
-    fine = mesh_of(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).subdivide())
-    for view in (9, 20, 35):
-        before = measured(name, mesh, SPHERE.poses[view], 128)
-        assert measured(name, fine, SPHERE.poses[view], 128) == pytest.approx(before, rel=REMESHED[name])
-
-
-def test_cutting_faces_into_four_adds_two_bits():
-    for view in (9, 20, 35):
-        coarse = measured("viewpoint_entropy", CUBE, SPHERE.poses[view])
-        fine = mesh_of(trimesh.creation.box([1, 1, 1]).subdivide())
-        assert measured("viewpoint_entropy", fine, SPHERE.poses[view]) == pytest.approx(coarse + 2, abs=0.05)
-
-
-def test_curvature_entropy_of_a_smooth_surface_hardly_depends_on_the_mesh():
-    coarse, fine = (mesh_of(trimesh.creation.torus(1, 0.4, n, n)) for n in (48, 96))
-    values = [measured("curvature_entropy", mesh, SPHERE.poses[20]) for mesh in (coarse, fine)]
-    assert min(values) > 2  # from the hollow to the outside the curvature changes its sign
-    assert values[0] == pytest.approx(values[1], abs=0.5)
-
-
-# Meshes as files have them
-
-
-def soup(mesh: Mesh, rng) -> Mesh:
-    """The same triangles, each with corners of its own, turned either way, in any order."""
-    faces = mesh.faces[rng.permutation(len(mesh.faces))]
-    faces = np.where(rng.random((len(faces), 1)) < 0.5, faces, faces[:, ::-1])
-    return Mesh(mesh.vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3), mesh.centre, mesh.radius)
-
-
-@pytest.mark.parametrize("name", MEASURES)
-def test_neither_shared_corners_nor_the_turn_of_faces_count(name):
-    mesh = CUBE
-    loose = soup(mesh, np.random.default_rng(0))
-    near = 0.02 if name == "mesh_saliency" else 1e-3  # which of two equal edges is cut first depends on the order
-    assert measured(name, loose, CORNER, 96) == pytest.approx(measured(name, mesh, CORNER, 96), rel=near, abs=1e-6)
-
-
-@pytest.mark.parametrize("name", MEASURES)
-def test_broken_meshes_have_finite_measures(name):
-    box = trimesh.creation.box([1, 1, 1])
-    flat = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0]], float)
-    broken = {
-        "open": (box.vertices, box.faces[:5]),
-        "without area here and there": (flat, np.array([[0, 1, 2], [0, 1, 3], [1, 1, 3], [4, 2, 3]])),
-        "three faces on one edge": (np.vstack([box.vertices, [[0, 0, 2]]]), np.vstack([box.faces, [[0, 1, 8]]])),
-        "doubled": (np.vstack([box.vertices] * 2), np.vstack([box.faces, box.faces[:, ::-1] + 8])),
-    }
-    for vertices, faces in broken.values():
-        value = measured(name, make_mesh(vertices, faces), CORNER, 48)
-        assert np.isfinite(value)
-        assert value >= 0
-
-
-def test_a_doubled_box_is_a_box():
-    box = trimesh.creation.box([1, 1, 1])
-    doubled = make_mesh(np.vstack([box.vertices] * 2), np.vstack([box.faces, box.faces[:, ::-1] + 8]))
-    assert measured("visible_area_ratio", doubled) == pytest.approx(0.5, rel=0.01)
-    assert measured("mean_curvature", doubled) == pytest.approx(measured("mean_curvature", CUBE))
-
-
-@pytest.mark.parametrize("name", MEASURES)
-def test_a_view_that_shows_nothing_measures_nothing(name):
-    away = look_at_origin(0, 0, 3)
-    away[:3, :3] = away[:3, :3] @ Rotation.from_euler("y", 180, degrees=True).as_matrix()
-    assert measured(name, CUBE, away, 32) == 0
-
-
-@pytest.mark.skipif("NEXTVIEW_DATA" not in os.environ, reason="needs the dataset")
-def test_real_meshes_have_finite_measures():
-    entries = list_dataset(Path(os.environ["NEXTVIEW_DATA"]) / "ModelNet10")
-    for i in np.random.default_rng(0).choice(len(entries), 5, replace=False):
-        mesh = load_mesh(entries[i].path)
-        for pose in SPHERE.poses[[0, 21]]:
-            view = view_of(mesh, pose, 112)
-            values = {name: function(view) for name, function in MEASURES.items()}
-            assert all(np.isfinite(value) and value >= 0 for value in values.values()), (entries[i].path, values)
-            assert values["visible_area_ratio"] <= 1
-
-
-# By name
-
-
-def test_they_are_sixteen_and_one():
-    assert len(MEASURES) == 17
-    for name, function in MEASURES.items():
-        assert find_measure(name) is function
-        documented = function.function.__doc__
-        assert name == "depth_entropy" or (documented and "Returns:" in documented)
-
-
-def test_they_are_listed(capsys):
-    main(["measures"])
-    printed = capsys.readouterr().out
-    assert all(name in printed for name in MEASURES)
-    assert "MODULE:FUNCTION" not in printed
-
-
-def test_a_mesh_is_asked_for_by_name():
-    with pytest.raises(MeasureError, match="needs the mesh"):
-        MEASURES["mean_curvature"](of_depth(np.full((8, 8), 2.5)))
-
-
-def test_what_is_no_depth_is_background():
-    view = MeasuredView(np.full((4, 4), np.nan), np.eye(4), np.eye(3))
-    assert len(view.depths) == 0
-    assert (view.depth == object_depth(np.zeros((4, 4)))).all()
-
-
-def test_saliency_is_computed_once_a_surface():
-    surface = surface_of(trimesh.creation.icosphere(1))
-    assert saliency_of(surface) is saliency_of(surface)
-
-
-def test_a_measure_of_ones_own_says_what_it_needs(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "own_measures.py").write_text(
-        "from nextview.measures.registry import Measure\n"
-        "def lowest(view):\n    return -view.depths.min() if len(view.depths) else 0\n"
-        "faces = Measure(lambda view: len(view.pixels[0]), 'mesh', 'mine', 'valley')\n"
-    )
-    assert find_measure("own_measures:lowest").needs == "depth"
-    faces = find_measure("own_measures:faces")
-    assert isinstance(faces, Measure)
-    assert (faces.needs, faces.good) == ("mesh", "valley")
-    assert faces(view_of(CUBE, CORNER, 64)) == 6
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from scipy.stats import entropy
+from skimage.measure import shannon_entropy
+
+from nextview.data.measures import QUANTUM, confidence_maps, depth_entropy, normalise_per_object
+
+
+def test_closed_forms():
+    assert depth_entropy(np.zeros((8, 8))) == 0
+    assert depth_entropy(np.full((8, 8), 2.5)) == 0
+    half = np.zeros((10, 10), np.float32)
+    half[5:] = 2.5
+    assert depth_entropy(half) == pytest.approx(1)  # background counts as a value
+    quarter = np.zeros((10, 10))
+    quarter[:5, :5] = 3.0
+    assert depth_entropy(quarter) == pytest.approx(0.25 * 2 + 0.75 * np.log2(4 / 3))
+
+
+@given(st.integers(1, 64), st.integers(1, 8))
+def test_k_values_equally_often_are_log2_k_bits(k, times):
+    depth = np.repeat(2 + np.arange(k) * 2 * QUANTUM, times).reshape(k, times)
+    assert depth_entropy(depth) == pytest.approx(np.log2(k), abs=1e-12)
+    assert depth_entropy(depth.astype(np.float32)) == pytest.approx(np.log2(k), abs=1e-12)
+
+
+def test_a_slanted_plane_of_uniform_depth():
+    # Depths spread evenly over 0.512 radii fill 512 quanta: 9 bits.
+    depth = (2 + (np.arange(512 * 64) + 0.5) / 64 * QUANTUM - QUANTUM / 2).reshape(128, 256)
+    assert depth_entropy(depth) == pytest.approx(9, abs=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_scikit_image_agrees_on_the_quantised_image(dtype):
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        depth = rng.uniform(2, 4, (60, 60)).round(rng.choice([1, 2, 3, 9])).astype(dtype)
+        depth[rng.random(depth.shape) < rng.random()] = 0
+        levels = np.floor(depth.astype(np.float64) / QUANTUM + 0.5)
+        assert depth_entropy(depth) == pytest.approx(shannon_entropy(levels, base=2), abs=1e-9)
+
+
+@given(npst.arrays(np.float64, (6, 7), elements=st.integers(0, 20).map(lambda k: k * QUANTUM)))
+def test_it_is_an_entropy(depth):
+    bits = depth_entropy(depth)
+    counts = np.unique(np.rint(depth / QUANTUM), return_counts=True)[1]
+    assert bits == pytest.approx(entropy(counts, base=2), abs=1e-12)
+    assert 0 <= bits <= np.log2(depth.size) + 1e-12
+    assert depth_entropy(depth[::-1].T) == pytest.approx(bits, abs=1e-12)
+
+
+def test_differences_below_the_quantum_do_not_count():
+    rng = np.random.default_rng(1)
+    depth = 2.5 + rng.uniform(-0.4, 0.4, (50, 50)) * QUANTUM
+    assert depth_entropy(depth) == 0
+    assert depth_entropy(np.where(np.arange(50) % 2, depth, depth + QUANTUM)) == pytest.approx(1)
+
+
+@given(npst.arrays(np.float64, (3, 9), elements=st.floats(-100, 100, allow_subnormal=False)))
+def test_normalising_keeps_order_and_ends_at_zero_and_one(values):
+    scaled = normalise_per_object(values)
+    assert scaled.dtype == np.float32
+    for row, out in zip(values, scaled, strict=True):
+        if np.ptp(row) == 0:
+            assert (out == 0).all()
+            continue
+        assert (out.min(), out.max()) == (0, 1)
+        np.testing.assert_allclose(out, np.interp(row, [row.min(), row.max()], [0, 1]), atol=1e-6)
+
+
+def test_each_object_is_normalised_by_itself():
+    values = np.array([[1.0, 2.0, 3.0], [10.0, 40.0, 20.0], [5.0, 5.0, 5.0]])
+    np.testing.assert_allclose(normalise_per_object(values), [[0, 0.5, 1], [0, 1, 1 / 3], [0, 0, 0]], rtol=1e-6)
+
+
+def test_confidence_where_right_and_zero_where_wrong():
+    half, three_quarters = np.log([1, 1]), np.log([1, 3])
+    logits = np.array([[three_quarters, half], [three_quarters, -three_quarters], [half, three_quarters]])
+    maps = confidence_maps(logits, np.array([1, 0, 0]))
+    # a tie counts for the lower index, so the second view of the first object is wrong and the first of the last right
+    np.testing.assert_allclose(maps, [[0.75, 0], [0, 0.75], [0.5, 0]], rtol=1e-6)
+    assert maps.dtype == np.float32
+
+
+def test_an_object_that_is_never_right_has_no_confidence():
+    logits = np.random.default_rng(0).normal(size=(4, 8, 3))
+    logits[2, :, 1] -= 50
+    maps = confidence_maps(logits, np.array([0, 2, 1, 1]))
+    assert not maps[2].any()
+    assert maps[[0, 1, 3]].any(1).all()
+
+
+def test_large_logits_do_not_overflow():
+    assert confidence_maps(np.array([[[1e4, -1e4]]], np.float32), np.array([0])) == 1

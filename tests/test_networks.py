@@ -1,16 +1,24 @@
-"""The ResNets are torchvision's by name, shape and number; its checkpoints load, and nothing else does."""
+"""Networks: shapes and numbers as published, checkpoints that load and nothing else, and ONNX with the same answers."""
 
+import math
 import os
 import pickle
+import sys
+from pathlib import Path
 
+import numpy as np
+import onnxruntime as ort
 import pytest
 
 torch = pytest.importorskip("torch")
 
-from nextview.models.model_card import ModelError  # noqa: E402
-from nextview.training.architectures import ResNet  # noqa: E402
-from nextview.training.checkpoints import load_checkpoint  # noqa: E402
+from nextview.errors import ModelError
+from nextview.learning.architectures import InvertedBottleneck, LiteNet, PointNet, ResNet, orthogonality
+from nextview.learning.export import export_onnx
+from nextview.learning.runs import start_from
 
+LITE0 = ((16, 3, 1), (24, 3, 2), (40, 5, 2), (80, 3, 3), (112, 5, 3), (192, 5, 4), (320, 3, 1))
+"""Width, kernel and blocks of the stages of EfficientNet-Lite0."""
 BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3), 152: (3, 8, 36, 3)}
 PUBLISHED = {18: 11_689_512, 34: 21_797_672, 50: 25_557_032, 101: 44_549_160, 152: 60_192_808}
 """Parameters at 1,000 classes, from torchvision's table of models."""
@@ -71,26 +79,13 @@ def test_resnet_is_torchvisions(depth):
     assert {name: tuple(value.shape) for name, value in network.state_dict().items()} == torchvisions_shapes(depth)
 
 
-@pytest.mark.parametrize("depth", [18, 50])
-def test_any_number_of_channels(depth):
-    (logits,) = ResNet(depth, 7, 5).eval()(torch.rand(2, 5, 64, 64))
-    assert logits.shape == (2, 7)
-
-
 @pytest.mark.parametrize("depth", [34, 50])
 def test_a_torchvision_checkpoint_loads_whole(tmp_path, depth):
     state = checkpoint(tmp_path / "resnet.pth", depth, classes=10)
     network = ResNet(depth, 10, 3)
-    load_checkpoint(network, tmp_path / "resnet.pth")
+    start_from(network, tmp_path / "resnet.pth")
     ours = network.state_dict()
     assert all(torch.equal(ours[name], value) for name, value in state.items())
-
-
-def test_a_checkpoint_from_before_batches_were_counted_loads(tmp_path):
-    state = checkpoint(tmp_path / "old.pth", counts_batches=False)
-    network = ResNet(18, 1000, 3)
-    load_checkpoint(network, tmp_path / "old.pth")
-    assert torch.equal(network.layer4[1].bn2.running_var, state["layer4.1.bn2.running_var"])
 
 
 @pytest.mark.parametrize("channels", [1, 4])
@@ -98,7 +93,7 @@ def test_other_channels_answer_grey_images_as_before(tmp_path, channels):
     checkpoint(tmp_path / "rgb.pth", classes=5)
     rgb, ours = ResNet(18, 5, 3), ResNet(18, 5, channels)
     for network in (rgb, ours):
-        load_checkpoint(network, tmp_path / "rgb.pth")
+        start_from(network, tmp_path / "rgb.pth")
     grey = torch.rand(2, 1, 32, 32)
     with torch.no_grad():
         expected = rgb.conv1(grey.expand(-1, 3, -1, -1))
@@ -109,7 +104,7 @@ def test_other_classes_keep_the_last_layer_of_the_network(tmp_path):
     state = checkpoint(tmp_path / "imagenet.pth")
     network = ResNet(18, 10, 3)
     before = network.fc.weight.clone()
-    load_checkpoint(network, tmp_path / "imagenet.pth")
+    start_from(network, tmp_path / "imagenet.pth")
     assert torch.equal(network.fc.weight, before)
     assert torch.equal(network.layer3[0].conv1.weight, state["layer3.0.conv1.weight"])
 
@@ -146,12 +141,9 @@ BROKEN = {
     "cannot be a pickle inside torch's own file": lambda path: torch.save({"x": Bomb(path.parent / "executed")}, path),
     "truncated": truncated,
     "empty": lambda path: path.write_bytes(b""),
-    "text": lambda path: path.write_text("404: Not Found"),
     "a list": lambda path: torch.save([torch.zeros(3)], path),
-    "a dict of numbers": lambda path: torch.save({"conv1.weight": 3}, path),
     "another network": lambda path: torch.save({"features.0.weight": torch.zeros(3)}, path),
     "another depth": lambda path: checkpoint(path, 34),
-    "a bottleneck network": lambda path: checkpoint(path, 50),
     "wrong shape": wrong_shape,
     "flat": lambda path: torch.save(checkpoint(path) | {"conv1.weight": torch.zeros(64)}, path),
     "not finite": not_finite,
@@ -165,7 +157,132 @@ def test_broken_and_foreign_files_are_refused_and_nothing_is_executed(tmp_path, 
     network = ResNet(18, 10, 4)
     before = {name: value.clone() for name, value in network.state_dict().items()}
     with pytest.raises(ModelError, match=r"weights\.pth: ") as refusal:
-        load_checkpoint(network, path)
+        start_from(network, path)
     assert "\n" not in str(refusal.value)
     assert not (tmp_path / "executed").exists()
     assert all(torch.equal(before[name], value) for name, value in network.state_dict().items())
+
+
+def lite_checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
+    """Random weights under the names that published checkpoints use, from the network's plan in words."""
+    rng, state = torch.Generator().manual_seed(seed), {}
+
+    def convolution(name, *shape):
+        state[f"{name}.weight"] = torch.randn(shape, generator=rng) / (shape[1] * shape[2] * shape[3]) ** 0.5
+
+    def norm(name, width):
+        for part in ("weight", "bias", "running_mean"):
+            state[f"{name}.{part}"] = torch.randn(width, generator=rng) / 10 + (part == "weight")
+        state[f"{name}.running_var"] = torch.rand(width, generator=rng) + 0.5
+        state[f"{name}.num_batches_tracked"] = torch.tensor(7)
+
+    convolution("_conv_stem", 32, 3, 3, 3)
+    norm("_bn0", 32)
+    inputs, index = 32, 0
+    for widths, kernel, repeats in LITE0:
+        for _ in range(repeats):
+            block, wide = f"_blocks.{index}", inputs * (6 if index else 1)
+            if index:
+                convolution(f"{block}._expand_conv", wide, inputs, 1, 1)
+                norm(f"{block}._bn0", wide)
+            convolution(f"{block}._depthwise_conv", wide, 1, kernel, kernel)
+            norm(f"{block}._bn1", wide)
+            convolution(f"{block}._project_conv", widths, wide, 1, 1)
+            norm(f"{block}._bn2", widths)
+            inputs, index = widths, index + 1
+    convolution("_conv_head", 1280, inputs, 1, 1)
+    norm("_bn1", 1280)
+    state["_fc.weight"] = torch.randn(classes, 1280, generator=rng) / 1280**0.5
+    state["_fc.bias"] = torch.randn(classes, generator=rng)
+    torch.save(state, path)
+    return state
+
+
+def test_it_is_as_large_as_published():
+    """4.7 million parameters and 407 million multiplications (TensorFlow's EfficientNet-Lite, 2020)."""
+    network, products = LiteNet(1000, 3).eval(), []
+    for part in network.modules():
+        if isinstance(part, torch.nn.Conv2d | torch.nn.Linear):
+            weights = part.weight.numel()
+            part.register_forward_hook(lambda _, __, out, weights=weights: products.append(weights * out[0, 0].numel()))
+    network(torch.zeros(1, 3, 224, 224))
+    assert sum(p.numel() for p in network.parameters()) == pytest.approx(4.7e6, rel=0.02)
+    assert sum(products) == pytest.approx(407e6, rel=0.06)
+
+
+def test_a_published_checkpoint_loads_whole(tmp_path):
+    state = lite_checkpoint(tmp_path / "lite.pth")
+    network = LiteNet(1000, 3)
+    start_from(network, tmp_path / "lite.pth")
+    ours = network.state_dict()
+    assert len(ours) == len(state)
+    assert torch.equal(ours["stem.weight"], state["_conv_stem.weight"])
+    assert torch.equal(ours["stages.15.depthwise.weight"], state["_blocks.15._depthwise_conv.weight"])
+    assert torch.equal(ours["stages.3.norm2.running_var"], state["_blocks.3._bn2.running_var"])
+    assert torch.equal(ours["norm1.bias"], state["_bn1.bias"])
+    assert torch.equal(ours["fc.weight"], state["_fc.weight"])
+
+
+def test_blocks_are_skipped_for_some_images_in_training_alone():
+    block = InvertedBottleneck(4, 6, 4, 3, 1, skip=0.25)
+    x = torch.rand(1, 4, 5, 5).expand(4000, -1, -1, -1)
+    whole = (block(x) - x).detach()
+    done = whole.flatten(1).abs().amax(1) > 0
+    assert done.float().mean().item() == pytest.approx(0.75, abs=0.03)
+    block.skip = 0.0
+    assert torch.allclose(whole[done] * 0.75, (block(x) - x)[done], atol=1e-6)
+    block.skip = 0.25
+    block.eval()
+    assert (block(x) - x).flatten(1).abs().amax(1).min() > 0
+
+
+def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
+    torch.manual_seed(0)
+    network = PointNet(5).eval()
+    cloud = torch.rand(3, 200, 3)
+    predicted, a, b = network(cloud)
+    assert predicted.shape == (3, 5, 3)
+    assert torch.allclose(a, torch.eye(3).expand(3, 3, 3))
+    assert torch.allclose(b, torch.eye(64).expand(3, 64, 64))
+    assert torch.allclose(network(cloud[:, torch.randperm(200)])[0], predicted, atol=1e-5)
+
+
+def test_orthogonality_of_rotations_and_scalings():
+    rotation = torch.linalg.qr(torch.randn(4, 3, 3)).Q
+    assert orthogonality(rotation) < 1e-5
+    assert orthogonality(2 * torch.eye(64).expand(2, 64, 64)).item() == pytest.approx(3 * math.sqrt(64))
+
+
+def test_export_keeps_the_answers(tmp_path):
+    torch.manual_seed(0)
+    network = ResNet(18, 5, 4).eval()
+    x = torch.rand(2, 4, 64, 64)
+    export_onnx(network, x.numpy(), "input", ["logits"], tmp_path / "net.onnx")
+    assert [p.name for p in tmp_path.iterdir()] == ["net.onnx"]
+    session = ort.InferenceSession(tmp_path / "net.onnx")
+    more = torch.rand(3, 4, 64, 64)  # another batch size than the example's
+    with torch.no_grad():
+        expected = network(more)
+    for ours, theirs in zip(session.run(None, {"input": more.numpy()}), expected, strict=True):
+        assert np.abs(ours - theirs.numpy()).max() < 0.01 * theirs.abs().max()
+    source = sys.modules[ResNet.__module__].__file__
+    assert source.encode() not in (tmp_path / "net.onnx").read_bytes()
+    full = sum(p.numel() for p in network.parameters()) * 4
+    assert (tmp_path / "net.onnx").stat().st_size < 0.6 * full
+
+
+def test_eight_bits_a_weight_are_enough_for_the_answers_and_nearly_halve_the_file_again(tmp_path):
+    torch.manual_seed(0)
+    network = ResNet(18, 10, 4).eval()
+    with torch.no_grad():  # every row of another magnitude, as in trained networks
+        network.layer4[1].conv1.weight *= torch.logspace(-2, 1, 512)[:, None, None, None]
+    x = np.random.default_rng(0).random((2, 4, 64, 64)).astype(np.float32)
+    output = {}
+    for bits in (16, 8):
+        export_onnx(network, x, "input", ["logits"], tmp_path / f"{bits}.onnx", bits)
+        session = ort.InferenceSession(tmp_path / f"{bits}.onnx", providers=["CPUExecutionProvider"])
+        output[bits] = session.run(["logits"], {"input": x})[0]
+    true = network(torch.from_numpy(x))[0].detach().numpy()
+    assert np.abs(output[8] - true).max() < 0.02 * np.abs(true).max()
+    assert np.abs(output[8] - true).max() > np.abs(output[16] - true).max()  # so they do have fewer
+    assert (tmp_path / "8.onnx").stat().st_size < 0.55 * (tmp_path / "16.onnx").stat().st_size

@@ -9,14 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from nextview.cameras.simulated import SimulatedCamera
-from nextview.cloud import visible_points
 from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError
-from nextview.mesh import make_mesh
-from nextview.models.network_input import InputSpec, from_observations
-from nextview.observation import LEAST_PIXELS, LEAST_SHARE, Observation, pinhole
-from nextview.viewsphere import ViewSphere
+from nextview.geometry.mesh import make_mesh
+from nextview.geometry.observation import LEAST_PIXELS, LEAST_SHARE, Observation, pinhole
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.simulation.simulated import SimulatedCamera
 
 POSE = ViewSphere.named("40").poses[13]
 SIZE = 64
@@ -30,19 +28,6 @@ def observe(**other) -> Observation:
 
 
 # Taking
-
-
-def test_points_and_picture_are_derived_once():
-    view = observe()
-    np.testing.assert_array_equal(view.points, visible_points(VIEW.depth, POSE, INTRINSICS))
-    assert view.points is view.points
-    assert view.picture is view.picture
-    assert view.visible == (VIEW.depth > 0).sum()
-    assert VIEW.picture is VIEW.image
-    empty = replace(view, depth=np.zeros_like(VIEW.depth))  # nothing derived is left over
-    assert not empty.points.any()
-    assert not empty.picture.any()
-    assert empty.visible == 0
 
 
 @pytest.mark.parametrize("name", ["chair", "ball"])
@@ -61,34 +46,6 @@ def test_without_an_image_the_depth_is_lit_as_the_renderer_lights_the_mesh(name)
         gap = np.abs(lit.astype(float) - view.image)[view.depth > 0]
         assert np.median(gap) <= 2
         assert np.mean(gap > 25) < 0.2  # edges, where the neighbours are on other faces
-
-
-def test_pixels_that_are_not_square_and_images_that_are_neither():
-    """A plane that faces the camera squarely: the cosine is that of the ray and the optical axis."""
-    intrinsics = np.array([[60, 0, 30], [0, 90, 20], [0, 0, 1.0]])
-    lit = Observation(np.full((48, 80), 3.0, np.float32), POSE, intrinsics).picture
-    row, column = np.mgrid[:48, :80] + 0.5
-    cosine = 1 / np.sqrt(((column - 30) / 60) ** 2 + ((row - 20) / 90) ** 2 + 1)
-    np.testing.assert_allclose(lit, 255 * (0.15 + 0.85 * cosine), atol=1)
-
-
-def test_lists_and_other_numbers_are_converted():
-    depth = np.where(VIEW.depth > 0, 3, 0)
-    view = Observation(depth.tolist(), POSE.tolist(), INTRINSICS.tolist(), 0.5, VIEW.image.tolist())
-    assert (view.depth.dtype, view.pose.dtype, view.intrinsics.dtype) == (np.float32, np.float64, np.float64)
-    np.testing.assert_array_equal(view.depth, depth)
-    np.testing.assert_array_equal(view.image, VIEW.image)
-    assert view.image.dtype == np.uint8
-    assert observe(depth=VIEW.depth.astype(np.float64)).depth.dtype == np.float32
-    assert not observe(depth=np.full((SIZE, SIZE), 1e300)).depth.any()  # beyond float32
-
-
-def test_what_is_of_the_right_type_is_not_copied():
-    view = observe(image=VIEW.image)
-    assert view.depth is VIEW.depth
-    assert view.pose is POSE
-    assert view.intrinsics is INTRINSICS
-    assert view.image is VIEW.image
 
 
 @pytest.mark.parametrize("size", [16, 64, 224])
@@ -178,44 +135,11 @@ def test_what_no_camera_gives_is_refused_in_one_sentence(other, words):
     assert "\n" not in str(refusal.value)
 
 
-def test_a_pose_written_with_four_digits_is_rigid_enough():
-    np.testing.assert_array_equal(observe(pose=np.round(POSE, 4)).pose, np.round(POSE, 4))
-
-
 def test_millimetres_with_a_few_pixels_of_noise_are_refused_still():
     depth = VIEW.depth * 450
     depth[np.nonzero(depth)[0][:3], np.nonzero(depth)[1][:3]] = 7
     with pytest.raises(ObservationError, match="millimetres"):
         observe(depth=depth)
-
-
-@pytest.mark.parametrize("nothing", [65535.0, 1e10, np.inf, np.nan, -1.0])
-@pytest.mark.parametrize("hidden", [0.5, 1.0])
-def test_one_large_number_for_nothing_is_no_other_unit(nothing, hidden):
-    depth = np.where(VIEW.depth > 0, VIEW.depth, np.float32(nothing))
-    depth.flat[: int(hidden * depth.size)] = nothing
-    assert observe(depth=depth).visible == (depth < 50).sum() - (depth < 0).sum()
-
-
-def test_a_wall_far_behind_the_object_is_no_other_unit():
-    wall = np.linspace(55, 70, SIZE * SIZE, dtype=np.float32).reshape(SIZE, SIZE)
-    np.testing.assert_array_equal(observe(depth=np.where(VIEW.depth > 0, VIEW.depth, wall)).depth, VIEW.depth)
-
-
-def test_a_simulated_camera_refuses_such_poses_too():
-    for pose in (POSE[:3], np.full((4, 4), np.nan), np.zeros((4, 4)), None):
-        with pytest.raises(ObservationError):
-            CHAIR.observe(pose)
-
-
-def test_views_of_two_cameras_are_not_seen_together():
-    for other in (
-        SimulatedCamera(sample_mesh("chair"), 32).observe(POSE),
-        SimulatedCamera(sample_mesh("chair"), SIZE, 4.0).observe(POSE),
-    ):
-        for spec in (InputSpec("geometry", 16), InputSpec("image", 16), InputSpec("cloud")):
-            with pytest.raises(ObservationError, match="from one camera"):
-                from_observations(spec, [VIEW, other])
 
 
 images = npst.arrays(

@@ -1,24 +1,18 @@
-"""The occupancy grid against closed forms: what a ball, a wall and empty space hide from where."""
+"""The occupancy grid against closed forms: what a ball and a wall hide, and what always holds."""
 
-import ast
-import sys
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-import nextview.occupancy
-from nextview.errors import ObservationError, UsageError
-from nextview.observation import pinhole
-from nextview.occupancy import FREE, OBJECT, OCCLUDER, UNSEEN, Occupancy, VoxelGrid, new_surface, new_volume
-from nextview.occupancy import visible_share as share_of
-from nextview.viewsphere import ViewSphere, look_at_origin
+from nextview.geometry.observation import pinhole
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.sensing.expected_visibility import FREE, OBJECT, OCCLUDER, UNSEEN, Occupancy, VoxelGrid
 
 GRID = VoxelGrid(64)
+BALL = GRID.within(1.0)
 SMALL = VoxelGrid(24)
 K = pinhole(224, 3.0)
 EYE = np.array([3.0, 0, 0])
@@ -73,8 +67,8 @@ def after(*poses, radius=0.6, grid=GRID):
 
 def test_a_ball_leaves_unseen_what_lies_behind_its_face():
     radius, pose = 0.6, look_at_origin(0, 0)
-    cells = after(pose, radius=radius).cells[GRID.ball]
-    middles = GRID.middles[:, GRID.ball.ravel()].T.astype(float)
+    cells = after(pose, radius=radius).cells[BALL]
+    middles = GRID.middles[:, BALL.ravel()].T.astype(float)
     hidden, slack = hidden_by_ball(middles, EYE, radius), GRID.pitch * np.sqrt(3) / 2
     # Exact but for voxels that the surface, or the border of the shadow, passes through.
     near = hidden_by_ball(middles, EYE, radius + slack) & ~hidden_by_ball(middles, EYE, radius - slack)
@@ -98,21 +92,6 @@ def test_occupied_are_the_voxels_that_the_visible_cap_passes_through():
     assert occupied[through].all()
 
 
-def test_where_nothing_is_measured_may_be_free_or_not():
-    pose, nothing = look_at_origin(0.3, 1), np.zeros((224, 224))
-    assert (Occupancy.unseen(GRID).seen(nothing, pose, K).cells[GRID.within(0.97)] == FREE).all()
-    assert (Occupancy.unseen(GRID).seen(nothing, pose, K, background_free=False).cells == UNSEEN).all()
-
-
-def test_what_is_beside_the_picture_or_behind_the_camera_stays_unseen():
-    wide = VoxelGrid(32, half=8.0)
-    cells = Occupancy.unseen(wide).seen(np.zeros((224, 224)), look_at_origin(0, 0), K).cells
-    x, y, z = (m.reshape(cells.shape) for m in wide.middles)
-    reach = (3 - x) / np.sqrt(8)  # the picture's half width at the depth 3 - x
-    inside = (x < 3) & (np.abs(y) < reach) & (np.abs(z) < reach)
-    np.testing.assert_array_equal(cells == FREE, inside)
-
-
 def test_object_and_occluder_are_kept_apart():
     pose = look_at_origin(0, 0)
     ball, wall = ball_depth(pose, 0.4), wall_depth(pose, 0.8, 0.2)
@@ -123,122 +102,6 @@ def test_object_and_occluder_are_kept_apart():
     assert (cells == OBJECT).any()
     assert np.abs(x[cells == OCCLUDER] - 0.8).max() < GRID.pitch
     assert x[cells == OBJECT].max() < 0.4 + GRID.pitch
-
-
-# New volume and new surface
-
-
-@pytest.mark.parametrize(("elevation", "azimuth"), [(0, 0), (0, 45), (0, 90), (0, 135), (0, 180), (54, 90), (72, 225)])
-def test_new_volume_is_the_shadow_that_the_seen_cap_does_not_hide(elevation, azimuth):
-    radius, occupancy = 0.6, after(look_at_origin(0, 0))
-    eye = look_at_origin(np.radians(elevation), np.radians(azimuth))[:3, 3]
-    middles = GRID.middles[:, GRID.ball.ravel()].T.astype(float)
-    asked = middles[hidden_by_ball(middles, EYE, radius)]
-    t = crossings(asked, eye, radius)
-    at = asked[:, None] + t[..., None] * (eye - asked)[:, None]
-    blocked = ((t > 0) & (t < 1) & (at @ EYE > radius**2)).any(1)  # the cap that was seen: p . eye > radius^2
-    exact = (~blocked).sum() * GRID.pitch**3
-    found = new_volume(occupancy, eye[None])[0]
-    assert found == pytest.approx(exact, rel=0.05, abs=0.02)
-
-
-def test_a_ball_seen_from_all_sides_has_nothing_new():
-    occupancy = after(*SPHERE.poses[[0, 2, 4, 6, 32, 36]], look_at_origin(-np.pi / 2 + 1e-3, 0), radius=0.6)
-    before = new_volume(after(SPHERE.poses[0]), SPHERE.poses[:, :3, 3]).max()
-    assert new_volume(occupancy, SPHERE.poses[:, :3, 3]).max() < 0.02 * before
-
-
-def test_before_the_first_view_all_is_new_from_everywhere():
-    occupancy = Occupancy.unseen(GRID)
-    np.testing.assert_allclose(new_volume(occupancy, SPHERE.poses[:, :3, 3]), GRID.ball.sum() * GRID.pitch**3)
-    assert GRID.ball.sum() * GRID.pitch**3 == pytest.approx(4 / 3 * np.pi, rel=0.01)
-
-
-@pytest.mark.parametrize("distance", [2.0, 3.0, 6.0])
-def test_an_unseen_ball_appears_as_large_as_the_disc_within_its_tangents(distance):
-    """From d radii the tangents touch the plane through the middle at d / sqrt(d^2 - 1)."""
-    eyes = SPHERE.directions[::5] * distance
-    found = new_surface(Occupancy.unseen(GRID), eyes)
-    half = distance / np.sqrt(distance**2 - 1)
-    assert (found > np.pi * half**2).all()  # voxels stand out by up to a half
-    assert (found < np.pi * (half + 2 * GRID.pitch) ** 2).all()  # and are drawn a pixel wide to each side
-
-
-def test_what_a_wall_hides_is_new_from_behind_it():
-    pose = look_at_origin(0, 0)
-    occupancy = Occupancy.unseen(GRID).seen(wall_depth(pose, 0.5, 0.5), pose, K)
-    eyes = SPHERE.poses[[0, 4], :3, 3]  # before the wall and behind it
-    volume, surface = new_volume(occupancy, eyes), new_surface(occupancy, eyes)
-    middles = GRID.middles.T.astype(float)
-    along = (0.5 - 3) / (middles[:, 0] - 3)  # where the way from the eye to a voxel crosses the wall's plane
-    behind = (middles[:, 0] < 0.5) & (np.abs(along[:, None] * middles[:, 1:]) < 0.5).all(1) & GRID.ball.ravel()
-    assert volume[1] == pytest.approx(behind.sum() * GRID.pitch**3, rel=0.08)
-    assert volume[0] < 0.05 * volume[1]
-    assert surface[0] < 0.15 * surface[1]  # a voxel on the edge of the shadow stands out beside the wall
-
-
-@pytest.mark.parametrize("together", [1, 3000, 10**9])
-@pytest.mark.parametrize("gain", [new_volume, new_surface])
-def test_cameras_that_are_asked_together_see_what_each_sees_alone(gain, together, monkeypatch):
-    """Also those that stand so near that what they see is drawn in wide pixels."""
-    cells = np.random.default_rng(0).choice(np.array([UNSEEN] * 6 + [FREE] * 3 + [OBJECT], np.uint8), (12, 12, 12))
-    occupancy = Occupancy(VoxelGrid(12), cells)
-    eyes = np.concatenate([scale * SPHERE.directions[::5] for scale in (1.3, 2, 3)])
-    alone = [gain(occupancy, eye[None])[0] for eye in eyes]
-    monkeypatch.setattr(sys.modules[gain.__module__], "TOGETHER", together)
-    np.testing.assert_array_equal(gain(occupancy, eyes), alone)
-
-
-def test_a_blocker_near_the_camera_has_no_holes():
-    """A wall of voxels at a quarter of the distance: its voxels lie four pixels apart in the picture."""
-    grid = VoxelGrid(64, half=2.0)
-    cells = np.full((64,) * 3, FREE)
-    x, y, z = (m.reshape(cells.shape) for m in grid.middles)
-    cells[(np.abs(x - 1.6) < grid.pitch / 2) & (np.abs(y) < 1) & (np.abs(z) < 1)] = OCCLUDER
-    cells[(x * x + y * y + z * z < 0.5**2)] = UNSEEN
-    eyes = np.array([[2.1, 0, 0], [0, 2.5, 0]])
-    found = new_volume(Occupancy(grid, cells), eyes) / grid.pitch**3
-    assert found[0] == 0
-    assert found[1] == (cells == UNSEEN).sum()
-
-
-# Line of sight
-
-
-@pytest.mark.parametrize("distance", [1.5, 3.0])
-def test_the_visible_share_behind_a_wall_is_that_of_the_shadow(distance):
-    """Points of a square board; a smaller wall before it hides a square of them, by similar triangles."""
-    grid = VoxelGrid(64, half=1.0)
-    cells = np.full((64,) * 3, FREE)
-    x, y, z = (m.reshape(cells.shape) for m in grid.middles)
-    half = 8 * grid.pitch
-    cells[(np.abs(x - 0.5 - grid.pitch / 2) < 1e-3) & (np.abs(y) < half) & (np.abs(z) < half)] = OCCLUDER
-    side = np.linspace(-0.6, 0.6, 31)
-    board = np.array([[0.0, b, c] for b in side for c in side])
-    shadow = half * distance / (distance - 0.5 - grid.pitch / 2)
-    exact = 1 - (np.abs(board[:, 1:]) < shadow).all(1).mean()
-    eyes = np.array([[distance, 0, 0], [-distance, 0, 0]])
-    found = share_of(Occupancy(grid, cells), board, eyes)
-    assert found[0] == pytest.approx(exact, abs=0.05)
-    assert found[1] == 1
-
-
-@pytest.mark.parametrize("density", [0.0, 0.5, 2.0, np.inf])
-def test_unseen_space_lets_through_what_its_density_says(density):
-    found = share_of(Occupancy.unseen(GRID), np.zeros((1, 3)), SPHERE.poses[:, :3, 3], density)
-    # On the way to the cube's border: 1 over the largest coordinate of the direction.
-    length = 1 / np.abs(SPHERE.directions).max(1)
-    np.testing.assert_allclose(found, np.exp(-density * length), atol=2 * min(density, 1) * GRID.pitch)
-    own = np.ones((64,) * 3, bool)
-    np.testing.assert_array_equal(share_of(Occupancy.unseen(GRID), np.zeros((1, 3)), EYE[None], density, own), 1)
-
-
-def test_what_is_behind_the_camera_hides_nothing():
-    cells = np.full((64,) * 3, FREE)
-    cells[40:] = OCCLUDER
-    assert share_of(Occupancy(GRID, cells), np.array([[-0.5, 0, 0]]), np.array([[0.2, 0, 0]]))[0] == 1
-    assert share_of(Occupancy(GRID, cells), np.array([[-0.5, 0, 0]]), np.array([[3.0, 0, 0]]))[0] == 0
-    assert np.isnan(share_of(Occupancy(GRID, cells), np.zeros((0, 3)), EYE[None])).all()
 
 
 # What always holds
@@ -284,31 +147,3 @@ def test_nothing_changes_if_all_moves_or_is_measured_in_another_unit(view, quart
     there = Occupancy.unseen(grid).seen(depth * unit, moved(pose), K)
     same = np.rot90(here.cells, quarters, (0, 1)) == there.cells
     assert same.mean() > 0.999  # a voxel whose middle lies on the edge of a pixel may fall to either side
-    eyes, far = SPHERE.poses[:, :3, 3], moved(SPHERE.poses)[:, :3, 3]
-    for gain, power in ((new_volume, 3), (new_surface, 2)):
-        ours, theirs = gain(here, eyes), gain(there, far) / unit**power
-        assert np.abs(ours - theirs).max() <= 0.1 * ours.max()  # the pixels of the z-buffer do not turn with the scene
-    points = centre + 0.5 * SPHERE.directions
-    elsewhere = points @ turn.T * unit + shift
-    np.testing.assert_allclose(share_of(here, points, eyes), share_of(there, elsewhere, far), atol=0.05)
-
-
-# What cannot be
-
-
-def test_grids_and_frames_that_cannot_be():
-    for bad in ({"n": 1}, {"half": 0.0}, {"half": np.inf}, {"centre": (np.nan, 0, 0)}):
-        with pytest.raises(UsageError, match="voxel grid"):
-            VoxelGrid(**bad)
-    with pytest.raises(ObservationError, match="one shape"):
-        Occupancy.unseen(SMALL).seen(np.ones((4, 4)), np.eye(4), K, np.ones((3, 4), bool))
-    with pytest.raises(UsageError, match="among the voxels"):
-        new_volume(Occupancy.unseen(SMALL), np.array([[0.1, 0, 0]]))
-
-
-def test_the_room_imports_only_from_rooms_above_it():
-    above = {"arguments", "errors", "viewsphere", "mesh", "observation", "depth", "cloud", "sensing", "occupancy"}
-    for file in Path(nextview.occupancy.__file__).parent.glob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.ImportFrom) and node.module.startswith("nextview"):
-                assert node.module.split(".")[1] in above, (file.name, node.module)

@@ -7,21 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nextview.belief import Calibration, FixedLength, Stopping
-from nextview.data.planning import plannable
-from nextview.episode import VISITED, Episodes
-from nextview.errors import PolicyError, UsageError
+from nextview.geometry.viewsphere import Directions, ViewSphere, look_at_origin, viewpoints_of
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.off_grid import OffGrid, anywhere
 from nextview.policies.registry import POLICIES, make_policy, make_policy_anywhere
-from nextview.viewsphere import Directions, ViewSphere, look_at_origin, viewpoints_of
+from nextview.recognition.belief import Calibration, FixedLength
+from nextview.session.episode import VISITED, Episodes
 
 SPHERE = ViewSphere.named("40")
 CLASSES = 10
 LAYOUTS = ("40", "12", "rings:0,30,60x12", "fibonacci:60", "fibonacci:7")
 NAMES = (
-    *(name for name in POLICIES if name not in plannable()),
+    *(name for name in POLICIES),
     *("lem", "lem-peak", "lcm", "lcm-peak", "lem-sphere-peak"),
     "gain",
     "visible-gain",
@@ -82,31 +80,6 @@ def test_travel_of_directions_is_counted_in_the_cells_of_the_40_views():
     between = SPHERE.travel_between(direction(27, 350), direction(36, 10))
     assert between == pytest.approx(np.hypot(0.5, 20 / 45))
     assert viewpoints_of("12").travel_between(direction(45, 5), direction(45, 350)) == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize(
-    ("what", "reason"),
-    [
-        ("41", "no viewpoints are called '41'.*40, 12.*fibonacci"),
-        ("rings:0,30", "no viewpoints"),
-        ("rings:0,99x8", "between -90 and 90"),
-        ("rings:0x2", "at least three"),
-        ("fibonacci:0", "at least one"),
-        ([[0, 0, 0]], "zero"),
-        ([[0, 0, np.nan]], "NaN"),
-        ([[1, 2]], "shape"),
-        ([["a", "b", "c"]], "viewpoints are"),
-        ([], "shape"),
-    ],
-)
-def test_impossible_layouts(what, reason):
-    with pytest.raises(UsageError, match=reason):
-        viewpoints_of(what)
-
-
-def test_local_policies_need_rings():
-    with pytest.raises(PolicyError, match="rings"):
-        make_policy("random", Directions.fibonacci(9))
 
 
 # Policies off their grid
@@ -213,27 +186,3 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(da
         assert not episodes.outcome.confident[0]
         paths.append(path)
     assert paths[0] == paths[1]
-
-
-def test_a_policy_that_knows_nothing_of_reach_is_kept_from_what_is_out_of_it():
-    class First:
-        needs = ()
-
-        def next_views(self, state, rng):
-            return (~state.visited).argmax(1)
-
-    reach = np.zeros(40, bool)
-    reach[[5, 17]] = True
-    episodes = Episodes(SPHERE, First(), np.array([3, 5]), Stopping(1.0, 9), np.random.default_rng(0))
-    rng = np.random.default_rng(0)
-
-    def within(state):
-        return replace(state, reachable=np.tile(reach, (len(state.current), 1)))
-
-    assert episodes.update(evidence(rng, 2), constrain=within).next_views.tolist() == [5, 17]
-    step = episodes.update(evidence(rng, 2), constrain=within)
-    assert step.next_views.tolist() == [17, -1]
-    assert step.stopped.tolist() == [False, True]
-    assert episodes.update(evidence(rng), constrain=within).stopped.tolist() == [True]
-    assert episodes.outcome.n_views.tolist() == [3, 2]
-    assert not episodes.outcome.confident.any()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.scenes import INTRINSICS, box, cast, pose_at
+from pipeline import INTRINSICS, box, cast, pose_at
 
 pytest.importorskip("rerun", reason="the extra 'record' is not installed")
 
@@ -14,11 +14,10 @@ from rerun.chunk import RrdReader
 import nextview
 from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
-from nextview.errors import ResultsError, UsageError
-from nextview.observation import Observation
-from nextview.report.recording import Recorder
+from nextview.geometry.observation import Observation
 from nextview.sensing import Frame
-from nextview.system import simulated
+from nextview.session.system import simulated
+from nextview.viewers.recording import Recorder
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "table.off"
 
@@ -50,7 +49,8 @@ class Recording:
 def made(tmp_path_factory):
     """An episode of several views, and its recording."""
     path = tmp_path_factory.mktemp("recorded") / "episode.rrd"
-    session = nextview.load(threshold=0.9999, max_views=3, threads=1).session(start=3, record=path)
+    session = nextview.load(threshold=0.9999, max_views=3, threads=1).session(start=3)
+    session.observers.append(Recorder(path))
     result = session.run(simulated(sample_mesh("table"), "kinect"))
     assert len(result.views) > 1
     return session, result, Recording(path)
@@ -68,23 +68,6 @@ def test_belief_and_travel_over_the_steps(made):
         for name, values in (("belief_now", view.belief), ("this_view_alone", view.alone)):
             np.testing.assert_array_equal(recording.at(name, "BarChart:values", step)[0]["buffer"], values)
     assert recording.steps("belief/chair", "Scalars:scalars") == steps
-
-
-def test_cameras_project_the_points_into_the_depth_image(made):
-    _, result, recording = made
-    for step, view in enumerate(result.views, 1):
-        rotation = recording.at("world/camera", "Transform3D:mat3x3", step).reshape(3, 3).T  # columns first
-        position = recording.at("world/camera", "Transform3D:translation", step).reshape(3)
-        pinhole = recording.at("world/camera", "Pinhole:image_from_camera", step).reshape(3, 3).T
-        size = recording.at("world/camera", "Pinhole:resolution", step).ravel().astype(int)
-        raw = np.array(recording.at("world/camera/depth", "DepthImage:buffer", step), np.uint8).tobytes()
-        depth = np.frombuffer(raw, np.float32).reshape(size[1], size[0])
-        points = np.array(recording.at(f"world/seen/{step}", "Points3D:positions", step).tolist())
-        np.testing.assert_array_equal(depth, view.observation.depth)
-        seen = (points - position) @ rotation
-        column, row, z = (seen @ pinhole.T).T
-        found = depth[(row / z).astype(int), (column / z).astype(int)]
-        np.testing.assert_allclose(found, z, atol=1e-4)
 
 
 def test_candidates_values_and_choices(made):
@@ -110,7 +93,8 @@ def test_candidates_values_and_choices(made):
 
 def test_frames_that_move_the_object_are_written_anew(tmp_path):
     path = tmp_path / "frames.rrd"
-    session = nextview.load(threshold=1.0, max_views=3, threads=1).session(distance=0.9, record=path)
+    session = nextview.load(threshold=1.0, max_views=3, threads=1).session(distance=0.9)
+    session.observers.append(Recorder(path))
     thing = [box((0.2, 0.3, 0.2), (0, 0, 0.1)), box((2, 2, 0.02), (0, 0, -0.01))]
     seen = []
     for azimuth in (0, 60, 140):
@@ -127,27 +111,10 @@ def test_frames_that_move_the_object_are_written_anew(tmp_path):
         np.testing.assert_allclose(points, seen[step - 1][0].points, atol=1e-6)
 
 
-def test_another_choice_is_written_too(tmp_path):
-    session = nextview.load(threshold=1.0, max_views=3, threads=1).session(start=3, record=tmp_path / "a.rrd")
-    camera = simulated(sample_mesh("table"))
-    session.update(camera.observe(session.pose))
-    first = session.view
-    session.failed()
-    assert session.view != first
-    session.reachable = np.zeros(40, bool)
-    assert session.done
-    recording = Recording(tmp_path / "a.rrd")
-    texts = [text[0] for text in recording.rows["log", "TextLog:text"][1]]
-    assert texts[0].endswith(f"next view {first}")
-    assert "next view" in texts[1]
-    assert texts[2].endswith("the end")
-    assert texts[1] != texts[0]
-    assert len(recording.rows["belief/chair", "Scalars:scalars"][1]) == 1  # nothing new was seen
-
-
 def test_a_recording_under_way_can_be_read_and_one_that_is_closed_is_complete(tmp_path):
     path = tmp_path / "a.rrd"
-    session = nextview.load(max_views=2, threads=1).session(start=3, record=path)
+    session = nextview.load(max_views=2, threads=1).session(start=3)
+    session.observers.append(Recorder(path))
     seen = simulated(sample_mesh("table")).observe(session.pose)
     session.update(Observation(np.zeros_like(seen.depth), seen.pose, seen.intrinsics))
     with pytest.warns(Warning, match="no footer"):  # as long as it is not complete
@@ -169,20 +136,3 @@ def test_the_command_writes_one_and_prints_the_same(tmp_path, capsys):
     recording = Recording(tmp_path / "new" / "episode.rrd")
     assert len(recording.steps("belief/table", "Scalars:scalars")) == len(json.loads(plain)["views"])
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["episode.rrd"]
-
-
-def test_a_command_that_fails_leaves_no_recording(tmp_path, capsys):
-    (tmp_path / "none.off").write_text("OFF\n")
-    with pytest.raises(SystemExit):
-        main(["recognise", str(tmp_path / "none.off"), "--record", str(tmp_path / "episode.rrd")])
-    with pytest.raises(SystemExit):
-        main(["recognise", str(SAMPLE), "--record", str(tmp_path / "episode.json")])
-    assert capsys.readouterr().err.endswith("nextview: episode.json: a recording for Rerun is called .rrd\n")
-    assert [path.name for path in tmp_path.iterdir()] == ["none.off"]
-
-
-def test_what_cannot_be_written_is_said_in_a_sentence(tmp_path):
-    (tmp_path / "file").write_text("")
-    for path in (tmp_path / "missing" / "a.rrd", tmp_path / "file" / "a.rrd"):
-        with pytest.raises((UsageError, ResultsError), match=r"a\.rrd"):
-            Recorder(path)

@@ -8,22 +8,20 @@ import pytest
 import trimesh
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from scenes import TABLE, box, cast, pose_at
+from pipeline import TABLE, box, cast, make_map_network, make_recogniser, pose_at
 from scipy.spatial.transform import Rotation
-from scipy.special import softmax
-from tests.tiny_models import make_map_network, make_recogniser
 
 import nextview
-from nextview import Observation, SessionError, SimulatedCamera, Stopping, UsageError, ViewSphere
-from nextview.belief import Calibration, log_evidence_of, reorient
+from nextview import Observation, SessionError, SimulatedCamera, Stopping, ViewSphere
 from nextview.data.samples import sample_mesh
-from nextview.errors import ObservationError, PolicyError
-from nextview.models.inference import MapNetwork, Models, Recogniser
+from nextview.errors import ObservationError
+from nextview.geometry.viewsphere import viewpoints_of
 from nextview.policies.maps import MapPeak
 from nextview.policies.registry import make_policy
-from nextview.sensing import Frame, ObjectFrame, ObservedObject
-from nextview.session import Session
-from nextview.viewsphere import viewpoints_of
+from nextview.recognition.belief import Calibration, log_evidence_of
+from nextview.recognition.inference import MapNetwork, Models, Recogniser
+from nextview.sensing import Frame, ObservedObject
+from nextview.session.session import Session
 
 SPHERE = ViewSphere.named("40")
 SHAPE = 120, 160
@@ -64,9 +62,9 @@ def run(session, first, look=frame) -> Session:
 
 def snapshot(session):
     """All that a session says, for comparison."""
-    views = [(v.index, v.next_view, v.travel, v.arc, *v.belief, *v.direction, v.doubts) for v in session.views]
+    views = [(v.index, v.next_view, v.travel, v.arc, *v.belief, *v.direction, v.warnings) for v in session.views]
     where = None if session.object is None else (len(session.object.sightings), session.object.revision)
-    return views, session.view, session.done, where, str(session._rng.bit_generator.state)
+    return views, session.view, session.done, where
 
 
 def same_decisions(a, b, atol):
@@ -90,7 +88,7 @@ def test_the_whole_way_from_frames_to_a_name():
     run(session, pose_at(40, 77, 0.6, middle), lambda pose: frame(pose, meshes=(TABLE, chair)))
     assert session.result.answer == "chair"
     assert session.result.confident
-    assert not any(view.doubts for view in session.views)
+    assert not any(view.warnings for view in session.views)
     target = session.poses[3]
     np.testing.assert_allclose(target[:3, 3] + 0.6 * target[:3, 2], session.object.object_frame.centre, atol=1e-9)
     assert np.linalg.norm(session.object.object_frame.centre - middle) < 0.02
@@ -111,30 +109,10 @@ def test_a_better_object_frame_changes_what_the_earlier_views_say(tiny):
         assert view.observation is observation
         e = tiny.evidence([observation])
         x, y, _ = observation.pose[:3, 3]
-        azimuth = np.array([np.arctan2(y, x) / (2 * np.pi) % 1])
+        azimuth = np.array([np.arctan2(y, x)])
         total = total + log_evidence_of(e.logits, e.azimuth_bins, azimuth).astype(np.float64)
     expected = tiny.recogniser.calibration.belief(total, k, 3)[0]
     np.testing.assert_allclose(session.views[-1].belief, expected, atol=1e-6)
-
-
-def test_only_what_changed_goes_through_the_networks_again(tiny):
-    counted = []
-
-    class Counting(Models):
-        def evidence(self, observations):
-            counted.append(len(observations))
-            return tiny.evidence(observations)
-
-    known = ObjectFrame([0, 0, 0.09], 0.14, np.eye(3))
-    run(
-        begin(Counting(tiny.recogniser, tiny.maps), object=ObservedObject(known=known)),
-        pose_at(40, 10, 0.7, (0, 0, 0.08)),
-    )
-    assert counted == [1, 1, 1, 1]
-    counted.clear()
-    session = run(begin(Counting(tiny.recogniser, tiny.maps)), pose_at(10, 10, 0.7, (0, 0, 0.08)))
-    assert counted[0] == 1
-    assert sum(counted) > len(session.views)
 
 
 @settings(deadline=None, max_examples=5)
@@ -152,35 +130,6 @@ def test_moving_the_world_and_the_poses_together_changes_nothing(tiny, elevation
         np.testing.assert_allclose(there.target, move @ here.target, atol=2e-3)
         pose = here.target
     same_decisions(here, there, 5e-3)
-
-
-@settings(deadline=None, max_examples=5)
-@given(st.integers(5, 70), st.integers(0, 359), st.sampled_from([0.25, 2.0, 4.0]))
-def test_scaling_the_world_changes_nothing_but_size(tiny, elevation, azimuth, scale):
-    pose = pose_at(elevation, azimuth, 0.7, (0, 0, 0.08))
-    here, there = begin(tiny), begin(tiny, distance=0.7 * scale)
-    while not here.done:
-        here.update(frame(pose))
-        there.update(frame(pose, scale=scale))
-        pose = here.target
-    same_decisions(here, there, 1e-6)
-    assert there.object.object_frame.radius == pytest.approx(scale * here.object.object_frame.radius, rel=1e-5)
-    np.testing.assert_allclose(there.poses[:, :3, 3], scale * here.poses[:, :3, 3], atol=1e-5)
-
-
-def test_the_same_frames_give_the_same_decisions(tiny):
-    for name in ("random-all", "random", "lem", "spread"):
-        a, b = (run(begin(tiny, make_policy(name, SPHERE), seed=5), pose_at(30, 50, 0.7, (0, 0, 0.1))) for _ in "ab")
-        assert snapshot(a) == snapshot(b)
-
-
-def test_doubts_of_a_frame_reach_the_user(tiny):
-    session = begin(tiny, max_views=2)
-    session.update(frame(pose_at(35, 0, 0.7, (0, 0, 0.08)), masked=True))
-    wrong = replace(frame(pose_at(35, 0, 0.7, (0, 0, 0.08)), masked=True), pose=pose_at(35, 90, 0.7, (0, 0, 0.08)))
-    view = session.update(wrong)
-    assert [doubt.name for doubt in view.doubts] == ["contradiction"]
-    assert "doubtful: contradiction" in repr(session.result)
 
 
 # Mistakes
@@ -222,43 +171,6 @@ def test_a_session_is_as_it_was_after_each_mistake(tiny, what, make, error, afte
     assert ends[0] == ends[1]
 
 
-def test_a_policy_that_fails_takes_the_frame_back(tiny):
-    class Fails:
-        needs = ()
-        broken = True
-
-        def next_views(self, state, rng):
-            rng.random(7)
-            if self.broken:
-                raise RuntimeError("a bug of one's own")
-            return (~state.visited).argmax(1)
-
-    policy = Fails()
-    session = begin(tiny, policy)
-    before = snapshot(session)
-    for meshes in ((TABLE, SOFA), (TABLE, SOFA)):
-        with pytest.raises(PolicyError, match="a bug of one's own"):
-            session.update(frame(pose_at(35, 0, 0.7, (0, 0, 0.08)), meshes=meshes))
-        assert snapshot(session) == before
-    policy.broken = False
-    assert session.update(frame(pose_at(35, 0, 0.7, (0, 0, 0.08)))).doubts == ()
-
-
-def test_frames_and_observations_do_not_mix(tiny):
-    camera = SimulatedCamera(sample_mesh("chair"), 16)
-    session = begin(tiny, distance=None)
-    session.update(camera.observe(session.pose))
-    with pytest.raises(SessionError, match="has taken observations"):
-        session.update(frame(pose_at(35, 0, 0.7)))
-    session = begin(tiny)
-    with pytest.raises(SessionError, match="before the first frame"):
-        _ = session.target
-    session.update(frame(pose_at(35, 0, 0.7)))
-    session.object.add(frame(pose_at(35, 90, 0.7)))
-    with pytest.raises(SessionError, match="outside of the session"):
-        session.update(frame(pose_at(35, 180, 0.7)))
-
-
 # Where the camera really stands
 
 
@@ -266,7 +178,7 @@ def test_the_pose_that_was_reached_counts(tiny):
     camera = SimulatedCamera(sample_mesh("chair"), 16)
     session = begin(tiny, distance=None)
     place = (27.0, 100.0)
-    pose = nextview.viewsphere.look_at_origin(*np.radians(place), 3.0)
+    pose = nextview.geometry.viewsphere.look_at_origin(*np.radians(place), 3.0)
     view = session.update(camera.observe(pose))
     assert view.index == (SPHERE.directions @ (pose[:3, 3] / 3)).argmax()
     assert view.angles == pytest.approx(place)
@@ -276,15 +188,6 @@ def test_the_pose_that_was_reached_counts(tiny):
     assert second.travel == pytest.approx(np.hypot((to_up - up) / 18, min(steps, 8 - steps)))
     a, b = pose[:3, 3] / 3, SPHERE.directions[second.index]
     assert second.arc == pytest.approx(np.arccos(a @ b))
-
-
-def test_views_near_the_place_count_as_visited(tiny):
-    camera, layout = SimulatedCamera(sample_mesh("chair"), 16), viewpoints_of("fibonacci:1000")
-    session = begin(tiny, make_policy("spread", layout), sphere=layout, distance=None)
-    session.update(camera.observe(session.pose))
-    angles = np.degrees(np.arccos(np.clip(layout.directions @ layout.directions[0], -1, 1)))
-    np.testing.assert_array_equal(session._episodes.steps[0].state.visited[0], angles <= 6)
-    assert (angles <= 6).sum() > 1
 
 
 # What the robot can do
@@ -338,18 +241,6 @@ def test_a_view_that_becomes_unreachable_is_replaced_at_once(tiny):
         session.failed()
 
 
-def test_before_the_first_view_the_nearest_one_in_reach_is_asked_for(tiny):
-    session = begin(tiny, distance=None)
-    session.failed()
-    assert session.view in np.flatnonzero(SPHERE.arc[0] == np.sort(SPHERE.arc[0])[1])
-    with pytest.raises(SessionError, match="none"):
-        session.reachable = np.zeros(40, bool)
-    assert session.reachable is None
-    for wrong in ([1, 0], np.zeros(39, bool), "all", np.ones(40)):
-        with pytest.raises(UsageError, match="mask"):
-            session.reachable = wrong
-
-
 def test_travel_in_seconds_is_weighed_as_travel_in_cells(tiny):
     """A cost that is proportional to travel changes nothing; another one is what decides where gains are alike."""
 
@@ -389,25 +280,6 @@ def test_travel_in_seconds_is_weighed_as_travel_in_cells(tiny):
         assert b == row.argmin()
 
 
-def test_an_infinite_cost_is_out_of_reach_and_nonsense_is_refused(tiny):
-    camera = SimulatedCamera(sample_mesh("chair"), 16)
-    session = begin(tiny, distance=None)
-    cost = np.full((40, 40), np.inf)
-    cost[:, 23] = 2.0
-    session.travel_cost = cost
-    assert session.update(camera.observe(session.pose)).next_view == 23
-    session.update(camera.observe(session.pose))
-    assert session.result.stranded
-    for wrong in (np.zeros((40, 39)), np.full((40, 40), np.nan), -np.ones((40, 40))):
-        with pytest.raises(UsageError, match="travel cost"):
-            session.travel_cost = wrong
-    session = begin(tiny, distance=None)
-    session.travel_cost = lambda a, b: np.nan
-    with pytest.raises(UsageError, match="from 0 on"):
-        session.update(camera.observe(session.pose))
-    assert not session.views
-
-
 def test_reach_and_cost_are_asked_in_the_world(tiny):
     session, asked = begin(tiny), []
 
@@ -427,22 +299,3 @@ def test_reach_and_cost_are_asked_in_the_world(tiny):
     assert session.target[2, 3] > 0.3
     for pose in starts:
         np.testing.assert_allclose(pose, first, atol=1e-12)
-
-
-@given(st.integers(0, 10**6), st.floats(0, 1))
-def test_one_view_says_the_same_from_wherever_azimuths_are_counted(seed, azimuth):
-    rng, calibration = np.random.default_rng(seed), Calibration(0.8, 1.0, bin_correlation=1.5)
-    logits, bins = rng.normal(size=(1, 3)), np.log(rng.dirichlet(np.full(8, 0.2), (1, 3)) + 1e-9)
-    bins -= np.log(np.exp(bins).sum(2, keepdims=True))
-    total = log_evidence_of(logits, bins, np.array([azimuth]))
-    np.testing.assert_allclose(calibration.belief(total, 1, 3)[0], softmax(logits[0] / 0.8), atol=1e-9)
-
-
-@given(st.integers(0, 10**6), st.integers(0, 7), st.floats(0, 1))
-def test_bins_between_two_azimuths_are_those_of_both_by_their_nearness(seed, step, share):
-    bins = np.log(np.random.default_rng(seed).dirichlet(np.ones(8), (1, 3)))
-    found = np.exp(reorient(bins, np.array([(step + share) / 8])))
-    for pointing in range(8):
-        expected = (1 - share) * np.exp(bins[0, :, (step - pointing) % 8])
-        expected += share * np.exp(bins[0, :, (step + 1 - pointing) % 8])
-        np.testing.assert_allclose(found[0, :, pointing], expected, atol=1e-6)

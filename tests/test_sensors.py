@@ -1,32 +1,25 @@
 """The sensor models against closed forms, against casting rays from the projector, and through the front door."""
 
-import json
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
-from scenes import box, cast, pose_at
-from scipy.ndimage import gaussian_filter
+from pipeline import box, cast, pose_at
 from scipy.stats import norm
-from tiny_models import make_recogniser
 
 import nextview
 from nextview import SimulatedCamera, ViewSphere
-from nextview.cameras.sensors import SENSORS, SensedCamera, Sensor, SensorMix, sensor_named
-from nextview.cameras.sensors.boxes_around import boxes_around
-from nextview.cameras.sensors.depth_noise import NO_GRAIN, normal_field
-from nextview.cameras.sensors.sensor import ERRORS, LARGEST, LIMITS
-from nextview.cli.main import main
-from nextview.data.rendering import render
+from nextview.data.rendering import RenderOptions, render
 from nextview.data.samples import sample_mesh
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError
-from nextview.mesh import make_mesh
+from nextview.geometry.mesh import make_mesh
+from nextview.simulation.sensed_camera import SensedCamera
+from nextview.simulation.sensor import ERRORS, SENSORS, Sensor, SensorMix, sensor_named
 
 SPHERE = ViewSphere.named("40")
 BALL = make_mesh(trimesh.creation.icosphere(4).vertices, trimesh.creation.icosphere(4).faces)
-REAL = [name for name in SENSORS if name != "none"]
 
 
 def rng(*seed: int) -> np.random.Generator:
@@ -76,21 +69,6 @@ def test_stereo_noise_grows_with_the_square_of_the_distance(distance):
     assert (measured - depth).std() == pytest.approx(distance**2 * 0.1 / (424 * 0.05), rel=0.02)
 
 
-def test_plain_noise_is_in_metres():
-    depth, _ = plane(SENSORS["none"], 1.0)
-    measured, _ = replace(SENSORS["none"], noise=0.003).measure(depth, rng(3))
-    assert (measured - depth).std() == pytest.approx(0.003, rel=0.02)
-
-
-@pytest.mark.parametrize("name", ["kinect", "stereo"])
-def test_disparity_comes_in_whole_steps(name):
-    sensor = SENSORS[name]
-    measured, _ = sensor.measure(plane(sensor, 1.5, 40)[0], rng(4))
-    steps = sensor.focal * sensor.baseline / measured[measured > 0].astype(float) / sensor.step
-    assert np.abs(steps - np.rint(steps)).max() < 0.01
-    assert len(np.unique(np.rint(steps))) > 20
-
-
 def test_neighbours_err_together_as_far_as_the_grain():
     sensor = replace(SENSORS["none"], noise=0.001, grain=1.8)
     depth, _ = plane(sensor, 1.0)
@@ -122,18 +100,6 @@ def test_edges_move_by_the_published_pixels_and_planes_stay():
     assert (source != np.arange(source.size).reshape(source.shape)).mean() > 0.5
 
 
-def test_flying_pixels_hang_between_the_two_surfaces_at_an_edge():
-    sensor = replace(SENSORS["none"], flying=0.4)
-    measured, source = sensor.measure(edge(sensor), rng(8))
-    middle = sensor.width // 2
-    beside = measured[:, middle - 1 : middle + 1]
-    flying = (beside > 0.8) & (beside < 1.2)
-    assert flying.mean() == pytest.approx(0.4, abs=4 * np.sqrt(0.24 / flying.size))
-    np.testing.assert_array_equal(source[:, middle - 1 : middle + 1] == -1, flying)
-    away = np.delete(measured, [middle - 1, middle], 1)
-    np.testing.assert_array_equal(away, np.delete(edge(sensor), [middle - 1, middle], 1))
-
-
 @pytest.mark.parametrize("tilt", [0, 60, 78, 84])
 @pytest.mark.parametrize("grain", [0.0, 1.8])
 def test_grazing_pixels_are_lost(tilt, grain):
@@ -163,15 +129,6 @@ def test_the_shadow_of_a_box_on_a_wall_has_the_width_that_geometry_says(baseline
     assert not lost[:, 300:].any()
 
 
-def test_a_pole_thinner_than_its_shift_casts_a_shadow_of_its_own_width():
-    sensor = replace(SENSORS["none"], shadow=0.075)
-    shift = sensor.focal * 0.075 * (1 / 0.75 - 1 / 1.5)
-    lost = np.flatnonzero((sensor.measure(box_before_wall(sensor, 300, 306), rng(11))[0] == 0)[200])
-    assert shift > 20
-    assert len(lost) == pytest.approx(6, abs=1)
-    assert lost.min() == pytest.approx(300 - shift, abs=1)
-
-
 def test_shadows_are_where_rays_from_the_projector_do_not_arrive():
     sensor = replace(SENSORS["none"], shadow=0.075)
     things = [box((0.3, 0.06, 0.2), (0, 0, 0.2)), box((0.05, 0.05, 0.3), (-0.1, 0.15, 0.1)), box((2, 2, 0.02))]
@@ -196,14 +153,7 @@ def test_shadows_are_where_rays_from_the_projector_do_not_arrive():
     assert inner.sum() < 0.005 * hidden.sum()
 
 
-@pytest.mark.parametrize("grain", [0.0, 2.5])
-def test_the_share_of_holes(grain):
-    sensor = replace(SENSORS["none"], holes=0.2, grain=grain)
-    lost = sensor.measure(plane(sensor, 1.0)[0], rng(13))[0] == 0
-    assert lost.mean() == pytest.approx(0.2, abs=0.02)
-
-
-@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("name", ["kinect", "wrist"])
 def test_no_strength_no_error_to_the_bit(name):
     sensor = SENSORS[name].scaled(0)
     depth, _ = plane(sensor, 1.0, 30)
@@ -217,7 +167,7 @@ def test_no_strength_no_error_to_the_bit(name):
     np.testing.assert_array_equal(views[0].pose, views[1].pose)
 
 
-@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("name", ["kinect", "wrist"])
 def test_same_seed_same_frames(name):
     mesh = sample_mesh("table")
 
@@ -295,20 +245,6 @@ def test_part_of_the_table_is_left_in_and_part_of_the_object_cut_off():
     assert 0.3 < min(kept) < 0.75 < max(kept) <= 1
 
 
-def test_boxes_stand_on_the_ground_beside_the_object():
-    mesh = sample_mesh("table")
-    boxes = boxes_around(mesh.vertices, 7, rng(24))
-    each = boxes.vertices.reshape(7, 8, 3)
-    np.testing.assert_allclose(each[:, :, 2].min(1), mesh.vertices[:, 2].min())
-    reach = np.hypot(*mesh.vertices[:, :2].T).max()
-    for one in each:
-        solid = trimesh.Trimesh(one, boxes.faces[:12], process=False)
-        assert solid.is_volume
-        assert solid.volume == pytest.approx(trimesh.convex.convex_hull(one).volume)
-        assert np.hypot(*solid.sample(2000, seed=0)[:, :2].T).min() > reach
-        assert np.hypot(*one[:, :2].T).max() < 3  # no camera stands in it
-
-
 def test_boxes_hide_what_is_behind_them_and_are_not_taken_for_the_object():
     mesh = sample_mesh("table")
     alone = SensedCamera(mesh, "none", rng(25))
@@ -321,10 +257,8 @@ def test_boxes_hide_what_is_behind_them_and_are_not_taken_for_the_object():
         if hidden is not None:
             np.testing.assert_array_equal(hidden.depth[kept], whole.depth[kept])
             assert (hidden.depth[whole.mask & ~kept] < whole.depth[whole.mask & ~kept]).all()
-            assert kept.sum() / whole.mask.sum() == pytest.approx(among.visible_share(pose), abs=0.02)
-        shares.append(among.visible_share(pose))
+        shares.append(kept.sum() / whole.mask.sum())
     assert min(shares) < 0.5 < max(shares)
-    assert alone.visible_share(SPHERE.poses[0]) == 1
 
 
 def test_a_mix_is_another_sensor_for_every_object():
@@ -339,77 +273,11 @@ def test_a_mix_is_another_sensor_for_every_object():
         assert [getattr(s, error) for s in weak] == pytest.approx([getattr(s, error) / 2 for s in strong])
 
 
-def test_size_is_told_only_where_it_is_known():
-    mesh = sample_mesh("chair")
-    assert SensedCamera(mesh, "kinect", rng(22)).observe(SPHERE.poses[9]).radius is None
-    known = replace(mesh, unit="m")
-    wrong = SensedCamera(known, replace(SENSORS["none"], size=0.1), rng(22))
-    expected = known.metres * wrong.object_frame.radius / 0.12
-    assert wrong.observe(SPHERE.poses[9]).radius == pytest.approx(expected)
-
-
-def test_a_sensor_that_measures_nothing_sees_nothing():
-    blind = SensedCamera(sample_mesh("chair"), replace(SENSORS["none"], holes=1.0), rng(23))
-    assert blind.frame(SPHERE.poses[5]) is None
-    seen = blind.observe(SPHERE.poses[5])
-    assert not seen.seen
-    np.testing.assert_allclose(seen.pose, SPHERE.poses[5], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["kinekt", "kinect:", "kinect:x", "kinect:-1", "kinect:inf", "kinect:nan", "kinect:101", "mix:-1", "mix:1e30", ""],
-)
-def test_what_is_no_sensor_is_refused(text):
-    with pytest.raises(UsageError, match="sensor"):
-        sensor_named(text)
-
-
-def test_numbers_that_no_sensor_has_are_refused():
-    for wrong in ({"axial": -1}, {"holes": np.nan}, {"focal": 0}, {"distance": 0.1}):
-        with pytest.raises(UsageError, match="sensor none"):
-            replace(SENSORS["none"], **wrong)
-    assert sensor_named("wrist:0.5").table == SENSORS["wrist"].table / 2
-    assert sensor_named("wrist:1") == SENSORS["wrist"]
-    assert sensor_named("mix:0.5") == SensorMix(0.5)
-
-
-@pytest.mark.parametrize("field", [field.name for field in fields(Sensor) if field.name != "name"])
-def test_every_number_of_a_sensor_has_its_limits(field):
-    """Beyond them is no sensor: a shadow of 1,000 km takes 10 GB, a grain of as many pixels minutes."""
-    low, high = LIMITS.get(field, (0, LARGEST))
-    for within in (low, high) if field not in ("distance", "radius") else ():  # these two limit each other
-        replace(Sensor(), **{field: within})
-    for beyond in (-1, 1e6, 10**9, np.nan, np.inf, 10**400, "1", None):
-        with pytest.raises(UsageError, match=f"^sensor none: {field} is "):
-            replace(Sensor(), **{field: beyond})
-
-
-def test_a_shadow_wider_than_can_be_drawn_is_refused():
-    near = Sensor(focal=1e5, distance=0.0011, radius=0.001, shadow=LARGEST)
-    with pytest.raises(UsageError, match=r"reaches .* pixels"):
-        SensedCamera(BALL, near, rng()).observe(SPHERE.poses[0])
-
-
-def test_a_window_narrower_than_a_pixel_is_none():
-    white = rng(1).standard_normal((20, 30))
-    for grain in (0.0, 1e-300, NO_GRAIN / 2):
-        assert normal_field(rng(1), (20, 30), grain).tobytes() == white.tobytes()
-    assert gaussian_filter(white, 0.99 * NO_GRAIN, mode="wrap").tobytes() == white.tobytes()
-
-
-def test_recognise_through_a_sensor_by_python_and_command_line(tmp_path, capsys):
-    path = tmp_path / "chair.off"
-    mesh = sample_mesh("chair")
-    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
-    system = nextview.load()
-    results = [system.recognise(path, 3, 5, sensor=sensor) for sensor in ("wrist:2", sensor_named("wrist:2"))]
-    main(["recognise", str(path), "--sensor", "wrist:2", "--start", "3", "--seed", "5", "--json"])
-    printed = json.loads(capsys.readouterr().out)
-    assert results[0].answer == results[1].answer == printed["answer"]
+def test_recognise_through_a_sensor_of_a_name_or_an_object():
+    mesh, system = sample_mesh("chair"), nextview.load()
+    results = [system.recognise(mesh, 3, 5, sensor=sensor) for sensor in ("wrist:2", sensor_named("wrist:2"))]
     assert results[0].confidence == results[1].confidence
-    assert printed["views"][0]["belief"][results[0].answer] == pytest.approx(results[0].views[0].belief.max(), abs=1e-4)
-    assert results[0].views[0].belief.max() != system.recognise(path, 3, 5).views[0].belief.max()
+    assert results[0].views[0].belief.max() != system.recognise(mesh, 3, 5).views[0].belief.max()
     with pytest.raises(UsageError, match="sensor is for meshes"):
         system.recognise(SimulatedCamera(mesh), sensor="kinect")
 
@@ -431,49 +299,21 @@ FEW = ViewSphere((20.0,), 3)
 
 def test_a_store_of_a_sensor_resumes_to_the_bit_and_with_no_other(dataset, tmp_path, capsys):
     whole, resumed = tmp_path / "whole.zarr", tmp_path / "resumed.zarr"
-    list(render(dataset, whole, FEW, workers=0, sensor="wrist:2"))
-    begun = render(dataset, resumed, FEW, workers=0, sensor="wrist:2")
+    list(render(dataset, whole, FEW, workers=0, options=RenderOptions(sensor="wrist:2")))
+    begun = render(dataset, resumed, FEW, workers=0, options=RenderOptions(sensor="wrist:2"))
     next(begun)
     begun.close()
     assert int(ViewStore.open(resumed).done.sum()) == 1
-    for other, words in (("wrist", "through the sensor wrist:2.*through wrist"), (None, "cannot go on without one")):
+    for other, words in (("wrist", "other sensor"), (None, "other sensor")):
         with pytest.raises(DatasetError, match=words):
-            list(render(dataset, resumed, FEW, workers=0, sensor=other))
-    list(render(dataset, resumed, FEW, workers=2, sensor="wrist:2"))
+            list(render(dataset, resumed, FEW, workers=0, options=RenderOptions(sensor=other)))
+    list(render(dataset, resumed, FEW, workers=2, options=RenderOptions(sensor="wrist:2")))
     a, b = ViewStore.open(whole), ViewStore.open(resumed)
     assert b.group.attrs["sensor"] == sensor_named("wrist:2").to_dict()
-    assert "--sensor wrist:2" in b.commands[0]
-    for name in ("image", "depth", "points", "digest", "measures/depth_entropy"):
+    for name in ("image", "depth", "points", "measures/depth_entropy"):
         np.testing.assert_array_equal(a.group[name][:], b.group[name][:], err_msg=name)
     clean = tmp_path / "clean.zarr"
     list(render(dataset, clean, FEW, workers=0))
     assert "sensor" not in ViewStore.open(clean).group.attrs
-    with pytest.raises(DatasetError, match="begun without a sensor"):
-        list(render(dataset, clean, FEW, workers=0, sensor="wrist:2"))
-
-
-def test_a_store_of_a_sensor_has_the_size_that_sensing_gives(dataset, tmp_path):
-    with pytest.raises(UsageError, match="224 pixels"):
-        list(render(dataset, tmp_path / "a.zarr", FEW, 64, sensor="kinect"))
-    with pytest.raises(UsageError, match="no sensor is called"):
-        list(render(dataset, tmp_path / "a.zarr", FEW, sensor="kinekt"))
-    assert not (tmp_path / "a.zarr").exists()
-
-
-def test_only_objects_that_a_card_calls_held_out_are_rendered(tmp_path):
-    for name in ("a", "b", "c"):
-        folder = tmp_path / "things" / "ball" / "train"
-        folder.mkdir(parents=True, exist_ok=True)
-        trimesh.Trimesh(BALL.vertices, BALL.faces, process=False).export(folder / f"{name}.off")
-    card = make_recogniser(tmp_path, ["ball"])
-    values = json.loads(card.read_text())
-    arguments = ["render", str(tmp_path / "things"), str(tmp_path / "some.zarr"), "--held-out", str(card)]
-    card.write_text(json.dumps(values | {"held_out": ["b", "elsewhere"]}))
-    main([*arguments, "--azimuths", "3", "--size", "16"])
-    store = ViewStore.open(tmp_path / "some.zarr")
-    assert store.names == ["b"]
-    assert store.done.all()
-    assert "--held-out" in store.commands[0]
-    card.write_text(json.dumps(values | {"held_out": ["elsewhere"]}))
-    with pytest.raises(DatasetError, match=r"holds no object that .* calls held out"):
-        list(render(tmp_path / "things", tmp_path / "none.zarr", SPHERE, held_out=card))
+    with pytest.raises(DatasetError, match="begun with other sensor"):
+        list(render(dataset, clean, FEW, workers=0, options=RenderOptions(sensor="wrist:2")))

@@ -3,30 +3,26 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 import trimesh
+from pipeline import make_recogniser, some_predictions
 from scipy.stats import norm
-from tests.test_predictions import some_predictions
-from tiny_models import make_recogniser
 
-from nextview.calibration.fitting_set import FittingSet
-from nextview.calibration.size_density import ANY_SIZE, RADII, densities, fit_weight
-from nextview.cameras.simulated import SimulatedCamera
 from nextview.cli.main import main
-from nextview.cli.recognise import Unit
 from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
-from nextview.data.rendering import Deform, render
+from nextview.data.rendering import RenderOptions, render
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, MeshError, ModelError, PredictionsError
-from nextview.mesh import UNITS, load_mesh
-from nextview.models.inference import Recogniser
-from nextview.models.model_card import read_card
-from nextview.models.size_evidence import SizeEvidence
-from nextview.viewsphere import ViewSphere
+from nextview.errors import DatasetError, PredictionsError
+from nextview.geometry.mesh import load_mesh
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.learning.card_fits import ANY_SIZE, RADII, densities, fit_weight
+from nextview.learning.fitting_set import FittingSet
+from nextview.recognition.inference import Recogniser
+from nextview.recognition.model_card import read_card
+from nextview.simulation.simulated import SimulatedCamera
 
 SPHERE = ViewSphere.named("40")
 CLASSES = ["big", "small"]
@@ -66,12 +62,6 @@ def test_a_density_is_that_of_its_class_and_a_share_of_anything():
         densities(radii[:3], np.array([0, 0, 1]), 2)
 
 
-def test_sizes_between_two_radii_are_interpolated_and_unknown_ones_say_nothing():
-    evidence = SizeEvidence(np.array([1.0, 4.0]), np.array([[0.0, 2.0], [1.0, 1.0]]), 0.5)
-    found = evidence.logits(np.array([1.0, 2.0, 4.0, 100.0, 0.001, np.nan]))
-    np.testing.assert_allclose(found, [[0, 0.5], [0.5, 0.5], [1, 0.5], [1, 0.5], [0, 0.5], [0, 0]], atol=1e-6)
-
-
 def test_the_weight_is_the_most_likely_one():
     """Log-odds of the shape and of the size that are both calibrated add up as they are."""
     rng = np.random.default_rng(0)
@@ -102,7 +92,7 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     assert radii["small_3"] == pytest.approx(load_mesh(shop / "meshes/small/train/small_3.off", unit="cm").metres)
     assert 0.15 < radii["small_3"] < 0.26
     with pytest.raises(DatasetError, match="measured in cm, not m"):
-        list(render(shop / "meshes", Path(views), SPHERE, 32, unit="m", workers=1))
+        list(render(shop / "meshes", Path(views), SPHERE, 32, workers=1, options=RenderOptions(unit="m")))
 
     test = shop / "test.npz"
     list(predict(Path(views), test, [read_card(Path(card))], {}, "test", workers=1))
@@ -131,45 +121,6 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["fit", "size", views, str(strange), card])
     assert "holds 'a'" in capsys.readouterr().err
-
-
-def test_a_stretched_mesh_keeps_its_size(shop, tmp_path):
-    path = shop / "meshes/big/test/big_7.off"
-    mesh = load_mesh(path)
-    assert Deform(turn=True)(mesh, 0, "big_7").radius == pytest.approx(mesh.radius)
-    assert mesh.radius / 1.5 < Deform(0.5)(mesh, 0, "big_7").radius < mesh.radius * 1.5
-
-
-@pytest.mark.parametrize("radius", [0.0, -1.0, np.nan, np.inf])
-def test_a_radius_is_a_positive_number(shop, radius):
-    observation = SimulatedCamera(load_mesh(shop / "meshes/big/test/big_7.off"), 32).observe(SPHERE.poses[0])
-    with pytest.raises(ValueError, match="a positive number of metres, or None"):
-        replace(observation, radius=radius)
-
-
-def test_a_unit_is_one_of_a_few(shop):
-    assert get_args(Unit) == tuple(UNITS)
-    with pytest.raises(MeshError, match="the unit is one of mm, cm, inch, foot, m, not 'mile'"):
-        load_mesh(shop / "meshes/big/test/big_7.off", unit="mile")
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"weight": None}, "'weight' of the size is not a finite number"),
-        ({"weight": -1}, "not a finite number"),
-        ({"radii_m": [1, 0.5]}, "do not fit together"),
-        ({"log_density": [[0, 0]]}, "sizes of 1 classes, not 2"),
-        ({"log_density": [[0], [0]]}, "do not fit together"),
-        ({"log_density": [[0, float("nan")], [0, 0]]}, "not a finite number"),
-    ],
-)
-def test_sizes_that_make_no_sense_are_refused_in_one_sentence(tmp_path, change, sentence):
-    card = make_recogniser(tmp_path, CLASSES)
-    size = {"weight": 1, "radii_m": [1, 2], "log_density": [[0, 0], [0, 0]]} | change
-    card.write_text(json.dumps(json.loads(card.read_text()) | {"size": size}))
-    with pytest.raises(ModelError, match=rf"tiny\.json: .*{sentence}"):
-        Recogniser(card)
 
 
 def test_predictions_keep_what_the_size_said(tmp_path):

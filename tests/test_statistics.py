@@ -1,10 +1,9 @@
 import numpy as np
-import pandas as pd
 import pytest
 from scipy import stats
 
-from nextview import metrics
 from nextview.benchmark import statistics as st
+from nextview.data import metrics
 
 
 def test_intervals_agree_with_scipy():
@@ -30,11 +29,6 @@ def test_ratios_and_class_means_agree_with_plain_loops():
             each = [draw[labels[draw] == c] for c in range(3)]
             parts = [top[d, m].sum() / bottom[d, m].sum() for d in each if bottom[d, m].sum() > 0]
             assert mean[s, m] == pytest.approx(np.mean(parts))
-
-
-def test_a_quantity_without_any_episode_has_no_interval():
-    nothing = metrics.ratio(np.zeros((4, 1)), np.zeros((4, 1)), st.resample(4, 10, np.random.default_rng(0)))
-    assert np.isnan(st.interval(nothing)).all()
 
 
 def test_mcnemar_with_one_run_is_the_textbook_test():
@@ -80,17 +74,3 @@ def test_calibration_error_is_the_gap_between_confidence_and_accuracy():
     sure, accuracy, count = metrics.reliability(np.array([0.0, 1.0]), np.array([False, True]), bins=4)
     np.testing.assert_array_equal(count, [1, 0, 0, 1])
     np.testing.assert_array_equal([sure[3], accuracy[3]], [1, 1])
-
-
-def test_area_is_the_mean_height_with_level_ends():
-    x = np.linspace(1, 3, 5)
-    assert st.area(x, x, 1, 3) == pytest.approx(2)
-    assert st.area(x, x, 1, 5) == pytest.approx((2 * 2 + 2 * 3) / 4)  # level at 3 after x = 3
-    assert st.area(x, x, 1.2, 1.3) == pytest.approx(1.25)
-
-
-def test_the_mean_over_classes_agrees_with_pandas():
-    rng = np.random.default_rng(4)
-    labels, right = rng.integers(0, 3, (50, 4)) * 2, rng.random((50, 4)) < 0.6  # classes 1 and 3 have nothing
-    by_class = pd.DataFrame({"label": labels.ravel(), "right": right.ravel()}).groupby("label")["right"].mean()
-    assert metrics.mean_over_classes(right, labels) == pytest.approx(by_class.mean())

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.tiny_models import make_map_network, make_recogniser
+from pipeline import make_map_network, make_recogniser
 
 import nextview
-from nextview.belief import Stopping
 from nextview.cli.main import main
 from nextview.data.samples import SAMPLES, sample_mesh
+from nextview.recognition.belief import Stopping
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "chair.off"
 
@@ -67,26 +67,6 @@ def test_a_folder_of_ones_own_models(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["answer"] in system.classes
 
 
-@pytest.mark.parametrize("wrong", ["nobody", "."])
-def test_what_is_no_collection_of_models_is_refused(wrong, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(nextview.ModelError):
-        nextview.load(wrong)
-
-
-def test_a_policy_in_the_working_folder(tmp_path, monkeypatch, capsys):
-    (tmp_path / "my_policy_for_a_test.py").write_text(
-        "class Next:\n"
-        "    needs = ()\n"
-        "    def __init__(self, sphere): pass\n"
-        "    def next_views(self, state, rng): return (~state.visited).argmax(1)\n"
-    )
-    monkeypatch.chdir(tmp_path)
-    arguments = ["--policy", "my_policy_for_a_test:Next", "--start", "5", "--threshold", "1", "--max-views", "3"]
-    main(["recognise", str(SAMPLE), *arguments, "--json"])
-    assert [view["view"] for view in json.loads(capsys.readouterr().out)["views"]] == [5, 0, 1]
-
-
 def test_what_gain_valued_is_what_it_followed():
     views = nextview.load(threshold=1.0).recognise(SAMPLE, start=3).views
     for view, following in itertools.pairwise(views):
@@ -97,7 +77,7 @@ def test_what_gain_valued_is_what_it_followed():
 
 def test_a_map_policy_values_its_window_alone():
     view = nextview.load(policy="lem-peak", threshold=1.0).recognise(SAMPLE, start=3).views[0]
-    window = nextview.ViewSphere.named("40").window(3)
+    window = nextview.ViewSphere.named("40").windows[3]
     np.testing.assert_array_equal(np.flatnonzero(np.isfinite(view.values)), np.sort(window.ravel()))
     np.testing.assert_allclose(view.values[window], view.maps["lem"])
 
@@ -108,21 +88,6 @@ def test_a_system_is_pickled_as_how_it_was_loaded():
     assert repr(again) == repr(system)
     assert str(again.recognise(SAMPLE, start=1)) == str(system.recognise(SAMPLE, start=1))
     assert len(pickle.dumps(system)) < 1000
-
-
-def test_the_picture_of_an_episode(tmp_path):
-    result = nextview.recognise(SAMPLE.with_stem("table"), start=33)
-    result.plot(tmp_path / "episode.png")
-    assert (tmp_path / "episode.png").stat().st_size > 10_000
-    with pytest.raises(nextview.UsageError, match="cannot be written"):
-        result.plot(tmp_path / "episode.docx")
-
-
-@pytest.mark.parametrize("how", ["--version", "attribute"])
-def test_the_version(how):
-    command = ["-m", "nextview", how] if how == "--version" else ["-c", "import nextview; print(nextview.__version__)"]
-    printed = subprocess.run([sys.executable, *command], capture_output=True, text=True, check=True).stdout
-    assert printed.split()[-1] == nextview.__version__
 
 
 def test_importing_and_a_robot_need_no_ray_caster():

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -61,16 +60,6 @@ def test_a_stage_that_makes_the_same_leaves_the_same_mark(tmp_path):
     assert marks[0] == marks[1] != marks[2]
 
 
-def test_of_a_link_only_the_link_is_removed(tmp_path):
-    (tmp_path / "meshes").mkdir()
-    (tmp_path / "meshes/chair.off").write_text("OFF")
-    for seed in (1, 2):
-        result = stage(tmp_path, "link", f"--state={seed}", "--commands", "ln -sfn meshes link")
-        assert result.returncode == 0, result.stderr
-    assert (tmp_path / "meshes/chair.off").read_text() == "OFF"
-    assert os.readlink(tmp_path / "link") == "meshes"
-
-
 def test_a_stage_is_made_by_one_process_at_a_time(tmp_path):
     inner = f"{sys.executable} {WORKFLOW / 'stage.py'} out --commands true"
     result = stage(tmp_path, "out", "--commands", f"touch out; {inner}")
@@ -90,25 +79,16 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
     result = snakemake(tmp_path, "-n", "-p", config=(f"data={tmp_path / 'ModelNet10'}",))
     assert result.returncode == 0, result.stdout + result.stderr
     planned = result.stdout + result.stderr
-    for card in (BUNDLED / "models/bundled").glob("*.json"):
+    for card in (BUNDLED / "recognition/bundled").glob("*.json"):
         assert f"--name {card.stem}" in planned or f"{card.stem.partition('-')[0]} runs/" in planned
     for command in ("render ModelNet10 sensed-held-out.zarr --sensor mix", "fit calibration", "fit size", "fit valleys",
-                    "fit policies", "train gain", "train agent", "measure", "plan", "evaluate", "benchmark",
+                    "fit policies", "train gain", "measure", "evaluate", "benchmark",
                     "report"):  # fmt: skip
         assert f"nextview {command} " in planned
-    assert "benchmarks/measure_study.py test.npz validation.npz --out measures" in planned
+    for script in ("train_agent ppo validation.npz", "plan views.zarr volumetric coverage"):
+        assert f"python -m research.{script}" in planned
+    assert "research.measure_study test.npz validation.npz --out measures" in planned
     assert "docs/results.md" in planned
-
-
-def test_the_graph_from_the_bundled_models_makes_tables_alone(tmp_path):
-    (tmp_path / "ModelNet10/chair/train").mkdir(parents=True)
-    options = (f"data={tmp_path / 'ModelNet10'}", "models=bundled", "latency=false")
-    result = snakemake(tmp_path, "-n", "-p", config=options)
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert "latency.txt" not in result.stdout + result.stderr
-    trained = {line.split()[0] for line in (result.stdout + result.stderr).split("nextview train ")[1:]}
-    assert trained == {"agent"}  # a rival of the bundled models
-    assert "docs/results.md" in result.stdout + result.stderr
 
 
 @pytest.mark.long
@@ -121,14 +101,14 @@ def test_a_small_run_of_the_whole_graph(tmp_path):
     assert result.returncode == 0, result.stdout + result.stderr
     page = (tmp_path / "docs/results.md").read_text()
     assert "| mvselect |" in page
-    for heading in ("Recogniser", "Map networks", "Policies at threshold 0.97", "Beside the thesis"):
+    for heading in ("Recogniser", "Map networks", "Policies at threshold 0.97", "Calibration"):
         assert f"## {heading}\n" in page
     accuracy = (tmp_path / "evaluation/test/accuracy.csv").read_text().splitlines()
     alone = next(line.split(",") for line in accuracy if line.startswith("1,,accuracy,"))
     assert "| one view, all objects | " in page
     assert f"{float(alone[4]):.3f} (" in page
     assert (tmp_path / "docs/images/front.png").stat().st_size > 10_000
-    for card in (BUNDLED / "models/bundled").glob("*.json"):
+    for card in (BUNDLED / "recognition/bundled").glob("*.json"):
         assert (tmp_path / "landed" / card.name).exists()
     again = snakemake(tmp_path, *small, "-n", config=("data=",))
     assert "Nothing to be done" in again.stdout + again.stderr

@@ -16,7 +16,7 @@ import numpy as np
 
 from nextview.data.folders import list_dataset
 from nextview.data.samples import SAMPLES, boxes_mesh
-from nextview.mesh import Mesh
+from nextview.geometry.mesh import Mesh
 
 LARGEST = 2_000_000
 """Bytes of a mesh file that is taken: large ones take long and show no more."""

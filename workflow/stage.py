@@ -69,7 +69,7 @@ def runnable(command: str) -> str:
     python = shlex.quote(sys.executable)
     if command.startswith("nextview "):
         return f"{python} -m nextview.cli.main {command.removeprefix('nextview ')}"
-    if command.startswith(("python benchmarks/", "python workflow/")):
+    if command.startswith(("python benchmarks/", "python research/", "python workflow/")):
         script, _, rest = command.removeprefix("python ").partition(" ")
         return f"{python} {shlex.quote(str(ROOT / script))} {rest}"
     if command.startswith("python "):
@@ -93,9 +93,10 @@ def run(out: Path, commands: list[str], needs: list[Path], state: str) -> None:
         for path in (out, beside(out, "part")):
             remove(path)
         note.write_text(json.dumps(begun, indent=1) + "\n")
+    here = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])}
     for command in commands:
         print(f"$ {command}", flush=True)
-        status = subprocess.run(["bash", "-o", "pipefail", "-c", runnable(command)]).returncode
+        status = subprocess.run(["bash", "-o", "pipefail", "-c", runnable(command)], env=here).returncode
         if status:
             sys.exit(status if status > 0 else 128 - status)
     done, part = beside(out, "done"), beside(out, "done.part")

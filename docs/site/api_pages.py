@@ -10,19 +10,16 @@ import nextview
 
 PACKAGE = Path(nextview.__file__).parent
 ROOMS = {
-    "Front door": ["system", "session"],
-    "Views and objects": ["viewsphere", "mesh", "observation", "errors"],
-    "Cameras": ["cameras"],
-    "From frames to observations": ["sensing"],
-    "Belief": ["belief", "novelty", "metrics"],
-    "Models": ["models"],
-    "Measures": ["measures"],
-    "Policies": ["policies", "episode"],
-    "Stores and predictions": ["data"],
-    "Calibration": ["calibration"],
-    "Training": ["training"],
+    "Front door": ["session", "errors"],
+    "Geometry": ["geometry"],
+    "Sensing": ["sensing"],
+    "Recognition": ["recognition"],
+    "Simulation": ["simulation"],
+    "Policies": ["policies"],
+    "Data": ["data"],
+    "Learning": ["learning"],
     "Benchmark": ["benchmark"],
-    "Reports": ["report"],
+    "Viewers": ["viewers"],
 }
 """Pages, and the modules and packages that each shows."""
 

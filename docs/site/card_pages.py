@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 
-from nextview.models.model_card import ModelCard, bundled_cards
 from nextview.policies.policy_card import PolicyCard, bundled_policies, read_policy_card
+from nextview.recognition.model_card import ModelCard, bundled_cards
 
 USE = {
     "recogniser": "Names the object in the depth image of a view; the evidence of several is fused into a belief.",
@@ -39,7 +39,8 @@ def card_pages() -> dict[str, str]:
         pages[f"models/{name}.md"] = _policy_page(name, policy)
         rows.append(f"| [{name}]({name}.md) | policy, {policy.scope} | {USE[policy.kind]} |")
     table = "\n".join(["| model | what it is | what it does |", "|---|---|---|", *rows])
-    top = f"# Models that ship with nextview\n\nFrom their cards. `nextview models NAME` prints one whole.\n\n{table}\n"
+    about = "From their cards. `nextview list models NAME` prints one whole."
+    top = f"# Models that ship with nextview\n\n{about}\n\n{table}\n"
     return {"models/index.md": top} | pages
 
 

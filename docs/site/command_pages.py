@@ -5,13 +5,12 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Iterator
 from contextlib import redirect_stdout, suppress
 from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
-from nextview.cli.commands import COMMANDS, GROUPS
+from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
 
 ROOT = Path(__file__).parents[2]
@@ -25,21 +24,13 @@ COLUMNS = "96"
 def command_pages() -> dict[str, str]:
     """Markdown of each page by its place in the site; the first lists them all."""
     examples, pages, rows = _examples(), {}, []
-    for words, command in _commands():
+    for words, command in COMMANDS.items():
         uri = f"commands/{words.replace(' ', '-')}.md"
-        rows.append(f"| [`nextview {words}`](../{uri}) | {_first_sentence(command.__doc__ or '')} |")
+        rows.append(f"| [`nextview {words}`](../{uri}) | {command.line} |")
         pages[uri] = f"# nextview {words}\n\n```text\n{help_of(words)}```\n\n{_used(examples.get(words, {}))}"
     table = "\n".join(["| command | |", "|---|---|", *rows])
     top = f"# Commands\n\nEach page is the command's own help. `nextview COMMAND --help` prints it.\n\n{table}\n"
     return {"commands/index.md": top} | pages
-
-
-def _commands() -> Iterator[tuple[str, object]]:
-    for name, command in COMMANDS.items():
-        if name in GROUPS:
-            yield from ((f"{name} {each}", function) for each, function in command.items())
-        else:
-            yield name, command
 
 
 def help_of(words: str) -> str:
@@ -51,13 +42,9 @@ def help_of(words: str) -> str:
     return "\n".join(line.rstrip() for line in printed.getvalue().strip().splitlines()) + "\n"
 
 
-def _first_sentence(text: str) -> str:
-    return " ".join(text.split("\n\n")[0].split()).partition(". ")[0].rstrip(".") + "."
-
-
 def _examples() -> dict[str, dict[str, str]]:
     """Of each command, the lines that use it and the page where each stands first."""
-    names = sorted((words for words, _ in _commands()), key=len, reverse=True)
+    names = sorted(COMMANDS, key=len, reverse=True)
     found: dict[str, dict[str, str]] = {}
     for source in SOURCES:
         for line in re.findall(r"^ {0,4}(nextview [a-z].*?)\s*(?:  #.*)?$", (ROOT / source).read_text(), re.M):

@@ -12,9 +12,8 @@ from pathlib import Path
 import tyro
 from playwright.sync_api import Browser, sync_playwright
 
-from nextview.explorer.exploration import Exploration
-from nextview.explorer.page import Page
-from nextview.explorer.shown_object import shown_objects
+from nextview.viewers.exploration import Exploration, shown_objects
+from nextview.viewers.page import Page
 
 IMAGES = Path(__file__).parents[1] / "images"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",

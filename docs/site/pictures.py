@@ -15,12 +15,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 import nextview
+from nextview.data.measures import depth_entropy
 from nextview.data.samples import sample_mesh
-from nextview.measures.depth_entropy import depth_entropy
+from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.maps import local_peaks
-from nextview.report.style import ACCENT, BLUE, FAINT, INK, STYLE, PlainFigure
-from nextview.session import View
-from nextview.viewsphere import ViewSphere
+from nextview.session.style import ACCENT, BLUE, FAINT, INK, STYLE, PlainFigure
+from nextview.session.view import View
 
 IMAGES = Path(__file__).parents[1] / "images"
 RESULTS = Path(__file__).parents[1] / "results.md"

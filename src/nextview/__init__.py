@@ -8,7 +8,6 @@
 
 from typing import Any
 
-from nextview.belief import Stopping
 from nextview.errors import (
     DatasetError,
     EntryError,
@@ -27,16 +26,19 @@ from nextview.errors import (
     SessionError,
     UsageError,
 )
-from nextview.mesh import Mesh, load_mesh
-from nextview.models.inference import Models
-from nextview.observation import Camera, Observation
+from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.geometry.observation import Camera, Observation
+from nextview.geometry.viewsphere import Directions, ViewSphere
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.registry import make_policy
-from nextview.session import Recognition, Session, View
-from nextview.system import System, load, recognise
-from nextview.viewsphere import Directions, ViewSphere
+from nextview.recognition.belief import Stopping
+from nextview.recognition.inference import Models
+from nextview.session.recognition import Recognition
+from nextview.session.session import Session
+from nextview.session.system import System, load, recognise
+from nextview.session.view import View
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "Camera",
@@ -80,7 +82,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """The simulated camera, imported when it is used: a robot does without."""
     if name == "SimulatedCamera":
-        from nextview.cameras.simulated import SimulatedCamera
+        from nextview.simulation.simulated import SimulatedCamera
 
         return SimulatedCamera
     raise AttributeError(f"module 'nextview' has no attribute {name!r}")

@@ -1,5 +1,5 @@
 """``python -m nextview`` is the ``nextview`` command."""
 
-from nextview.cli.main import main
+from nextview_command import main
 
 main()

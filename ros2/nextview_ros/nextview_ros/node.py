@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 from tf2_ros import Buffer, TransformException, TransformListener
 
 import nextview
-from nextview.belief import Stopping
+from nextview.recognition.belief import Stopping
 from nextview.sensing import ObservedObject
 from nextview_ros.conversion import fill_pose, frame_of, seconds
 
@@ -178,7 +178,7 @@ class RecogniseNode(Node):
         feedback.views, feedback.classes = len(session.views), list(session.models.classes)
         if session.views:
             feedback.belief = session.views[-1].belief.tolist()
-            feedback.doubts = [doubt.message for doubt in session.views[-1].doubts]
+            feedback.warnings = [warning.message for warning in session.views[-1].warnings]
         if not session.done:
             target = feedback.next_pose
             target.header.frame_id = self.value("world_frame")

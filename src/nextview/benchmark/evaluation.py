@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from nextview import metrics
-from nextview.belief import Calibration
 from nextview.benchmark import statistics as st
 from nextview.benchmark.published import comparable_classes, published_map, published_recognisers
 from nextview.benchmark.true_maps import known_maps, true_map
+from nextview.data import metrics
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError
-from nextview.measures.map_names import CONFIDENCE, measure_of
-from nextview.models.model_card import ModelCard
+from nextview.recognition.belief import Calibration
+from nextview.recognition.map_names import CONFIDENCE, measure_of
+from nextview.recognition.model_card import ModelCard
 
 Float = NDArray[np.float64]
 
@@ -28,20 +28,17 @@ RELIABILITY_LOOKS = (1, 2, 5)
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The results, each a long table; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``.
+    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``.
 
     Attributes:
-        accuracy: n_views (1, or V: all logits summed), label (empty: all classes), measure, objects, value,
-            low, high, published. The measures: ``accuracy``; ``clean_accuracy``, without the objects whose very mesh
-            also has another label; ``shape_accuracy``, where the recogniser takes how large the objects are, when it
-            is not; with ``class_`` before it the mean over classes.
-        fusion: n_views, accuracy, low, high, class_accuracy, confidence (its mean), calibration_error: that many random
-            views fused, calibrated as the recogniser's card says.
-        confusion: n_views, label, answer, answers: how many; a view is an answer, or a whole object.
-        reliability: n_views, bin, confidence, accuracy, answers: after one view and a few more, in random order.
-        maps: map, by, label, measure, value, low, high, published; the measures are those of ``metrics.map_errors``.
-            ``by`` is the network or a baselines made from the true maps of these very objects, which flatters it:
-            their mean, the same for every view; or their mean for the object's true class at the view.
+        accuracy: by n_views (1, or V: all logits summed), label (empty: all) and measure: ``accuracy``;
+            ``clean_accuracy``, without the objects whose very mesh also has another label; ``shape_accuracy``, where
+            the recogniser is not told the size; with ``class_`` before it the mean over classes.
+        fusion: the same, mean confidence and calibration error of so many random views fused.
+        confusion: answers by n_views, label and answer; a view is an answer, or a whole object.
+        reliability: confidence and accuracy by n_views and bin.
+        maps: scores (``metrics.map_errors``) by map, by, label. ``by`` is the network, or the mean of the true maps of
+            these very objects: over all, or for the object's true class at the view.
         left_out: for each map that is not judged, or not of all objects, why.
     """
 
@@ -54,47 +51,26 @@ class Evaluation:
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """The tables by name."""
-        found = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {name: table for name, table in found.items() if isinstance(table, pd.DataFrame)}
+        return {name: table for name, table in vars(self).items() if isinstance(table, pd.DataFrame)}
 
 
 def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluation:
-    """Judge the recogniser and the map networks behind some predictions.
-
-    Args:
-        p: what they said.
-        samples: of the bootstrap.
-        rng: draws them, and the orders in which views are fused.
-
-    Raises:
-        ResultsError: the recogniser knows one class only.
-    """
+    """Judge the recogniser and the map networks behind some predictions."""
     if len(p.classes) < 2:
         raise ResultsError(f"the recogniser knows one class only, {p.classes[0]}: there is nothing to tell apart")
     if samples < 1:
         raise ResultsError(f"at least one sample of the bootstrap is needed, not {samples}")
     weights = st.resample(len(p), samples, rng)
     right, confidence = fused_views(p.log_evidence, p.labels, p.calibration, rng, len(p.classes))
-    judged = _judged(p)
-    maps, left_out = _maps(p, weights)
-    return Evaluation(
-        _accuracy(p, judged, weights),
-        _fusion(p, right, confidence, weights),
-        _confusion(p, judged),
-        _reliability(right, confidence),
-        maps,
-        left_out,
-    )
+    judged, (maps, left_out) = _judged(p), _maps(p, weights)
+    accuracy, fusion = _accuracy(p, judged, weights), _fusion(p, right, confidence, weights)
+    return Evaluation(accuracy, fusion, _confusion(p, judged), _reliability(right, confidence), maps, left_out)
 
 
 def _judged(p: Predictions) -> dict[int, NDArray]:
-    """What single views say and all of them together, by the number of views, each (N, answers, C)."""
-    return {1: p.logits, len(p.sphere): all_fused(p)[:, None]}
-
-
-def all_fused(p: Predictions) -> Float:
-    """Logarithm of the belief from all views of each object, up to a constant, (N, C)."""
-    return p.calibration.log_belief(p.log_evidence.astype(np.float64).sum(1), len(p.sphere), len(p.classes))
+    """Logits of single views, and log-beliefs of all views together, by the number of views, each (N, answers, C)."""
+    fused = p.calibration.log_belief(p.log_evidence.astype(np.float64).sum(1), len(p.sphere), len(p.classes))
+    return {1: p.logits, len(p.sphere): fused[:, None]}
 
 
 def fused_views(
@@ -104,20 +80,7 @@ def fused_views(
     rng: np.random.Generator,
     classes: int,
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations.
-
-    Every view comes first once, second once, and so on: with one view this is the single-view accuracy exactly.
-
-    Args:
-        log_evidence: by the recogniser, so that it adds up, (N, V, D); see ``log_evidence_of``.
-        labels: (N,).
-        calibration: how far a sum of it is to be trusted.
-        rng: draws one order for each object.
-        classes: how many.
-
-    Returns:
-        Whether the answer is right, and its confidence, each (V views, N, V rotations).
-    """
+    """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations."""
     n, v, _ = log_evidence.shape
     order = rng.permuted(np.tile(np.arange(v), (n, 1)), axis=1)
     shuffled = np.take_along_axis(log_evidence.astype(np.float64), order[:, :, None], axis=1)
@@ -133,11 +96,7 @@ def fused_views(
 def _means(
     top: Float, bottom: Float, labels: NDArray[np.int64], classes: tuple[str, ...], weights: Float | None
 ) -> Iterator[tuple[str, str, Float, Float, Float]]:
-    """Ratios of sums over objects (N, M): over all of them, as the mean over classes ("class_"), and in each class.
-
-    Yields:
-        Label (empty: all), what stands before the measure, and values with the ends of their intervals, each (M,).
-    """
+    """Ratios of sums over objects (N, M): over all of them, as the mean over classes ("class_"), and in each class."""
     everything = np.ones(len(labels), bool)
     groups = [("", "", everything), ("", "class_", everything)]
     groups += [(classes[index], "", labels == index) for index in np.unique(labels)]
@@ -176,6 +135,7 @@ def _fusion(p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.flo
     top = right.mean(2).T
     one = np.ones_like(top)
     low, high = st.interval(metrics.ratio(top, one, weights))
+    errors = [metrics.calibration_error(c.ravel(), r.ravel()) for c, r in zip(confidence, right, strict=True)]
     return pd.DataFrame(
         {
             "n_views": np.arange(1, len(right) + 1),
@@ -184,10 +144,7 @@ def _fusion(p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.flo
             "high": high,
             "class_accuracy": metrics.class_mean(top, one, p.labels, np.ones((1, len(p))))[0],
             "confidence": confidence.mean((1, 2), np.float64),
-            "calibration_error": [
-                metrics.calibration_error(sure.ravel(), answer.ravel())
-                for sure, answer in zip(confidence, right, strict=True)
-            ],
+            "calibration_error": errors,
         }
     )
 
@@ -205,9 +162,8 @@ def _reliability(right: NDArray[np.bool_], confidence: NDArray[np.float32]) -> p
     rows, v = [], len(right)
     for n_views in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
         turns = slice(None) if n_views < v else slice(1)  # all views are the same in every order
-        sure, share, count = metrics.reliability(
-            confidence[n_views - 1, :, turns].ravel().astype(np.float64), right[n_views - 1, :, turns].ravel()
-        )
+        belief, answers = confidence[n_views - 1, :, turns].ravel().astype(np.float64), right[n_views - 1, :, turns]
+        sure, share, count = metrics.reliability(belief, answers.ravel())
         rows += [(n_views, i, sure[i], share[i], count[i]) for i in np.flatnonzero(count)]
     return pd.DataFrame(rows, columns=["n_views", "bin", "confidence", "accuracy", "answers"])
 
@@ -219,12 +175,7 @@ def judged_objects(p: Predictions, name: str) -> NDArray[np.int64]:
 
 
 def baselines(true: NDArray[np.floating], labels: NDArray[np.int64]) -> dict[str, NDArray[np.floating]]:
-    """Maps to be measured against: the mean map, and the mean map of the class at the view, each as ``true`` is.
-
-    Args:
-        true: (N, V, rings, 3).
-        labels: true class of each object, (N,).
-    """
+    """Maps to be measured against: the mean map, and the mean map of the class at the view, each as ``true`` is."""
     classes, row = np.unique(labels, return_inverse=True)
     of_class = np.stack([true[labels == index].mean(0) for index in classes])
     return {"mean map": np.broadcast_to(true.mean((0, 1)), true.shape), "mean map of the class": of_class[row]}
@@ -263,11 +214,7 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
 
 
 def scores_for_card(card: ModelCard, p: Predictions) -> dict[str, Any]:
-    """The scores of one of the models that made some predictions, as its card notes them.
-
-    Raises:
-        ResultsError: the model did not make them, or they hold nothing that it can be judged by.
-    """
+    """The scores of one of the models that made some predictions, as its card notes them."""
     if p.models.get(card.kind) != (card.name, card.sha256):
         raise ResultsError(f"these predictions were not made by model {card.name}")
     if card.kind == "recogniser":

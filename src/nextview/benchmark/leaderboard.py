@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import pandas as pd
 
@@ -21,104 +21,44 @@ def headline_threshold(thresholds: Sequence[float]) -> float:
     return min(thresholds, key=lambda t: abs(t - 0.97))
 
 
-class Standing(NamedTuple):
-    """A policy under one threshold; difference and p_holm, to the reference, are NaN for the reference itself.
+def leaderboard(tables: Tables, threshold: float) -> list[Any]:
+    """The policies under one threshold, the most accurate first and those that no robot could follow last.
 
-    Accuracy has a 95 % interval, low to high; travel is in grid cells, over all episodes.
+    Returns:
+        Rows with policy, accuracy, its 95 % interval low to high, class_accuracy, n_views, travel (grid cells, over all
+        episodes), difference and p_holm to the reference (NaN for the reference itself), and differs: whether that is
+        significant.
     """
-
-    policy: str
-    accuracy: float
-    low: float
-    high: float
-    class_accuracy: float
-    n_views: float
-    travel: float
-    difference: float
-    p_holm: float
-
-    @property
-    def differs(self) -> bool:
-        """Whether its accuracy differs significantly from that of the reference."""
-        return self.p_holm < SIGNIFICANT
-
-
-def leaderboard(tables: Tables, threshold: float) -> list[Standing]:
-    """The policies under one threshold, the most accurate first and those that no robot could follow last."""
     rows = tables.summary[tables.summary["threshold"] == threshold]
     table = rows.pivot(index="policy", columns="measure", values="value")
     table = table.join(rows[rows["measure"] == "accuracy"].set_index("policy")[["low", "high"]])
     table = table.join(_tests(tables, threshold).set_index("policy")[["difference", "p_holm"]]).reset_index()
-    columns = ["policy", "accuracy", "low", "high", "class_accuracy", "n_views", "travel_all", "difference", "p_holm"]
-    standings = [Standing(*row) for row in table[columns].to_numpy(object).tolist()]
-    return sorted(standings, key=lambda s: (is_oracle(s.policy), -s.accuracy))
+    table = table.rename(columns={"travel_all": "travel"}).assign(differs=table["p_holm"] < SIGNIFICANT)
+    return sorted(table.itertuples(index=False), key=lambda s: (is_oracle(s.policy), -s.accuracy))
 
 
-class PromisedRisk(NamedTuple):
-    """An error rate that was promised of those who stop early, and the measured one with its 95 % interval."""
-
-    policy: str
-    risk: float
-    threshold: float
-    error: float
-    low: float
-    high: float
-    confident: float
-
-    @property
-    def broken(self) -> bool:
-        """Whether more were wrong than was promised, and chance does not explain it: the whole interval lies above."""
-        return self.low > self.risk
+def promised_risks(tables: Tables) -> list[Any]:
+    """The rows of ``Tables.risks``, and broken: whether more were wrong than was promised, beyond chance."""
+    return list(tables.risks.assign(broken=tables.risks["low"] > tables.risks["risk"]).itertuples(index=False))
 
 
-def promised_risks(tables: Tables) -> list[PromisedRisk]:
-    """Every promise that was put to the test."""
-    return [PromisedRisk(*row) for row in tables.risks.to_numpy(object).tolist()]
-
-
-class LevelCell(NamedTuple):
-    """A policy in the worlds of one level after some views; difference and what follows are NaN for the reference."""
-
-    accuracy: float
-    low: float
-    high: float
-    travel: float
-    difference: float
-    difference_low: float
-    difference_high: float
-    p_holm: float
-
-
-class LevelRow(NamedTuple):
-    """A policy in the worlds of one level; its cells by the number of views."""
-
-    level: str
-    worlds: int
-    policy: str
-    cells: list[tuple[int, LevelCell]]
-
-
-def level_rows(tables: Tables) -> list[list[LevelRow]]:
-    """The policies at each level, those that no robot could follow last; nothing where the objects are no worlds."""
-    found: list[list[LevelRow]] = []
-    for level, rows in tables.levels.groupby("level", sort=False):
-        policies = []
-        for policy, mine in rows.groupby("policy", sort=False):
-            values = mine[list(LevelCell._fields)].to_numpy(float).tolist()
-            cells = [(int(k), LevelCell(*row)) for k, row in zip(mine["n_views"], values, strict=True)]
-            policies.append(LevelRow(str(level), int(mine["worlds"].iloc[0]), str(policy), cells))
-        found.append(sorted(policies, key=lambda row: is_oracle(row.policy)))
+def level_rows(tables: Tables) -> list[list[tuple[str, list[Any]]]]:
+    """The rows of ``Tables.levels`` by level and policy, those that no robot could follow last."""
+    found = []
+    for _, rows in tables.levels.groupby("level", sort=False):
+        policies = [(str(name), list(mine.itertuples())) for name, mine in rows.groupby("policy", sort=False)]
+        found.append(sorted(policies, key=lambda policy: is_oracle(policy[0])))
     return found
 
 
 def level_differences(tables: Tables, reference: str) -> str | None:
-    """A sentence that names the policies of a robot that differ in worlds after so many views; None if none does."""
+    """A sentence that names the policies of a robot that differ in scenes after so many views; None if none does."""
     found = [
-        f"{row.policy} by {100 * cell.difference:+.1f} points after {n_views} views under {row.level} clutter"
-        for rows in level_rows(tables)
+        f"{policy} by {100 * row.difference:+.1f} points after {row.n_views} views under {row.level} clutter"
+        for policies in level_rows(tables)
+        for policy, rows in policies
         for row in rows
-        for n_views, cell in row.cells
-        if not is_oracle(row.policy) and cell.p_holm < SIGNIFICANT
+        if not is_oracle(policy) and row.p_holm < SIGNIFICANT
     ]
     return f"With no threshold, significantly different from {reference}: {'; '.join(found)}." if found else None
 
@@ -135,24 +75,19 @@ def nothing_differs(tables: Tables, threshold: float, reference: str) -> str | N
 
 
 def too_few(tables: Tables, threshold: float, objects: int) -> str | None:
-    """A warning where there are too few objects to tell policies apart; else None.
-
-    That is so with fewer than ``FEW_OBJECTS``, or where the intervals of the differences in accuracy between the
-    policies that a robot could follow and the reference reach, in the median, more than ``WIDE`` to either side.
-    """
+    """A warning where there are too few objects to tell policies apart; else None."""
     tests = _robot_tests(tables, threshold)
     half = float((tests["high"] - tests["low"]).median() / 2)  # NaN if nothing was compared
     if objects >= FEW_OBJECTS and not half > WIDE:
         return None
-    doubt = "" if half != half else f" and differences in accuracy are known to ±{100 * half:.1f} points"
+    unclear = "" if half != half else f" and differences in accuracy are known to ±{100 * half:.1f} points"
     return (
-        f"Too few objects to tell: there are {objects:,}{doubt}. Take no order of the policies from this; it wants "
+        f"Too few objects to tell: there are {objects:,}{unclear}. Take no order of the policies from this; it wants "
         f"at least {FEW_OBJECTS} objects and ±{100 * WIDE:g} points."
     )
 
 
 def _tests(tables: Tables, threshold: float) -> pd.DataFrame:
-    """Of the accuracy against the reference."""
     t = tables.tests
     return t[(t["threshold"] == threshold) & (t["measure"] == "accuracy")]
 

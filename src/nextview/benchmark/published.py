@@ -9,8 +9,8 @@ from importlib.resources import files
 import numpy as np
 
 from nextview.data.predictions import Predictions
-from nextview.measures.map_names import LCM, LEM
-from nextview.worlds import level_of
+from nextview.recognition.map_names import LCM, LEM
+from nextview.simulation.scene_layout import clutter_level
 
 COLUMNS = {
     "random": "random",
@@ -20,7 +20,6 @@ COLUMNS = {
     f"{LCM}-peak": "LCM10",
 }
 """Policies of tables 5, 8 to 11 under their published names."""
-
 FIVE_VIEWS = {
     "low-entropy-5": "low_entropy",
     "high-entropy-5": "high_entropy",
@@ -28,7 +27,6 @@ FIVE_VIEWS = {
     "random-fixed-5": "random",
 }
 """Fixed views of tables 3 and 12. Both are of a network for 40 classes."""
-
 ACCURACY = {10: "table8_accuracy_per_class_modelnet10", 40: "table10_accuracy_per_class_modelnet40"}
 TRAVEL = {10: "table9_travel_per_class_modelnet10", 40: "table11_travel_per_class_modelnet40"}
 
@@ -54,11 +52,8 @@ def published_classes(classes: tuple[str, ...]) -> int | None:
 
 
 def comparable_classes(p: Predictions) -> tuple[str, ...]:
-    """The classes by which published numbers are found beside predictions.
-
-    None for those of worlds: what was published is of objects that stand alone.
-    """
-    return () if any(map(level_of, p.names)) else p.classes
+    """The classes by which published numbers are found; none for scenes: those published are of single objects."""
+    return () if any(map(clutter_level, p.names)) else p.classes
 
 
 def published_threshold(policy: str) -> float | None:
@@ -69,15 +64,7 @@ def published_threshold(policy: str) -> float | None:
 def published(
     policy: str, threshold: float | None, measure: str, classes: tuple[str, ...], label: str | None = None
 ) -> float | None:
-    """The published value of one of our cells; None where nothing was published for it.
-
-    Args:
-        policy: name of a entry.
-        threshold: of the cell; the published ones differ between policies (table 5).
-        measure: "accuracy" or "travel_moved", over objects or, with "class_" before it, over classes.
-        classes: of the data: only those of ModelNet10 and 40 were published.
-        label: the class, for one of the tables by class.
-    """
+    """The published value of one of our cells; None where nothing was published for it."""
     n = published_classes(classes)
     if n is None:
         return None
@@ -112,17 +99,7 @@ def published_recognisers(classes: tuple[str, ...], views: int) -> list[tuple[st
 
 
 def published_map(name: str, measure: str, classes: tuple[str, ...], label: str | None = None) -> float | None:
-    """The published score of a map network that was trained on these classes and tested on them (tables 4 and 7).
-
-    Table 4's peaks are means over table 7's classes, and its loss is the mean over objects; the text does not say so.
-
-    Args:
-        name: of the map; LEM and LCM have some.
-        measure: "mse" (the published loss, which has 1e-4 of a regulariser in it), "d0", "d_le_1" or "d_lt_2", over
-            objects or, with "class_" before it, over classes.
-        classes: of the data.
-        label: the class, for table 7.
-    """
+    """The published score of a map network that was trained on these classes and tested on them (tables 4 and 7)."""
     n = published_classes(classes)
     over_classes, kind = measure.startswith("class_"), measure.removeprefix("class_")
     column = {"mse": "loss"}.get(kind, kind)

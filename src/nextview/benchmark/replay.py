@@ -1,43 +1,40 @@
-"""Replay: run a policy through all episodes at once, from predictions instead of a camera.
+"""Replay: run policies through all episodes at once, from predictions instead of a camera.
 
-A policy chooses in each episode by itself and does not know the threshold, so where it goes does not depend on when it
-will be stopped. So every policy is run once, to the last view, through the same loop as live use; an episode under a
-threshold is the beginning of that path, up to the first view that is confident enough. A random policy draws once for
-all thresholds in this way, which also pairs its episodes. A path ends early only where the belief is exactly 1 in
-double precision: no threshold can want more.
+A policy does not know the threshold, so where it goes does not depend on it. Every policy is run once, to the last
+view, through the same loop as live use; ``truncate`` ends the episodes where a ``Stopping`` rule does. A random policy
+draws once for all thresholds in this way, which also pairs its episodes. A path ends early only where the belief is
+exactly 1 in double precision: no threshold can want more.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.belief import FixedLength, Stopping
 from nextview.benchmark.entries import EpisodeSpecs, entry_policy, fixed_views
 from nextview.benchmark.true_maps import TRUE, true_map
 from nextview.data.predictions import Predictions
-from nextview.data.world_sight import sight_of, worlds_of
-from nextview.episode import run_episodes
-from nextview.errors import EntryError, PolicyError, UsageError
-from nextview.policies.base import Evidence, Policy, maps_among
-from nextview.policies.fixed import ViewList
-from nextview.viewsphere import ViewSphere
+from nextview.data.scene_views import scenes_of, sight_of
+from nextview.errors import EntryError, NextviewError, PolicyError, UsageError
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.policies.base import Evidence, Policy
+from nextview.policies.baselines import ViewList
+from nextview.recognition.belief import FixedLength, Stopping
+from nextview.recognition.map_names import maps_among
+from nextview.session.episode import run_episodes
+
+THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)
+"""The thesis's (section 5.3)."""
+PART = 4096
+"""Episodes of fixed views that are run at once."""
 
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Where E episodes went, up to K views, and what was believed after each.
-
-    Attributes:
-        views: in order, (E, K) int64, -1 after the end.
-        answers: most believed class after each view, (E, K) int64.
-        confidences: its belief, (E, K) float64, -1 after the end.
-        travel: moved so far, grid cells, (E, K) float64.
-        arc: moved so far, radians, (E, K) float64.
-        fixed: the views were settled beforehand, and no threshold stops them.
-    """
+    """Where E episodes went, up to K views, and what was believed after each."""
 
     views: NDArray[np.int64]
     answers: NDArray[np.int64]
@@ -49,7 +46,7 @@ class Trajectories:
 
 @dataclass(frozen=True)
 class Outcomes:
-    """How E episodes ended under one threshold: as ``nextview.episode.Outcome``, each (E,)."""
+    """How E episodes ended under one rule: as ``nextview.session.episode.Outcome``, each (E,)."""
 
     answer: NDArray[np.int64]
     confidence: NDArray[np.float64]
@@ -59,62 +56,47 @@ class Outcomes:
     arc: NDArray[np.float64]
 
 
-def make_specs(
-    predictions: Predictions, runs: int, seed: int, valley_classes: tuple[int, ...] | None = None
-) -> EpisodeSpecs:
+def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
     """Every object from ``runs`` random first views: episode = run * objects + object.
 
     Args:
         predictions: what the models say.
         runs: first views of each object.
-        seed: decides them, alone: they are the same for every policy and threshold. In worlds they are drawn among
+        seed: decides the first views: they are the same for every policy and threshold. In scenes they are drawn among
             those that can be reached.
-        valley_classes: classes (indices) for the policies that need them; those of each map's card by default.
+
+    Raises:
+        UsageError: fewer than one run.
     """
     if runs < 1:
         raise UsageError(f"at least one run is needed, not {runs}")
-    n, rng, worlds = len(predictions), np.random.default_rng([seed]), worlds_of(predictions)
+    n, rng, scenes = len(predictions), np.random.default_rng([seed]), scenes_of(predictions)
     starts = rng.integers(len(predictions.sphere), size=runs * n)
     objects = np.tile(np.arange(n), runs)
-    if worlds is not None:
+    if scenes is not None:
         draws = rng.random((len(objects), len(predictions.sphere)))
-        starts = np.where(worlds.reachable[objects], draws, -1).argmax(1)
-    return EpisodeSpecs(predictions, objects, starts, valley_classes, worlds)
+        starts = np.where(scenes.reachable[objects], draws, -1).argmax(1)
+    return EpisodeSpecs(predictions, objects, starts, scenes)
 
 
 def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int) -> Trajectories:
-    """Run one entry through all episodes.
-
-    Args:
-        name: see ``entries``.
-        specs: the episodes to go through.
-        max_views: views at most; fixed views bring their own number.
-        seed: for policies that draw; what a policy draws depends on the seed and its name alone.
-
-    Raises:
-        EntryError: it failed, or chose a view that cannot be taken.
-    """
+    """Run one entry through all episodes, to the last view."""
     rng = np.random.default_rng([seed, *name.encode()])
     views = fixed_views(name, specs, rng)
     if views is None:
         return _run(name, entry_policy(name, specs), specs, Stopping(1.0, max_views), rng)
-    # These draw nothing more and may be long: in parts, whose steps do not all have to be held at once.
-    done = []
+    # Fixed views draw nothing more and may be long: in parts, whose steps are not all held at once.
+    parts = []
     for start in range(0, len(views), PART):
         part = slice(start, start + PART)
         here = replace(specs, objects=specs.objects[part], starts=views[part, 0])
-        done.append(_run(name, ViewList(views[part]), here, FixedLength(max_views=views.shape[1]), rng))
+        parts.append(_run(name, ViewList(views[part]), here, FixedLength(max_views=views.shape[1]), rng))
     names = [f.name for f in fields(Trajectories) if f.name != "fixed"]
-    whole = {name: np.concatenate([getattr(part, name) for part in done]) for name in names}
-    return replace(done[0], **whole, fixed=True)
-
-
-PART = 4096
-"""Episodes of fixed views that are run at once."""
+    whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return replace(parts[0], **whole, fixed=True)
 
 
 def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng: np.random.Generator) -> Trajectories:
-    """Follow a policy through all episodes."""
     p, objects = specs.predictions, specs.objects
     maps = {
         name: true_map(p, name.removeprefix(TRUE)) if name.startswith(TRUE) else p.maps[name]
@@ -123,12 +105,9 @@ def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng
     p = replace(p, maps=maps)
 
     def observe(which: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
-        evidence = p.evidence(objects[which], views)
-        if specs.worlds is None or p.calibration.visibility is None:
-            return evidence
-        return replace(evidence, shown=specs.worlds.shown(objects[which], views))
+        return p.evidence(objects[which], views)
 
-    sight = sight_of(specs.worlds, objects)
+    sight = sight_of(specs.scenes, objects)
     try:
         done = run_episodes(observe, p.sphere, policy, specs.starts, stopping, rng, p.calibration, *sight)
     except PolicyError as error:
@@ -144,7 +123,6 @@ def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng
 
 
 def _moved(sphere: ViewSphere, views: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Travel and arc up to each view, each (E, K)."""
     legs = (views[:, :-1], views[:, 1:])
     still = np.zeros((len(views), 1))
     going = views[:, 1:] >= 0
@@ -152,18 +130,59 @@ def _moved(sphere: ViewSphere, views: NDArray[np.int64]) -> tuple[NDArray[np.flo
     return travel, arc
 
 
-def truncate(paths: Trajectories, threshold: float | None, threshold_decay: float = 0.0) -> Outcomes:
-    """The episodes under a threshold (None: never reached) and its decay, see ``Stopping``."""
-    e, last = np.arange(len(paths.views)), (paths.views >= 0).sum(1) - 1
-    n_views = np.arange(1, paths.views.shape[1] + 1)
-    threshold_at = (
-        np.inf
-        if threshold is None or paths.fixed
-        else Stopping(threshold, len(n_views), threshold_decay).threshold_at(n_views)
-    )
-    reached = paths.confidences >= threshold_at
-    confident = np.asarray(reached.any(1))
-    at = np.where(confident, reached.argmax(1), last)
+def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcomes:
+    """The episodes as a rule ends them."""
+    e, count = np.arange(len(paths.views)), (paths.views >= 0).sum(1)
+    if stopping is None or paths.fixed:
+        confident, at = np.zeros(len(e), bool), count - 1
+    else:
+        n_views = np.arange(1, min(paths.views.shape[1], stopping.max_views) + 1)
+        reached = paths.confidences[:, : len(n_views)] >= stopping.threshold_at(n_views)
+        confident = np.asarray(reached.any(1))
+        at = np.where(confident, reached.argmax(1), np.minimum(count, len(n_views)) - 1)
     return Outcomes(
         paths.answers[e, at], paths.confidences[e, at], at + 1, confident, paths.travel[e, at], paths.arc[e, at]
     )
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Every entry under every threshold from the same first views, and the results."""
+
+    specs: EpisodeSpecs
+    runs: int
+    thresholds: tuple[float, ...]
+    max_views: int
+    seed: int
+    threshold_decay: float | None = None
+    paths: dict[str, Trajectories] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)
+
+    def stopping(self, threshold: float) -> Stopping:
+        """The rule of a threshold."""
+        rule = Stopping.of(self.specs.predictions.calibration, threshold, max_views=self.max_views)
+        return rule if self.threshold_decay is None else replace(rule, threshold_decay=self.threshold_decay)
+
+    def ends(self, name: str, threshold: float | None) -> Outcomes:
+        """The episodes of an entry under a threshold; None takes all views."""
+        return truncate(self.paths[name], None if threshold is None else self.stopping(threshold))
+
+    def cells(self) -> Iterator[tuple[str, float | None, Outcomes]]:
+        """Every entry under every threshold; fixed views once, with threshold None."""
+        for name, paths in self.paths.items():
+            for threshold in (None,) if paths.fixed else self.thresholds:
+                yield name, threshold, self.ends(name, threshold)
+
+    def right(self, answer: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which answers, (E,), name the true class, (runs, N)."""
+        return (answer == self.specs.labels).reshape(self.runs, -1)
+
+
+def run_grid(grid: Grid, names: Sequence[str]) -> Iterator[int]:
+    """Run the entries one after the other; one that fails leaves its sentence and takes nothing from the others."""
+    for n, name in enumerate(names, 1):
+        try:
+            grid.paths[name] = replay(name, grid.specs, grid.max_views, grid.seed)
+        except NextviewError as error:
+            grid.failures[name] = str(error)
+        yield n

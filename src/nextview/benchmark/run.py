@@ -1,135 +1,212 @@
-"""The benchmark, from predictions to a folder of results."""
+"""The benchmark: from predictions to a folder of results, and back from the folder."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+import json
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
-from nextview.arguments import takes_paths
-from nextview.belief import PLAIN_SUM, Stopping
-from nextview.benchmark import results
 from nextview.benchmark.entries import default_entries
-from nextview.benchmark.experiment import THRESHOLDS, Grid, run_grid
-from nextview.benchmark.replay import make_specs
-from nextview.benchmark.summary import summarise
+from nextview.benchmark.replay import THRESHOLDS, Grid, make_specs, run_grid
+from nextview.benchmark.summary import Tables, summarise
 from nextview.data.predictions import Predictions
-from nextview.errors import EntryError, UsageError
-from nextview.measures.map_names import LEM
-from nextview.models.model_card import file_hash
-from nextview.outputs import check_folder, written_results
+from nextview.data.progress import Track, silently
+from nextview.errors import EntryError, ResultsError, UsageError
+from nextview.files import check_new, command, new_folder, sha256_of
 from nextview.policies.registry import with_cards
-
-Track = Callable[[Iterable[int], int, str], object]
-"""Exhausts counts of what is done, given the last count and what is being done."""
-
-
-def _unseen(done: Iterable[int], total: int, what: str) -> None:
-    for _ in done:
-        pass
+from nextview.recognition.belief import PLAIN_SUM, Stopping
+from nextview.recognition.map_names import LEM
+from nextview.recognition.model_card import find_models
 
 
-@takes_paths("predictions", "out")
-def run_benchmark(
-    predictions: Path,
-    out: Path,
-    policies: Sequence[str] = (),
-    own: Mapping[str, Path] | None = None,
-    thresholds: Sequence[float] = THRESHOLDS,
-    risks: Sequence[float] = (),
-    threshold_decay: float | None = None,
-    uncalibrated: bool = False,
-    split: str | None = None,
-    runs: int = 10,
-    max_views: int = 5,
-    reference: str = "random",
-    valley_classes: Sequence[str] | None = None,
-    samples: int = 2000,
-    seed: int = 0,
-    track: Track = _unseen,
-    through: Callable[[Grid, str], object] = lambda grid, name: None,
-) -> results.Results:
-    """Run every policy under every threshold from the same first views, and write episodes, tables and tests.
+@dataclass(frozen=True)
+class BenchmarkSettings:
+    """What is run.
 
-    An entry that fails takes nothing from the others; why it did stands in the settings of the results.
-
-    Args:
-        predictions: made by ``data.predicting.predict``.
-        out: folder for the results; earlier results there are replaced.
-        policies: see ``entries``; all that the predictions allow by default. The reference is run in any case.
-        own: cards of policies that take part too, or are meant where ``policies`` names them.
+    Attributes:
+        policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
+        models: a folder with models of your own: the policies learned for them take part, by their names.
         thresholds: of the belief.
-        risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too.
-        threshold_decay: how fast a threshold comes down with the views, see ``Stopping``; by default with the
-            recogniser's correlation, or not at all with ``risks``, which are promised for thresholds that stay.
-        uncalibrated: believe the plain sum of the logits, as published.
+        risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too. With them
+            thresholds stay; else they come down with the views, by the recogniser's correlation.
+        uncalibrated: believe the plain sum of the logits, as published, whatever the recogniser's card says.
         split: take only the objects of this one; needed where the predictions hold several.
         runs: random first views of each object.
         max_views: views at most.
         reference: the policy that the others are compared with.
-        valley_classes: classes whose map valley is the better view; those of each map's card by default.
         samples: of the bootstrap.
         seed: decides first views, random policies and the bootstrap.
-        track: shows how far it is; by default nothing is shown.
-        through: is called with all that was run and the name of each policy that has just come through.
+    """
+
+    policies: tuple[str, ...] = ()
+    models: str = "modelnet10"
+    thresholds: tuple[float, ...] = THRESHOLDS
+    risks: tuple[float, ...] = ()
+    uncalibrated: bool = False
+    split: Literal["train", "test", "val"] | None = None
+    runs: int = 10
+    max_views: int = 5
+    reference: str = "random"
+    samples: int = 2000
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Results:
+    """A folder of results: how it was run, from which predictions, and the tables."""
+
+    folder: Path
+    settings: dict[str, Any]
+    predictions: Predictions
+    tables: Tables
+
+    def episodes(self, policy: str, threshold: float | None) -> pd.DataFrame:
+        """The episodes of one cell, one a row: run by run, in each the objects in the order of the predictions."""
+        cell = [("policy", "==", policy)] + ([] if threshold is None else [("threshold", "==", threshold)])
+        return pq.read_table(self.folder / "episodes.parquet", filters=cell).to_pandas()
+
+
+def run_benchmark(
+    predictions: Path,
+    out: Path,
+    settings: BenchmarkSettings = BenchmarkSettings(),
+    *,
+    overwrite: bool = False,
+    track: Track = silently,
+) -> Results:
+    """Run every policy under every threshold from the same first views, and say which are better than the reference.
+
+    Episodes, tables and tests are written; nextview report makes a page of them. Why a policy failed stands in the
+    settings of the results.
+
+    Args:
+        predictions: made by nextview predict.
+        out: folder for the results.
+        settings: what is run.
+        overwrite: replace the files of earlier results.
+        track: shows how far it is.
 
     Raises:
         UsageError: settings that make no sense.
-        PredictionsError: the predictions cannot be used.
         RiskError: the recogniser's calibration does not promise such an error rate.
         EntryError: not one policy came to its end.
-        ResultsError: ``out`` cannot be written.
     """
-    check_folder(out, results.KIND)
-    if not thresholds:
+    check_new(out, overwrite, folder=True)
+    grid, names, promised = _prepare(predictions, settings)
+    track(run_grid(grid, names), len(names), "replaying policies")
+    if not grid.paths:
+        raise EntryError("\n".join(grid.failures.values()))
+    rng = np.random.default_rng([settings.seed, 1])
+    tables = summarise(grid, settings.reference, settings.samples, rng, promised)
+    table = grid.specs.predictions
+    made = asdict(settings) | {
+        "command": command(),
+        "predictions": predictions.name,
+        "predictions_sha256": sha256_of(predictions),
+        "models": table.models,
+        "policies": names,
+        "failures": grid.failures,
+        "thresholds": grid.thresholds,
+        "risks": {str(risk): threshold for risk, threshold in promised.items()},
+        "calibration": [table.calibration.temperature, table.calibration.correlation],
+        "threshold_decay": grid.threshold_decay,
+        "valley_classes": [table.classes[i] for i in grid.specs.valley_classes(LEM)],
+    }
+    with new_folder(out, overwrite) as part:
+        _write_episodes(part / "episodes.parquet", grid)
+        for name, frame in vars(tables).items():
+            frame.to_csv(part / f"{name}.csv", index=False)
+        table.save(part / "predictions.npz")
+        (part / "benchmark.json").write_text(json.dumps(made, indent=1) + "\n")
+    return load(out)
+
+
+def _prepare(predictions: Path, s: BenchmarkSettings) -> tuple[Grid, list[str], dict[float, float]]:
+    """What is run, the names of the entries, and the threshold that promises each error rate."""
+    if not s.thresholds:
         raise UsageError("at least one threshold is needed")
     table = Predictions.load(predictions)
-    if uncalibrated:
+    if s.uncalibrated:
         table = replace(table, calibration=PLAIN_SUM)
-    if threshold_decay is None:
-        threshold_decay = 0.0 if risks else table.calibration.correlation
-    for threshold in thresholds:
-        Stopping(threshold, max_views, threshold_decay)  # says what is wrong with it
-    if risks and threshold_decay:
-        raise UsageError("error rates are promised for thresholds without a threshold decay")
-    promised = {risk: table.calibration.threshold(risk, max_views) for risk in risks}
+    decay = 0.0 if s.risks else table.calibration.correlation
+    for threshold in s.thresholds:
+        Stopping(threshold, s.max_views, decay)  # says what is wrong with it
+    promised = {risk: table.calibration.threshold(risk, s.max_views) for risk in s.risks}
+    table = chosen_split(table, predictions, s.split)
+    specs, cards = make_specs(table, s.runs, s.seed), find_models(s.models).policies
+    names = [with_cards(name, cards) for name in s.policies] or [*default_entries(specs), *map(str, cards.values())]
+    names = list(dict.fromkeys([*([s.reference] if s.policies else []), *names]))
+    thresholds = tuple(sorted({*s.thresholds, *promised.values()}))
+    return Grid(specs, s.runs, thresholds, s.max_views, s.seed, decay), names, promised
+
+
+def chosen_split(table: Predictions, path: Path, split: str | None) -> Predictions:
+    """The objects of one split; all of them where the predictions hold one only."""
     if split:
-        table = table.of_split(split)
-    elif len(set(table.splits)) > 1:
-        raise UsageError(f"{predictions}: holds training and test objects; choose with --split which are compared")
-    unknown = [name for name in valley_classes or () if name not in table.classes]
-    if unknown:
-        raise UsageError(f"{predictions}: knows no class {unknown[0]!r}; there are {', '.join(table.classes)}")
-    valleys = None if valley_classes is None else tuple(map(table.classes.index, valley_classes))
-    specs = make_specs(table, runs, seed, valleys)
-    own = own or {}
-    wanted = [with_cards(name, own) for name in policies] or [*default_entries(specs), *map(str, own.values())]
-    names = list(dict.fromkeys([*([reference] if policies else []), *wanted]))
-    grid = Grid(specs, runs, tuple(sorted({*thresholds, *promised.values()})), max_views, seed, threshold_decay)
-    with written_results(out, results.KIND) as part:
-        track(run_grid(grid, names, through), len(names), "replaying policies")
-        if not grid.paths:
-            raise EntryError("\n".join(grid.failures.values()))
-        tables = summarise(grid, reference, samples, np.random.default_rng([seed, 1]), promised)
-        settings = {
-            "predictions": predictions.name,
-            "predictions_sha256": file_hash(predictions),
-            "models": table.models,
-            "policies": names,
-            "failures": grid.failures,
-            "split": split,
-            "reference": reference,
-            "thresholds": grid.thresholds,
-            "risks": {str(risk): threshold for risk, threshold in promised.items()},
-            "calibration": [table.calibration.temperature, table.calibration.correlation],
-            "threshold_decay": threshold_decay,
-            "runs": runs,
-            "max_views": max_views,
-            "valley_classes": [table.classes[i] for i in specs.valley_classes(LEM)],
-            "samples": samples,
-            "seed": seed,
-        }
-        results.save(part, grid, tables, settings)
-    return results.load(out)
+        return table.of_split(split)
+    if len(set(table.splits)) > 1:
+        raise UsageError(f"{path}: holds training and test objects; choose one with --split")
+    return table
+
+
+def load(folder: Path) -> Results:
+    """Read a folder of results."""
+    folder = Path(folder)
+    try:
+        settings = json.loads((folder / "benchmark.json").read_text())
+        tables = Tables(**{name: pd.read_csv(folder / f"{name}.csv") for name in Tables.__dataclass_fields__})
+        pq.read_schema(folder / "episodes.parquet")
+    except (FileNotFoundError, NotADirectoryError):
+        raise ResultsError(f"{folder}: holds no benchmark results; make some with nextview benchmark") from None
+    except (ValueError, RecursionError, pa.ArrowInvalid) as error:
+        raise ResultsError(f"{folder}: these benchmark results are damaged ({error})") from None
+    return Results(folder, settings, Predictions.load(folder / "predictions.npz"), tables)
+
+
+STOPS = ("views ran out", "confident", "fixed views")
+
+
+def _write_episodes(path: Path, grid: Grid) -> None:
+    p, n = grid.specs.predictions, len(grid.specs.objects)
+
+    def words(codes: Any, names: tuple[str, ...]) -> pa.DictionaryArray:
+        return pa.DictionaryArray.from_arrays(pa.array(codes, pa.int32()), pa.array(names))
+
+    names, labels = words(grid.specs.objects, p.names), words(grid.specs.labels, p.classes)
+    run = pa.array(np.repeat(np.arange(grid.runs, dtype=np.int32), len(p)))
+    writer = None
+    for policy, threshold, ends in grid.cells():
+        paths = grid.paths[policy]
+        table = pa.table(
+            {
+                "object": names,
+                "label": labels,
+                "run": run,
+                "policy": words(np.zeros(n), (policy,)),
+                "threshold": pa.array(np.full(n, np.nan if threshold is None else threshold)),
+                "views": _lists(paths.views, ends.n_views),
+                "stop": words(np.where(paths.fixed, 2, ends.confident), STOPS),
+                "answer": words(ends.answer, p.classes),
+                "confidence": pa.array(ends.confidence),
+                "n_views": pa.array(ends.n_views, pa.int32()),
+                "travel": pa.array(ends.travel),
+                "arc": pa.array(ends.arc),
+            }
+        )
+        writer = writer or pq.ParquetWriter(path, table.schema, compression="zstd")
+        writer.write_table(table)
+    if writer is not None:
+        writer.close()
+
+
+def _lists(views: NDArray[np.int64], n_views: NDArray[np.int64]) -> pa.ListArray:
+    taken = np.arange(views.shape[1]) < n_views[:, None]
+    offsets = np.concatenate([[0], np.cumsum(n_views)]).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(views[taken].astype(np.int16)))

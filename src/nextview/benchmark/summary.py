@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from nextview import metrics
 from nextview.benchmark import statistics as st
 from nextview.benchmark.entries import is_oracle
-from nextview.benchmark.experiment import Grid
-from nextview.benchmark.levels import by_level, target_weights
 from nextview.benchmark.published import comparable_classes, published
-from nextview.benchmark.replay import Outcomes, truncate
+from nextview.benchmark.replay import Grid, Outcomes
+from nextview.data import metrics
+from nextview.simulation.scene_layout import LEVELS, clutter_level
 
 Float = NDArray[np.float64]
 
@@ -24,65 +23,50 @@ Cell = tuple[str, float | None, Outcomes]
 TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
 SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)
 """Thresholds of the curves of accuracy against views and travel: from the first view for all to the last for most."""
+LEVEL_VIEWS = (2, 3, 5)
+"""After so many views the policies are compared."""
+LEVEL_COLUMNS = ["level", "scenes", "policy", "n_views", "accuracy", "low", "high", "travel", "difference"]
+LEVEL_COLUMNS += ["difference_low", "difference_high", "p"]
 
 
 @dataclass(frozen=True)
 class Tables:
-    """The results, each a long table; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``.
+    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``.
 
     Attributes:
-        summary: policy, threshold, measure, value, low, high, published. The measures: ``accuracy``;
-            ``clean_accuracy``, without the objects whose very mesh also has another label; ``n_views``;
-            ``travel_moved``, over the episodes that moved, as published, and ``travel_all``, in grid cells;
-            ``arc_all`` in radians; ``confident``, the share that reached the threshold, and ``confident_accuracy``,
-            how often these are right; ``calibration_error``. With ``class_`` before them they are means over classes;
-            ``class_accuracy_std`` is the deviation between classes.
-        per_class: policy, threshold, label, measure (accuracy, travel_moved), value, low, high, published.
-        tests: policy, threshold, measure, difference to the reference, low, high, p (paired bootstrap), p_holm, and
-            for accuracy mcnemar, mcnemar_holm. Holm's correction is over all rows of a measure.
-        sweep: policy, threshold, accuracy, views, travel_all, arc_all: the points of the curves.
-        areas: policy, budget (n_views or travel_all), value: mean accuracy over all budgets, low, high, and the
-            difference to the reference with difference_low, difference_high, p and p_holm.
-        reliability: policy, threshold, bin, confidence, accuracy, episodes.
-        risks: policy, risk (an error rate that was promised), threshold that promises it, error (measured among the
-            episodes that reached it), low, high, confident (their share): only of policies a robot could follow.
-        levels: of worlds, see ``levels.by_level``.
+        summary: a row a policy, threshold and measure: ``accuracy``; ``clean_accuracy``, without the objects whose very
+            mesh also has another label; ``n_views``; ``travel_moved``, over the episodes that moved, as published, and
+            ``travel_all``, grid cells; ``arc_all``, radians; ``confident``, the share that reached the threshold, and
+            ``confident_accuracy``, of these; ``calibration_error``; with ``class_`` before it the mean over classes.
+        per_class: the same of classes (accuracy, travel_moved).
+        tests: differences to the reference, p (paired bootstrap), for accuracy mcnemar, and both after Holm's
+            correction over all rows of a measure.
+        sweep: the points of the curves of accuracy against views and travel.
+        reliability: confidence and accuracy by bin.
+        risks: error rates that were promised and those measured among the episodes that reached their threshold.
+        levels: of scenes: accuracy after so many views by the level of clutter, see ``by_level``.
     """
 
     summary: pd.DataFrame
     per_class: pd.DataFrame
     tests: pd.DataFrame
     sweep: pd.DataFrame
-    areas: pd.DataFrame
     reliability: pd.DataFrame
     risks: pd.DataFrame
     levels: pd.DataFrame
-
-    def named(self) -> dict[str, pd.DataFrame]:
-        """The tables by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 def summarise(
     grid: Grid, reference: str, samples: int, rng: np.random.Generator, promised: Mapping[float, float] | None = None
 ) -> Tables:
-    """All tables of a grid.
-
-    Args:
-        grid: what was run.
-        reference: the policy that the others are compared with.
-        samples: of the bootstrap.
-        rng: draws them; the same ones for all policies, which pairs the differences.
-        promised: the threshold for each error rate that the calibration promises, among those of the grid.
-    """
+    """All tables of a grid."""
     weights = target_weights(grid.specs.predictions.names, samples, rng)
     cells = list(grid.cells())
     summary, drawn = _summary(grid, cells, weights)
-    sweep, areas = _areas(grid, reference, weights[:500])
     tests = _tests(grid, cells, summary, drawn, reference)
     per_class, risks = _per_class(grid, cells, weights), _risks(summary, promised or {})
     levels = by_level(grid, reference, samples, rng)
-    return Tables(summary, per_class, tests, sweep, areas, _reliability(grid, cells), risks, levels)
+    return Tables(summary, per_class, tests, _sweep(grid), _reliability(grid, cells), risks, levels)
 
 
 def _measures(grid: Grid, ends: Outcomes) -> dict[str, tuple[Float, Float]]:
@@ -120,7 +104,6 @@ def _columns(grid: Grid, cells: list[Cell], names: tuple[str, ...] | None = None
 
 
 def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFrame, dict[tuple, Float]]:
-    """The table, and the bootstrap samples (S,) behind each of its cells."""
     labels, classes = grid.specs.predictions.labels, comparable_classes(grid.specs.predictions)
     duplicate_groups = np.ones((1, weights.shape[1]))
     keys, top, bottom = _columns(grid, cells)
@@ -183,42 +166,17 @@ def _tests(
     return table
 
 
-def _areas(grid: Grid, reference: str, weights: Float) -> tuple[pd.DataFrame, pd.DataFrame]:
-    measures = ("accuracy", "n_views", "travel_all", "arc_all")
-    points, drawn = {}, {}  # of each policy: (T, measures), and its bootstrap samples (S, T, measures)
+def _sweep(grid: Grid) -> pd.DataFrame:
+    measures, points = ("accuracy", "n_views", "travel_all", "arc_all"), []
     for name, paths in grid.paths.items():
         if not paths.fixed:
-            _, top, _ = _columns(grid, [(name, t, truncate(paths, t, grid.threshold_decay)) for t in SWEEP], measures)
-            points[name] = top.mean(0).reshape(len(SWEEP), -1)
-            drawn[name] = (weights @ top / weights.sum(1, keepdims=True)).reshape(len(weights), len(SWEEP), -1)
-    rows = [(name, t, *values) for name, curve in points.items() for t, values in zip(SWEEP, curve, strict=True)]
-    sweep = _frame(rows, ["policy", "threshold", *measures])
-    reach = {"n_views": (1.0, float(grid.max_views)), "travel_all": (0.0, float(sweep["travel_all"].max()))}
-    rows = []
-    for budget, (low, high) in reach.items():
-        if not high > low:
-            continue
-
-        def height(curve: Float, x: int = measures.index(budget), low: float = low, high: float = high) -> float:
-            return st.area(curve[:, x], curve[:, 0], low, high)
-
-        value = {name: height(curve) for name, curve in points.items()}
-        spread = {name: np.array([height(curve) for curve in curves])[:, None] for name, curves in drawn.items()}
-        for name in points:
-            row = [name, budget, value[name], *np.ravel(st.interval(spread[name]))]
-            if reference in points and name != reference:
-                difference, samples = np.array([value[name] - value[reference]]), spread[name] - spread[reference]
-                row += [difference[0], *np.ravel(st.interval(samples)), st.bootstrap_p(difference, samples)[0]]
-            rows.append((*row, *[np.nan] * (9 - len(row))))
-    areas = _frame(
-        rows, ["policy", "budget", "value", "low", "high", "difference", "difference_low", "difference_high", "p"]
-    )
-    areas["p_holm"] = _holm(areas, "budget", "p")
-    return sweep, areas
+            _, top, _ = _columns(grid, [(name, t, grid.ends(name, t)) for t in SWEEP], measures)
+            curve = top.mean(0).reshape(len(SWEEP), -1)
+            points += [(name, t, *values) for t, values in zip(SWEEP, curve, strict=True)]
+    return _frame(points, ["policy", "threshold", *measures])
 
 
 def _holm(table: pd.DataFrame, family: str, column: str) -> pd.Series:
-    """Holm's correction of a column within each family of tests."""
     return table.groupby(family)[column].transform(lambda p: st.holm(p.to_numpy()))
 
 
@@ -246,3 +204,57 @@ def _frame(rows: list, columns: list[str]) -> pd.DataFrame:
     table = pd.DataFrame(rows, columns=columns)
     numbers = [c for c in columns if c in ("threshold", "published")]
     return table.astype(dict.fromkeys(numbers, "float64"))
+
+
+def levels_of(names: Sequence[str]) -> NDArray[np.str_]:
+    """The level of clutter of each scene, by its name, (N,); "" for a single object."""
+    return np.array([clutter_level(name) for name in names])
+
+
+def target_weights(names: Sequence[str], samples: int, rng: np.random.Generator) -> Float:
+    """Bootstrap weights, (samples, N); scenes around one target are drawn together, as they are not independent."""
+    targets = [name.rpartition("@")[0] if clutter_level(name) else name for name in names]
+    place = {target: i for i, target in enumerate(dict.fromkeys(targets))}
+    return st.resample(len(place), samples, rng)[:, [place[target] for target in targets]]
+
+
+def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator) -> pd.DataFrame:
+    """Accuracy in scenes after 1 view and after LEVEL_VIEWS, by the level of clutter; no threshold ends an episode."""
+    names: tuple[str, ...] = grid.specs.predictions.names
+    level_of, order, rows = levels_of(names), list(LEVELS), []
+    paths = {name: paths for name, paths in grid.paths.items() if not paths.fixed}
+    counts = [k for k in (1, *LEVEL_VIEWS) if k <= grid.max_views]
+    known = [level for level in order if level in level_of]
+    for level in [*known, *sorted({*level_of} - {*known, ""})]:
+        mine = np.flatnonzero(level_of == level)
+        weights = target_weights([names[i] for i in mine], samples, rng)
+        weights /= weights.sum(1, keepdims=True)
+        right = {}
+        for name, path in paths.items():
+            answers = _after(path.answers, path.views, counts)
+            right[name] = grid_mean(grid, (answers == grid.specs.labels[:, None]).astype(np.float64))[mine]
+        for name, path in paths.items():
+            low, high = st.interval(weights @ right[name])
+            travel = grid_mean(grid, _after(path.travel, path.views, counts))[mine].mean(0)
+            compared = np.full((4, len(counts)), np.nan)
+            if reference in right and name != reference:
+                against = right[name] - right[reference]
+                drawn = weights @ against
+                compared = np.stack([against.mean(0), *st.interval(drawn), st.bootstrap_p(against.mean(0), drawn)])
+                compared[3, np.array(counts) == 1] = np.nan  # there the policies have chosen nothing
+            mean = right[name].mean(0)
+            for i, k in enumerate(counts):
+                rows.append((level, len(mine), name, k, mean[i], low[i], high[i], travel[i], *compared[:, i]))
+    table = pd.DataFrame(rows, columns=LEVEL_COLUMNS)
+    return table.assign(p_holm=st.holm(table["p"].to_numpy(np.float64)))
+
+
+def _after(values: NDArray, views: NDArray[np.int64], counts: list[int]) -> NDArray:
+    """Values after so many views, or after the last one where an episode ended before, (E, counts)."""
+    taken = (views >= 0).sum(1)
+    return values[np.arange(len(values))[:, None], np.minimum(taken[:, None], counts) - 1]
+
+
+def grid_mean(grid: Grid, values: NDArray) -> Float:
+    """Mean over the runs of each object, (E, ...) to (N, ...)."""
+    return values.reshape(grid.runs, -1, *values.shape[1:]).mean(0)

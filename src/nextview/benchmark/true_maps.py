@@ -1,4 +1,4 @@
-"""Maps that no model predicts: the true measures around every view, for oracles and for judging what is predicted."""
+"""What no model predicts: true measures and maps of every view, and plans, from predictions and their view store."""
 
 from __future__ import annotations
 
@@ -7,62 +7,57 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.benchmark.stored import stored_rows
+from nextview.data.measures import confidence_maps, normalise_per_object
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError
-from nextview.measures.confidence_map import confidence_maps
-from nextview.measures.depth_entropy import normalise_per_object
-from nextview.measures.map_names import CONFIDENCE, map_name, measure_of
+from nextview.errors import DatasetError, EntryError
+from nextview.recognition.map_names import CONFIDENCE, map_name, measure_of
 
 TRUE = "true-"
 """How the names of true maps begin."""
-
-
-def true_lem(p: Predictions) -> NDArray[np.float32]:
-    """Local windows of the true entropy map, (N, V, R, 3)."""
-    return normalise_per_object(p.depth_entropy)[:, p.sphere.windows]
-
-
-def true_lcm(p: Predictions) -> NDArray[np.float32]:
-    """Local windows of the recogniser's confidence, 0 where it is wrong (section 4.1.3), (N, V, R, 3)."""
-    return confidence_maps(p.logits, p.labels)[:, p.sphere.windows]
-
-
-IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {"depth_entropy": true_lem, CONFIDENCE: true_lcm}
-"""Measures whose true maps the predictions themselves tell; those of others stand in the store that they were made
-from."""
+IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {
+    "depth_entropy": lambda p: normalise_per_object(p.depth_entropy),
+    CONFIDENCE: lambda p: confidence_maps(p.logits, p.labels),  # 0 where the recogniser is wrong (section 4.1.3)
+}
+"""True maps, (N, V), that predictions hold; those of other measures stand in the view store."""
 
 
 def true_map(p: Predictions, name: str) -> NDArray[np.float32]:
-    """Local windows of the true map of that name, (N, V, R, 3), 0 .. 1.
-
-    Raises:
-        EntryError: neither the predictions nor their store tell it.
-    """
+    """Local windows of the true map of that name, (N, V, R, 3), 0 .. 1."""
     measure = measure_of(name)
-    if measure in IN_PREDICTIONS:
-        return IN_PREDICTIONS[measure](p)
-    return normalise_per_object(true_measure(p, measure))[:, p.sphere.windows]
+    known = IN_PREDICTIONS.get(measure)
+    values = normalise_per_object(stored_rows(p, f"measures/{measure}")) if known is None else known(p)
+    return values[:, p.sphere.windows]
 
 
 def known_maps(p: Predictions) -> tuple[str, ...]:
-    """Names of the maps whose truth can be told."""
-    return tuple(map(map_name, dict.fromkeys((*IN_PREDICTIONS, *stored_measures(p.store)))))
-
-
-def stored_measures(store: str) -> tuple[str, ...]:
-    """Names of the measures in a store; none where there is no store."""
+    """Names of the maps whose truth is known."""
     try:
-        return tuple(ViewStore.open(store).measures) if store else ()
+        stored = tuple(ViewStore.open(p.store).measures) if p.store else ()
     except DatasetError:
-        return ()
+        stored = ()
+    return tuple(map(map_name, dict.fromkeys((*IN_PREDICTIONS, *stored))))
 
 
 def true_measure(p: Predictions, measure: str) -> NDArray[np.float32]:
-    """A measure of the views of some predictions, from the store that they were made from, (N, V) float32.
-
-    Raises:
-        EntryError: the store is not there, not the same any more, or lacks the measure.
-    """
+    """A measure of the views of some predictions, (N, V) float32."""
     return p.depth_entropy if measure == "depth_entropy" else stored_rows(p, f"measures/{measure}")
+
+
+def stored_rows(p: Predictions, name: str) -> NDArray:
+    """Rows of one of the store's arrays for the objects of predictions, (N, ...)."""
+    if not p.store:
+        raise EntryError("these predictions do not say which view store they were made from, so they lack " + name)
+    try:
+        store = ViewStore.open(p.store)
+        store.array(name)
+        row = {stored: i for i, stored in enumerate(store.names)}
+        objects = [row.get(wanted, -1) for wanted in p.names]
+        if -1 in objects:
+            raise EntryError(f"{p.store}: holds no object {p.names[objects.index(-1)]}, for which {name} is needed")
+        entropy = np.array([store.read("measures/depth_entropy", i) for i in objects])
+        if not np.array_equal(entropy, p.depth_entropy):
+            raise EntryError(f"{p.store}: holds other views than those that these predictions were made from")
+        return np.array([store.read(name, i) for i in objects])
+    except DatasetError as error:
+        raise EntryError(str(error)) from error

@@ -1,81 +1,104 @@
-"""The commands of ``nextview`` by name; each is one file beside this one."""
+"""The commands of ``nextview``: a table from each name to the function that it calls, which is imported when called."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
-from nextview.cli.benchmark import benchmark
-from nextview.cli.capture import capture
-from nextview.cli.check import check
-from nextview.cli.completion import completion
-from nextview.cli.correspond import correspond
-from nextview.cli.demo import demo
-from nextview.cli.download import download
-from nextview.cli.evaluate import evaluate
-from nextview.cli.explore import explore
-from nextview.cli.export import export_recogniser
-from nextview.cli.export_maps import export_lcm, export_lem, export_map
-from nextview.cli.fit import fit_calibration, fit_size, fit_valleys
-from nextview.cli.fit_policies import fit_policies
-from nextview.cli.fit_unknown import fit_unknown
-from nextview.cli.fit_visibility import fit_visibility
-from nextview.cli.inspect import inspect
-from nextview.cli.measure import measure
-from nextview.cli.measures import measures
-from nextview.cli.models import models
-from nextview.cli.plan import plan
-from nextview.cli.predict import predict
-from nextview.cli.recognise import recognise
-from nextview.cli.render import render
-from nextview.cli.report import report
-from nextview.cli.train_agent import train_agent
-from nextview.cli.train_gain import train_gain
-from nextview.cli.train_grid import train_grid
-from nextview.cli.train_maps import train_lcm, train_lem, train_map
-from nextview.cli.train_recogniser import train_recogniser
-from nextview.cli.worlds import worlds
 
-COMMANDS: dict[str, Any] = {
-    "recognise": recognise,
-    "demo": demo,
-    "explore": explore,
-    "capture": capture,
-    "models": models,
-    "download": download,
-    "worlds": worlds,
-    "render": render,
-    "check": check,
-    "measure": measure,
-    "measures": measures,
-    "plan": plan,
-    "correspond": correspond,
-    "inspect": inspect,
-    "train": {
-        "recogniser": train_recogniser,
-        "grid": train_grid,
-        "map": train_map,
-        "lem": train_lem,
-        "lcm": train_lcm,
-        "gain": train_gain,
-        "agent": train_agent,
-    },
-    "export": {"recogniser": export_recogniser, "map": export_map, "lem": export_lem, "lcm": export_lcm},
-    "predict": predict,
-    "fit": {
-        "size": fit_size,
-        "calibration": fit_calibration,
-        "visibility": fit_visibility,
-        "unknown": fit_unknown,
-        "valleys": fit_valleys,
-        "policies": fit_policies,
-    },
-    "evaluate": evaluate,
-    "benchmark": benchmark,
-    "report": report,
-    "completion": completion,
+@dataclass(frozen=True)
+class Command:
+    """A command: the function whose parameters are its options and whose docstring is its help."""
+
+    function: str
+    line: str  # in the list of all commands
+    then: str = ""  # printed at the end; names in braces are arguments, ``found`` is what the function returns
+    show: str = ""  # function of printing.py that shows what the function returns
+    presets: Mapping[str, str] = field(default_factory=dict)  # what --preset may name, for a function with a recipe
+
+
+CLI, LEARNING, THESIS = "nextview.cli", "nextview.learning", "nextview.learning.recipes:THESIS"
+EXPORTED = "{found.card}: largest difference between torch and ONNX on real views {found.difference:.2g}"
+COMMANDS = {
+    "recognise": Command(f"{CLI}.recognise:recognise", "say what an object is: a mesh file, or captured views"),
+    "demo": Command(f"{CLI}.recognise:demo", "recognise a sample object, and draw the episode"),
+    "explore": Command(f"{CLI}.explore:explore", "choose views in the browser, and see what is believed"),
+    "capture": Command(f"{CLI}.capture:capture", "write depth images of a mesh, as a camera would take them"),
+    "list": Command(f"{CLI}.listing:show", "list the bundled models, or the view measures"),
+    "download": Command(f"{CLI}.download:download", "download ModelNet10 or ModelNet40"),
+    "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes, a target half hidden in each"),
+    "render": Command(f"{CLI}.stores:render", "render every view of a dataset into a view store"),
+    "check": Command(f"{CLI}.stores:check", "check that a view store is sound"),
+    "measure": Command(f"{CLI}.scenes:measure", "compute view measures, into the store"),
+    "overlap": Command(f"{CLI}.pictures:overlap", "compute which part of a view each other view shows"),
+    "inspect": Command(f"{CLI}.pictures:inspect", "draw what a view store holds, or one object of it"),
+    "train recogniser": Command(
+        f"{LEARNING}.recogniser_training:train_recogniser",
+        "train a recogniser",
+        "next: nextview export recogniser {out} {store} MODELS",
+        "trained",
+        {"thesis": f"{THESIS}_RECOGNISER"},
+    ),
+    "train map": Command(
+        f"{LEARNING}.map_training:train_map",
+        "train a network that predicts a measure of views",
+        "next: nextview export map {out} {store} MODELS",
+        "trained",
+        {"thesis": f"{THESIS}_MAP"},
+    ),
+    "train gain": Command(
+        f"{LEARNING}.gain_training:train_gain",
+        "train the policy that predicts the gain of a view",
+        "learned from {found.objects} objects; on {found.validated_on} the {recipe.objective} after 2, 3, ... views is "
+        "{found.value} at travel weight 0; travel weight {found.travel_weight:g}: {found.card}; in {found.states} "
+        "states its answers differ from the networks' by {found.difference:.1g} at most",
+    ),
+    "export recogniser": Command(
+        f"{LEARNING}.export:export_recogniser", "turn a trained recogniser into a model", EXPORTED
+    ),
+    "export map": Command(f"{LEARNING}.export:export_map", "turn a trained map network into a model", EXPORTED),
+    "predict": Command(f"{CLI}.predict:predict", "run the models over every view of a store, once"),
+    "fit calibration": Command(
+        f"{LEARNING}.card_fits:fit_calibration",
+        "calibrate a recogniser's belief",
+        "{found.objects} objects: temperature of one view {found.calibration.temperature}, correlation of two views "
+        "{found.calibration.correlation}; negative log-likelihood over 1 to 5 views {found.before:.3f} before, "
+        "{found.after:.3f} after",
+    ),
+    "fit size": Command(
+        f"{LEARNING}.card_fits:fit_size",
+        "learn how large the objects of each class are",
+        "sizes of {found.objects} objects; by {found.weighed_on} others, weight beside the logits "
+        "{found.size.weight:.2f}; negative log-likelihood of single views {found.before:.3f} by shape alone, "
+        "{found.after:.3f} with the size",
+    ),
+    "fit unknown": Command(
+        f"{LEARNING}.unknown:fit_unknown",
+        "learn to notice objects of no known class",
+        "{found.objects} known objects against {found.outliers} synthetic outliers; false-alarm rates by "
+        "{found.held_out} others",
+    ),
+    "fit valleys": Command(
+        f"{LEARNING}.card_fits:fit_valleys",
+        "find classes whose best views are a map's valleys",
+        "{found.objects} objects: the valley is better for these classes: {found.classes}",
+    ),
+    "fit policies": Command(
+        f"{LEARNING}.policy_tables:fit_policies",
+        "learn simple policies: sequence, ring, class table",
+        "{found.objects} objects: run one with --policy {out}/NAME.json",
+    ),
+    "evaluate": Command(
+        "nextview.benchmark.evaluation_page:write_evaluation",
+        "judge a recogniser and its maps on every view",
+        "numbers, figures and evaluate.html are in {out}",
+        "print_evaluation",
+    ),
+    "benchmark": Command(
+        "nextview.benchmark.run:run_benchmark", "compare policies", "next: nextview report {out}", "print_results"
+    ),
+    "report": Command("nextview.benchmark.report:report", "write one HTML page of a benchmark's results", "{found}"),
 }
-GROUPS = {
-    "train": "Train a network on a view store.",
-    "export": "Turn a training run into an ONNX model with a card.",
-    "fit": "Fit what sizes mean, a recogniser's calibration, what it does not know, a map's valleys, simple policies.",
-}
+"""By name, in the order in which they are listed."""
+RESUMES = ("render", "measure", "predict", "train recogniser", "train map", "learn", "scenes", "overlap")
+"""Beginnings of the commands that go on where an interrupted run was stopped."""

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import tyro
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 
-def download(
-    dataset: tyro.conf.Positional[Literal["modelnet10", "modelnet40"]],
-    destination: tyro.conf.Positional[Path],
-    /,
-) -> None:
-    """Download ModelNet10 (473 MB) or ModelNet40 (2 GB) and unpack it. Resumes a download that was cut off.
+def download(dataset: Literal["modelnet10", "modelnet40"], destination: Path, /) -> None:
+    """Download ModelNet10 (473 MB) or ModelNet40 (2 GB), verify and unpack it.
 
     Args:
         dataset: which one.
@@ -26,13 +23,23 @@ def download(
     from nextview.data.downloading import download as fetch
 
     archive = ARCHIVES[dataset]
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=console) as progress:
-        tasks = {}
-        for what, done, total in fetch(archive, destination):
-            if what not in tasks:
-                tasks[what] = progress.add_task(f"{what} {archive.folder}", total=total)
-            progress.update(tasks[what], completed=done)
-    console.print(f"{destination / archive.folder}")
+    columns = BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()
+    with Progress(TextColumn("{task.description}"), *columns, console=console) as progress:
+        console.print(f"{fetch(archive, destination, bar=_Bar(progress, archive.folder))}")
+
+
+class _Bar:
+    """What pooch moves while it downloads."""
+
+    total = 0
+
+    def __init__(self, progress: Progress, name: str) -> None:
+        self._progress, self._task = progress, progress.add_task(f"downloading {name}", total=None)
+
+    def update(self, advance: int) -> None:
+        self._progress.update(self._task, advance=advance, total=self.total)
+
+    def reset(self) -> None:
+        self._progress.update(self._task, completed=0)
+
+    def close(self) -> None: ...

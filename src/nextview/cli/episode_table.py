@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from rich import box
@@ -11,26 +12,20 @@ from rich.table import Table
 from rich.text import Text
 
 from nextview.cli.ending import printable
-from nextview.cli.terminal import Terminal
-from nextview.session import Recognition
+from nextview.cli.progress import Terminal
+from nextview.session.recognition import Recognition
 
 
 def _angles(view: int, angles: tuple[float, float]) -> str:
-    elevation, azimuth = angles
-    return f"{view}\n{elevation:.0f}°, {round(azimuth) % 360}°"
+    return f"{view}\n{angles[0]:.0f}°, {round(angles[1]) % 360}°"
 
 
 def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[str] = ()) -> None:
     """Print each view and the answer; of captured views, which frame answered and how far off it was."""
     sphere = result.sphere
-    table = Table(
-        box=box.SIMPLE,
-        show_lines=True,
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
-        title=f"Looking at {name}, next views by {policy}",
-        caption=f"view: number, elevation, azimuth; travel: grid cells; stops at {result.stopping}",
-    )
+    table = Table(box=box.SIMPLE, show_lines=True, pad_edge=False, padding=(0, 1, 0, 0))
+    table.title = f"Looking at {name}, next views by {policy}"
+    table.caption = f"view: number, elevation, azimuth; travel: grid cells; stops at {result.stopping}"
     for column in ("step", "view", "this view alone", "belief, top 3", "stops at", "next", "travel"):
         table.add_column(column, justify="right" if column in ("step", "travel") else "left", no_wrap=True)
     if frames:  # their names may be long
@@ -51,69 +46,47 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
     console = Terminal()
     console.print(table)
     for step, view in enumerate(result.views, 1):
-        for doubt in view.doubts:
-            console.print(f"Step {step} is doubtful ({doubt.name}): {doubt.message}.", markup=False, highlight=False)
+        for warning in view.warnings:
+            console.print(f"Step {step}: warning ({warning.name}): {warning.message}.")
     left = "no other view in reach" if result.stranded else "no views left"
     reason = "threshold reached" if result.confident else left
-    belief = float(result.views[-1].belief.max())
-    rest = (
-        f"belief {belief:.3f}, after {len(result.views)} view{'s' * (len(result.views) > 1)} "
-        f"and {result.travel:.2f} cells of travel ({reason})."
-    )
+    views = f"{len(result.views)} view{'s' * (len(result.views) > 1)}"
+    rest = f"{result.views[-1].belief.max():.3f}, after {views} and {result.travel:.2f} cells of travel ({reason})."
     if result.unknown:
-        most_like = f": most like a {printable(f'{result.most_like}')}, "
+        most_like = f": most like a {printable(f'{result.most_like}')}, belief "
         console.print(Text.assemble("It is ", ("of no known class", "bold"), most_like, rest))
     else:
-        console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), ", ", rest))
+        console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), ", belief ", rest))
     if result.novelty is not None:
-        share = f"{100 * result.novelty:.2g} %"
-        console.print(f"Of objects of known classes, {share} look at least as strange.")
+        console.print(f"Of objects of known classes, {100 * result.novelty:.2g} % are at least as novel.")
 
 
-def as_json(result: Recognition, frames: Sequence[str] = ()) -> str:
+def episode_as_json(result: Recognition, frames: Sequence[str] = ()) -> str:
     """Everything the table shows, and the whole beliefs and maps, as one JSON object."""
-
-    def rounded(values: np.ndarray) -> list:
-        """As JSON has them: what is no number becomes null."""
-        found = np.round(np.asarray(values, float), 6)
-        return [None if np.isnan(x) else x for x in found.tolist()] if found.ndim == 1 else found.tolist()
-
     views = []
     for step, view in enumerate(result.views, 1):
-        bins = (
-            None if view.azimuth_bins is None or not view.observation.seen else view.azimuth_bins[view.belief.argmax()]
-        )
-        views.append(
-            {
-                "view": view.index,
-                "elevation": round(view.angles[0], 6),
-                "azimuth": round(view.angles[1], 6),
-                "degrees_off": round(view.degrees_off, 6),
-                **({"frame": frames[step - 1]} if frames else {}),
-                "seen": view.observation.seen,
-                "alone": dict(zip(result.classes, rounded(view.alone), strict=True)),
-                "belief": dict(zip(result.classes, rounded(view.belief), strict=True)),
-                "azimuth_bin": None
-                if bins is None
-                else {"degrees": 360 * int(bins.argmax()) / len(bins), "belief": round(float(bins.max()), 6)},
-                "maps": {name: rounded(values) for name, values in view.maps.items()},
-                "values": None if view.values is None else rounded(view.values),
-                "threshold": round(float(result.stopping.threshold_at(step)), 6),
-                "next_view": view.next_view,
-                "travel_cells": round(view.travel, 6),
-                "travel_radians": round(view.arc, 6),
-                "doubts": [doubt.message for doubt in view.doubts],
-            }
-        )
-    return json.dumps(
-        {
-            "answer": result.answer,
-            "confidence": round(result.confidence, 6),
-            "most_like": result.most_like,
-            "unknown": result.unknown,
-            "novelty": None if result.novelty is None else round(result.novelty, 6),
-            "threshold_reached": result.confident,
-            "views": views,
-        },
-        indent=1,
-    )
+        best = None
+        if view.azimuth_bins is not None and view.observation.seen:
+            bins = view.azimuth_bins[view.belief.argmax()]
+            best = {"degrees": 360 * int(bins.argmax()) / len(bins), "belief": bins.max()}
+        one: dict[str, Any] = {"view": view.index, "elevation": view.angles[0], "azimuth": view.angles[1]}
+        one |= {"degrees_off": view.degrees_off} | ({"frame": frames[step - 1]} if frames else {})
+        one |= {"seen": view.observation.seen, "alone": dict(zip(result.classes, view.alone, strict=True))}
+        one |= {"belief": dict(zip(result.classes, view.belief, strict=True)), "azimuth_bin": best, "maps": view.maps}
+        one |= {"values": view.values, "threshold": float(result.stopping.threshold_at(step))}
+        one |= {"next_view": view.next_view, "travel_cells": view.travel, "travel_radians": view.arc}
+        views.append(one | {"warnings": [warning.message for warning in view.warnings]})
+    parts = ("answer", "confidence", "most_like", "unknown", "novelty")
+    whole = {name: getattr(result, name) for name in parts} | {"threshold_reached": result.confident, "views": views}
+    return json.dumps(_plain(whole), indent=1)
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it: six digits, and null for what is no number."""
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return (None if np.isnan(value) else round(value, 6)) if isinstance(value, float) else value

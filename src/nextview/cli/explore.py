@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from typing import Literal
 
-import tyro
+from nextview.cli.progress import console
+from nextview.cli.sources import Looking
 
 
 def explore(
-    path: tyro.conf.Positional[Path | None] = None,
+    path: Path | None = None,
     /,
-    policy: str | None = None,
+    looking: Looking = Looking(),
     compare: str | None = None,
-    models: str = "modelnet10",
-    threshold: float = 0.97,
-    max_views: int = 5,
-    viewpoints: str = "40",
     sensor: str | None = None,
     start: int | None = None,
     up: Literal["y", "z"] | None = None,
@@ -33,33 +32,29 @@ def explore(
     Args:
         path: a mesh file; a folder of meshes, or of class folders of them; a view store. The sample objects if not
             given.
-        policy: how the next view is chosen, as in nextview recognise.
+        looking: who looks; exploring goes on where an episode would end.
         compare: another policy, to walk beside it.
-        models: bundled models by name, or a folder with models of your own.
-        threshold: the belief at which an episode would stop; exploring goes on.
-        max_views: the number of views at which it would.
-        viewpoints: where the camera may look from, as in nextview recognise.
         sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist or none, or NAME:STRENGTH.
         start: where policies look first; drawn by the seed if not given.
         up: the up axis of mesh files; z if not given, but y for GLB.
         seed: decides the first view, whatever a policy draws and the errors of a sensor.
-        host: address to serve the page at; 0.0.0.0 lets other machines see and drive it.
+        host: address to serve the page at; 0.0.0.0 lets every machine that reaches this one see and drive the page.
         port: of the page; the next free one if it is taken.
         browser: open the page in this machine's browser, where it has a screen.
     """
-    import viser  # noqa: F401  # so that what is missing is said before models are opened
+    import viser  # noqa: F401  # a missing extra is named before models are opened
 
-    from nextview.cli.progress import console
-    from nextview.explorer.exploration import Exploration
-    from nextview.explorer.page import Page
-    from nextview.explorer.shown_object import shown_objects
+    from nextview.viewers.exploration import Exploration, shown_objects
+    from nextview.viewers.page import Page
 
-    policies = [policy] if compare is None else [policy, compare]
-    options = {"threshold": threshold, "max_views": max_views, "viewpoints": viewpoints}
-    exploration = Exploration(shown_objects(path, up), policies, sensor, start, seed, models=models, **options)
-    page = Page(exploration, host, port)
-    console.print(f"{page.address} shows {len(exploration.objects)} objects; Ctrl-C ends it", highlight=False)
-    if browser and has_screen():
+    options = dict(vars(looking))
+    policies = [options.pop("policy"), *([] if compare is None else [compare])]
+    page = Page(Exploration(shown_objects(path, up), policies, sensor, start, seed, **options), host, port)
+    console.print(f"{page.address} shows {len(page.exploration.objects)} objects; Ctrl-C ends it")
+    if host not in ("127.0.0.1", "localhost", "::1"):
+        console.print("Everybody who reaches this address may drive the page.", style="yellow")
+    screen = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if browser and screen:  # else a browser would open in the terminal
         import webbrowser
 
         webbrowser.open(page.address)
@@ -67,11 +62,3 @@ def explore(
         page.server.sleep_forever()
     finally:
         page.stop()
-
-
-def has_screen() -> bool:
-    """Whether a window can be shown: else a browser would open in the terminal."""
-    import os
-    import sys
-
-    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,20 +1,27 @@
-"""The ``nextview`` command: runs one of those in commands.py."""
+"""The ``nextview`` command: finds one of those in commands.py, and calls it."""
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
-from typing import Any
+from collections.abc import Mapping
+from difflib import get_close_matches
 
 from nextview import __version__
-from nextview.cli.application import CONFIG, application, group
-from nextview.cli.commands import COMMANDS, GROUPS
+from nextview.cli.commands import COMMANDS, RESUMES
 from nextview.cli.ending import orderly_end
+from nextview.errors import UsageError
+
+ABOUT = "Active 3D object recognition: what an object is, and where to look next."
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run a command; see ``orderly_end`` for how it may end."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    with orderly_end(_advice(arguments)):
+    resumes = " ".join(arguments[:2]).startswith(RESUMES)
+    os.environ["COLUMNS"] = str(min(max(shutil.get_terminal_size().columns, 20), 500))  # tyro hangs in fewer
+    with orderly_end("run the same command again; it resumes" if resumes else "nothing was written"):
         _run(arguments)
 
 
@@ -22,21 +29,44 @@ def _run(arguments: list[str]) -> None:
     if arguments == ["--version"]:
         print(f"nextview {__version__}")
         return
-    prog, description = "nextview", "Active 3D object recognition: what it is, and where to look next."
-    app = application(arguments)
-    if arguments and isinstance(COMMANDS.get(arguments[0]), dict):  # by itself, for shorter messages
-        name, *arguments = arguments
-        prog, description, app = f"{prog} {name}", GROUPS[name], group(name, arguments)
-    app.cli(prog=prog, description=description, args=arguments, config=CONFIG)
+    words = 0
+    while words < len(arguments) and not arguments[words].startswith("-") and words < 2:
+        words += 1
+    for count in range(words, 0, -1):
+        name = " ".join(arguments[:count])
+        if name in COMMANDS:
+            return _call(name, arguments[count:])
+    group = arguments[0] if words else ""
+    listed = {name: command.line for name, command in COMMANDS.items() if f"{name} ".startswith(f"{group} ".lstrip())}
+    if words == 2 or not listed:
+        name = " ".join(arguments[:words]) if listed else group
+        near = get_close_matches(name, [*COMMANDS, *(name.split()[0] for name in COMMANDS)], 1, 0.6)
+        hint = f"did you mean {near[0]!r}?" if near else "nextview --help lists all"
+        raise UsageError(f"there is no command {name!r}; {hint}")
+    print_commands(group, listed)
 
 
-def _advice(arguments: list[str]) -> str:
-    """How to go on with a command that was stopped; those that resume say so in their help."""
-    command: Any = COMMANDS
-    for name in arguments[:2]:
-        command = command.get(name) if isinstance(command, dict) else command
-    resumes = "Resumes" in (getattr(command, "__doc__", None) or "") and not isinstance(command, dict)
-    return "run the same command again" + ("; it resumes" if resumes else "")
+def _call(name: str, arguments: list[str]) -> None:
+    from nextview.cli.call import call
+    from nextview.cli.progress import console, track
+
+    command = COMMANDS[name]
+    result, given = call(name, command, arguments, {"track": track})
+    if command.show:
+        from nextview.cli import printing
+
+        getattr(printing, command.show)(result)
+    if command.then:
+        console.print(command.then.format(found=result, **given), soft_wrap=True)
+
+
+def print_commands(group: str, lines: Mapping[str, str]) -> None:
+    """Print the commands, or those of a group, one line each."""
+    usage = f"nextview {group} COMMAND" if group else "nextview COMMAND"
+    print(f"usage: {usage} [ARGUMENTS]\n\n{ABOUT}\n")
+    for name, line in lines.items():
+        print(f"  {name:18}  {line}")
+    print(f"\n{usage} --help explains one; nextview --version tells the version.")
 
 
 if __name__ == "__main__":

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
-import tyro
+import numpy as np
 
+from nextview.cli.progress import console, follow
+from nextview.cli.stores import Split, Workers
+from nextview.data import predicting
+from nextview.data.predictions import Predictions
 from nextview.errors import ModelError, UsageError
+from nextview.recognition.model_card import find_card, find_models
 
 
 def predict(
-    store: tyro.conf.Positional[Path],
-    out: tyro.conf.Positional[Path],
+    store: Path,
+    out: Path,
     /,
-    split: Literal["train", "test"] | None = None,
+    split: Split | None = None,
     models: str = "modelnet10",
     recogniser: tuple[str, ...] = (),
     held_out: bool = False,
     maps: tuple[str, ...] | None = None,
     by_shape: bool = False,
-    batch: int = 8,
-    workers: int | None = None,
-    scheduler: str | None = None,
+    workers: Workers = Workers(),
+    overwrite: bool = False,
 ) -> None:
     """Run the recogniser and the map networks over every view of a store, once. Resumes where it was.
 
@@ -37,18 +40,9 @@ def predict(
         maps: maps to predict with those models, or NAME=CARD for others; all that those models predict by default.
         by_shape: recognise by shape alone. By default the size of the objects counts too, where the store knows it
             (nextview render --unit) and the card of the recogniser says what sizes mean (nextview fit size).
-        batch: views a call of the networks.
-        workers: processes; one for each core by default.
-        scheduler: address of a dask.distributed scheduler, to use its workers instead.
+        workers: who does the work.
+        overwrite: replace predictions of other objects or models.
     """
-    from nextview.cli.predictions_table import print_predictions
-    from nextview.cli.progress import console, track
-    from nextview.data import predicting as job
-    from nextview.data.predictions import Predictions
-    from nextview.data.store import ViewStore
-    from nextview.models.collection import find_models
-    from nextview.models.model_card import find_card
-
     if len(recogniser) > 1 and not held_out:
         raise UsageError("several recognisers can only share the work with --held-out")
     if out.suffix != ".npz":
@@ -60,8 +54,19 @@ def predict(
             raise ModelError(f"no network of {models} predicts the map {name!r}; there are {', '.join(found.maps)}")
         cards[name] = find_card(card or found.maps[name])
     judges = [find_card(r) for r in recogniser or (found.recogniser,)]
-    steps = job.predict(store, out, judges, cards, split, held_out, not by_shape, batch, workers, scheduler)
-    before, total = next(steps)
-    track((done for done, _ in steps), total, f"predicting {store.name}", before, len(ViewStore.open(store).sphere))
-    print_predictions(Predictions.load(out))
-    console.print(f"predictions in {out}; compare policies with: nextview benchmark {out}", soft_wrap=True)
+    shape = not by_shape
+    steps = predicting.predict(store, out, judges, cards, split, held_out, shape, **vars(workers), overwrite=overwrite)
+    follow(steps, f"predicting {store.name}")
+    for line in summed_up(Predictions.load(out)):
+        console.print(line)
+    console.print(f"predictions in {out}; compare policies with: nextview benchmark {out} RESULTS", soft_wrap=True)
+
+
+def summed_up(p: Predictions) -> list[str]:
+    """How often the recogniser is right in each split, from single views and from all of them."""
+    right, fused, lines = p.logits.argmax(2) == p.labels[:, None], p.logits.sum(1).argmax(1) == p.labels, []
+    for split in np.unique(p.splits):
+        here = p.splits == split
+        shares = f"right from one view {right[here].mean():.3f}, from all {len(p.sphere)} {fused[here].mean():.3f}"
+        lines.append(f"{here.sum()} {split} objects: {shares}".replace("  ", " "))
+    return lines

@@ -1,80 +1,70 @@
-"""A progress bar around anything that reports what it has done."""
+"""Progress on standard error: a bar in a terminal, else a line now and then."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Iterable, Iterator
+from typing import Any
 
-from rich.console import Console, RenderableType
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich.console import Console
 from rich.table import Column
 from rich.text import Text
 
 from nextview.cli.ending import printable
-from nextview.cli.terminal import Terminal
+
+EVERY = 30.0
+"""Seconds between two lines where the output is no terminal."""
+
+
+class Terminal(Console):
+    """Prints text as it is: brackets and colons in names are no markup, and control characters are shown, not sent."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, highlight=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Every text passes here, those in tables too."""
+        return super().render_str(printable(text), **options)
+
 
 console = Terminal(stderr=True)
 
 
-def track(
-    done: Iterable[int],
-    total: int,
-    what: str,
-    before: int = 0,
-    views: int = 0,
-    above: Callable[[], RenderableType] | None = None,
-) -> None:
-    """Exhaust an iterable that yields how much is done so far; show it, the time left and, at the end, the time taken.
+def track(done: Iterable[int], total: int, what: str, /) -> None:
+    """Exhaust an iterable of growing counts, and show how far it is, the speed and the time left."""
+    (_show_bar if console.is_terminal else _print_lines)(done, total, what)
 
-    Args:
-        done: counts, growing.
-        total: the last count.
-        what: what is being done.
-        before: how much an earlier run had done.
-        views: if given, the speed is shown too, in objects of so many views.
-        above: if given, what it makes is shown above the bar while something is left to do; in a terminal only.
-    """
-    # All of it fits into 80 columns, at thousands of objects and views a second too.
-    name = TextColumn(
-        "{task.description}", markup=False, table_column=Column(no_wrap=True, max_width=20, overflow="ellipsis")
-    )
-    columns = [name, BarColumn(8), MofNCompleteColumn(), TimeRemainingColumn(elapsed_when_finished=True)]
-    columns += [Speed(views)] if views else []
-    with _ProgressBelow(*columns, console=console, above=above if console.is_terminal else None) as progress:
-        task = progress.add_task(printable(what), total=total, completed=before)
+
+def follow(steps: Iterator[tuple[int, int]], what: str) -> None:
+    """Track a stage that yields how many are done, of how many."""
+    _, total = next(steps)
+    track((done for done, _ in steps), total, what)
+
+
+def _show_bar(done: Iterable[int], total: int, what: str) -> None:
+    from rich import progress  # takes as long to import as all the rest of rich
+
+    class Speed(progress.ProgressColumn):
+        def render(self, task: progress.Task) -> Text:
+            speed = task.finished_speed or task.speed
+            return Text(f"{speed:.1f}/s" if speed else "", no_wrap=True)
+
+    width = Column(no_wrap=True, max_width=24, overflow="ellipsis")
+    name = progress.TextColumn("{task.description}", table_column=width, markup=False)
+    left = progress.TimeRemainingColumn(elapsed_when_finished=True)
+    columns = (name, progress.BarColumn(8), progress.MofNCompleteColumn(), left, Speed())
+    with progress.Progress(*columns, console=console) as shown:
+        task = None
         for n in done:
-            progress.update(task, completed=n, refresh=above is not None)
+            if task is None:
+                task = shown.add_task(printable(what), total=total, completed=n)
+            shown.update(task, completed=n)
 
 
-class _ProgressBelow(Progress):
-    """Progress bars below something else."""
-
-    def __init__(self, *columns: ProgressColumn, console: Console, above: Callable[[], RenderableType] | None) -> None:
-        self.above = above
-        super().__init__(*columns, console=console)
-
-    def get_renderables(self) -> Iterable[RenderableType]:
-        """What stands above, until all is done, and the bars."""
-        if self.above is not None and not self.finished:
-            yield self.above()
-        yield from super().get_renderables()
-
-
-class Speed(ProgressColumn):
-    """Objects and views a second."""
-
-    def __init__(self, views: int) -> None:
-        super().__init__()
-        self.views = views
-
-    def render(self, task: Task) -> Text:
-        """As text; empty until there is a speed to speak of."""
-        speed = task.finished_speed or task.speed
-        return Text(f"{speed:.1f} objects/s, {speed * self.views:.0f} views/s" if speed else "", no_wrap=True)
+def _print_lines(done: Iterable[int], total: int, what: str) -> None:
+    begun = last = time.monotonic()
+    for n in done:
+        now = time.monotonic()
+        if now - last > EVERY:
+            console.print(f"{what}: {n} of {total} after {now - begun:.0f} s", soft_wrap=True)
+            last = now

@@ -1,49 +1,53 @@
-"""``nextview recognise``: look at one object, a mesh or captured views, until it is clear what it is."""
+"""``nextview recognise`` and ``nextview demo``: look at one object until it is clear what it is."""
 
 from __future__ import annotations
 
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
-import tyro
+from nextview.cli.episode_table import episode_as_json, print_episode
+from nextview.cli.progress import console
+from nextview.cli.sources import PICTURES, Looking, Source
+from nextview.errors import ObservationError, UsageError
+from nextview.files import check_new, new_file
+from nextview.session.system import System, load
 
-from nextview.mesh_format import MAX_FACES
 
-if TYPE_CHECKING:
-    from nextview.observation import Camera
-    from nextview.session import FrameCamera
+@dataclass(frozen=True)
+class Output:
+    """What is made of it.
 
-Unit = Literal["mm", "cm", "inch", "foot", "m"]
-"""The keys of ``mesh.UNITS``, without the time that it takes to import them."""
-Three = tuple[float, float, float]
+    Attributes:
+        figure: write a picture of the episode to this file (PNG, PDF or SVG).
+        record: write the episode to this file (.rrd), for the Rerun viewer.
+        json: print JSON instead of a table.
+        overwrite: replace these files if they exist.
+    """
+
+    figure: Path | None = None
+    record: Path | None = None
+    json: bool = False
+    overwrite: bool = False
+
+    def check(self) -> None:
+        """Refuse files that cannot be written, before any work."""
+        for file, kinds in ((self.figure, PICTURES), (self.record, (".rrd",))):
+            if file is not None:
+                check_new(file, self.overwrite)
+                if file.suffix.lower() not in kinds:
+                    raise UsageError(f"{file}: the name ends in {' or '.join(kinds)}")
 
 
 def recognise(
-    path: tyro.conf.Positional[Path],
+    path: Path,
     /,
-    models: str = "modelnet10",
-    policy: str | None = None,
-    threshold: float = 0.97,
-    risk: float | None = None,
-    max_views: int = 5,
-    viewpoints: str = "40",
-    unknown: float = 0.0,
+    source: Source = Source(),
+    looking: Looking = Looking(),
+    output: Output = Output(),
     start: int | None = None,
-    up: Literal["y", "z"] | Three | None = None,
-    unit: Unit | None = None,
-    max_faces: int = MAX_FACES,
-    point: Three | None = None,
-    box: tuple[float, float, float, float, float, float] | Path | None = None,
-    object_id: int | None = None,
-    intrinsics: tuple[float, float, float, float] | Path | None = None,
-    raw: bool = False,
-    any_size: bool = False,
     seed: int = 0,
-    sensor: str | None = None,
-    figure: Path | None = None,
-    record: Path | None = None,
-    json: bool = False,
-    timing: bool = False,
 ) -> None:
     """Recognise an object by next best views, and show where it looked and why.
 
@@ -53,67 +57,61 @@ def recognise(
 
     Args:
         path: OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder of captured views.
-        models: bundled models by name, or a folder with models of your own.
-        policy: how the next view is chosen: gain (the predicted gain of a view less its weighted travel; the default),
-            MAP, MAP-peak or MAP-sphere-peak for a map of the models (lem, lcm), random, random-all, furthest,
-            unidirectional, spread, spread-local, another learned one, the card of one (.json), or MODULE:CLASS for your
-            own.
-        threshold: stop when the belief in one class reaches this after one view, less after several.
-        risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
-        max_views: stop after so many views.
-        viewpoints: where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in degrees by views on
-            each ring), or fibonacci:60 (spread evenly over the upper half).
-        unknown: say "unknown" of an object that looks as strange as at most this share of the objects of known
-            classes (0.05: so one in 20 of these is taken for unknown); 0 always names a class. Ends with status 0 too.
+        source: what is looked at.
+        looking: who looks, and when it ends.
+        output: what is made of it.
         start: first view; of the 40, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
-        up: a mesh file's up axis; z if not given, but y for GLB. Of a folder, also a direction in its world; z if not
-            given, but the normal of the support plane for 7-Scenes.
-        unit: a mesh file's unit of length, if it is known: how large an object is says something of its class.
-        max_faces: refuse a mesh of more triangles, or a file of more than 60 bytes for each of these.
-        point: of a folder: near the object that is meant, metres, in the capture's world.
-        box: of a folder: the upright box into which the object just fits, its low and its high corner, metres (heights
-            along --up), or a JSON file with low, high and axes.
-        object_id: of a BOP folder with several objects: the one that is meant.
-        intrinsics: of a folder: FX FY CX CY, pixels, or a file with the pinhole matrix.
-        raw: of a folder: take the depth as it is, without denoising.
-        any_size: of a folder: the object's size says nothing of its class, as with toys.
         seed: decides the first view, whatever the policy draws and the errors of a sensor.
-        sensor: look at a mesh through a sensor with all its errors: kinect, stereo, setup, wrist or none, or
-            NAME:STRENGTH (docs/your_camera.md); clean renders if not given.
-        figure: write a picture of the episode to this file (PNG, PDF or SVG).
-        record: write the episode to this file (.rrd), for the Rerun viewer.
-        json: print JSON instead of a table.
-        timing: also print where the time went, from the start of the process.
     """
-    from nextview.cli.show import show
-    from nextview.errors import UsageError
+    output.check()
+    name = path.name if source.sensor is None else f"{path.name} through {source.sensor}"
+    show(source.camera(path, seed), name, load(**vars(looking)), output, start, seed)
 
-    options = {"policy": policy, "threshold": threshold, "risk": risk, "max_views": max_views, "viewpoints": viewpoints}
-    options["unknown"] = unknown
-    if path.is_dir():
-        if unit is not None:
-            raise UsageError(f"{path}: --unit is for mesh files; a folder of captured views has lengths of its own")
-        if sensor is not None:
-            raise UsageError(f"{path}: --sensor is for mesh files; captured views have the errors of their own")
 
-        def make() -> Camera | FrameCamera:
-            from nextview.cli.captured_folder import captured_camera
+def demo(
+    shape: Literal["table", "chair", "monitor"] = "table",
+    start: int = 33,
+    figure: Path = Path("nextview_demo.png"),
+    overwrite: bool = False,
+) -> None:
+    """Recognise a sample object that ships with nextview, and draw the episode.
 
-            return captured_camera(path, up, point, box, object_id, intrinsics, raw, any_size)
+    Args:
+        shape: which one.
+        start: first view, 0 to 39.
+        figure: where to write the picture.
+        overwrite: replace the picture if it exists.
+    """
+    from nextview.data.samples import sample_mesh
+    from nextview.simulation.simulated import SimulatedCamera
+
+    output = Output(figure, overwrite=overwrite)
+    output.check()
+    show(SimulatedCamera(sample_mesh(shape)), f"the sample {shape}", load(), output, start)
+
+
+def show(camera: Any, name: str, system: System, output: Output, start: int | None, seed: int = 0) -> None:
+    """Recognise what a camera sees, print the episode and write what is asked for."""
+    session = system.session_with(camera, start, seed)
+    with ExitStack() as recorded:
+        if output.record is not None:
+            from nextview.viewers.recording import Recorder
+
+            recorder = Recorder(recorded.enter_context(new_file(output.record, output.overwrite)))
+            recorded.callback(recorder.close)
+            session.observers.append(recorder)
+        result = session.run(camera)
+    if not result.seen:
+        why = "is it made of a few small parts far apart, or are a sensor's errors too strong?"
+        nothing = f"there is no answer, for nothing of it is seen from any of {len(result.views)} views"
+        raise ObservationError(f"{name}: {nothing}; {why}")
+    frames = [taken.frame.name for taken in getattr(camera, "taken", ())]
+    if output.json:
+        print(episode_as_json(result, frames))
     else:
-        captured = {"point": point, "box": box, "object-id": object_id, "intrinsics": intrinsics}
-        captured |= {"raw": raw or None, "any-size": any_size or None}
-        for name, value in captured.items():
-            if value is not None:
-                raise UsageError(f"{path}: --{name} is for folders of captured views, and this is none")
-        if isinstance(up, tuple):
-            raise UsageError(f"{path}: the up axis of a mesh file is y or z, not {up}")
-
-        def make() -> Camera | FrameCamera:
-            from nextview.mesh import load_mesh
-            from nextview.system import simulated
-
-            return simulated(load_mesh(path, up, unit, max_faces), sensor, seed)
-
-    name = path.name if sensor is None else f"{path.name} through {sensor}"
-    show(make, name, models, options, start, seed, figure, json, timing, record)
+        print_episode(result, name, system.policy_name, frames)
+    for frame, reason in getattr(camera, "left_out", {}).items():
+        console.print(f"left out: {frame}: {reason}", style="yellow")
+    if output.figure is not None:
+        with new_file(output.figure, output.overwrite) as part:
+            result.plot(part, name)

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import multiprocessing
-import multiprocessing.util
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from multiprocessing import resource_tracker
-from types import FrameType
 from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from nextview.arguments import whole
+from nextview.checks import whole
 from nextview.errors import DatasetError
 
 MOST = 1024
@@ -34,14 +30,8 @@ class WorkerDied(Exception):
 
 
 def count(workers: int | None) -> int:
-    """How many processes are meant: one for each core by default.
-
-    Raises:
-        UsageError: fewer than none, or more than any machine bears.
-    """
-    if workers is None:
-        return os.cpu_count() or 1
-    return whole(workers, "the number of workers", 0, MOST)
+    """The number of processes: one for each core by default."""
+    return os.cpu_count() or 1 if workers is None else whole(workers, "the number of workers", 0, MOST)
 
 
 def each(
@@ -52,18 +42,10 @@ def each(
 ) -> Iterator[tuple[Item, Result | WorkerDied]]:
     """Call ``function(item)`` for every item, side by side; yields (item, result) as they come, in any order.
 
-    The function and the items must be picklable. A process that dies costs no more than the item it was working on, and
-    that only if it dies again when it works on nothing else. What the function raises ends the run.
-
-    Args:
-        function: what to call.
-        items: hashable, begun in this order.
-        workers: processes; one for each core by default; 0 to work in this one.
-        scheduler: address of a dask.distributed scheduler, to use its workers instead of this machine's cores.
-
-    Raises:
-        UsageError: fewer than no workers.
-        DatasetError: the scheduler cannot be reached, or dask.distributed is not installed.
+    Function and items must be picklable, items hashable. A process that dies costs no more than the item it was working
+    on, and that only if it dies again when it works on nothing else. What the function raises ends the run. ``workers``
+    are processes, one for each core by default, 0 to work in this one; ``scheduler`` is the address of a
+    dask.distributed scheduler to use instead.
     """
     if scheduler is not None:
         yield from _on_cluster(function, items, scheduler)
@@ -79,6 +61,7 @@ def each(
             for item, result in _in_pool(function, waiting, workers):
                 finished.add(item)
                 yield item, result
+            return
         except BrokenProcessPool:
             waiting = [item for item in waiting if item not in finished]
             # Items are begun in order, so the first that are not finished were being worked on. Try each alone.
@@ -88,16 +71,13 @@ def each(
                     yield from _in_pool(function, [item], 1)
                 except BrokenProcessPool:
                     yield item, WorkerDied("the process that worked on it died, twice")
-        else:
-            return
 
 
 def _in_pool(function: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[tuple[Item, Result]]:
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(min(workers, len(items)), multiprocessing.get_context("spawn"), _begin_worker)
     try:
-        with _signals_wait():
-            jobs = {pool.submit(function, item): item for item in items}
+        jobs = {pool.submit(function, item): item for item in items}
         for job in as_completed(jobs):
             yield jobs[job], job.result()
     except KeyboardInterrupt:  # what is being worked on counts as not done: wait for none of it
@@ -108,34 +88,10 @@ def _in_pool(function: Callable[[Item], Result], items: Sequence[Item], workers:
         pool.shutdown(cancel_futures=True)
 
 
-@contextmanager
-def _signals_wait() -> Iterator[None]:
-    """Keep SIGINT and SIGTERM for the end of this block, and Ctrl-C for ever from the processes that start in it.
-
-    A process that is left half started complains, and a terminal sends Ctrl-C to all: the parent decides what it means.
-    """
-    if threading.current_thread() is not threading.main_thread():  # signals are none of its business
-        yield
-        return
-    came: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    resource_tracker.ensure_running()  # its start would end the mask of signals
-    before = {number: signal.signal(number, lambda number, frame: came.append(number)) for number in numbers}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # what is started inherits this, and no handlers
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for number, handler in before.items():
-            signal.signal(number, handler or signal.SIG_DFL)
-    for first in came[:1]:
-        signal.raise_signal(first)
-
-
 def _begin_worker() -> None:
-    """Use one core; end when told to, and with the parent: a worker whose parent was killed would wait for ever."""
-    signal.signal(signal.SIGTERM, _stop)
-    threadpool_limits(1, "blas")  # each core has a worker: the threads of BLAS would wait for each other
+    """Use one core, leave Ctrl-C to the parent, and end with it: without it a worker would wait for ever."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threadpool_limits(1, "blas")
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -144,12 +100,6 @@ def _begin_worker() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def _stop(number: int, frame: FrameType | None) -> None:
-    """End at once, but free what only this process knows of, such as the locks of codecs: Python complains of these."""
-    multiprocessing.util._exit_function()  # type: ignore[attr-defined]
-    os._exit(128 + number)
 
 
 def _on_cluster(

@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
-import json
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from nextview.arguments import regular_file, takes_paths
-from nextview.belief import PLAIN_SUM, Calibration, log_evidence_of
 from nextview.data.splits import deduplicated
 from nextview.errors import PredictionsError
-from nextview.outputs import written_whole
+from nextview.files import decode_record, new_file, regular_file
+from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
-from nextview.viewsphere import ViewSphere
+from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
 
 FORMAT = 1
+ARRAYS = ("logits", "depth_entropy", "labels", "splits", "conflicting")
+OPTIONAL = ("azimuth_bins", "of_size")
 KEYS = (
-    "format", "logits", "depth_entropy", "names", "labels", "classes", "splits", "conflicting", "elevations",
-    "azimuths", "distance", "calibration", "models", "azimuth_bins", "of_size", "store", "commands",
+    *ARRAYS, *OPTIONAL, "format", "names", "classes", "elevations", "azimuths", "distance", "calibration", "models",
+    "store", "commands",
 )  # fmt: skip
 GROUPS = ("map/", "valley/")
 """The arrays of a file, and how the names of those begin of which there may be several; others are not read."""
+PACKED, SPARE = 100, 64 * 2**20
+"""A file holds at most this many times its size, and so many bytes more."""
 SAME = 1e-5
 """Difference between logits that are the same, but for rounding."""
 KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}
@@ -38,28 +43,22 @@ class Predictions:
 
     Attributes:
         logits: of the recogniser for each view alone, (N, V, C) float32.
-        maps: predicted local maps around each view by name ("lem"), each (N, V, R, 3) float32; those of
-            the whole sphere, (N, V, R, azimuths), once round from the view, are called so ("lem-sphere").
+        maps: predicted local maps around each view by name ("lem"), each (N, V, R, 3) float32; those of the whole
+            sphere ("lem-sphere") are (N, V, R, azimuths), once round from the view.
         depth_entropy: the true measure, bits, (N, V) float32.
         names: of the objects, unique.
         labels: true class of each as an index into ``classes``, (N,) int64.
         classes: their names, in the order of the logits.
         splits: "train", "test" or "" for each object, (N,).
-        conflicting: objects that are the very mesh of another one with another label, in any split, (N,) bool.
+        conflicting: objects that are the very mesh of another one with another label, (N,) bool.
         sphere: the viewpoints.
         models: name and SHA-256 of the recogniser ("recogniser") and of each map network ("lem").
         valley_classes: for each map, the classes for which its card says that the valley is the better view.
-        calibration: how far the recogniser's card says that a sum of its logits is to be trusted.
-        azimuth_bins: what the recogniser says of the azimuth bins of the object, (N, V, C, azimuth bins) float32, see
-            ``Evidence``; None if it cannot tell them.
-        of_size: what the size of the object has added to the logits of each of its views, (N, C) float32; None if the
-            recogniser knows nothing of sizes.
-        store: absolute path of the view store they were made from; empty if it is not known. ``depth_entropy`` tells
-            whether what lies there is still the same.
+        calibration: how far a sum of the recogniser's logits is to be trusted.
+        azimuth_bins: see ``Evidence``, (N, V, C, azimuth bins) float32; None if the recogniser cannot tell them.
+        of_size: what the object's size added to the logits, (N, C) float32; None if sizes are not known.
+        store: absolute path of the view store they were made from; empty if it is not known.
         commands: all that made them, in order, from the meshes on; () if that is not known.
-
-    Raises:
-        PredictionsError: shapes that do not fit, nothing inside, or a number that is not finite.
     """
 
     logits: NDArray[np.float32]
@@ -115,7 +114,7 @@ class Predictions:
     @cached_property
     def log_evidence(self) -> NDArray[np.float32]:
         """What the recogniser says of each view, so that views can be summed, (N, V, D); see ``log_evidence_of``."""
-        return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.turn)
+        return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.azimuth)
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
@@ -132,11 +131,7 @@ class Predictions:
         )
 
     def of_split(self, split: str) -> Predictions:
-        """The objects of one split.
-
-        Raises:
-            PredictionsError: there are none.
-        """
+        """The objects of one split."""
         kept = self.splits == split
         if not kept.any():
             there = ", ".join(repr(str(name)) for name in np.unique(self.splits))
@@ -163,83 +158,81 @@ class Predictions:
             return self
         return replace(self, logits=self.logits - self.of_size[:, None], of_size=None)
 
-    @takes_paths("path")
-    def save(self, path: Path) -> None:
-        """Write one .npz file, aside and then renamed, so that it is whole or not there."""
-        arrays: dict[str, Any] = {
+    def save(self, path: Path, overwrite: bool = False) -> None:
+        """Write one .npz file, whole or not at all; ResultsError if that cannot be."""
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
+        arrays |= {name: values for name in OPTIONAL if (values := getattr(self, name)) is not None}
+        arrays |= {f"map/{name}": values for name, values in self.maps.items()}
+        arrays |= {f"valley/{name}": np.array(classes, np.str_) for name, classes in self.valley_classes.items()}
+        arrays |= {
             "format": FORMAT,
-            "logits": self.logits,
-            "depth_entropy": self.depth_entropy,
             "names": np.array(self.names),
-            "labels": self.labels,
             "classes": np.array(self.classes),
-            "splits": self.splits,
-            "conflicting": self.conflicting,
             "elevations": np.array(self.sphere.elevations),
             "azimuths": self.sphere.azimuths,
             "distance": self.sphere.distance,
-            "calibration": np.array(json.dumps(self.calibration.to_dict())),
+            "calibration": np.array(msgspec.json.encode(self.calibration).decode()),
             "store": np.array(self.store),
             "models": np.array([(kind, *model) for kind, model in self.models.items()]).reshape(-1, 3),
+            "commands": np.array(self.commands, np.str_),
         }
-        arrays |= {f"map/{name}": values for name, values in self.maps.items()}
-        arrays |= {f"valley/{name}": np.array(classes, np.str_) for name, classes in self.valley_classes.items()}
-        if self.azimuth_bins is not None:
-            arrays["azimuth_bins"] = self.azimuth_bins
-        if self.of_size is not None:
-            arrays["of_size"] = self.of_size
-        if self.commands:
-            arrays["commands"] = np.array(self.commands)
-        with written_whole(path) as part, part.open("wb") as file:
+        with new_file(Path(path), overwrite) as part, part.open("wb") as file:
             np.savez_compressed(file, **arrays)
 
     @classmethod
-    @takes_paths("path")
     def load(cls, path: str | Path) -> Predictions:
-        """Read what ``save`` wrote. Nothing is unpickled.
-
-        Raises:
-            PredictionsError: there is no such file, it is damaged, or what it holds does not fit together.
-        """
-        regular_file(Path(path), "a predictions file", PredictionsError)
+        """Read what ``save`` wrote; PredictionsError if it is missing or damaged. Nothing is unpickled."""
+        path = Path(path)
+        if not path.exists():
+            raise PredictionsError(f"{path}: there is no such file; make one with nextview predict")
+        regular_file(path, "a predictions file", PredictionsError)
         try:
-            with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-                f = {name: file[name] for name in file.files if name in KEYS or name.startswith(GROUPS)}
-        except FileNotFoundError:
-            raise PredictionsError(f"{path}: there is no such file; make one with nextview predict") from None
-        except MemoryError:
-            raise PredictionsError(f"{path}: too large for this machine's memory, or damaged") from None
+            return cls._from(_arrays(path))
+        except KeyError as error:
+            raise PredictionsError(f"{path}: lacks {error.args[0]}") from None
+        except PredictionsError as error:
+            raise PredictionsError(f"{path}: {error}") from None
         except Exception as error:  # zipfile, zlib and numpy raise whatever a damaged file makes them raise
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise PredictionsError(f"{path}: not a predictions file ({reason})") from None
-        if "format" not in f or f["format"].tolist() != FORMAT:
-            raise PredictionsError(f"{path}: not a predictions file of format {FORMAT}; make it again")
 
+    @classmethod
+    def _from(cls, f: dict[str, NDArray]) -> Predictions:
         def group(prefix: str) -> dict[str, NDArray]:
             return {name.removeprefix(prefix): values for name, values in f.items() if name.startswith(prefix)}
 
-        try:
-            return cls(
-                f["logits"],
-                group("map/"),
-                f["depth_entropy"],
-                tuple(f["names"].tolist()),
-                f["labels"],
-                tuple(f["classes"].tolist()),
-                f["splits"],
-                f["conflicting"],
-                ViewSphere(tuple(f["elevations"].tolist()), int(f["azimuths"]), float(f["distance"])),
-                {kind: (name, sha) for kind, name, sha in f["models"].tolist()},
-                {name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
-                Calibration.from_dict(json.loads(str(f["calibration"]))) if "calibration" in f else PLAIN_SUM,
-                f.get("azimuth_bins"),
-                f.get("of_size"),
-                str(f.get("store", "")),
-                tuple(f["commands"].tolist()) if "commands" in f else (),
-            )
-        except KeyError as error:
-            raise PredictionsError(f"{path}: {error.args[0]}") from None
-        except ValueError as error:
-            raise PredictionsError(f"{path}: {error}") from None
-        except (TypeError, AttributeError, OverflowError, RecursionError) as error:
-            raise PredictionsError(f"{path}: not a predictions file ({error})") from None
+        if "format" not in f or f["format"].tolist() != FORMAT:
+            raise PredictionsError(f"not a predictions file of format {FORMAT}; make it again")
+        arrays: dict[str, Any] = {name: f[name] for name in ARRAYS} | {name: f.get(name) for name in OPTIONAL}
+        return cls(
+            **arrays,
+            maps=group("map/"),
+            names=tuple(f["names"].tolist()),
+            classes=tuple(f["classes"].tolist()),
+            sphere=ViewSphere(tuple(f["elevations"].tolist()), int(f["azimuths"]), float(f["distance"])),
+            models={kind: (name, sha) for kind, name, sha in f["models"].tolist()},
+            valley_classes={name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
+            calibration=_calibration(f["calibration"]) if "calibration" in f else PLAIN_SUM,
+            store=str(f.get("store", "")),
+            commands=tuple(f["commands"].tolist()) if "commands" in f else (),
+        )
+
+
+def _calibration(text: NDArray[np.str_]) -> Calibration:
+    return decode_record(str(text).encode(), Calibration, "not a calibration", PredictionsError)
+
+
+def _arrays(path: Path) -> dict[str, NDArray]:
+    """The arrays of a file that are read, by name, after the sizes that they announce were held against the file's."""
+    with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+        wanted = [name for name in file.files if name in KEYS or name.startswith(GROUPS)]
+        members = {name: file.zip.getinfo(f"{name}.npy") for name in wanted}
+        if sum(member.file_size for member in members.values()) > PACKED * path.stat().st_size + SPARE:
+            raise PredictionsError("announces more than such a file can hold")
+        for member in members.values():
+            with file.zip.open(member) as stream:
+                first = npy.read_magic(stream) == (1, 0)
+                shape, _, dtype = (npy.read_array_header_1_0 if first else npy.read_array_header_2_0)(stream)
+            if math.prod(shape) * dtype.itemsize > member.file_size:
+                raise PredictionsError(f"{member.filename} announces more than it holds")
+        return {name: file[name] for name in wanted}

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import UsageError
-from nextview.mesh import Mesh, make_mesh
+from nextview.geometry.mesh import Mesh, make_mesh
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Two opposite corners, centimetres, z up."""
@@ -47,11 +47,7 @@ SAMPLES: dict[str, Callable[[], list[Box]]] = {"chair": chair, "table": table, "
 
 
 def sample_mesh(name: str) -> Mesh:
-    """A sample object by name.
-
-    Raises:
-        UsageError: there is none of that name.
-    """
+    """A sample object by name."""
     if name not in SAMPLES:
         raise UsageError(f"no sample is called {name!r}; there are {', '.join(SAMPLES)}")
     return boxes_mesh(SAMPLES[name](), name)

@@ -10,56 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
-from nextview.observation import Observation
-from nextview.viewsphere import Viewpoints, ViewSphere
+from nextview.geometry.observation import Observation
+from nextview.geometry.viewsphere import Viewpoints, ViewSphere
+from nextview.recognition.evidence import Evidence, items_at
 
+Float = NDArray[np.float64]
 Scope = Literal["global", "local"]
 """Where a policy may go: to all views, or to those of the local window."""
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What the models say of one view in each of B episodes.
-
-    Attributes:
-        logits: (B, classes) float.
-        maps: those that the policy needs, by name: predicted local maps ("lem"), each (B, rings, 3) float, and maps of
-            the whole sphere ("lem-sphere"), (B, rings, azimuths), columns once round from the view.
-        azimuth_bins: logarithms of how likely each side of the object is the one that is seen, if it is of each class,
-            (B, classes, azimuth bins) float: azimuth bins in even steps of azimuth from one that the recogniser has
-            settled on for the class. None if the recogniser cannot tell.
-        seen: whether anything was seen, (B,) bool; None if something was in all. A view without is no evidence: in
-            episodes all the above counts as zero there.
-        novelty: how strange each view is, (B,) float, see ``nextview.novelty``; None if the recogniser cannot tell.
-        observations: the views themselves, B of them; None where only what the models say of them is known.
-        shown: share of the object that shows in each view, as far as it can tell, (B,) float; None where nothing is
-            known to hide any, or that does not matter. See ``Calibration.weights``.
-    """
-
-    logits: NDArray[np.floating]
-    maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
-    azimuth_bins: NDArray[np.floating] | None = None
-    seen: NDArray[np.bool_] | None = None
-    novelty: NDArray[np.floating] | None = None
-    observations: Sequence[Observation] | None = None
-    shown: NDArray[np.floating] | None = None
-
-    def of(self, rows: Any) -> Evidence:
-        """That of some of the episodes, by index or mask."""
-        return Evidence(
-            self.logits[rows],
-            {name: values[rows] for name, values in self.maps.items()},
-            None if self.azimuth_bins is None else self.azimuth_bins[rows],
-            None if self.seen is None else self.seen[rows],
-            None if self.novelty is None else self.novelty[rows],
-            _some(self.observations, rows),
-            None if self.shown is None else self.shown[rows],
-        )
-
-
-def _some(given: Sequence[Any] | None, rows: Any) -> list[Any] | None:
-    """Some items of a sequence, by index or mask."""
-    return None if given is None else [given[i] for i in np.arange(len(given))[rows]]
 
 
 @dataclass(frozen=True)
@@ -74,57 +31,41 @@ class EpisodeState:
         step: views taken so far, 1 or more.
         episodes: which episodes these are, (B,) int64: where an oracle looks up its truth. Live there is one, 0.
         azimuth_bins: belief, over all views, in the azimuth bin that is seen from the current view, if the object is
-            of each class, (B, classes, azimuth bins) float64, sums to 1 over the azimuth bins. None if the recogniser
-            cannot tell, or "azimuth_bins" is not among the policy's needs.
+            of each class, (B, classes, azimuth bins) float64; None unless the policy needs it.
         reachable: which views the camera can be brought to, (B, V) bool; None for all.
-        travel: what it costs to go from here to each view, grid cells, (B, V) float64; None for the travel of the
-            viewpoints, see ``travel_from``.
-        places: unit vectors towards the places where the camera really stood, the last one here, (B, step, 3) float64;
-            None where these are the views themselves. Then ``visited`` are the views nearest to them.
-        observations: all views taken so far in each episode, in order, B sequences; None if "observations" is not among
-            the policy's needs.
-        visibility: share of the object that is expected to show from each view, 0 to 1, (B, V) float64; None if
-            "visibility" is not among the policy's needs. 1 where nothing is known to stand around the object.
+        travel: cost to go from here to each view, grid cells, (B, V) float64; None for the travel of the viewpoints.
+        places: unit vectors towards where the camera really stood, the last one here, (B, step, 3) float64; None where
+            these are the views themselves. Then ``visited`` are the views nearest to them.
+        observations: all views taken so far, in order, B sequences; None unless the policy needs them.
+        visibility: expected share of the object that shows from each view, 0 to 1, (B, V) float64; None unless the
+            policy needs it.
     """
 
     current: NDArray[np.int64]
     visited: NDArray[np.bool_]
-    belief: NDArray[np.float64]
+    belief: Float
     evidence: Evidence
     step: int
     episodes: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
-    azimuth_bins: NDArray[np.float64] | None = None
+    azimuth_bins: Float | None = None
     reachable: NDArray[np.bool_] | None = None
-    travel: NDArray[np.float64] | None = None
-    places: NDArray[np.float64] | None = None
+    travel: Float | None = None
+    places: Float | None = None
     observations: Sequence[Sequence[Observation]] | None = None
-    visibility: NDArray[np.float64] | None = None
+    visibility: Float | None = None
 
     @property
     def free(self) -> NDArray[np.bool_]:
         """The views that may be chosen: reachable and not visited, (B, V) bool."""
         return ~self.visited if self.reachable is None else ~self.visited & self.reachable
 
-    def of(self, rows: Any) -> EpisodeState:
+    def select(self, rows: Any) -> EpisodeState:
         """Some of the episodes, by index or mask."""
-
-        def part(values: NDArray[Any] | None) -> Any:
-            return None if values is None else values[rows]
-
-        return EpisodeState(
-            self.current[rows],
-            self.visited[rows],
-            self.belief[rows],
-            self.evidence.of(rows),
-            self.step,
-            self.episodes[rows],
-            part(self.azimuth_bins),
-            part(self.reachable),
-            part(self.travel),
-            part(self.places),
-            _some(self.observations, rows),
-            part(self.visibility),
-        )
+        parts: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            parts[name] = value[rows] if isinstance(value, np.ndarray) else value
+        observations = items_at(self.observations, rows)
+        return EpisodeState(**parts | {"evidence": self.evidence.select(rows), "observations": observations})
 
 
 class Policy(Protocol):
@@ -132,9 +73,7 @@ class Policy(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the maps it wants in the evidence; "azimuth_bins" for what the recogniser says of them;
-        "observations" for the depth seen so far; and "visibility" for what is expected to show from each view.
-        """
+        """Names of maps that it wants in the evidence, "azimuth_bins", "observations", "visibility"."""
         ...
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -146,7 +85,7 @@ class Policy(Protocol):
 class ValuesViews(Protocol):
     """A policy that can show what it decides by. Optional: nothing but pictures depends on it."""
 
-    def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
+    def view_values(self, state: EpisodeState) -> Float:
         """What each candidate view is valued at, (B, V) float64; NaN for those that are not considered."""
         ...
 
@@ -156,9 +95,6 @@ class ScoresViews(Protocol):
     """A policy on a grid that goes to the free view with the highest score less its weighted travel.
 
     It can be asked from any place about any views, see ``policies.off_grid``.
-
-    Attributes:
-        travel_weight: of a grid cell of travel.
     """
 
     @property
@@ -166,51 +102,60 @@ class ScoresViews(Protocol):
         """Of a grid cell of travel."""
         ...
 
-    def scores(self, state: EpisodeState) -> NDArray[np.float64]:
+    def scores(self, state: EpisodeState) -> Float:
         """The score of each view before travel counts, (B, V) float64; NaN for those that are not considered."""
         ...
 
 
-def maps_among(needs: Sequence[str]) -> list[str]:
-    """Those of a policy's needs that are maps."""
-    return [name for name in needs if name not in ("azimuth_bins", "observations", "visibility")]
-
-
-def travel_from(sphere: Viewpoints, state: EpisodeState) -> NDArray[np.float64]:
+def travel_from(sphere: Viewpoints, state: EpisodeState) -> Float:
     """What it costs to go from where the camera is to each view, grid cells, (B, V)."""
     return sphere.travel[state.current] if state.travel is None else state.travel
 
 
-def visibility_of(state: EpisodeState) -> NDArray[np.float64]:
-    """What is expected to show from each view, (B, V).
-
-    Raises:
-        PolicyError: it is not told, though a policy needs it.
-    """
+def visibility_of(state: EpisodeState) -> Float:
+    """What is expected to show from each view, (B, V)."""
     if state.visibility is None:
         raise PolicyError("this policy needs the share of the object that is expected to show from each view")
     return state.visibility
 
 
-def in_window(sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]) -> NDArray[np.float64]:
+def check_weight(travel_weight: float) -> None:
+    """Refuse a travel weight that is negative or not finite."""
+    if not 0 <= travel_weight < np.inf:
+        raise PolicyError(f"a travel weight is a number from 0 on, not {travel_weight}")
+
+
+def in_window(sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]) -> Float:
     """Values of the local window's cells, (B, rings, 3), where they lie on the sphere, (B, V); NaN elsewhere."""
     found = np.full(state.visited.shape, np.nan)
     np.put_along_axis(found, sphere.windows[state.current].reshape(len(found), -1), values.reshape(len(found), -1), 1)
     return found
 
 
+def window_of(sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Of values of all views, (B, V), those of the local window's cells, (B, rings, 3)."""
+    return values[np.arange(len(values))[:, None, None], sphere.windows[state.current]]
+
+
+def considered(sphere: ViewSphere, state: EpisodeState, values: Float, scope: Scope) -> Float:
+    """Values of the views, (B, V), where a policy of this scope may go; NaN elsewhere."""
+    return values if scope == "global" else in_window(sphere, state, window_of(sphere, state, values))
+
+
+def best_view(
+    sphere: Viewpoints, state: EpisodeState, values: NDArray[np.floating], scope: Scope = "global"
+) -> NDArray[np.int64]:
+    """The free view with the highest value, (B, V): of all views, or of the local window; (B,) int64."""
+    if scope == "global":
+        return np.where(state.free, values, -np.inf).argmax(1)
+    assert isinstance(sphere, ViewSphere)
+    return best_in_window(sphere, state, window_of(sphere, state, values))
+
+
 def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]) -> NDArray[np.int64]:
-    """The free view of the local window with the highest score.
+    """The free view of the local window with the highest score, by finite scores of its cells, (B, rings, 3).
 
     Where none of the window is free, the free view with the shortest travel; where none is, the window's best.
-
-    Args:
-        sphere: the viewpoints.
-        state: B episodes.
-        scores: of the windows' cells, (B, rings, 3), finite.
-
-    Returns:
-        (B,) int64.
     """
     b = len(state.current)
     rows = np.arange(b)

@@ -1,4 +1,7 @@
-"""The thesis's baselines (section 5.3, figure 11): they look at nothing but where the camera has been."""
+"""Policies that ask no network: by where the camera has been, by what shows, and views that were settled beforehand.
+
+The thesis's baselines (section 5.3, figure 11) are ``Random``, ``Furthest`` and ``Unidirectional``.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.policies.base import EpisodeState, best_in_window
-from nextview.viewsphere import Viewpoints, ViewSphere
+from nextview.errors import PolicyError
+from nextview.geometry.viewsphere import Viewpoints, ViewSphere
+from nextview.policies.base import (
+    EpisodeState,
+    Scope,
+    best_in_window,
+    best_view,
+    check_weight,
+    travel_from,
+    visibility_of,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -19,7 +31,6 @@ class Random:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """See ``Policy.next_views``."""
         return best_in_window(self.sphere, state, rng.random((len(state.current), self.sphere.rings, 3)))
 
 
@@ -31,8 +42,7 @@ class RandomAll:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """See ``Policy.next_views``."""
-        return np.where(state.free, rng.random(state.visited.shape), -1.0).argmax(1)
+        return best_view(self.sphere, state, rng.random(state.visited.shape))
 
 
 @dataclass(frozen=True)
@@ -43,7 +53,6 @@ class Furthest:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """See ``Policy.next_views``."""
         window = self.sphere.windows[state.current]
         distance = self.sphere.travel[state.current[:, None, None], window]
         return best_in_window(self.sphere, state, distance + 1e-6 * rng.random(distance.shape))
@@ -57,7 +66,6 @@ class Unidirectional:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """See ``Policy.next_views``."""
         n = self.sphere.azimuths
         ring, azimuth = np.divmod(state.current, n)
         ahead = ring[:, None] * n + (azimuth[:, None] + np.arange(1, n)) % n
@@ -68,3 +76,64 @@ class Unidirectional:
             window = np.zeros((len(ring), self.sphere.rings, 3))
             chosen = np.where(round_trip, best_in_window(self.sphere, state, window), chosen)
         return chosen
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The unvisited view farthest on the sphere from all visited ones; equal ones with equal chance."""
+
+    sphere: Viewpoints
+    scope: Scope = "global"
+    needs: tuple[str, ...] = ()
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        nearest = np.full(state.visited.shape, np.inf)
+        for view in range(len(self.sphere)):  # one at a time, so that the memory does not grow with V squared
+            seen = state.visited[:, view]
+            nearest[seen] = np.minimum(nearest[seen], self.sphere.arc[view])
+        return best_view(self.sphere, state, nearest + 1e-6 * rng.random(nearest.shape), self.scope)
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """The free view from which most of the object should show, less the weighted travel; equal ones by chance."""
+
+    sphere: Viewpoints
+    travel_weight: float = 0.0
+    needs: tuple[str, ...] = ("visibility",)
+
+    def __post_init__(self) -> None:
+        check_weight(self.travel_weight)
+
+    def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
+        """Expected share less the weighted travel there, (B, V)."""
+        return visibility_of(state) - self.travel_weight * travel_from(self.sphere, state)
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        values = self.view_values(state) + 1e-6 * rng.random(state.visited.shape)
+        return best_view(self.sphere, state, values)
+
+
+@dataclass(frozen=True)
+class ViewList:
+    """Goes where a list says."""
+
+    views: NDArray[np.int64]  # of each episode in order, (E, k); the first of them are the first views
+    needs: tuple[str, ...] = ()
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        if state.step >= self.views.shape[1]:
+            raise PolicyError(f"only {self.views.shape[1]} views are listed")
+        return self.views[state.episodes, state.step]
+
+
+def orbit(sphere: ViewSphere, starts: NDArray[np.int64], k: int) -> NDArray[np.int64]:
+    """The next k views round the ring of each start, (E,), then round the ring above; the lowest follows the top."""
+    n, step = sphere.azimuths, np.arange(k)
+    ring = (sphere.ring[starts][:, None] + step // n) % sphere.rings
+    return ring * n + (sphere.azimuth_index[starts][:, None] + step) % n
+
+
+def ranked(values: NDArray[np.floating], k: int) -> NDArray[np.int64]:
+    """The k views with the highest values, (E, V), highest first, equal ones in their order: (E, k) int64."""
+    return np.argsort(-values, axis=1, kind="stable")[:, :k]

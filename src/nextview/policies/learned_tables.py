@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
-from nextview.policies.base import EpisodeState, Scope, best_in_window, in_window
-from nextview.policies.spread import Spread
-from nextview.viewsphere import ViewSphere
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.policies.base import EpisodeState, Scope, best_view, considered
+from nextview.policies.baselines import Spread
 
 
 def cells_from(sphere: ViewSphere) -> NDArray[np.int64]:
@@ -33,17 +33,10 @@ def cells_to(sphere: ViewSphere) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class FixedSequence:
-    """The same moves for every object: a list of cells, each seen from the view before, for each ring to start from.
-
-    Attributes:
-        sphere: the viewpoints.
-        moves: cell of each move, (rings, K) int64.
-        scope: whether the moves leave the local window ("global") or not ("local"); the views after the last move do as
-            the moves did.
-    """
+    """The same moves for every object: a list of cells, each seen from the view before, for each ring to start from."""
 
     sphere: ViewSphere
-    moves: NDArray[np.int64]
+    moves: NDArray[np.int64]  # cells, (rings, K)
     scope: Scope = "global"
     needs: tuple[str, ...] = ()
 
@@ -61,7 +54,6 @@ class FixedSequence:
         return np.stack(views, 1)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """See ``Policy.next_views``."""
         chosen = Spread(self.sphere, self.scope).next_views(state, rng)
         if state.step >= self.paths.shape[1]:
             return chosen
@@ -76,13 +68,7 @@ class FixedSequence:
 
 @dataclass(frozen=True)
 class FixedRing:
-    """Straight to one ring, then round it by the same number of azimuth steps each time.
-
-    Attributes:
-        sphere: the viewpoints.
-        ring: which.
-        steps: from view to view; views that are left out come when it has gone round.
-    """
+    """Straight to one ring, then round it by the same number of azimuth steps each time."""
 
     sphere: ViewSphere
     ring: int
@@ -94,7 +80,6 @@ class FixedRing:
             raise PolicyError(f"there is no ring {self.ring} to be walked in steps of {self.steps}")
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """See ``Policy.next_views``."""
         n, rows = self.sphere.azimuths, np.arange(len(state.current))
         order = np.concatenate([[0], np.arange(1, n) * self.steps, np.arange(1, n)])
         ahead = self.ring * n + (self.sphere.azimuth_index[state.current][:, None] + order) % n
@@ -105,16 +90,10 @@ class FixedRing:
 
 @dataclass(frozen=True)
 class ClassTable:
-    """The unvisited cell with the highest value for the class believed and the ring that the camera is on.
-
-    Attributes:
-        sphere: the viewpoints.
-        values: (classes, rings, V) float64: by believed class, current ring and cell.
-        scope: "global", among all views; or "local", among those of the local window.
-    """
+    """The unvisited cell with the highest value for the class believed and the ring that the camera is on."""
 
     sphere: ViewSphere
-    values: NDArray[np.float64]
+    values: NDArray[np.float64]  # by believed class, current ring and cell, (classes, rings, V)
     scope: Scope = "global"
     needs: tuple[str, ...] = ()
 
@@ -124,22 +103,14 @@ class ClassTable:
             raise PolicyError(f"the table has to hold finite numbers of the shape (classes, {wanted[0]}, {wanted[1]})")
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """See ``Policy.next_views``."""
-        scores = self._looked_up(state)
-        if self.scope == "global":
-            return np.where(state.free, scores, -np.inf).argmax(1)
-        return best_in_window(self.sphere, state, self._window(state, scores))
+        return best_view(self.sphere, state, self._looked_up(state), self.scope)
 
     travel_weight = 0.0
 
     def scores(self, state: EpisodeState) -> NDArray[np.float64]:
         """The table where it may go; see ``ScoresViews``."""
-        scores = self._looked_up(state)
-        return scores if self.scope == "global" else in_window(self.sphere, state, self._window(state, scores))
+        return considered(self.sphere, state, self._looked_up(state), self.scope)
 
     def _looked_up(self, state: EpisodeState) -> NDArray[np.float64]:
         values = self.values[state.belief.argmax(1), self.sphere.ring[state.current]]
         return values[np.arange(len(values))[:, None], cells_to(self.sphere)[state.current]]
-
-    def _window(self, state: EpisodeState, scores: NDArray[np.float64]) -> NDArray[np.float64]:
-        return scores[np.arange(len(scores))[:, None, None], self.sphere.windows[state.current]]

@@ -8,37 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
-from nextview.policies.base import EpisodeState, best_in_window, in_window
-from nextview.viewsphere import ViewSphere
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.policies.base import EpisodeState, best_in_window, best_view, in_window
 
 
 def local_peaks(maps: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Cells that no neighbour exceeds (3x3 maximum filter; nothing lies beyond the border).
-
-    Args:
-        maps: (B, rows, columns).
-
-    Returns:
-        (B, rows, columns) bool.
-    """
+    """Cells of maps, (B, rows, columns), that no neighbour exceeds (3x3 maximum filter; nothing beyond the border)."""
     # As SciPy's maximum_filter; recognising an object imports no SciPy, which keeps its start short.
     padded = np.pad(maps, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2))
     return np.asarray(maps) >= around.max((-2, -1))
-
-
-def sphere_peaks(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Scores of a map of the whole sphere that put every peak before every other view, each group by value.
-
-    Args:
-        values: (B, rings, azimuths); the last azimuth is next to the first.
-
-    Returns:
-        (B, rings, azimuths) float64.
-    """
-    values = np.asarray(values, np.float64)
-    round_once = np.concatenate([values[..., -1:], values, values[..., :1]], 2)
-    return values + (np.ptp(values, axis=(1, 2), keepdims=True) + 1) * local_peaks(round_once)[..., 1:-1]
 
 
 def peaks_first(maps: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -48,20 +27,20 @@ def peaks_first(maps: NDArray[np.floating]) -> NDArray[np.float64]:
     return maps + span * local_peaks(maps)
 
 
+def sphere_peaks(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The same of maps of the whole sphere, (B, rings, azimuths): the last azimuth is next to the first."""
+    values = np.asarray(values, np.float64)
+    round_once = np.concatenate([values[..., -1:], values, values[..., :1]], 2)
+    return values + (np.ptp(values, axis=(1, 2), keepdims=True) + 1) * local_peaks(round_once)[..., 1:-1]
+
+
 @dataclass(frozen=True)
 class MapPeak:
-    """Go to the highest unvisited peak of a predicted map, or the deepest valley where the belief says so.
-
-    Attributes:
-        sphere: the viewpoints.
-        map_name: the map in the evidence, (B, rings, 3).
-        valley_classes: classes (indices) for which the lowest valley is the better view. What counts is the class
-            *believed* at that moment; the true one is unknown to a robot.
-    """
+    """Go to the highest unvisited peak of a predicted map, or the deepest valley where the belief says so."""
 
     sphere: ViewSphere
-    map_name: str
-    valley_classes: tuple[int, ...] = ()
+    map_name: str  # in the evidence, (B, rings, 3)
+    valley_classes: tuple[int, ...] = ()  # those who are *believed* to be of one of these go to the lowest valley
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -79,7 +58,6 @@ class MapPeak:
         return in_window(self.sphere, state, self._climbed(state))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """See ``Policy.next_views``."""
         return best_in_window(self.sphere, state, self._climbed(state))
 
     def _climbed(self, state: EpisodeState) -> NDArray[np.float64]:
@@ -97,19 +75,12 @@ class MapPeak:
 class SpherePeak:
     """Go to the highest unvisited peak of a predicted map of the whole sphere, then to the highest other view.
 
-    With the map of the entropy, as in Parisotto, Mukherjee and Kasaei, "MORE: simultaneous multi-view 3D object
-    recognition and pose estimation" (Intelligent Service Robotics 16, 2023): a network predicts the depth-entropy of
-    all views around the object from one of them, and the map's local peaks are the views to take. Simplified: they
-    settle the views after the first one, on 60 viewpoints; here the map is predicted anew from each view, on the grid
-    that the network was taught.
-
-    Attributes:
-        sphere: the viewpoints.
-        map_name: the map in the evidence, (B, rings, azimuths), columns once round from the view.
+    As in Parisotto, Mukherjee and Kasaei, "MORE: simultaneous multi-view 3D object recognition and pose estimation"
+    (Intelligent Service Robotics 16, 2023). But here the map is predicted anew from each view, on the network's grid.
     """
 
     sphere: ViewSphere
-    map_name: str
+    map_name: str  # in the evidence, (B, rings, azimuths), columns once round from the view
     travel_weight = 0.0
 
     @property
@@ -126,8 +97,7 @@ class SpherePeak:
         return self._on_sphere(state, sphere_peaks(state.evidence.maps[self.map_name]))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """See ``Policy.next_views``."""
-        return np.where(state.free, self.scores(state), -np.inf).argmax(1)
+        return best_view(self.sphere, state, self.scores(state))
 
     def _on_sphere(self, state: EpisodeState, maps: NDArray[np.float64]) -> NDArray[np.float64]:
         n = self.sphere.azimuths

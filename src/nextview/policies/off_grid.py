@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.geometry.viewsphere import Viewpoints, ViewSphere, angle_between, azimuth_of, elevation_of
 from nextview.policies.base import EpisodeState, Policy, ScoresViews, ValuesViews, travel_from
-from nextview.viewsphere import Viewpoints, ViewSphere, angle_between, elevation_of, turn_of
 
 Float = NDArray[np.float64]
 
@@ -28,19 +28,11 @@ def anywhere(policy: Policy, sphere: Viewpoints) -> Policy:
 
 @dataclass(frozen=True)
 class OffGrid:
-    """A policy on its grid, for any views.
+    """A policy on its grid, for any views. Camera and views on the grid itself make no difference.
 
-    One that scores views goes to the free view with the highest score, less its weighted travel; the scores are
-    interpolated between the four views of the turned grid around each view, and a view counts only where all of them
-    do. Where none counts it goes to the free view with the shortest travel. Any other policy chooses among the cells of
-    the turned grid that have a free view, and goes to the one nearest to the cell.
-
-    Camera and views on the grid itself make no difference: then the policy decides alone.
-
-    Attributes:
-        policy: on the grid.
-        grid: which it knows.
-        sphere: the views.
+    The scores of one that scores views are interpolated between the four views of the turned grid around each view; a
+    view counts only where all of them do, and where none counts the nearest free one is taken. Any other policy chooses
+    among the cells that have a free view, and goes to the view nearest to the cell.
     """
 
     policy: Policy
@@ -53,12 +45,11 @@ class OffGrid:
         return self.policy.needs
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """See ``Policy.next_views``."""
         if self._on_grid(state):
             return self.policy.next_views(state, rng)
         turned, ahead = self._turned(state)
         if not isinstance(self.policy, ScoresViews):
-            return self._nearest_to(self.policy.next_views(turned, rng), state, ahead)
+            return self._nearest_to(self.policy.next_views(turned, rng), state)
         scores = self._between(self.policy.scores(turned), ahead)
         scores -= self.policy.travel_weight * travel_from(self.sphere, state)
         free = state.free
@@ -87,8 +78,8 @@ class OffGrid:
     def _turned(self, state: EpisodeState) -> tuple[EpisodeState, Float]:
         """The state on the turned grid, and how many steps of azimuth each view lies ahead of the camera, (B, V)."""
         n, rows = self.grid.azimuths, np.arange(len(state.current))[:, None]
-        here = self.sphere.directions[state.current] if state.places is None else state.places[:, -1]
-        ahead = (self.sphere.turn[None] - turn_of(here)[:, None]) * n % n
+        here = self._here(state)
+        ahead = (self.sphere.azimuth[None] - azimuth_of(here)[:, None]) / (2 * np.pi) * n % n
         ring = np.abs(np.radians(self.grid.elevations) - elevation_of(here)[:, None]).argmin(1)
         ring_of = np.abs(np.radians(self.grid.elevations) - self.sphere.elevation[:, None]).argmin(1)
         cell = ring_of * n + np.floor(ahead + 0.5).astype(np.int64) % n
@@ -109,16 +100,31 @@ class OffGrid:
             reachable=reachable,
             travel=None,
             places=None,
-            visibility=None if state.visibility is None else self._nearest_of(state.visibility, ahead),
+            visibility=None if state.visibility is None else self._nearest_of(state.visibility, state),
         )
         return turned, ahead
 
-    def _nearest_of(self, values: Float, ahead: Float) -> Float:
+    def _grid_directions(self, state: EpisodeState) -> Float:
+        """Unit vectors towards the views of the turned grid, (B, grid, 3)."""
+        azimuth = azimuth_of(self._here(state))[:, None] + self.grid.azimuth
+        elevation = np.broadcast_to(np.radians(self.grid.elevations)[self.grid.ring], azimuth.shape)
+        flat = np.cos(elevation)
+        return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], 2)
+
+    def _nearest_of(self, values: Float, state: EpisodeState) -> Float:
         """Of the views' values, (B, V), that of the view nearest to each cell of the turned grid, (B, grid)."""
-        behind = ahead[:, None] * 2 * np.pi / self.grid.azimuths - 2 * np.pi * self.grid.turn[:, None]
-        up, other = np.radians(self.grid.elevations)[self.grid.ring][:, None], self.sphere.elevation
-        near = np.sin(up) * np.sin(other) + np.cos(up) * np.cos(other) * np.cos(behind)
+        near = self._grid_directions(state) @ self.sphere.directions.T
         return np.take_along_axis(values, near.argmax(2), 1)
+
+    def _nearest_to(self, cells: NDArray[np.int64], state: EpisodeState) -> NDArray[np.int64]:
+        """The free view nearest to a cell of the turned grid, (B,)."""
+        towards = self._grid_directions(state)[np.arange(len(cells)), cells]
+        arc = angle_between(towards[:, None], self.sphere.directions[None])
+        return np.where(state.free, arc, np.inf).argmin(1)
+
+    def _here(self, state: EpisodeState) -> Float:
+        """Unit vectors towards the cameras, (B, 3)."""
+        return self.sphere.directions[state.current] if state.places is None else state.places[:, -1]
 
     def _between(self, values: Float, ahead: Float) -> Float:
         """Values of the turned grid's views, (B, grid), between which the views lie, (B, V); NaN beside a NaN."""
@@ -136,13 +142,3 @@ class OffGrid:
                 corner = values[rows, order[ring] * n + step % n]
                 found += np.where(share > 1e-6, share * corner, 0.0)
         return found
-
-    def _nearest_to(self, cells: NDArray[np.int64], state: EpisodeState, ahead: Float) -> NDArray[np.int64]:
-        """The free view nearest to a cell of the turned grid, (B,)."""
-        here = self.sphere.directions[state.current] if state.places is None else state.places[:, -1]
-        azimuth = 2 * np.pi * (turn_of(here) + self.grid.azimuth_index[cells] / self.grid.azimuths)
-        elevation = np.radians(self.grid.elevations)[self.grid.ring[cells]]
-        flat = np.cos(elevation)
-        towards = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], 1)
-        arc = angle_between(towards[:, None], self.sphere.directions[None])
-        return np.where(state.free, arc, np.inf).argmin(1)

@@ -7,23 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from nextview.arguments import as_line, of_kind
+from nextview.checks import one_line, plugin, plugin_errors, plugins
 from nextview.errors import PolicyError
-from nextview.measures.map_names import SPHERE, in_order
-from nextview.models.inference import MAPS
-from nextview.occupancy import new_surface, new_volume
-from nextview.own_code import import_own, own_code
+from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.policies.base import Policy
-from nextview.policies.baselines import Furthest, Random, RandomAll, Unidirectional
-from nextview.policies.gain import Gain
+from nextview.policies.baselines import Furthest, Random, RandomAll, Spread, Unidirectional, Visibility
+from nextview.policies.gain import Gain, VisibleGain
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card
-from nextview.policies.spread import Spread
-from nextview.policies.visibility import Visibility, VisibleGain
-from nextview.policies.volumetric import Volumetric
-from nextview.viewsphere import Viewpoints, ViewSphere
+from nextview.recognition.map_names import SPHERE, in_order
+from nextview.recognition.model_card import MAPS
 
 POLICIES: dict[str, Callable[[Any], Policy]] = {
     "random": Random,
@@ -32,18 +25,15 @@ POLICIES: dict[str, Callable[[Any], Policy]] = {
     "unidirectional": Unidirectional,
     "spread": Spread,
     "spread-local": lambda sphere: Spread(sphere, "local"),
-    "volumetric": lambda sphere: Volumetric(sphere, new_volume),
-    "coverage": lambda sphere: Volumetric(sphere, new_surface),
     "visibility": Visibility,
 }
 """Those that follow no map; every predicted map has its own, see ``map_policy``."""
-
-ANYWHERE = ("random-all", "spread", "volumetric", "coverage", "visibility")
-"""Those that ask for no grid."""
-
+GROUP = "nextview.policies"
+"""Entry points by which packages add policies of their own."""
+ANYWHERE = ("random-all", "spread", "visibility")
+"""Those that need no grid."""
 VISIBLE = "visible-"
-"""Before the name of a learned policy: its values times the share of the object that is expected to show."""
-
+"""Before the name of a gain policy: its values times the share of the object that is expected to show."""
 DEFAULT = "gain"
 """The policy where none is named."""
 
@@ -58,10 +48,10 @@ def make_policy(
     """A policy by name.
 
     Args:
-        name: one of POLICIES, one by a map ("view_area", "view_area-peak", "view_area-sphere-peak", see
-            ``map_policy``), a learned one that is bundled, the path of a learned one's card (.json), the same with
-            "visible-" before it (a gain policy, times what shows), or "module:Class" for one of your own, which is
-            called with the sphere alone. One that weighs travel takes another travel weight as NAME@WEIGHT.
+        name: one of POLICIES; one by a map ("lem", "lem-peak", "lem-sphere-peak", see ``map_policy``); a learned one
+            that is bundled; the path of a learned one's card (.json); a gain policy with "visible-" before its name;
+            one that an installed package adds; or "MODULE:CLASS" for one of your own, which is called with the
+            viewpoints alone. NAME@WEIGHT sets the travel weight of one that weighs travel.
         sphere: the viewpoints; a ``ViewSphere`` but for those of ANYWHERE and your own.
         valley_classes: classes (indices) whose believers go to the map's valley.
         classes: names of the recogniser's classes; a learned policy for others is refused.
@@ -70,41 +60,62 @@ def make_policy(
     Raises:
         PolicyError: there is no such policy, or it cannot be made.
     """
-    of_kind(name, str, "a policy is a name", PolicyError)
-    of_kind(sphere, Viewpoints, "the viewpoints of a policy are a ViewSphere or Directions", PolicyError)
-    if not np.iterable(valley_classes) or not (classes is None or np.iterable(classes)):
-        raise PolicyError(f"classes are a list of them, not {as_line(valley_classes)} and {as_line(classes)}")
     if "@" in name and ":" not in name:
-        card, _, travel_weight = name.partition("@")
-        return _at_travel_weight(make_policy(card, sphere, valley_classes, classes, maps), name, travel_weight)
-    learned = bundled_policies()
-    if name.startswith(VISIBLE):
-        card = name.removeprefix(VISIBLE)
-        if card in learned or card.endswith(".json"):
-            return _visible(read_policy(learned.get(card, Path(card)), sphere, classes), name)
+        plain, _, travel_weight = name.partition("@")
+        return _at_travel_weight(make_policy(plain, sphere, valley_classes, classes, maps), name, travel_weight)
+    if _on_grid(name, maps) and not isinstance(sphere, ViewSphere):
+        raise PolicyError(f"policy {name} needs viewpoints on rings")
     if name in POLICIES:
-        if name not in ANYWHERE and not isinstance(sphere, ViewSphere):
-            raise PolicyError(f"policy {name} needs viewpoints on rings")
         return POLICIES[name](sphere)
     by_map = map_policy(name, sphere, valley_classes, maps)
     if by_map is not None:
-        if not isinstance(sphere, ViewSphere):
-            raise PolicyError(f"policy {name} needs viewpoints on rings")
         return by_map
-    if name in learned or name.endswith(".json"):
-        return read_policy(learned.get(name, Path(name)), sphere, classes)
-    if ":" in name:
-        return _import_policy(name, sphere)
-    known = [*POLICIES, *map_policy_names(maps), *learned, f"{VISIBLE}{DEFAULT}"]
+    card = _card(name)
+    if card is not None:
+        policy = read_policy(card, sphere, classes)
+        return _visible(policy, name) if name.startswith(VISIBLE) else policy
+    path = plugins(GROUP).get(name, name)
+    if ":" in path:
+        return _import_policy(path, sphere)
+    known = [*policy_names(), *map_policy_names(maps), *bundled_policies(), f"{VISIBLE}{DEFAULT}"]
     raise PolicyError(f"no policy is called {name!r}; there are {', '.join(known)}")
 
 
-def map_policy(name: str, sphere: Any, valley_classes: Sequence[int], maps: Collection[str]) -> Policy | None:
-    """The policy that climbs a predicted map; None if the name is not that of one.
+def make_policy_anywhere(
+    name: str,
+    viewpoints: Viewpoints,
+    valley_classes: Sequence[int] = (),
+    classes: Sequence[str] | None = None,
+    maps: Collection[str] = (),
+) -> Policy:
+    """A policy by name for live use, whatever the viewpoints: see ``policies.off_grid``."""
+    card = _card(name.partition("@")[0])
+    if card is not None:
+        about = read_policy_card(card)
+        viewpoints = ViewSphere(about.elevations, about.azimuths)
+    elif _on_grid(name, maps) and not isinstance(viewpoints, ViewSphere):
+        viewpoints = ViewSphere.named("40")
+    return make_policy(name, viewpoints, valley_classes, classes, maps)
 
-    MAP goes to the peaks of the local window, and to its valleys for the valley classes; MAP-peak always to the peaks;
-    MAP-sphere-peak to those of the whole sphere. Arguments as for ``make_policy``.
-    """
+
+def policy_names() -> list[str]:
+    """POLICIES, and those that installed packages add."""
+    return [*POLICIES, *plugins(GROUP)]
+
+
+def _card(name: str) -> Path | None:
+    """The card of a learned policy, also after "visible-"; None if the name is not that of one."""
+    card = name.removeprefix(VISIBLE)
+    return Path(card) if card.endswith(".json") else bundled_policies().get(card)
+
+
+def _on_grid(name: str, maps: Collection[str]) -> bool:
+    """Whether it is a policy that knows rings and neighbours."""
+    return (name in POLICIES and name not in ANYWHERE) or map_policy(name, None, (), maps) is not None
+
+
+def map_policy(name: str, sphere: Any, valley_classes: Sequence[int], maps: Collection[str]) -> Policy | None:
+    """The policy that climbs a predicted map; None if the name is not that of one."""
     of = name.removesuffix("-peak")
     window, always = of.removesuffix(SPHERE), of != name
     if window not in (*MAPS, *maps) or (of != window and not always):
@@ -127,29 +138,6 @@ def with_cards(name: str, cards: Mapping[str, Path]) -> str:
     return name if card is None else f"{VISIBLE}{card}{weighted}{travel_weight}"
 
 
-def make_policy_anywhere(
-    name: str,
-    viewpoints: Viewpoints,
-    valley_classes: Sequence[int] = (),
-    classes: Sequence[str] | None = None,
-    maps: Collection[str] = (),
-) -> Policy:
-    """A policy by name for live use, whatever the viewpoints: see ``policies.off_grid``.
-
-    One that was learned on a grid is made for that, the baselines that know neighbours for the 40 views where the
-    viewpoints are on no grid, and all others for the viewpoints. Arguments and errors as for ``make_policy``.
-    """
-    card = name.partition("@")[0].removeprefix(VISIBLE)
-    path = bundled_policies().get(card, Path(card) if card.endswith(".json") else None)
-    if path is not None:
-        about = read_policy_card(path)
-        return make_policy(name, ViewSphere(about.elevations, about.azimuths), valley_classes, classes)
-    on_grid = (name in POLICIES and name not in ANYWHERE) or map_policy(name, viewpoints, (), maps) is not None
-    if on_grid and not isinstance(viewpoints, ViewSphere):
-        return make_policy(name, ViewSphere.named("40"), valley_classes, classes, maps)
-    return make_policy(name, viewpoints, valley_classes, classes, maps)
-
-
 def _visible(policy: Policy, name: str) -> Policy:
     if not isinstance(policy, Gain):
         raise PolicyError(f"{name}: this policy values no views that could be weighed by what shows")
@@ -166,12 +154,11 @@ def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
 
 
 def _import_policy(path: str, sphere: Viewpoints) -> Policy:
-    with own_code(lambda said: PolicyError(f"policy {path} cannot be made ({said})")):
-        policy = import_own(path)(sphere)
-        getattr(policy, "needs", None)  # may be code, too
+    with plugin_errors(lambda said: PolicyError(f"policy {path} cannot be made ({said})")):
+        policy = plugin(path)(sphere)
     for part in ("next_views", "needs"):
         if not hasattr(policy, part):
             raise PolicyError(f"policy {path} has no {part}; see nextview.policies.base.Policy")
     if not isinstance(policy.needs, tuple | list) or not all(isinstance(need, str) for need in policy.needs):
-        raise PolicyError(f"policy {path}: its needs are a tuple of names, not {as_line(policy.needs)}")
+        raise PolicyError(f"policy {path}: its needs are a tuple of names, not {one_line(repr(policy.needs))}")
     return policy

@@ -4,16 +4,16 @@ from typing import TYPE_CHECKING, Any
 
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box, ObjectFrame
-from nextview.sensing.plausibility import Doubt, check_observation, check_views
+from nextview.sensing.plausibility import ViewWarning, check_observation, check_views
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
-__all__ = ["Box", "Doubt", "Frame", "ObjectFrame", "ObservedObject", "check_observation", "check_views"]
+__all__ = ["Box", "Frame", "ObjectFrame", "ObservedObject", "ViewWarning", "check_observation", "check_views"]
 
 
 def __getattr__(name: str) -> Any:
-    """The observed object, imported when it is used: it takes SciPy, which recognition does without."""
+    """``ObservedObject`` takes SciPy, which ``nextview recognise`` starts without: imported when it is used."""
     if name == "ObservedObject":
         from nextview.sensing.observed_object import ObservedObject
 

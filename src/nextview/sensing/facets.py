@@ -1,9 +1,9 @@
-"""Clean a depth image: a small plane for every pixel of the object, fitted to its neighbourhood on the same surface.
+"""Clean a depth image by a small plane for every pixel of the object, and look at these as the networks were taught to.
 
-This is the sloped facet model of Haralick and Watson (A facet model for image data, Computer Graphics and Image
-Processing 15, 1981), on inverse depth, where planes of the world are planes of the image: 1/z = n . (x, y, 1) for the
-ray (x, y, 1) of a pixel, which says that n . P = 1 for every point P of the plane. Noise is averaged, holes are filled,
-normals come with it, and edges stay sharp because a pixel may take the plane of a window beside it.
+The sloped facet model of Haralick and Watson (A facet model for image data, Computer Graphics and Image Processing 15,
+1981), on inverse depth, where planes of the world are planes of the image: 1/z = n . (x, y, 1) for the ray (x, y, 1) of
+a pixel, so n . P = 1 for every point P of the plane. Noise is averaged, holes are filled, normals come with it, and
+edges stay sharp because a pixel may take the plane of a window beside it.
 """
 
 from __future__ import annotations
@@ -14,37 +14,89 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from nextview.sensing.noise import ROWS, Noise, estimate_noise
+from nextview.geometry.observation import pinhole
+from nextview.geometry.viewsphere import DISTANCE
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Index = NDArray[np.int64]
 
 CLOSE_ENOUGH = 1.5
-"""Deviation of a window's pixels from its plane up to which they are taken for noise, in its standard deviations."""
+"""Standard deviations of noise that a window may deviate from its plane."""
 STEEPEST_ERROR = 0.1
 """Error of the slope (tangent) that noise may leave: six degrees of the normal."""
 FINEST = 2e-4
 """Relative noise of depth that even the best frame is taken to have."""
 STEEPEST = np.tan(np.radians(85.0))
 """Slope towards the ray beyond which neighbouring pixels are taken for two surfaces."""
+BINS = 4
+"""Ranges of depth in which the noise is measured, with equally many pixels."""
+ROWS = 20
+"""About so many rows of a picture are enough to measure it."""
+LAGS = (1, 2, 4, 6)
+"""Distances of the pixels that are compared: in many sensors neighbours err together."""
+NEAREST, FARTHEST = 0.5, 100.0
+"""Depth of what can be shown, object radii; all of the object is between 2 and 4."""
+WIDEST = 1 / 16
+"""Half the width of what one sensor pixel covers here at most, as a part of the image: it bounds the time."""
+LAYER = 0.03
+"""Object radii of depth within which facets are of one surface; the nearest to a pixel is shown."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of inverse depth, 1/metres, at ascending depths, and how many pixels err together."""
+
+    depths: NDArray[np.float64]
+    sigmas: NDArray[np.float64]
+    grain: int = 1
+
+    def at(self, depth: NDArray[np.floating] | float) -> NDArray[np.float64]:
+        """Standard deviation of inverse depth at some depths, same shape, 1/metres."""
+        return np.asarray(np.interp(depth, self.depths, self.sigmas))
+
+
+def estimate_noise(depth: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noise:
+    """Measure the noise of a depth image, (H, W), metres, on its usable pixels, (H, W) bool; zero where they are few.
+
+    On a plane the second difference of inverse depth along a row is noise alone, with the variance 6 sigma^2 if its
+    pixels do not err together; the median of its size does not mind the edges.
+    """
+    q = np.where(usable, 1 / np.where(usable, depth, 1), np.nan)
+    found = []
+    for lag in LAGS:
+        second = np.abs(q[:, : -2 * lag] - 2 * q[:, lag:-lag] + q[:, 2 * lag :]) if q.shape[1] > 2 * lag else q[:, :0]
+        known = np.isfinite(second)
+        if not known.any():
+            break
+        found.append((lag, second[known], depth[:, lag:-lag][known]))
+    if not found:
+        return Noise(np.ones(1), np.zeros(1))
+    typical = np.array([_sigma(second) for _, second, _ in found])
+    grain = found[int((typical >= 0.7 * typical.max()).argmax())][0]
+    _, second, at = found[-1]
+    parts = np.array_split(np.argsort(at), min(BINS, len(at)))
+    depths = np.array([np.median(at[part]) for part in parts], np.float64)
+    return Noise(depths, np.array([_sigma(second[part]) for part in parts]), grain)
+
+
+def _sigma(second: NDArray[np.floating]) -> float:
+    """Standard deviation of the noise from the sizes of second differences."""
+    return float(np.median(second)) / (0.6745 * np.sqrt(6))
 
 
 @dataclass(frozen=True)
 class Facets:
-    """Planes of the pixels of an object, in the camera's frame.
+    """Planes of the N pixels of an object, in the camera's frame.
 
-    Attributes:
-        planes: n of each, with n . P = 1 for points P of the plane, (N, 3) float64, 1/metres.
-        rays: (x, y, 1) through each pixel's centre, (N, 3) float64.
-        rows: of each in the frame, (N,) int64.
-        columns: of each in the frame, (N,) int64.
-        pitch: distance between neighbouring rays along x and y at depth 1, (2,) float64.
+    ``planes`` are n of each, with n . P = 1 for points P of the plane, (N, 3), 1/metres; ``rays`` (x, y, 1) through the
+    pixels' centres, (N, 3); ``pitch`` the distance between neighbouring ones along x and y at depth 1, (2,).
     """
 
     planes: Float
     rays: Float
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
+    rows: Index
+    columns: Index
     pitch: Float
 
     @property
@@ -54,16 +106,10 @@ class Facets:
 
 
 def drop_flying(depth: NDArray[np.float32], usable: Mask, noise: float, pitch: float) -> Mask:
-    """The usable pixels without those that hang in the air between two surfaces.
+    """The usable pixels, (H, W) bool, without those that hang in the air between two surfaces.
 
-    A pixel stays if at least three of its eight neighbours are on its surface: as near in depth as noise and a steep
-    slope allow.
-
-    Args:
-        depth: (H, W), metres, all that was measured.
-        usable: pixels of the object, (H, W) bool.
-        noise: of inverse depth, 1/metres.
-        pitch: angle between neighbouring pixels, radians.
+    A pixel stays if at least three of its eight neighbours are on its surface: as near in depth as noise of inverse
+    depth, 1/metres, and a steep slope allow. ``pitch`` is the angle between neighbouring pixels, radians.
     """
     h, w = depth.shape
     padded = np.pad(depth, 1)
@@ -84,19 +130,11 @@ def fit_facets(
     coarse: int = 1,
     frame_noise: Noise | None = None,
 ) -> Facets:
-    """The facets of an object in a depth image.
+    """Facets of an object, whose pixels are ``mask``, in a depth image, or in a part of it that starts at ``corner``.
 
-    Args:
-        depth: (H, W) float32, metres, 0 = nothing: a frame or a part of it.
-        mask: the object's pixels, (H, W) bool. With ``denoise`` holes in it are filled.
-        intrinsics: of the frame, pixels, first pixel's centre at 0.5.
-        corner: row and column of the part's first pixel in the frame.
-        denoise: smooth, fill holes and drop flying pixels. If not, every pixel keeps its depth.
-        coarse: one facet for a square of so many pixels.
-        frame_noise: that of the whole frame, because a thin object has too few pixels in a row to tell.
-
-    Returns:
-        The facets; none where there are too few pixels to fit one.
+    One for each square of ``coarse`` pixels; none where there are too few pixels to fit one. ``intrinsics`` are of the
+    whole frame, as is ``frame_noise``: a thin object has too few pixels in a row to tell. Without ``denoise`` every
+    pixel keeps its depth, holes stay, and so do flying pixels.
     """
     focal = intrinsics[[0, 1], [0, 1]]
     h, w = depth.shape
@@ -104,9 +142,15 @@ def fit_facets(
     noise, grain, wanted = 0.0, 1, usable
     if denoise:
         if usable.any():
-            noise, grain = _noise(depth, usable, frame_noise)
+            few, typical = slice(None, None, max(1, h // ROWS)), float(np.median(depth[usable]))
+            measured = estimate_noise(depth[few], usable[few])
+            if frame_noise is not None and measured.at(typical) >= frame_noise.at(typical):
+                measured = frame_noise
+            noise, grain = float(measured.at(typical)), measured.grain
         usable = drop_flying(depth, usable, noise, 1 / focal.mean())
-        wanted = _without_holes(usable, mask, depth > 0)
+        near = ndimage.maximum_filter(usable, 5, mode="constant")
+        closed = ~ndimage.maximum_filter(~near, 5, mode="constant", cval=0)
+        wanted = usable | (closed & (mask | (depth == 0)))  # what was not measured, or dropped, too
     if not usable.any():
         none = np.zeros(0, np.int64)
         return Facets(np.zeros((0, 3)), np.zeros((0, 3)), none, none, coarse / focal)
@@ -127,9 +171,8 @@ def fit_facets(
     own = np.where(count > 0, sums[6, rows, columns] / np.maximum(count, 1e-9), np.nan)
     if denoise:
         noise = max(noise, FINEST * float(middle[2]))
-        planes = _choose(
-            sums, own, rows, columns, here, noise, _radii(noise, float(middle[2]), pitch, max(1, grain / coarse))
-        )
+        radii = _radii(noise, float(middle[2]), pitch, max(1, grain / coarse))
+        planes = _choose(sums, own, rows, columns, here, noise, radii)
     else:
         planes = _fit(sums, 1, 1)[rows * sums.shape[2] + columns, :3]
         planes[:, 2] = own - (planes[:, :2] * here).sum(1)
@@ -143,25 +186,8 @@ def fit_facets(
     return Facets(planes[good], rays[good], rows[good], columns[good], pitch)
 
 
-def _noise(depth: NDArray[np.float32], usable: Mask, frame_noise: Noise | None) -> tuple[float, int]:
-    """Standard deviation of inverse depth and grain of an object's pixels: no more than those of the whole frame."""
-    few = slice(None, None, max(1, len(depth) // ROWS))
-    own = estimate_noise(depth[few], usable[few])
-    middle = float(np.median(depth[usable]))
-    if frame_noise is None or own.at(middle) < frame_noise.at(middle):
-        return float(own.at(middle)), own.grain
-    return float(frame_noise.at(middle)), frame_noise.grain
-
-
-def _without_holes(usable: Mask, mask: Mask, measured: Mask) -> Mask:
-    """The usable pixels and what was not measured, or dropped, among them."""
-    near = ndimage.maximum_filter(usable, 5, mode="constant")
-    closed = ~ndimage.maximum_filter(~near, 5, mode="constant", cval=0)
-    return usable | (closed & (mask | ~measured))
-
-
 def _moments(weight: Float, x: Float, y: Float, q: Float) -> Float:
-    """What a fit of planes sums over pixels, (10, H, W): 1, x, y, xx, xy, yy, q, xq, yq, qq."""
+    """Moments for a fit of planes, (10, H, W): 1, x, y, xx, xy, yy, q, xq, yq, qq."""
     x, y = x[None, :], y[:, None]
     wx, wy = weight * x, weight * y
     return np.stack([weight, wx, wy, wx * x, wx * y, wy * y, q, x * q, y * q, q * q])
@@ -176,8 +202,7 @@ def _blocks(images: Float, side: int) -> Float:
 
 
 def _radii(noise: float, inverse: float, pitch: Float, grain: float) -> tuple[int, int]:
-    """Windows that grow with the noise: half sides of the small one, which leaves slopes as good as they should be,
-    and of one twice as large, pixels.
+    """Half sides of two windows that grow with the noise, pixels, the larger first; slopes of the smaller are accurate.
 
     The slope of a plane fitted to k x k pixels that err for themselves has the standard deviation sigma sqrt(12) / k^2
     per pixel; where grains of g x g pixels err together it is g times that.
@@ -189,22 +214,16 @@ def _radii(noise: float, inverse: float, pitch: Float, grain: float) -> tuple[in
 
 
 def _fit(sums: Float, radius: int, enough: float) -> Float:
-    """Planes of windows of (2 radius + 1)^2 cells around every cell.
+    """Planes of windows of (2 radius + 1)^2 cells around every cell, (H W, 4): slopes, value at x = y = 0, variance.
 
-    Returns:
-        For each cell in turn the plane's slopes along x and y, its value at x = y = 0, and the variance of the
-        residuals, infinite for windows with fewer than ``enough`` pixels: (H W, 4).
+    The last, of the residuals, is infinite for windows with fewer than ``enough`` pixels.
     """
     side = 2 * radius + 1
     means = np.stack([ndimage.uniform_filter(image, side, mode="constant") for image in sums])
     n = means[0] * side**2
     x, y, xx, xy, yy, q, xq, yq, qq = means[1:] / np.maximum(means[0], 1e-9)
-    xx -= x * x
-    xy -= x * y
-    yy -= y * y
-    xq -= x * q
-    yq -= y * q
-    qq -= q * q
+    for square, a, b in ((xx, x, x), (xy, x, y), (yy, y, y), (xq, x, q), (yq, y, q), (qq, q, q)):
+        square -= a * b
     ridge = 1e-5 * max(float(xx.max()), float(yy.max())) + 1e-30  # pixels in one line have no plane: a level one
     xx += ridge
     yy += ridge
@@ -217,30 +236,13 @@ def _fit(sums: Float, radius: int, enough: float) -> Float:
 
 
 def _choose(
-    sums: Float,
-    own: Float,
-    rows: NDArray[np.int64],
-    columns: NDArray[np.int64],
-    here: Float,
-    noise: float,
-    radii: tuple[int, int],
+    sums: Float, own: Float, rows: Index, columns: Index, here: Float, noise: float, radii: tuple[int, int]
 ) -> Float:
-    """For every wanted cell the plane of the largest window that shows one surface, which is the cell's own.
+    """For every wanted cell the plane of the largest window that shows only the cell's own surface, (N, 3), or NaN.
 
     First the windows around the cell, the larger one before the smaller; then small ones that have it at their rim.
-    Windows lie so densely that one is centred within half the small radius of every cell.
-
-    Args:
-        sums: moments, (10, H, W).
-        own: inverse depth of the wanted cells, (N,), NaN in holes.
-        rows: of these, (N,).
-        columns: of these, (N,).
-        here: their x and y, (N, 2).
-        noise: of inverse depth.
-        radii: of the windows, the larger first.
-
-    Returns:
-        (N, 3); NaN where no window has enough pixels.
+    Windows lie so densely that one is centred within half the small radius of every cell. From the moments (10, H, W),
+    and of the wanted cells inverse depth (N,), NaN in holes, rows, columns, and x and y ``here`` (N, 2).
     """
     step = max(1, radii[1] // 2)
     if step > 1:
@@ -271,5 +273,76 @@ def _choose(
 
 
 def _deviation(planes: Float, here: Float, own: Float) -> Float:
-    """How far planes (N, 3 or more) at x and y (N, 2) are from the cells' own inverse depth (N,), NaN in holes."""
+    """Distance of planes, (N, 3 or more), at x and y, (N, 2), from the cells' own inverse depth, (N,), NaN in holes."""
     return planes[:, 0] * here[:, 0] + planes[:, 1] * here[:, 1] + planes[:, 2] - own
+
+
+def virtual_pose(pose: Float) -> Float:
+    """Where the networks would have looked from: in the camera's direction, at their distance, horizon level.
+
+    From and to camera-to-world, (4, 4), OpenCV axes, object frame, object radii.
+    """
+    position = pose[:3, 3]
+    outward = position / np.linalg.norm(position) if position.any() else -pose[:3, 2]
+    right = np.array([-outward[1], outward[0], 0.0])
+    if np.hypot(right[0], right[1]) < 1e-6:  # straight above: keep the camera's own right
+        right = pose[:3, 0] - (pose[:3, 0] @ outward) * outward
+    right /= np.linalg.norm(right)
+    virtual = np.eye(4)
+    virtual[:3, :3] = np.stack([right, np.cross(-outward, right), -outward], 1)
+    virtual[:3, 3] = DISTANCE * outward
+    return virtual
+
+
+def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """The depth image of the facets from the virtual pose, object radii, and the facet in each pixel, -1 for none.
+
+    Each facet is cast where the virtual camera sees it; a pixel shows the nearest surface, at the depth where its own
+    ray meets the facet's plane, so that planes stay planes. ``pose`` is that of the camera that saw them, object frame,
+    object radii; ``radius`` in metres.
+    """
+    target = virtual_pose(pose)
+    focal = pinhole(size, DISTANCE)[0, 0]
+    turn = target[:3, :3].T @ pose[:3, :3]
+    shift = target[:3, :3].T @ (pose[:3, 3] - target[:3, 3])
+    points = facets.points / radius
+    seen_from = points[:, 2]  # depth in the sensor's own image
+    points = points @ turn.T + shift
+    # n . P = 1 in the sensor's frame; P = turn^T (P' - shift), so n' . P' = 1 + n' . shift.
+    normals = facets.planes * radius @ turn.T
+    offset = 1 + normals @ shift
+    z = points[:, 2]
+    front = np.flatnonzero((z > NEAREST) & (z < FARTHEST))
+    x, y = focal * points[front, :2].T / z[front] + size / 2
+    # A facet is as wide as a sensor's pixel: so many pixels here, half to each side; somewhat more where it is turned.
+    # A sensor that stands within the object has wider ones; they fill gaps no farther than WIDEST.
+    half = np.clip(0.6 * focal * facets.pitch.mean() * seen_from[front] / z[front], 0.5, WIDEST * size) + 0.05
+    # The first column and row whose centres it covers:
+    left, top = (np.clip(np.ceil(at - half - 0.5), -size, size).astype(np.int64) for at in (x, y))
+    layer = (z[front] / LAYER).astype(np.int64) << 48 | front
+    best = np.full(size * size, np.iinfo(np.int64).max)
+    across = range(int(2 * half.max()) + 1) if len(front) else range(0)
+    for down in across:
+        row = top + down
+        dy = np.abs(row + 0.5 - y)
+        some = np.flatnonzero((dy <= half) & (row >= 0) & (row < size))
+        for right in across:
+            column = left[some] + right
+            dx = np.abs(column + 0.5 - x[some])
+            hit = np.flatnonzero((dx <= half[some]) & (column >= 0) & (column < size))
+            it = some[hit]
+            key = layer[it] | ((dx[hit] + dy[it]) * 64).astype(np.int64) << 32
+            np.minimum.at(best, row[it] * size + column[hit], key)
+    shown = np.flatnonzero(best < np.iinfo(np.int64).max)
+    facet = np.full(size * size, -1)
+    facet[shown] = best[shown] & 0xFFFFFFFF
+    chosen = facet[shown]
+    rays = np.stack([(shown % size + 0.5) / focal, (shown // size + 0.5) / focal, np.ones(len(shown))], 1)
+    rays[:, :2] -= size / 2 / focal
+    with np.errstate(divide="ignore"):
+        meets = offset[chosen] / (normals[chosen] * rays).sum(1)
+    # A plane seen edge-on runs away within a pixel: stay near the facet.
+    near = np.abs(meets - z[chosen]) < LAYER
+    depth = np.zeros(size * size, np.float32)
+    depth[shown] = np.where(near, meets, z[chosen])
+    return depth.reshape(size, size), facet.reshape(size, size)

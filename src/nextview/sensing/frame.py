@@ -7,51 +7,42 @@ from dataclasses import InitVar, dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nextview.arguments import as_line, number
+from nextview.checks import one_line
 from nextview.errors import ObservationError
-from nextview.observation import LARGEST, array_of, numbers
+from nextview.geometry.observation import LARGEST, array_of, numbers
 
 FARTHEST = 65.0
-"""Metres beyond which a float depth is taken for "nothing"; 65.535 m is also what uint16 millimetres can say."""
+"""Metres: float depth beyond is nothing; uint16 millimetres reach as far."""
+LARGEST_MEDIAN = 20.0
+"""Metres: beyond it a depth image is of another unit. Inches are 39 times as many as metres."""
+ASPECTS = (4 / 3, 16 / 9, 16 / 10, 512 / 424, 640 / 576)
+"""Width over height of what sensors give, as against parts that were cut out of it."""
 AXES = {
     "opencv": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ros": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
 }
-"""The axes of a camera pose: OpenCV's optical axes (x right, y down, z forward), OpenGL's (x right, y up, z backward)
-and those of a robot's body (x forward, y left, z up; ROS REP 103). Columns: OpenCV's axes in the named ones."""
-
+"""Of a camera pose: OpenCV's (x right, y down, z forward), OpenGL's (x right, y up, z backward) and those of a robot's
+body (x forward, y left, z up; ROS REP 103). Columns: OpenCV's axes in the named ones."""
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue in a grey image (ITU-R BT.601)."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What a depth camera gave at one moment. Only depth and intrinsics are needed.
-
-    The arguments may be in the habits of the sensor; the attributes are in those of nextview.
-
-    Args:
-        depth: along the optical axis, (H, W), any size. Float: metres, where NaN, infinity, zero and negative numbers
-            mean nothing. uint16: millimetres, where 0 and 65535 mean nothing (ROS REP 118).
-        intrinsics: pinhole matrix, (3, 3), pixels.
-        pose: camera-to-world, (4, 4), metres, any world frame. None: the camera itself is the world; good for a single
-            frame only.
-        mask: where the object is, (H, W) bool; None if that is to be found.
-        image: grey (H, W) or colour (H, W, 3) uint8, registered to the depth.
-        axes: of the pose: "opencv", "opengl" or "ros", see AXES.
-        pixel_centre: coordinate of the first pixel's centre in the convention of the intrinsics: 0 for OpenCV and ROS,
-            0.5 for OpenGL and for nextview's own ``Observation``.
+    """What a depth camera gave at one moment. Only depth and intrinsics are needed. ObservationError names mistakes.
 
     Attributes:
-        depth: (H, W) float32, metres, 0 = nothing.
-        intrinsics: (3, 3) float64; pixel (row, column) has its centre at (column + 0.5, row + 0.5).
-        pose: (4, 4) float64, OpenCV axes; or None.
-        mask: as given.
-        image: grey, (H, W) uint8; or None.
-
-    Raises:
-        ObservationError: what is wrong, and the likely mistake.
+        depth: along the optical axis, (H, W). Handed in as float metres, where NaN, infinity, zero and negative numbers
+            mean nothing, or as uint16 millimetres, where 0 and 65535 do. Becomes float32, metres, 0 = nothing.
+        intrinsics: pinhole matrix, (3, 3), pixels. Becomes float64, with the first pixel's centre at 0.5.
+        pose: camera-to-world, (4, 4), metres, any world frame; becomes OpenCV's axes. None: the camera itself is the
+            world; good for a single frame only.
+        mask: where the object is, (H, W) bool; None if that is to be found.
+        image: grey (H, W) or colour (H, W, 3) uint8, registered to the depth; becomes grey.
+        axes: of the pose handed in: "opencv", "opengl" or "ros", see AXES.
+        pixel_centre: of the first pixel in the intrinsics handed in: 0 for OpenCV and ROS, 0.5 for OpenGL and for
+            nextview's own ``Observation``.
     """
 
     depth: NDArray[np.float32]
@@ -65,13 +56,13 @@ class Frame:
     def __post_init__(self, axes: str, pixel_centre: float) -> None:
         depth = _metres(self.depth)
         intrinsics = _check_intrinsics(self.intrinsics, depth.shape)
-        if not abs(number(pixel_centre, "the coordinate of the first pixel's centre")) <= 1:
-            raise ObservationError(f"the first pixel's centre has the coordinate 0 or 0.5, not {as_line(pixel_centre)}")
+        if not abs(pixel_centre) <= 1:
+            raise ObservationError(f"the first pixel's centre has the coordinate 0 or 0.5, not {pixel_centre!r}")
         intrinsics[:2, 2] += 0.5 - pixel_centre
         object.__setattr__(self, "depth", depth)
         object.__setattr__(self, "intrinsics", intrinsics)
-        if not isinstance(axes, str) or axes not in AXES:
-            raise ObservationError(f"the axes of a pose are {', '.join(AXES)}, not {as_line(axes)}")
+        if axes not in AXES:
+            raise ObservationError(f"the axes of a pose are {', '.join(AXES)}, not {one_line(repr(axes))}")
         if self.pose is not None:
             pose = check_pose(self.pose)
             pose[:3, :3] = pose[:3, :3] @ AXES[axes]
@@ -80,13 +71,19 @@ class Frame:
             mask = array_of(self.mask, "the mask")
             if mask.shape != depth.shape or mask.dtype != bool:
                 raise ObservationError(
-                    f"a mask is (H, W) bool as the depth is, {depth.shape}, not {mask.shape} {mask.dtype}"
+                    f"a mask is (H, W) bool as the depth, {depth.shape}, not {mask.shape} {mask.dtype}"
                 )
             if not (mask & (depth > 0)).any():
                 raise ObservationError("no pixel of the mask has a depth: a mask of another image, or empty")
             object.__setattr__(self, "mask", mask)
         if self.image is not None:
-            object.__setattr__(self, "image", _grey(self.image, depth.shape))
+            image = array_of(self.image, "the image")
+            if image.dtype != np.uint8 or image.shape not in (depth.shape, (*depth.shape, 3)):
+                raise ObservationError(
+                    f"an image is (H, W) or (H, W, 3) uint8 registered to the depth, {depth.shape}, not {image.shape} "
+                    f"{image.dtype}"
+                )
+            object.__setattr__(self, "image", image if image.ndim == 2 else np.rint(image @ LUMA).astype(np.uint8))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -131,26 +128,31 @@ def _metres(depth: ArrayLike) -> NDArray[np.float32]:
         raise ObservationError(f"depth is float metres or uint16 millimetres, not {depth.dtype}")
     seen = metres[::4, ::4]
     middle = float(np.median(seen[seen > 0])) if (seen > 0).any() else 0.0
+    wrong = ""
     if middle > FARTHEST:
-        raise ObservationError(
-            f"the depth has a median of {middle:.0f} where metres are expected: millimetres? Divide them by 1000, or "
-            "hand them in as uint16"
-        )
-    if 0 < middle < 0.01:
-        raise ObservationError(
-            f"the depth has a median of {middle:.2g} m: scaled to 0 .. 1, divided twice, or uint16 of another unit?"
-        )
+        wrong = "where metres are expected: millimetres? Divide them by 1000, or hand them in as uint16"
+    elif middle > LARGEST_MEDIAN:
+        wrong = "m, and no depth camera measures so far: is it in inches or feet?"
+    elif 0 < middle < 0.01:
+        wrong = "m: scaled to 0 .. 1, divided twice, or uint16 of another unit?"
+    if wrong:
+        raise ObservationError(f"the depth has a median of {middle:.4g} {wrong}")
     metres = np.where(metres < FARTHEST, metres, np.float32(0))
     if not metres.any():
         raise ObservationError("nothing is seen: no pixel has a depth")
     return metres
 
 
+def _matrix(values: ArrayLike, what: str, shape: tuple[int, int]) -> NDArray[np.float64]:
+    matrix = numbers(values, what).astype(np.float64)
+    if matrix.shape != shape or not (np.abs(matrix) < LARGEST).all():
+        given = f"of the shape {matrix.shape}" if matrix.shape != shape else "with NaN, infinity or what no camera has"
+        raise ObservationError(f"{what} is a {shape} matrix of finite numbers, not one {given}")
+    return matrix
+
+
 def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    k = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64)
-    if k.shape != (3, 3) or not (np.abs(k) < LARGEST).all():
-        given = f"of the shape {k.shape}" if k.shape != (3, 3) else "with NaN, infinity or what no camera has"
-        raise ObservationError(f"intrinsics are a (3, 3) matrix of finite numbers, not one {given}")
+    k = _matrix(intrinsics, "the matrix of intrinsics", (3, 3))
     if not np.array_equal(k[2], [0, 0, 1]) or k[1, 0] != 0 or abs(k[0, 1]) > 1e-3 * abs(k[0, 0]):
         raise ObservationError("intrinsics are [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: transposed, or with a skew?")
     k[0, 1] = 0
@@ -163,52 +165,35 @@ def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[
             f"a focal length of {focal:.3g} is too short for an image of {width} x {height}: it is expected in "
             "pixels, not in millimetres or parts of the image"
         )
+    point = f"the principal point ({k[0, 2]:.0f}, {k[1, 2]:.0f}) is"
     if not (-width < k[0, 2] < 2 * width and -height < k[1, 2] < 2 * height):
+        raise ObservationError(f"{point} far off an image of {width} x {height}: intrinsics of another resolution?")
+    across, down = 2 * k[0, 2] / width, 2 * k[1, 2] / height  # 1 in the middle
+    scale, whole = (across + down) / 2, min(abs(width / height / aspect - 1) for aspect in ASPECTS) < 0.01
+    if whole and abs(scale - 1) > 0.2 and abs(across - down) < 0.08 * scale:
         raise ObservationError(
-            f"the principal point ({k[0, 2]:.0f}, {k[1, 2]:.0f}) is far off an image of {width} x {height}: intrinsics "
-            "of another resolution?"
+            f"{point} the middle of an image of {scale * width:.0f} x {scale * height:.0f}, and the depth is {width} x "
+            f"{height}: intrinsics of another resolution"
         )
     return k
 
 
 def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
-    """A copy of a rigid pose.
-
-    Args:
-        pose: (4, 4).
-
-    Raises:
-        ObservationError: it is not rigid; names the likely mistake.
-    """
-    pose = numbers(pose, "the pose").astype(np.float64)
-    if pose.shape != (4, 4) or not (np.abs(pose) < LARGEST).all():
-        given = f"of the shape {pose.shape}" if pose.shape != (4, 4) else "with NaN, infinity or what no camera has"
-        raise ObservationError(f"a pose is a (4, 4) matrix of finite numbers, not one {given}")
+    """A copy of a rigid pose, (4, 4); an ObservationError names the likely mistake if it is not rigid."""
+    pose = _matrix(pose, "the pose", (4, 4))
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         transposed = np.allclose(pose[:, 3], [0, 0, 0, 1], atol=1e-6)
-        raise ObservationError(
-            f"the last row of a pose is 0, 0, 0, 1, not {np.round(pose[3], 3).tolist()}"
-            + (": transposed?" if transposed else "")
-        )
+        last = np.round(pose[3], 3).tolist()
+        raise ObservationError(f"the last row of a pose is 0, 0, 0, 1, not {last}" + ": transposed?" * transposed)
     rotation = pose[:3, :3]
     gram = rotation.T @ rotation
     scale = np.sqrt(np.trace(gram) / 3)
     if not np.allclose(gram, np.eye(3), atol=1e-3):
         scaled = scale > 0 and np.allclose(gram / scale**2, np.eye(3), atol=1e-3)
-        raise ObservationError(
-            "the pose is not rigid: " + (f"its rotation is scaled by {scale:.3g}" if scaled else "no rotation matrix")
-        )
+        what = f"its rotation is scaled by {scale:.3g}" if scaled else "no rotation matrix"
+        raise ObservationError(f"the pose is not rigid: {what}")
     if np.linalg.det(rotation) < 0:
         raise ObservationError("the pose is mirrored (left-handed axes): one axis has the wrong sign")
     u, _, vt = np.linalg.svd(rotation)
     pose[:3, :3] = u @ vt  # poses from text files are rounded
     return pose
-
-
-def _grey(image: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    given = array_of(image, "the image")
-    if given.dtype != np.uint8 or given.shape not in (shape, (*shape, 3)):
-        raise ObservationError(
-            f"an image is (H, W) or (H, W, 3) uint8 registered to the depth, {shape}, not {given.shape} {given.dtype}"
-        )
-    return given if given.ndim == 2 else np.rint(given @ LUMA).astype(np.uint8)

@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import combinations
-from numbers import Real
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nextview.arguments import as_line
+from nextview.checks import number, points
 from nextview.errors import ObservationError, UsageError
-from nextview.observation import LARGEST, numbers
+from nextview.geometry.observation import LARGEST
 
 Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class ObjectFrame:
-    """The object's centre, size and axes in the world. Positions in the object frame are in object radii.
+    """The object's centre, (3,) metres, world, radius and axes. Positions in the object frame are in object radii.
 
-    Attributes:
-        centre: (3,) float64, metres, world.
-        radius: object radius, metres: of the sphere about the centre that holds the object.
-        axes: (3, 3) float64; rows are the object's x, y and z (up) in the world.
-
-    Raises:
-        UsageError: the axes are no rotation, or the radius is not positive.
+    ``radius``, metres, is that of the sphere about the centre that holds the object; the rows of ``axes``, (3, 3), are
+    the object's x, y and z (up) in the world. UsageError if they are no rotation, or the radius is not positive.
     """
 
     centre: Float
@@ -35,12 +29,8 @@ class ObjectFrame:
     axes: Float
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.radius, Real) and 0 < self.radius < LARGEST):
-            raise UsageError(f"the object radius is a positive number of metres, not {as_line(self.radius)}")
-        centre = three(self.centre)
-        if centre is None:
-            raise UsageError(f"the object's centre is three numbers, metres, not {as_line(self.centre)}")
-        object.__setattr__(self, "centre", centre)
+        number(self.radius, "the object radius, metres,", most=LARGEST, above=0)
+        object.__setattr__(self, "centre", three(self.centre, "the object's centre"))
         object.__setattr__(self, "axes", _rotation(self.axes, "the object's axes"))
 
     def pose_in_object(self, pose: ArrayLike) -> Float:
@@ -51,14 +41,9 @@ class ObjectFrame:
         return pose
 
     def pose_in_world(self, pose: ArrayLike, distance: float | None = None) -> Float:
-        """A pose in the object frame, such as those of a ``ViewSphere``, as a camera-to-world pose in metres.
+        """A pose in the object frame, (..., 4, 4), object radii, as a camera-to-world pose in metres; OpenCV axes.
 
-        Args:
-            pose: (..., 4, 4), object radii, OpenCV axes.
-            distance: stand so far from the object's centre instead, metres, in the same direction.
-
-        Returns:
-            (..., 4, 4) float64, OpenCV axes.
+        With a ``distance`` it stands so far from the object's centre instead, metres, in the same direction.
         """
         pose = np.array(pose, np.float64)
         position = pose[..., :3, 3] * self.radius
@@ -71,16 +56,10 @@ class ObjectFrame:
 
 @dataclass(frozen=True)
 class Box:
-    """An upright box in the world that an object just fits into.
+    """An upright box in the world that an object just fits into: ``low <= axes @ position <= high`` inside.
 
-    Attributes:
-        low: its lowest corner along each of its axes, metres, (3,).
-        high: its highest corner, (3,).
-        axes: (3, 3), rows are the box's x, y and z (up) in the world: ``low <= axes @ position <= high`` inside. The
-            world's own by default.
-
-    Raises:
-        UsageError: a box without an inside, or axes that are no rotation.
+    The corners ``low`` and ``high`` are (3,), metres; the rows of ``axes``, (3, 3), are the box's x, y and z (up) in
+    the world, by default the world's own. UsageError if it has no inside, or the axes are no rotation.
     """
 
     low: Float
@@ -88,13 +67,11 @@ class Box:
     axes: Float = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        low, high = three(self.low), three(self.high)
-        if low is None or high is None or not (low < high).all():
-            given = f"{as_line(self.low)} and {as_line(self.high)}"
-            raise UsageError(f"a box has a low and a high corner of three numbers, not {given}")
-        axes = _rotation(self.axes, "the axes of a box")
-        for name, value in (("low", low), ("high", high), ("axes", axes)):
-            object.__setattr__(self, name, value)
+        for corner in ("low", "high"):
+            object.__setattr__(self, corner, three(getattr(self, corner), f"the {corner} corner of a box"))
+        if not (self.low < self.high).all():
+            raise UsageError(f"a box has a low and a high corner, not {self.low.tolist()} and {self.high.tolist()}")
+        object.__setattr__(self, "axes", _rotation(self.axes, "the axes of a box"))
 
     @property
     def object_frame(self) -> ObjectFrame:
@@ -103,42 +80,29 @@ class Box:
         return ObjectFrame(middle @ self.axes, diagonal / 2, self.axes)
 
 
-def three(values: Any) -> Float | None:
-    """Three real numbers that can be metres, (3,) float64; None if they are not."""
-    try:
-        array = numbers(values, "").astype(np.float64)
-    except ObservationError:
-        return None
-    return array if array.shape == (3,) and bool((np.abs(array) < LARGEST).all()) else None
+def three(values: Any, what: str) -> Float:
+    """Three real numbers that can be metres, (3,) float64; UsageError if they are not."""
+    given = points([values], f"{what}, in a list,")[0]
+    if not (np.abs(given) < LARGEST).all():
+        raise UsageError(f"{what} is three numbers, metres, not {given.tolist()}")
+    return given
 
 
 def _rotation(values: Any, what: str) -> Float:
-    try:
-        axes = numbers(values, what).astype(np.float64)
-    except ObservationError as error:
-        raise UsageError(str(error)) from None
-    fits = axes.shape == (3, 3) and (np.abs(axes) < 2).all()
-    if not fits or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-3) or np.linalg.det(axes) < 0:
+    axes = points(values, what)
+    if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-3) or np.linalg.det(axes) < 0:
         raise UsageError(f"{what} are the rows of a (3, 3) rotation matrix")
     return axes
 
 
 def upright_axes(up: ArrayLike, front: ArrayLike | None = None) -> Float:
-    """Axes with z along ``up`` and x as near to the front as can be.
+    """Axes with z along ``up``, (3,), and x as near to the ``front``, (3,), as can be: rows x, y, z, (3, 3) float64.
 
-    Args:
-        up: direction in the world, (3,), any length.
-        front: direction in the world, (3,), not along ``up``. The world's x by default; its y where x is up.
-
-    Returns:
-        Rows x, y, z, (3, 3) float64.
-
-    Raises:
-        UsageError: no direction.
+    The front is the world's x by default; its y where x is up.
     """
-    z = three(up)
-    if z is None or not z.any():
-        raise UsageError(f"up is a direction, three numbers, not {as_line(up)}")
+    z = three(up, "up")
+    if not z.any():
+        raise UsageError("up is a direction, three numbers, not 0, 0, 0")
     z = z / np.abs(z).max()  # first, or squares of the smallest numbers would be zero
     z = z / np.linalg.norm(z)
     x = np.eye(3)[0 if abs(z[0]) < 0.9 else 1] if front is None else np.asarray(front, np.float64)
@@ -148,41 +112,26 @@ def upright_axes(up: ArrayLike, front: ArrayLike | None = None) -> Float:
 
 
 def enclose(points: Float, axes: Float, floor: float | None) -> ObjectFrame:
-    """The object frame of what has been seen of an object.
+    """The object frame of points on an object, (N, 3), world, metres.
 
-    As for meshes, the centre is in the middle: of the smallest circle around all seen from above, and half way between
-    top and bottom. The radius is the distance of the farthest point. A circle, because of two walls of a box that meet
-    at a right angle it gives the middle of the whole box.
-
-    Args:
-        points: on the object, (N, 3), world, metres.
-        axes: rows x, y, z (up) in the world, (3, 3).
-        floor: height along z of the plane that the object stands on, to which it reaches unseen; None if there is none.
-
-    Raises:
-        ObservationError: the points have no extent.
+    The centre is the middle of the smallest circle around all seen from above, and half way between top and bottom,
+    which is the ``floor`` where the object stands on one. Of two walls of a box that meet at a right angle a circle
+    gives the middle of the whole box.
     """
     upright = points @ axes.T
     low, high = upright.min(0), upright.max(0)
     if not (high - low).max() > 1e-6 * max(np.abs(upright).max(), 1e-9):
         raise ObservationError("what is seen of the object is in one place, it has no size")
     bottom = low[2] if floor is None else min(floor, high[2])
-    flat = upright[:, :2]
-    centre = np.array([*smallest_circle(flat)[0], (bottom + high[2]) / 2])
+    centre = np.array([*smallest_circle(upright[:, :2])[0], (bottom + high[2]) / 2])
     radius = np.sqrt(((upright - centre) ** 2).sum(1).max())
     return ObjectFrame(centre @ axes, max(float(radius), float(high[2] - bottom) / 2), axes)
 
 
 def smallest_circle(points: Float) -> tuple[Float, float]:
-    """The smallest circle that holds all points.
+    """Centre (2,) and radius of the smallest circle that holds all points, (N, 2).
 
     The farthest point joins those that hold the circle, at most three, until none is outside; each time it grows.
-
-    Args:
-        points: (N, 2).
-
-    Returns:
-        Centre (2,) and radius.
     """
     corners = points[:1]
     centre, radius = points[0], 0.0
@@ -193,18 +142,11 @@ def smallest_circle(points: Float) -> tuple[Float, float]:
             return centre, radius
         corners = np.vstack([corners, points[farthest]])
         fits = []
-        for count in (2, 3):
-            for chosen in combinations(corners, count):
-                middle = _circumcentre(np.array(chosen))
-                reach = np.linalg.norm(corners - middle, axis=1).max()
-                fits.append((reach, np.array(chosen), middle))
+        for chosen in map(np.array, chain(combinations(corners, 2), combinations(corners, 3))):
+            edges = chosen[1:] - chosen[0]  # equally far from all, or the middle of those in line:
+            middle = chosen[0] + np.linalg.lstsq(edges, (edges**2).sum(1) / 2, rcond=None)[0]
+            fits.append((np.linalg.norm(corners - middle, axis=1).max(), chosen, middle))
         reach, corners, centre = min(fits, key=lambda fit: fit[0])
         if reach <= radius:
             return centre, radius  # rounding: no better circle is to be had
         radius = float(reach)
-
-
-def _circumcentre(points: Float) -> Float:
-    """The point in the plane of two or three points that is equally far from all; their middle if they are in line."""
-    edges = points[1:] - points[0]
-    return points[0] + np.linalg.lstsq(edges, (edges**2).sum(1) / 2, rcond=None)[0]

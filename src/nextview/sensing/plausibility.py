@@ -1,4 +1,4 @@
-"""Name the likely mistake behind an observation that cannot be right."""
+"""Refuse what cannot be right in a frame, and name the likely mistake behind an observation."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.observation import Observation
-from nextview.sensing.frame import AXES
+from nextview.errors import ObservationError
+from nextview.geometry.observation import Observation
+from nextview.sensing.frame import AXES, Frame
 
 Float = NDArray[np.float64]
 
@@ -22,47 +23,84 @@ INNERMOST = 0.4
 """How far from the origin the outermost of what is seen has to be."""
 CONTRADICTION = 0.2
 """Share of the surface seen in one view of which another view says that it is not there, from which they contradict."""
+OFF_CENTRE = 0.25
+"""How far a principal point is from the middle of a picture that is no part of a larger one, half sides of it."""
+FAR_DEPTH = 10.0
+"""Metres: few depth cameras measure farther, and no object that stands on something fills a picture from there."""
+TOO_FAR = 2.5
+"""So many times as far as a frame shows anything an object cannot be: of a near one only the front shows."""
+FAR_ORIGIN = 30.0
+"""Metres from the origin of the world, within which robots work; where positions in millimetres begin."""
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """Something that is likely to be wrong.
+class ViewWarning:
+    """Something that is likely to be wrong, in a sentence.
 
-    Attributes:
-        name: of the mistake: "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside" or
-            "contradiction".
-        message: one sentence for the user.
+    Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside" and "contradiction"; of a
+    frame "intrinsics", "unit" and "far origin".
     """
 
     name: str
     message: str
 
 
-def check_observation(observation: Observation) -> list[Doubt]:
-    """What is likely to be wrong with an observation; usually nothing. Takes less than a millisecond.
+def refuse_far(frame: Frame, last: Frame | None, target: Float | None, radius: float) -> None:
+    """Refuse a camera that is much farther from where it stood, or from its target, than anything that it sees."""
+    camera, farthest = frame.camera_to_world[:3, 3], float(frame.depth.max())
+    if last is not None:
+        moved, reach = np.linalg.norm(camera - last.camera_to_world[:3, 3]), farthest + float(last.depth.max())
+        if moved > TOO_FAR * reach:
+            raise ObservationError(
+                f"the camera is {moved:.0f} m from where it was, and what it sees is within {reach:.1f} m: is the pose "
+                "in millimetres?"
+            )
+    distance = 0.0 if target is None or frame.mask is not None else np.linalg.norm(target - camera)
+    if distance - radius > TOO_FAR * farthest:
+        raise ObservationError(
+            f"the target is {distance:.0f} m away, and nothing in the frame is farther than {farthest:.1f} m: is the "
+            "pose in millimetres, or are target and pose of different worlds?"
+        )
 
-    What no camera can give, such as a pose that is not rigid, was refused when the observation was made.
+
+def check_frame(frame: Frame) -> list[ViewWarning]:
+    """What is likely to be wrong with a frame though it can be right; usually nothing."""
+    found, (height, width), k = [], frame.shape, frame.intrinsics
+    off = max(abs(2 * k[0, 2] / width - 1), abs(2 * k[1, 2] / height - 1))
+    if off > OFF_CENTRE:
+        message = f"the principal point ({k[0, 2]:.0f}, {k[1, 2]:.0f}) is far from the middle of an image of {width} x "
+        message += f"{height}: intrinsics of another resolution, unless the image is a part of a larger one"
+        found.append(ViewWarning("intrinsics", message))
+    seen = frame.depth[::4, ::4]
+    middle = float(np.median(seen[seen > 0])) if seen.any() else 0.0
+    if middle > FAR_DEPTH:
+        found.append(ViewWarning("unit", f"the depth has a median of {middle:.0f} m: is it in inches or feet?"))
+    origin = float(np.linalg.norm(frame.camera_to_world[:3, 3]))
+    if origin > max(FAR_ORIGIN, 20 * middle):
+        message = f"the camera is {origin:.0f} m from the world's origin, and sees {middle:.2g} m far: is the"
+        found.append(ViewWarning("far origin", message + " pose in millimetres?"))
+    return found
+
+
+def check_observation(observation: Observation) -> list[ViewWarning]:
+    """What is likely to be wrong with an observation; usually nothing.
 
     The object fills most of the unit sphere about the origin and nothing of it is outside. Where that is not so, the
-    usual mistakes are undone one after the other: the one without which it would be so is named.
+    usual mistake without which it would be so is named.
     """
-    depth, pose = observation.depth, np.asarray(observation.pose, np.float64)
-    seen = np.flatnonzero(depth)
+    seen, pose = np.flatnonzero(observation.depth), np.asarray(observation.pose, np.float64)
     if len(seen) < FEWEST:
-        return [
-            Doubt(
-                "nothing seen",
-                f"only {len(seen)} pixels have a depth: is the object in the picture, and the depth in object radii?",
-            )
-        ]
-    rows, columns = np.divmod(seen[:: max(1, len(seen) // SAMPLE)], depth.shape[1])
-    k = observation.intrinsics
-    z = depth[rows, columns].astype(np.float64)
-    x, y = (columns + 0.5 - k[0, 2]) / k[0, 0] * z, (rows + 0.5 - k[1, 2]) / k[1, 1] * z
-    points = np.stack([x, y, z], 1)
-    if _plausible(points, pose):
-        return []
-    return [_diagnose(points, pose)]
+        message = f"only {len(seen)} pixels have a depth: is the object in the picture, and the depth in object radii?"
+        return [ViewWarning("nothing seen", message)]
+    points = _surface(observation, seen)
+    return [] if _plausible(points, pose) else [ViewWarning(*_diagnose(points, pose))]
+
+
+def _surface(observation: Observation, seen: NDArray[np.int64]) -> Float:
+    """Some of the surface that pixels, by index, show, (N, 3), camera frame."""
+    rows, columns = np.divmod(seen[:: max(1, len(seen) // SAMPLE)], observation.depth.shape[1])
+    k, z = observation.intrinsics, observation.depth[rows, columns].astype(np.float64)
+    return np.stack([(columns + 0.5 - k[0, 2]) / k[0, 0] * z, (rows + 0.5 - k[1, 2]) / k[1, 1] * z, z], 1)
 
 
 def _reach(points: Float, pose: Float) -> float:
@@ -76,67 +114,47 @@ def _plausible(points: Float, pose: Float) -> bool:
     return INNERMOST < _reach(points, pose) < OUTERMOST
 
 
-def _diagnose(points: Float, pose: Float) -> Doubt:
-    """The mistake without which the points would lie in the unit sphere."""
+def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
+    """Name and message of the mistake without which the points would lie in the unit sphere."""
     reach, distance = _reach(points, pose), float(np.linalg.norm(pose[:3, 3]))
     if reach < INNERMOST:
-        return Doubt(
-            "scale",
+        return "scale", (
             f"all that is seen lies within {reach:.2g} object radii of the object's centre: lengths in metres? Divide "
-            "depth and camera position by the object radius",
+            "depth and camera position by the object radius"
         )
     for name, said in (("opengl", "OpenGL's (x right, y up, z backward)"), ("ros", "a ROS body's (x forward, z up)")):
         turned = pose.copy()
         turned[:3, :3] = pose[:3, :3] @ AXES[name]
         if _plausible(points, turned):
-            return Doubt(
-                f"{name} axes",
+            return f"{name} axes", (
                 f"the view looks away from the object: the camera's axes are {said}, OpenCV's (x right, y down, z "
-                "forward) are expected",
+                "forward) are expected"
             )
-    inverse = np.asarray(np.linalg.inv(pose), np.float64)
-    if _plausible(points, inverse):
-        return Doubt("inverse pose", "the pose is inverse: camera-to-world is expected, this is world-to-camera")
+    if _plausible(points, np.asarray(np.linalg.inv(pose), np.float64)):
+        return "inverse pose", "the pose is inverse: camera-to-world is expected, this is world-to-camera"
     middle = float(np.median(np.linalg.norm(points, axis=1)))
     factor = distance / middle if middle > 0 else 1.0
     for scale in factor * np.array([1, 0.9, 0.8, 1.1, 1.2]):
-        if _plausible(points * scale, pose):
-            return Doubt(
-                "scale",
-                f"the depth is {1 / scale:.2g} times what the camera's distance of {distance:.2g} object radii asks "
-                "for: one of them in metres? Both are expected in object radii",
-            )
         scaled = pose.copy()
         scaled[:3, 3] /= scale
-        if _plausible(points, scaled):
-            return Doubt(
-                "scale",
-                f"the camera's distance of {distance:.2g} is {scale:.2g} times what the depth asks for: in metres? "
-                "Both are expected in object radii",
+        if _plausible(points * scale, pose) or _plausible(points, scaled):
+            return "scale", (
+                f"depth and the camera's distance of {distance:.2g} do not fit, by a factor of {scale:.2g}: is one "
+                "in metres? Both are expected in object radii"
             )
-    return Doubt(
-        "outside",
+    return "outside", (
         f"the surface that is seen reaches {reach:.2g} object radii from the object's centre, more than 1: a wrong "
-        "pose, centre or radius, or more in the picture than the object?",
+        "pose, centre or radius, or more in the picture than the object?"
     )
 
 
-def check_views(first: Observation, second: Observation) -> list[Doubt]:
-    """Whether two views of one object contradict each other's geometry; usually not.
-
-    A surface that one view saw has to be seen in the other, or be hidden there. Where the other looks through it the
-    two contradict: a wrong pose, or the object has moved.
-    """
+def check_views(first: Observation, second: Observation) -> list[ViewWarning]:
+    """Whether one of two views of an object looks through a surface that the other saw; usually not."""
     share = max(_seen_through(first, second), _seen_through(second, first))
     if share < CONTRADICTION:
         return []
-    return [
-        Doubt(
-            "contradiction",
-            f"two views contradict each other: {share:.0%} of the surface that one saw is missing in the other: a "
-            "wrong pose, or the object has moved",
-        )
-    ]
+    message = f"two views contradict each other: {share:.0%} of the surface that one saw is missing in the other: a "
+    return [ViewWarning("contradiction", message + "wrong pose, or the object has moved")]
 
 
 def _seen_through(first: Observation, second: Observation) -> float:
@@ -144,18 +162,14 @@ def _seen_through(first: Observation, second: Observation) -> float:
     seen = np.flatnonzero(first.depth)
     if len(seen) == 0 or not second.depth.any():
         return 0.0
-    rows, columns = np.divmod(seen[:: max(1, len(seen) // SAMPLE)], first.depth.shape[1])
-    k = first.intrinsics
-    z = first.depth[rows, columns].astype(np.float64)
-    points = np.stack([(columns + 0.5 - k[0, 2]) / k[0, 0] * z, (rows + 0.5 - k[1, 2]) / k[1, 1] * z, z], 1)
-    points = points @ first.pose[:3, :3].T + first.pose[:3, 3]
+    points = _surface(first, seen) @ first.pose[:3, :3].T + first.pose[:3, 3]
     points = (points - second.pose[:3, 3]) @ second.pose[:3, :3]
     points = points[points[:, 2] > 0.1]
     if len(points) == 0:
         return 1.0
     k, (height, width) = second.intrinsics, second.depth.shape
-    column = np.floor(points[:, 0] / points[:, 2] * k[0, 0] + k[0, 2]).astype(np.int64)
-    row = np.floor(points[:, 1] / points[:, 2] * k[1, 1] + k[1, 2]).astype(np.int64)
+    at = points[:, :2] / points[:, 2:] * k[[0, 1], [0, 1]] + k[:2, 2]
+    column, row = np.floor(at).astype(np.int64).T
     margin = max(2, width // 50)  # what the object frame may be off
     inside = (column >= margin) & (column < width - margin) & (row >= margin) & (row < height - margin)
     if not inside.any():

@@ -1,7 +1,7 @@
-"""Which pixels show the object: what stands on the support plane, in clusters of their footprint seen from above.
+"""The support plane, and which pixels show the object: clusters, seen from above, of what stands on it.
 
-Seen from above the parts of one object lie together even where it hides itself, such as the far legs of a table under
-its top; things that stand side by side lie apart.
+From above the parts of one object lie together even where it hides itself, such as the far legs of a table under its
+top; things that stand side by side lie apart.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
-from nextview.sensing.frame import Frame
-from nextview.sensing.noise import Noise
+from nextview.sensing.facets import Noise
+from nextview.sensing.frame import AXES, Frame
 from nextview.sensing.object_frame import Box
-from nextview.sensing.support_plane import Plane
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,8 +26,133 @@ CELL = 0.01
 CROWD = 3
 """Pixels that make a cell occupied."""
 REACH, FAR = 250, 1000
-"""Cells to each side of the middle of what is seen above the plane; farther things are left out. And
-cells from those of the first frame beyond which nothing can be a part of the same object: a wrong pose."""
+"""Cells to each side of the middle of what is seen above the plane: farther things are left out. And cells from those
+of the first frame beyond which nothing can be a part of the same object."""
+TRIALS = 200
+"""Planes that are tried: with one point in ten on the plane, 0.8 of all draws hit it at least once."""
+TILT = np.cos(np.radians(12.0))
+"""Cosine of the lean of a support plane against gravity, at most: errors of a calibration."""
+LEAST = 0.04
+"""Share of what is seen that lies on a support plane, at least; more if gravity is not known."""
+LEAST_ALONE = 0.15
+SAMPLES = 1500
+"""Pixels in which planes are searched."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A grid of points of a frame, world, metres, with the distance from a plane up to which each is on it."""
+
+    points: Float
+    tolerance: Float
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    camera: Float
+
+
+def sample(frame: Frame, pixels: NDArray[np.bool_], noise: Noise) -> Samples:
+    """Some of the given pixels, (H, W) bool, which all have a depth."""
+    step = max(1, int(np.sqrt(pixels.sum() / SAMPLES)))
+    first = step // 2
+    rows, columns = np.nonzero(pixels[first::step, first::step])
+    points = frame.positions(first + step * rows, first + step * columns)
+    z = frame.depth[first::step, first::step][rows, columns].astype(np.float64)
+    return Samples(points, 3 * noise.at(z) * z**2 + 0.003 * z, rows, columns, frame.camera_to_world[:3, 3])
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Positions p with ``normal @ p + offset`` = 0, normal of unit length; above it that is the height in metres."""
+
+    normal: Float
+    offset: float
+
+    def height(self, points: Float) -> Float:
+        """Of points (..., 3) above the plane, metres."""
+        return points @ self.normal + self.offset
+
+    def holds(self, samples: Samples) -> NDArray[np.bool_]:
+        """Which samples are on it, (N,) bool."""
+        return np.abs(self.height(samples.points)) < samples.tolerance
+
+    def extent(self, samples: Samples) -> Float:
+        """The samples on it, (M, 3), connected with most of them in the picture: no wall at its height."""
+        on = self.holds(samples)
+        if not on.any():
+            return samples.points[on]
+        grid = np.zeros((samples.rows.max() + 1, samples.columns.max() + 1), bool)
+        grid[samples.rows, samples.columns] = on
+        part = ndimage.label(grid)[0][samples.rows, samples.columns]
+        return samples.points[on & (part == np.bincount(part[on]).argmax())]
+
+
+def find_plane(
+    samples: Samples, rng: np.random.Generator, up: Float | None = None, above: Float | None = None
+) -> Plane | None:
+    """The plane with most samples on it, by RANSAC (Fischler and Bolles 1981), with all trials in one product.
+
+    The camera and a point ``above``, (3,), lie above it, and it is level against ``up``, (3,), where these are given.
+    None if too few samples lie on any.
+    """
+    points = samples.points
+    if len(points) < 10:
+        return None
+    a, b, c = points[rng.integers(len(points), size=(3, TRIALS))]
+    normals = np.cross(b - a, c - a)
+    if up is not None:
+        normals[::2] = up  # one point is enough where the direction is known; the triples find what leans a little
+    length = np.linalg.norm(normals, axis=1)
+    normals, through = normals[length > 0] / length[length > 0, None], a[length > 0]
+    offsets = -(normals * through).sum(1)
+    turn = np.where((normals @ samples.camera + offsets if up is None else normals @ up) < 0, -1, 1)
+    normals, offsets = normals * turn[:, None], offsets * turn
+    fits = normals @ samples.camera + offsets > 0
+    if up is not None:
+        fits &= normals @ up > TILT
+    if above is not None:
+        fits &= normals @ above + offsets > np.median(samples.tolerance)
+    normals, offsets = normals[fits], offsets[fits]
+    if len(normals) == 0:
+        return None
+    count = (np.abs(points @ normals.T + offsets) < samples.tolerance[:, None]).sum(0)
+    best = int(count.argmax())
+    plane = refine_plane(Plane(normals[best], float(offsets[best])), samples)
+    level = up is None or plane.normal @ up > TILT
+    return plane if level and plane.holds(samples).mean() > (LEAST_ALONE if up is None else LEAST) else None
+
+
+def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
+    """The plane of least squares through the samples within ``loose`` tolerances of one, if ten are; three times."""
+    points, tolerance = samples.points, loose * samples.tolerance
+    for _ in range(3):
+        on = np.abs(plane.height(points)) < tolerance
+        if on.sum() < 10:
+            return plane
+        weight = 1 / tolerance[on, None] ** 2
+        centre = (weight * points[on]).sum(0) / weight.sum()
+        spread = points[on] - centre
+        normal = np.linalg.eigh((weight * spread).T @ spread)[1][:, 0]
+        normal *= np.sign(normal @ plane.normal) or 1.0
+        plane = Plane(normal, float(-normal @ centre))
+    return plane
+
+
+def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
+    """The mistake in a camera-to-world pose, (4, 4), without which the largest plane in view would be level; or None.
+
+    Floors and tables are level and walls upright. A plane that leans in between points to a wrong pose; so does one
+    that is level but lies over the camera. Of a wall nothing is said: seen from the side it would pass for a floor.
+    """
+    if plane.normal @ up > TILT or abs(plane.normal @ up) < np.sqrt(1 - TILT**2):
+        return None
+    rotation = pose[:3, :3]
+    mistakes = {
+        "the camera's axes are OpenGL's?": rotation @ AXES["opengl"],
+        "the camera's axes are those of a ROS body?": rotation @ AXES["ros"],
+        "the pose is inverse, world-to-camera?": rotation.T,
+    }
+    seen = rotation.T @ plane.normal
+    return next((mistake for mistake, right in mistakes.items() if right @ seen @ up > TILT), None)
 
 
 def inside_box(frame: Frame, box: Box) -> Mask:
@@ -47,13 +171,7 @@ def inside_sphere(frame: Frame, centre: Float, radius: float) -> Mask:
 
 
 def above_plane(frame: Frame, plane: Plane, noise: Noise) -> Mask:
-    """Pixels that are higher above a plane than noise explains, (H, W) bool.
-
-    Args:
-        frame: the frame.
-        plane: the support plane.
-        noise: of the frame.
-    """
+    """Pixels that are higher above a plane than the noise of the frame explains, (H, W) bool."""
     height = frame.along(plane.normal, plane.offset)
     high = height > np.float32(0.003) * frame.depth
     high &= frame.depth > 0
@@ -68,13 +186,10 @@ def above_plane(frame: Frame, plane: Plane, noise: Noise) -> Mask:
 
 @dataclass(frozen=True)
 class Footprint:
-    """The cells, seen from above, over which a frame shows something above the plane.
+    """The cells, seen from above, over which a frame shows something above the plane: (K, 2) indices, each once.
 
-    Attributes:
-        cells: index along the two horizontal axes, (K, 2) int64, each once.
-        area: of the surface seen over each, square metres (facing the camera), (K,) float64.
-        pixels: how many pixels show something over each, (K,) int64.
-        cell_of: the cell of each pixel of the frame, -1 for none, (H, W) int32.
+    ``area`` is that of the surface over each, square metres, ``pixels`` how many show it, ``cell_of`` the cell of each
+    pixel of the frame, (H, W) int32, -1 for none.
     """
 
     cells: NDArray[np.int64]
@@ -88,14 +203,7 @@ class Footprint:
 
 
 def footprint(frame: Frame, above: Mask, axes: Float, cell: float) -> Footprint:
-    """The footprint of the pixels ``above``.
-
-    Args:
-        frame: the frame.
-        above: its pixels above the plane, (H, W) bool.
-        axes: upright axes, rows, (3, 3).
-        cell: side of a cell, metres.
-    """
+    """The footprint of the pixels ``above``, (H, W) bool, along upright axes, (3, 3), in cells of a side in metres."""
     rows, columns = np.divmod(np.flatnonzero(above), above.shape[1])
     z = frame.depth[rows, columns]
     pose, (x, y) = frame.camera_to_world, frame.rays
@@ -120,8 +228,9 @@ def footprint(frame: Frame, above: Mask, axes: Float, cell: float) -> Footprint:
 
 
 def clusters(footprints: Sequence[Footprint]) -> list[NDArray[np.int64]]:
-    """Label of each cell in each footprint, (K,) int64 each: 1, 2, ... for the clusters of all taken together, 0 for
-    cells that too few pixels saw, or that lie far from all that the first footprint shows.
+    """Label of each cell in each footprint, (K,) int64 each: 1, 2, ... for the clusters of all taken together.
+
+    0 for cells that too few pixels saw, or that lie far from all that the first footprint shows.
     """
     cells = np.concatenate([f.cells for f in footprints])
     if len(cells) == 0:
@@ -141,12 +250,7 @@ def clusters(footprints: Sequence[Footprint]) -> list[NDArray[np.int64]]:
 
 
 def on_ground(points: Float, plane: Float) -> Mask:
-    """Which points, seen from above, lie over what was seen of the plane, (N,) bool.
-
-    Args:
-        points: (N, 2).
-        plane: points of the support plane, (M, 2): what stands within their hull stands on it.
-    """
+    """Which points, (N, 2), lie within the hull of what was seen of the plane, (M, 2), (N,) bool."""
     if len(plane) < 3:
         return np.ones(len(points), bool)
     try:
@@ -157,13 +261,7 @@ def on_ground(points: Float, plane: Float) -> Mask:
 
 
 def largest(foot: Footprint, labels: NDArray[np.int64], plane: Float) -> int:
-    """The cluster with most surface in view among those that stand on what was seen of the plane; 0 if there is none.
-
-    Args:
-        foot: of one frame.
-        labels: of its cells.
-        plane: points of the support plane, in cells, (M, 2).
-    """
+    """The cluster with most surface in view on the plane, whose points are given in cells, (M, 2); or 0."""
     if not labels.any():
         return 0
     area = np.bincount(labels, foot.area)
@@ -175,7 +273,5 @@ def largest(foot: Footprint, labels: NDArray[np.int64], plane: Float) -> int:
 
 def nearest(foot: Footprint, labels: NDArray[np.int64], point: Float) -> int:
     """The cluster nearest to a point, in cells, (2,), seen from above; 0 if there is none."""
-    if not labels.any():
-        return 0
     distance = np.where(labels > 0, np.linalg.norm(foot.cells + 0.5 - point, axis=1), np.inf)
-    return int(labels[distance.argmin()])
+    return int(labels[distance.argmin()]) if labels.any() else 0

@@ -1,0 +1,63 @@
+"""Area measures: how much of the object is seen, and how evenly over its faces (thesis, section 3.4.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.measured_view import MeasuredView
+
+
+def bits(shares: NDArray[np.floating]) -> float:
+    """Shannon entropy of shares that add up to 1, bits (thesis, equation 3); 0 of none."""
+    shares = shares[shares > 0]
+    return float(-(shares * np.log2(shares)).sum()) if len(shares) else 0.0
+
+
+def view_area(view: MeasuredView) -> float:
+    """Share of the image that shows the object: its projected area.
+
+    Dutagaci et al. 2010 ("view area"), Secord et al. 2011 ("projected area"); thesis, section 3.4.1.
+
+    Returns:
+        Between 0 and 1; the sphere around the object fills pi/4 of the image.
+    """
+    return len(view.depths) / view.depth.size
+
+
+def visible_area_ratio(view: MeasuredView) -> float:
+    """Area of the surface that is seen, over the area of the whole surface; what is hidden of a face does not count.
+
+    Plemenos and Benayada 1996, Polonsky et al. 2005 ("visibility ratio"), Dutagaci et al. 2010 ("ratio of visible
+    area"); thesis, section 3.4.1.
+
+    Returns:
+        Between 0 and 1: of a sphere from distance d, (1 - 1/d) / 2.
+    """
+    return min(float(view.seen_area.sum() / view.surface.area), 1.0)
+
+
+def surface_visibility(view: MeasuredView) -> float:
+    """Area of the faces of which anything is seen, over the area of all faces: the ratio of visible area by faces.
+
+    Secord et al. 2011 ("surface visibility"), Dutagaci et al. 2010; thesis, section 3.4.1, by "the mesh area visible
+    from a viewpoint". Large faces that are nearly hidden count whole, so it depends on how the mesh is cut.
+
+    Returns:
+        Between 0 and 1: 1/2 of a cube of which three sides are seen.
+    """
+    return float(view.surface.areas[view.pixels[0]].sum() / view.surface.area)
+
+
+def viewpoint_entropy(view: MeasuredView) -> float:
+    """Shannon entropy of the shares that the faces have in the object's projected area.
+
+    Vázquez et al. 2001, without their background; Dutagaci et al. 2010 ("surface area entropy"); thesis, section 3.4.1
+    and equation 3. It counts faces as they are cut: cut each into four and it is 2 bits more, from everywhere.
+
+    Returns:
+        Bits; 0 where one face is seen or none.
+    """
+    view.surface  # noqa: B018  # says if there is none
+    pixels = view.pixels[1]
+    return bits(pixels / pixels.sum()) if len(pixels) else 0.0

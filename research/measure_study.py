@@ -1,0 +1,283 @@
+"""Which measure of a view serves recognition? Every measure that a store holds, against what a recogniser says.
+
+    python -m research.measure_study test.npz validation.npz --out measures [--store views.zarr] [--runs 10]
+        [--policies random-all volumetric mvselect.json gain] [--objects 300]
+
+Writes measures.md (the table), measures.csv (every number in a row of its own) and measures.png into the folder.
+
+For each measure: the rank correlation, over the views of an object, of its value with the log-probability that the
+recogniser gives the true class there, as the mean over objects, of all classes and of each; how often its best view is
+the recogniser's best one, or next to it; and accuracy and travel of the policy that climbs its true map in the local
+window, after fixed numbers of views. That policy sees what no robot can, and so is an oracle by name; what it does not
+see is the class: it goes to the valley for those that it believes in at that moment and for which the valley gained on
+the validation objects. Other policies can stand beside, under the names that nextview benchmark has for them. Intervals
+are 95 % bootstrap intervals over objects; p is McNemar's test against random choice in the window, over objects,
+corrected by Holm's method for all measures, policies and numbers of views together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from nextview.cli.extra import require
+
+require("benchmark")
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import tyro
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.special import log_softmax
+from scipy.stats import rankdata
+
+from nextview.benchmark.replay import make_specs, replay
+from nextview.benchmark.statistics import holm, interval, mcnemar, resample
+from nextview.benchmark.true_maps import true_map, true_measure
+from nextview.cli.ending import orderly_end
+from nextview.cli.progress import track
+from nextview.data.metrics import ratio
+from nextview.data.predictions import Predictions
+from nextview.data.splits import sample
+from nextview.data.store import ViewStore
+from nextview.errors import UsageError
+from nextview.files import new_file
+from nextview.learning.card_fits import valley_gains
+from nextview.recognition.map_names import map_name
+from nextview.session.style import BLUE, INK, STYLE, PlainFigure, to_png
+
+RANDOM = "random"
+"""What the policies are compared with: a view of the local window drawn at random."""
+CONFIDENCE = "confidence"
+"""The recogniser's own confidence, as a measure: the ceiling of what a map of one view can be."""
+AGREEMENT = {"best": "best view is the recogniser's", "best_near": "or next to it"}
+
+
+def correlations(values: NDArray[np.floating], reference: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Spearman's rank correlation along the rows, (N,); 0 where one of the two is constant."""
+    a, b = (rankdata(x, axis=1) for x in (values, reference))
+    a, b = a - a.mean(1, keepdims=True), b - b.mean(1, keepdims=True)
+    spread = np.sqrt((a**2).sum(1) * (b**2).sum(1))
+    return np.divide((a * b).sum(1), spread, out=np.zeros(len(a)), where=spread > 0)
+
+
+def of_true_class(p: Predictions) -> NDArray[np.float64]:
+    """Log-probability of the true class in each view alone, (N, V)."""
+    return log_softmax(p.logits.astype(np.float64), axis=2)[np.arange(len(p)), :, p.labels]
+
+
+def agreement(p: Predictions, values: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:
+    """Whether each object's best view by a measure is the recogniser's, or at most a cell away, (N,) each.
+
+    Several best views count by the share of them: a measure that is constant agrees as often as chance does.
+    """
+    theirs = of_true_class(p).argmax(1)
+    best = values >= values.max(1, keepdims=True)
+    away = p.sphere.travel[theirs]
+    return {name: (best & (away <= reach)).sum(1) / best.sum(1) for name, reach in (("best", 0), ("best_near", 1))}
+
+
+def valleys_of(validation: Predictions, measure: str) -> tuple[int, ...]:
+    """The classes (indices) for which the valley of a true map gained on the validation objects."""
+    maps = true_map(validation, map_name(measure))
+    gains = valley_gains(validation.sphere, validation.logits, maps, validation.labels)
+    return tuple(c for c, gain in gains.items() if gain > 0)
+
+
+def study(
+    test: Predictions, validation: Predictions, measures: list[str], policies: tuple[str, ...],
+    n_views: tuple[int, ...], runs: int, samples: int, seed: int, rows: list[tuple],
+) -> Iterator[int]:  # fmt: skip
+    """Compute everything; yields how many entries are done.
+
+    Args:
+        test: predictions to judge by.
+        validation: predictions of other objects, by which peak or valley is chosen.
+        measures: names.
+        policies: entries of the benchmark, beside them.
+        n_views: after which policies are compared.
+        runs: first views of each object.
+        samples: of the bootstrap.
+        seed: of it and of the first views.
+        rows: gets measure, label, quantity, value, low, high, p.
+    """
+    weights = resample(len(test), samples, np.random.default_rng([seed, 1]))
+    reference = of_true_class(test)
+    right: dict[tuple[str, int], NDArray[np.bool_]] = {}
+
+    def note(name: str, quantities: dict[str, NDArray[np.float64]], labels: bool = False) -> None:
+        top = np.stack(list(quantities.values()), 1)
+        groups = [("", np.ones(len(test), bool))]
+        groups += [(test.classes[c], test.labels == c) for c in np.unique(test.labels)] if labels else []
+        for label, here in groups:
+            low, high = interval(ratio(top[here], np.ones_like(top[here]), weights[:, here]))
+            for i, quantity in enumerate(quantities):
+                rows.append((name, label, quantity, top[here, i].mean(), low[i], high[i], np.nan))
+
+    for done, name in enumerate([RANDOM, *measures, *policies], 1):
+        if name not in measures:
+            entry, valleys = name, None
+        else:
+            values = true_measure(test, name) if name != CONFIDENCE else np.exp(reference)
+            note(name, {"correlation": correlations(values, reference)}, labels=True)
+            note(name, agreement(test, values))
+            entry, valleys = f"true-{map_name(name)}", valleys_of(validation, name)
+            rows.append((name, ", ".join(test.classes[c] for c in valleys), "valleys", len(valleys), *[np.nan] * 3))
+        given = {} if valleys is None else {map_name(name): tuple(test.classes[c] for c in valleys)}
+        specs = make_specs(replace(test, valley_classes=given or test.valley_classes), runs, seed)
+        paths = replay(entry, specs, max(n_views), seed)
+        for k in n_views:
+            right[name, k] = (paths.answers[:, k - 1] == specs.labels).reshape(runs, -1)
+            accuracy = right[name, k].mean(0)
+            note(name, {f"accuracy_{k}": accuracy, f"travel_{k}": paths.travel[:, k - 1].reshape(runs, -1).mean(0)})
+            if name != RANDOM:
+                note(name, {f"over_random_{k}": accuracy - right[RANDOM, k].mean(0)})
+                rows[-1] = (*rows[-1][:-1], mcnemar(right[name, k], right[RANDOM, k]))
+        yield done
+
+
+def markdown(table: pd.DataFrame, n_views: tuple[int, ...]) -> str:
+    """The table as text, the highest correlation first."""
+    found = {(r.measure, r.quantity): r for r in table.itertuples() if not r.label or r.quantity == "valleys"}
+    names = [*ordered(table)[::-1], *others(table)]
+    at = ", ".join(map(str, n_views))
+    head = ["measure", "correlation", *AGREEMENT.values(), f"accuracy at {at} views", f"points over random at {at}",
+            f"travel at {at}", "valley for"]  # fmt: skip
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for name in [RANDOM, *names]:
+        r = found.get((name, "correlation"))
+        cells = [name.replace("_", " ") if r else Path(name).stem if name.endswith(".json") else name]
+        if r is None:
+            cells += [""] * 3
+        else:
+            cells.append(f"{r.value:.2f} ({r.low:.2f} to {r.high:.2f})")
+            cells += [f"{100 * found[name, quantity].value:.0f} %" for quantity in AGREEMENT]
+        cells.append(", ".join(f"{found[name, f'accuracy_{k}'].value:.3f}" for k in n_views))
+        over = [found[name, f"over_random_{k}"] for k in n_views] if name != RANDOM else []
+        cells.append(", ".join(map(points, over)))
+        cells.append(", ".join(f"{found[name, f'travel_{k}'].value:.2f}" for k in n_views))
+        cells.append("" if r is None else found[name, "valleys"].label or "none")
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([*lines, "", "\\* p < 0.05 after Holm's correction."]) + "\n"
+
+
+def points(row: Any) -> str:
+    """A difference of shares in points, with its interval; a star where it is significant."""
+    value, low, high = (f"{round(100 * x, 1) + 0.0:+.1f}" for x in (row.value, row.low, row.high))
+    return f"{value}{'*' * (row.p_holm < 0.05)} ({low} to {high})"
+
+
+def ordered(table: pd.DataFrame) -> list[str]:
+    """The measures by their correlation, the lowest first."""
+    overall = table[(table["quantity"] == "correlation") & (table["label"] == "")]
+    return overall.sort_values("value", kind="stable")["measure"].tolist()
+
+
+def others(table: pd.DataFrame) -> list[str]:
+    """The policies that are beside the measures, as they were named."""
+    return [name for name in table["measure"].unique() if name != RANDOM and name not in ordered(table)]
+
+
+def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
+    """Correlation overall, by class, and what the policies gain, one row a measure."""
+    names = ordered(table)
+    classes = [label for label in table[table["quantity"] == "correlation"]["label"].unique() if label]
+    with matplotlib.rc_context(STYLE):
+        made = PlainFigure((13, 0.34 * len(names) + 1.9), layout="constrained")
+        left, middle, right = made.subplots(1, 3, sharey=True, width_ratios=[1, 0.11 * len(classes) + 0.6, 1])
+    y = np.arange(len(names))
+
+    def numbers(quantity: str) -> pd.DataFrame:
+        return table[(table["quantity"] == quantity) & (table["label"] == "")].set_index("measure").loc[names]
+
+    overall = numbers("correlation")
+    left.hlines(y, overall["low"], overall["high"], color=INK)
+    left.plot(overall["value"], y, "o", color=INK, markersize=5)
+    left.axvline(0, color=INK, linewidth=0.8)
+    left.set_yticks(y, [name.replace("_", " ") for name in names])
+    left.set_xlabel("rank correlation with the log-probability\nof the true class, mean of objects")
+
+    of_class = table[(table["quantity"] == "correlation") & (table["label"] != "")]
+    cells = of_class.pivot(index="measure", columns="label", values="value").loc[names, classes]
+    reach = max(float(np.abs(cells.drop(index=CONFIDENCE, errors="ignore").to_numpy()).max(initial=0)), 1e-9)
+    shown = middle.imshow(cells, cmap="RdBu_r", vmin=-reach, vmax=reach, aspect="auto", origin="lower")
+    for (i, j), value in np.ndenumerate(cells.to_numpy()):
+        faint = abs(value) > 0.6 * reach
+        middle.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color="white" if faint else INK)
+    middle.set_xticks(range(len(classes)), [name.replace("_", " ") for name in classes], rotation=45, ha="right")
+    middle.grid(False)
+    middle.set_xlabel("the same, by class")
+    made.colorbar(shown, ax=middle, location="top", shrink=0.6, aspect=30)
+
+    for step, (k, colour) in enumerate(zip(n_views, (BLUE, "#c2571a", "#00805a", "#7a6fd0"), strict=False)):
+        over = numbers(f"over_random_{k}")
+        at = y + 0.22 * (len(n_views) - 1) / 2 - 0.22 * step
+        right.hlines(at, 100 * over["low"], 100 * over["high"], color=colour)
+        right.plot(100 * over["value"], at, "o", color=colour, markersize=4, label=f"{k} views")
+    right.axvline(0, color=INK, linewidth=0.8)
+    right.set_xlabel("accuracy of the policy that climbs the true map,\npoints over a random view of the window")
+    right.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(n_views))
+    return made
+
+
+def main(
+    test: tyro.conf.Positional[Path],
+    validation: tyro.conf.Positional[Path],
+    out: Path = Path("measures"),
+    store: Path | None = None,
+    measures: tuple[str, ...] = (),
+    policies: tuple[str, ...] = (),
+    objects: int | None = None,
+    n_views: tuple[int, ...] = (2, 3, 5),
+    runs: int = 10,
+    samples: int = 1000,
+    seed: int = 0,
+) -> None:
+    """Compare the measures.
+
+    Args:
+        test: predictions of the test split (nextview predict --split test).
+        validation: predictions of training objects that the recogniser has not seen (nextview predict --held-out).
+        out: folder of the results.
+        store: the view store, if it is not where the predictions say, with its measures (nextview measure).
+        measures: names; by default all that the store holds, and the confidence.
+        policies: others in the same table, as nextview benchmark names them.
+        objects: only so many of each file, as nextview measure and nextview plan spread them.
+        n_views: after which policies are compared.
+        runs: random first views of each object.
+        samples: of the bootstrap.
+        seed: of everything random.
+    """
+    tables = [Predictions.load(path) for path in (test, validation)]
+    tables = [p.of_objects(sample(np.arange(len(p)), objects)) for p in tables]
+    if store is not None:
+        tables = [replace(p, store=str(store.resolve())) for p in tables]
+    if set(tables[0].names) & set(tables[1].names):
+        raise UsageError(f"{validation}: holds objects of {test}: peak or valley would be chosen on what is judged")
+    if tables[0].classes != tables[1].classes:
+        raise UsageError(f"{validation}: is of other classes than {test}")
+    if not n_views or min(n_views) < 2:
+        raise UsageError("policies are compared after two views or more")
+    names = list(measures) or [*ViewStore.open(tables[0].store).measures, CONFIDENCE]
+    rows: list[tuple] = []
+    comparing = study(*tables, names, policies, n_views, runs, samples, seed, rows)
+    track(comparing, 1 + len(names) + len(policies), "comparing measures")
+    table = pd.DataFrame(rows, columns=["measure", "label", "quantity", "value", "low", "high", "p"])
+    table["p_holm"] = holm(table["p"].to_numpy())
+    text = markdown(table, n_views)
+    out.mkdir(parents=True, exist_ok=True)
+    with new_file(out / "measures.csv", True) as part:
+        table.to_csv(part, index=False)
+    with new_file(out / "measures.md", True) as part:
+        part.write_text(text)
+    to_png(figure(table, n_views), out / "measures.png")
+    print(text, end="")
+
+
+if __name__ == "__main__":
+    with orderly_end("run it again"):
+        tyro.cli(main)

@@ -1,0 +1,458 @@
+"""Gymnasium environments: learn, or judge, a policy of your own. Importing this registers them; docs/environments.md.
+
+- ``nextview/Recognise-v0``: over a file of predictions, thousands of episodes in one batch, nothing is rendered.
+- ``nextview/RecogniseMesh-v0``: over meshes, rendered and shown to the networks as the agent goes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from nextview.checks import number, one_line, whole
+from nextview.data.folders import list_dataset
+from nextview.data.predictions import Predictions
+from nextview.data.samples import SAMPLES, sample_mesh
+from nextview.errors import DatasetError, PredictionsError, SessionError, UsageError
+from nextview.geometry.mesh import load_mesh
+from nextview.geometry.observation import Observation
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.learning.rollout import OBJECTIVES, value_of
+from nextview.policies.base import EpisodeState
+from nextview.policies.gain import INPUTS, Frame, features, maps_of, mirrored_features, ordered, origin
+from nextview.policies.learned_tables import cells_from
+from nextview.recognition.belief import Calibration, FixedLength, Stopping
+from nextview.recognition.evidence import Evidence
+from nextview.recognition.inference import Models, Recogniser, open_maps
+from nextview.recognition.map_names import in_order
+from nextview.recognition.model_card import find_models
+from nextview.session.episode import Episodes
+from nextview.simulation.simulated import SimulatedCamera
+
+Rows = NDArray[np.int64]
+Source = str | Path | Predictions
+CAMERAS = 16
+"""Meshes that are kept ready to be looked at."""
+_HERE = "nextview.benchmark.environments"
+gymnasium.register("nextview/Recognise-v0", f"{_HERE}:RecogniseEnv", vector_entry_point=f"{_HERE}:RecogniseVectorEnv")
+gymnasium.register("nextview/RecogniseMesh-v0", f"{_HERE}:RecogniseMeshEnv")
+Split = Literal["train", "test"]
+"""Objects to learn from, or objects to judge by."""
+FAR = 100.0
+"""Bound of the observation space for what a map network says; the networks of this project stay far below."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What the agent sees, what it is paid for, and when an episode ends.
+
+    Attributes:
+        inputs: of an observation: "belief", "view" (what the last one alone says), "place" (the ring and which views
+            were taken), "azimuth_bin", and predicted maps by name ("lem", "view_area-sphere").
+        frame: where azimuths are counted from: the "camera", or the "object" as it is believed to be turned.
+        objective: paid is by how much a view changes "right", the "belief" in the true class, or its "log-belief".
+        max_views: views at most, at least 2; the first is not the agent's.
+        threshold: belief that ends an episode after the second view or later; None always takes ``max_views``.
+        view_price: taken from the reward for each view.
+        travel_price: taken from it for each grid cell of travel.
+    """
+
+    inputs: tuple[str, ...] = ("belief", "view", "place")
+    frame: Frame = "camera"
+    objective: str = "right"
+    max_views: int = 5
+    threshold: float | None = None
+    view_price: float = 0.0
+    travel_price: float = 0.0
+
+    def __post_init__(self) -> None:
+        inputs = (self.inputs, (*INPUTS, *self.maps), "an observation")
+        frame = ((self.frame,), get_args(Frame), "the frame")
+        for given, known, what in (inputs, frame, ((self.objective,), OBJECTIVES, "the objective")):
+            unknown = [name for name in given if name not in known] if given else [None]
+            if unknown:
+                raise UsageError(f"{what} is of {', '.join(known)}, not {unknown[0]!r}")
+        whole(self.max_views, "the number of views, the agent's first choice being the second,", 2)
+        number(self.view_price, "the view_price", 0)
+        number(self.travel_price, "the travel_price", 0)
+        Stopping(0.5 if self.threshold is None else self.threshold)  # says what is wrong with it
+
+    @property
+    def maps(self) -> tuple[str, ...]:
+        """The maps among the inputs."""
+        return maps_of(self.inputs)
+
+    def stopping(self, calibration: Calibration) -> Stopping:
+        """The rule that ends episodes, with the decay that the calibration asks for."""
+        if self.threshold is None:
+            return FixedLength(max_views=self.max_views)
+        return AfterAction(self.threshold, self.max_views, calibration.correlation)
+
+
+def rows(values: Any, n: int, below: int, what: str) -> NDArray[np.int64]:
+    """What an agent or a user chose, ``n`` whole numbers from 0 to below ``below``; (n,), or one number for one."""
+    array = np.atleast_1d(np.asarray(values))
+    if array.shape != (n,) or array.dtype.kind not in "iu" or not ((array >= 0) & (array < below)).all():
+        many = "a whole number" if n == 1 else f"{n} whole numbers"
+        raise UsageError(f"{what}: {many} from 0 to {below - 1}, not {one_line(repr(values))}")
+    return array.astype(np.int64)
+
+
+@dataclass(frozen=True)
+class AfterAction(Stopping):
+    """As ``Stopping``, but never at the first view: an environment has no episode without an action."""
+
+    def threshold_at(self, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
+        """See ``Stopping``; infinity for one view."""
+        return np.where(np.asarray(n_views) < 2, np.inf, super().threshold_at(n_views))
+
+
+@dataclass(frozen=True)
+class Task:
+    """N objects, what is seen of them, and the rules."""
+
+    names: tuple[str, ...]
+    labels: NDArray[np.int64]
+    classes: tuple[str, ...]
+    sphere: ViewSphere
+    calibration: Calibration
+    observe: Callable[[NDArray[np.int64], NDArray[np.int64]], Evidence] = field(repr=False)
+    rules: Rules = Rules()
+    balanced: bool = False
+
+    def __post_init__(self) -> None:
+        whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
+
+    def draw(self, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Objects and first views of ``n`` episodes, each (n,) int64."""
+        weight = 1 / np.bincount(self.labels)[self.labels]
+        chance = weight / weight.sum() if self.balanced else None
+        return rng.choice(len(self.labels), n, p=chance), rng.integers(len(self.sphere), size=n)
+
+    def begin(self, options: Any, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The same as the options of ``reset`` say, else drawn."""
+        objects, starts = self.draw(n, rng)
+        given = {"object": objects, "start": starts} | (options or {})
+        return rows(given["object"], n, len(self.labels), "object"), rows(given["start"], n, len(self.sphere), "start")
+
+    @property
+    def observation_space(self) -> gymnasium.spaces.Box:
+        """Of the numbers that ``policies.gain.features`` makes, (D,) float32; all but the maps from 0 to 1."""
+        c, rules = len(self.classes), self.rules
+        widths = {name: len(mirrored_features(self.sphere, c, (name,), rules.frame)) for name in ordered(rules.inputs)}
+        high = np.concatenate([np.full(wide, FAR if name in rules.maps else 1.0) for name, wide in widths.items()])
+        return gymnasium.spaces.Box(np.where(high > 1, -FAR, 0).astype(np.float32), high.astype(np.float32))
+
+    @property
+    def action_space(self) -> gymnasium.spaces.Discrete:
+        """Where to go: a ring, and how many azimuth steps ahead: ``ring * azimuths + steps``, V of them."""
+        return gymnasium.spaces.Discrete(len(self.sphere))
+
+
+def replayed(
+    predictions: str | Path | Predictions, split: Split | None = "train", balanced: bool = False, rules: Rules = Rules()
+) -> Task:
+    """The task of recognising the objects of one split.
+
+    Args:
+        predictions: to learn from, of objects that the recogniser was not trained on (``nextview predict --held-out``).
+        split: "train" to learn from, each shape once; "test" to judge by; None for all.
+        balanced: draw every class equally often.
+        rules: see ``Rules``.
+
+    Raises:
+        PredictionsError: there are no objects of that split, or no such map or azimuth bins.
+    """
+    p = predictions if isinstance(predictions, Predictions) else Predictions.load(Path(predictions))
+    p = p if split is None else p.of_split(split)
+    p = p.deduplicate() if split == "train" else p
+    lacking = [name for name in rules.maps if name not in p.maps]
+    if lacking:
+        known = ", ".join((*INPUTS, *in_order(p.maps)))
+        raise PredictionsError(f"these predictions hold no map {lacking[0]!r}; inputs are some of {known}")
+    if ("azimuth_bin" in rules.inputs or rules.frame == "object") and p.azimuth_bins is None:
+        raise PredictionsError("these predictions hold no azimuth bins, which the inputs or the frame need")
+    p = replace(p, maps={name: p.maps[name] for name in rules.maps})
+    return Task(p.names, p.labels, p.classes, p.sphere, p.calibration, p.evidence, rules, balanced)
+
+
+@dataclass
+class Asked:
+    """The policy of a cohort: goes where the actions want, or as near to there as a view is free."""
+
+    sphere: ViewSphere
+    views: NDArray[np.int64]
+    needs: tuple[str, ...] = ()
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See ``Policy.next_views``."""
+        return np.where(state.free, self.sphere.travel[self.views[state.episodes]], np.inf).argmin(1)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the agent is handed after a view in A episodes: (A, D) float32, and change of the objective and price, (A,).
+
+    ``info`` has for each: "object", "view", "n_views", "travel" (cells so far), "answer", its "confidence",
+    "prediction_target" and "action_mask", the actions that lead to a view not taken yet, (A, V) int8.
+    """
+
+    observation: NDArray[np.float32]
+    change: NDArray[np.float64]
+    price: NDArray[np.float64]
+    ended: NDArray[np.bool_]
+    info: dict[str, NDArray[Any]]
+
+
+class Cohort:
+    """B episodes side by side, all at the same view. ``first`` is what is seen before any action."""
+
+    def __init__(self, task: Task, objects: NDArray[np.int64], starts: NDArray[np.int64]) -> None:
+        self.task, self.objects = task, objects
+        self._asked = Asked(task.sphere, np.array(starts))
+        rng, stopping = np.random.default_rng(0), task.rules.stopping(task.calibration)  # nothing is drawn
+        self.episodes = Episodes(task.sphere, self._asked, starts, stopping, rng, task.calibration)
+        self._visited = np.zeros((len(objects), len(task.sphere)), bool)
+        self._value, self._travel = np.zeros(len(objects)), np.zeros(len(objects))
+        self.first = self._look(np.zeros(len(objects)))
+
+    def step(self, actions: NDArray[np.int64]) -> Seen:
+        """Go on in each running episode; where a view was taken before, to the nearest one that was not."""
+        sphere, running, rules = self.task.sphere, self.episodes.running, self.task.rules
+        before = self.episodes.steps[-1].views[~self.episodes.steps[-1].stopped]  # ``current`` is what comes next
+        self._asked.views[running] = self._reached[np.arange(len(running)), actions]
+        self.episodes.keep_choice(self.episodes.next_choice())
+        way = sphere.travel[before, self.episodes.current[running]]
+        self._travel[running] += way
+        return self._look(rules.view_price + rules.travel_price * way)
+
+    def _look(self, price: NDArray[np.float64]) -> Seen:
+        task, running, k = self.task, self.episodes.running, len(self.episodes.steps) + 1
+        sphere, calibration, classes = task.sphere, task.calibration, len(task.classes)
+        objects, views = self.objects[running], self.episodes.current[running]
+        step = self.episodes.update(task.observe(objects, views))
+        n_seen = np.maximum(step.seen, 1)
+        self._visited[running, views] = True
+        visited, labels = self._visited[running], task.labels[objects]
+        azimuth_bins = calibration.azimuth_bins(step.total, n_seen, classes, sphere.azimuth[views])
+        state = EpisodeState(views, visited, step.belief, step.evidence, k, running, azimuth_bins)
+        value = value_of(calibration.log_belief(step.total, n_seen, classes), labels, task.rules.objective)
+        change = value - self._value[running] if k > 1 else np.zeros(len(running))
+        self._value[running] = value
+        reached = cells_from(sphere)[origin(sphere, state, task.rules.frame)]
+        self._reached = reached[~step.stopped]
+        info = {
+            "object": objects,
+            "view": views,
+            "n_views": np.full(len(running), k),
+            "travel": self._travel[running],
+            "answer": step.belief.argmax(1),
+            "confidence": step.belief.max(1),
+            "prediction_target": labels,
+            "action_mask": (~np.take_along_axis(visited, reached, 1)).astype(np.int8),
+        }
+        seen = features(sphere, state, task.rules.inputs, task.rules.frame).astype(np.float32)
+        return Seen(seen, change, price, step.stopped, info)
+
+
+class TaskEnv(gymnasium.Env[Any, Any]):
+    """One episode at a time of any task."""
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.observation_space, self.action_space = task.observation_space, task.action_space
+        self._cohort: Cohort | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See ``gymnasium.Env.reset``."""
+        super().reset(seed=seed)
+        self._cohort = Cohort(self.task, *self.task.begin(options, 1, self.np_random))
+        return self._observed(self._cohort.first)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """See ``gymnasium.Env.step``."""
+        if self._cohort is None or len(self._cohort.episodes.running) == 0:
+            raise SessionError("no episode is under way; call reset")
+        seen = self._cohort.step(rows(action, 1, len(self.task.sphere), "action"))
+        observation, info = self._observed(seen)
+        return observation, float((seen.change - seen.price)[0]), bool(seen.ended[0]), False, info
+
+    def _observed(self, seen: Seen) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        return seen.observation[0], info_of(seen)
+
+
+def info_of(seen: Seen) -> dict[str, Any]:
+    """The info of a single episode."""
+    return {name: values[0] for name, values in seen.info.items()}
+
+
+class RecogniseEnv(TaskEnv):
+    """Recognise an object by few views; what the models see in them is looked up in predictions.
+
+    Args:
+        predictions, split, balanced: see ``replayed``.
+        rules: options of ``Rules``, by name.
+
+    >>> env = gymnasium.make("nextview/Recognise-v0", predictions="validation.npz")    # doctest: +SKIP
+    """
+
+    def __init__(
+        self, predictions: Source, split: Split | None = "train", balanced: bool = False, **rules: Any
+    ) -> None:
+        super().__init__(replayed(predictions, split, balanced, Rules(**rules)))
+
+
+class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
+    """Many episodes of a task at once; as many cohorts as there are numbers of views are under way at most."""
+
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(self, task: Task, num_envs: int) -> None:
+        self.task, self.num_envs = task, whole(num_envs, "the number of environments", 1)
+        self.single_observation_space, self.single_action_space = task.observation_space, task.action_space
+        self.observation_space = batch_space(task.observation_space, num_envs)
+        self.action_space = batch_space(task.action_space, num_envs)
+        self._cohorts: list[tuple[Cohort, Rows]] = []
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """See ``gymnasium.vector.VectorEnv.reset``."""
+        super().reset(seed=seed)
+        cohort = Cohort(self.task, *self.task.begin(options, self.num_envs, self.np_random))
+        self._cohorts = [(cohort, np.arange(self.num_envs))]
+        return cohort.first.observation, cohort.first.info
+
+    def step(
+        self, actions: Any
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """See ``gymnasium.vector.VectorEnv.step``."""
+        seen, info = self._go(actions)
+        return seen.observation, seen.change - seen.price, seen.ended, np.zeros(self.num_envs, bool), info
+
+    def _go(self, actions: Any) -> tuple[Seen, dict[str, Any]]:
+        """What is seen in each episode; where one ended, the observation and the info are those of the next."""
+        if not self._cohorts:
+            raise SessionError("no episode is under way; call reset")
+        actions = rows(actions, self.num_envs, len(self.task.sphere), "actions")
+        wheres = [members[cohort.episodes.running] for cohort, members in self._cohorts]
+        parts = [cohort.step(actions[where]) for (cohort, _), where in zip(self._cohorts, wheres, strict=True)]
+        seen = _merged(parts, np.argsort(np.concatenate(wheres)))
+        self._cohorts = [(cohort, members) for cohort, members in self._cohorts if len(cohort.episodes.running)]
+        over = np.flatnonzero(seen.ended)
+        if len(over) == 0:
+            return seen, seen.info
+        last, info = seen.observation.copy(), {name: values.copy() for name, values in seen.info.items()}
+        fresh = Cohort(self.task, *self.task.draw(len(over), self.np_random))
+        self._cohorts.append((fresh, over))
+        seen.observation[over] = fresh.first.observation
+        for name, values in fresh.first.info.items():
+            info[name][over] = values
+        ended = {"final_obs": last, "_final_obs": seen.ended, "final_info": seen.info, "_final_info": seen.ended}
+        return seen, info | ended
+
+
+def _merged(seen: list[Seen], order: Rows) -> Seen:
+    def joined(values: Any) -> Any:
+        return np.concatenate(list(values))[order]
+
+    info = {name: joined(part.info[name] for part in seen) for name in seen[0].info}
+    names = ("observation", "change", "price", "ended")
+    return Seen(**{name: joined(getattr(part, name) for part in seen) for name in names}, info=info)
+
+
+class RecogniseVectorEnv(TaskVectorEnv):
+    """See ``RecogniseEnv``, of which this runs ``num_envs`` side by side."""
+
+    def __init__(
+        self, num_envs: int, predictions: Source, split: Split | None = "train", balanced: bool = False, **rules: Any
+    ) -> None:
+        super().__init__(replayed(predictions, split, balanced, Rules(**rules)), num_envs)
+
+
+class RecogniseMeshEnv(TaskEnv):
+    """Recognise an object by few views of its mesh.
+
+    Args:
+        meshes: a folder, CLASS/train|test/MESH or CLASS/MESH; the bundled samples by default, which have no splits.
+        split: "train", "test", or None for a folder without splits.
+        models: the name of bundled models, or a folder of your own.
+        viewpoints: a layout of ``ViewSphere.named``.
+        depth: add the depth image: the observation is then {"state": (D,), "depth": (size, size) float32, object radii,
+            0 where there is no object}.
+        size: side of the image, pixels; a multiple of what the networks take, 112 for the bundled ones.
+        balanced: draw every class equally often.
+        rules: options of ``Rules``, by name.
+
+    Raises:
+        DatasetError: there are no such meshes, or one is of a class that the recogniser does not know.
+    """
+
+    def __init__(
+        self,
+        meshes: str | Path | None = None,
+        split: Split | None = "train",
+        models: str | Path = "modelnet10",
+        viewpoints: str = "40",
+        depth: bool = False,
+        size: int = 224,
+        balanced: bool = False,
+        **rules: Any,
+    ) -> None:
+        whole(size, "the side of an image", 1)
+        given, found, sphere = Rules(**rules), find_models(models), ViewSphere.named(viewpoints)
+        networks = Models(Recogniser(found.recogniser), open_maps(found.maps, given.maps))
+        objects = _samples() if meshes is None else _of_folder(Path(meshes), split)
+        unknown = [label for _, label, _ in objects if label not in networks.classes]
+        if unknown:
+            raise DatasetError(f"the recogniser knows no class {unknown[0]!r}; it knows {', '.join(networks.classes)}")
+        labels = np.array([networks.classes.index(label) for _, label, _ in objects])
+        self._looking = _Rendered([load for *_, load in objects], networks, sphere, size)
+        calibration = networks.recogniser.calibration
+        names = tuple(name for name, *_ in objects)
+        super().__init__(Task(names, labels, networks.classes, sphere, calibration, self._looking, given, balanced))
+        self._depth = depth
+        if depth:
+            image = gymnasium.spaces.Box(0, np.float32(sphere.distance + 1), (size, size))
+            self.observation_space = gymnasium.spaces.Dict({"state": self.task.observation_space, "depth": image})
+
+    def _observed(self, seen: Seen) -> tuple[Any, dict[str, Any]]:
+        state = seen.observation[0]
+        return {"state": state, "depth": self._looking.last.depth} if self._depth else state, info_of(seen)
+
+
+class _Rendered:
+    """Evidence by rendering: ``Task.observe``. ``last`` is the observation that it came from."""
+
+    last: Observation
+
+    def __init__(self, loads: list[Any], models: Models, sphere: ViewSphere, size: int) -> None:
+        self._models, self._sphere = models, sphere
+        self._camera = lru_cache(CAMERAS)(lambda k: SimulatedCamera(loads[k](), size, sphere.distance))
+
+    def __call__(self, objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
+        seen = [self._camera(int(k)).observe(self._sphere.poses[v]) for k, v in zip(objects, views, strict=True)]
+        self.last = seen[-1]
+        return self._models.evidence(seen)
+
+
+def _samples() -> list[tuple[str, str, Any]]:
+    return [(name, name, partial(sample_mesh, name)) for name in SAMPLES]
+
+
+def _of_folder(folder: Path, split: str | None) -> list[tuple[str, str, Any]]:
+    entries = [e for e in list_dataset(folder) if split in (None, e.split)]
+    if not entries:
+        raise DatasetError(f"{folder}: holds no meshes of the split {split!r}; split=None takes all that there are")
+    return [(e.name, e.label, partial(load_mesh, e.path)) for e in entries]

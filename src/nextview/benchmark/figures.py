@@ -1,0 +1,241 @@
+"""The figures of a benchmark, from its tables, and of an evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from nextview.benchmark.entries import is_oracle
+from nextview.benchmark.evaluation import Evaluation, judged_objects
+from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold
+from nextview.benchmark.page import words
+from nextview.benchmark.run import Results
+from nextview.benchmark.true_maps import true_map
+from nextview.data.predictions import Predictions
+from nextview.recognition.map_names import LCM, LEM
+from nextview.session import style
+from nextview.session.style import ACCENT, BLUE, GREY, INK, LIGHT_BLUE, legend, new_figure, percent_axis
+
+COLOURS = {
+    "random": GREY, "gain": "#b5179e", "random-all": "#4a5560", "furthest": "#d99000", "unidirectional": LIGHT_BLUE,
+    LEM: BLUE, f"{LEM}-peak": "#7a6fd0", LCM: "#00805a", f"{LCM}-peak": "#5bb98c", "oracle-valley": ACCENT,
+    f"true-{LEM}": BLUE, f"true-{LEM}-peak": "#7a6fd0", "true-oracle-valley": ACCENT, f"true-{LCM}": "#00805a",
+    "oracle-gain": "#111111", "oracle-gain-all": "#777777",
+}  # fmt: skip
+OWN = ("#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff7043", "#5c6bc0")
+"""For all others, in turn."""
+MOST = 8
+"""Curves of policies that a robot could follow, at most."""
+EXAMPLES, ROWS = 5, 12
+"""Examples of maps of each class, from the best to the worst, and classes at most."""
+TRUE_PEAK: dict[str, Any] = {"marker": "o", "color": "white", "markeredgecolor": INK, "markersize": 6.5}
+PREDICTED_PEAK: dict[str, Any] = {"marker": "x", "color": ACCENT, "markeredgewidth": 1.8, "markersize": 5}
+
+
+def ceiling(results: Results) -> list[str]:
+    """One step of foresight, in the window if it was run there, else over all views; empty if it was not run."""
+    ran = set(results.tables.sweep["policy"])
+    return [name for name in ("oracle-gain", "oracle-gain-all") if name in ran][:1]
+
+
+def compared(results: Results) -> list[str]:
+    """The policies of the curves: the reference, the most accurate others, the published oracle and the ceiling."""
+    names, reference = list(results.tables.sweep["policy"].unique()), results.settings["reference"]
+    summary, headline = results.tables.summary, headline_threshold(results.settings["thresholds"])
+    at = (summary["measure"] == "accuracy") & (summary["threshold"] == headline)
+    accuracy = summary[at].set_index("policy")["value"]
+    robots = sorted((n for n in names if not is_oracle(n)), key=lambda n: (n != reference, -accuracy[n]))[:MOST]
+    return [n for n in names if n in robots] + [n for n in ("oracle-valley", *ceiling(results)) if n in names]
+
+
+def look_of(policy: str, results: Results) -> dict:
+    """Colour and line of a policy, the same in all figures; no two of those ``compared`` share both."""
+    own = [name for name in (*compared(results), *results.tables.sweep["policy"].unique()) if name not in COLOURS]
+    colour = COLOURS.get(policy) or OWN[list(dict.fromkeys(own)).index(policy) % len(OWN)]
+    return {
+        "color": colour,
+        "linestyle": ":" if policy.startswith("oracle-gain") else "--" if is_oracle(policy) else "-",
+    }
+
+
+def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure:
+    """Accuracy against threshold, with 95 % intervals (figures 15 and 18)."""
+    figure, axes = new_figure(4.6, 3.5)
+    table = results.tables.summary.query("measure == @measure and threshold == threshold")
+    ticks = sorted(table["threshold"].unique())
+    for k, name in enumerate(names := [n for n in compared(results) if n in set(table["policy"])]):
+        rows = table[table["policy"] == name].sort_values("threshold")
+        x = np.arange(len(rows)) + (k - len(names) / 2) * 0.04  # side by side, so that the bars can be told apart
+        look = look_of(name, results)
+        axes.plot(x, rows["value"], marker="o", markersize=3.5, label=name, **look)
+        axes.vlines(x, rows["low"], rows["high"], color=look["color"], linewidth=0.8, alpha=0.55)
+    axes.set_xticks(np.arange(len(ticks)), [f"{t:g}" for t in ticks])
+    axes.set_xlabel("confidence threshold")
+    axes.set_ylabel(words(measure))
+    percent_axis(axes.yaxis)
+    legend(axes)
+    return figure
+
+
+def budget_curve(results: Results, budget: str) -> Figure:
+    """Accuracy against mean views or mean travel, over all thresholds."""
+    figure, axes = new_figure(4.6, 3.5)
+    for name in compared(results):
+        rows = results.tables.sweep[results.tables.sweep["policy"] == name]
+        axes.plot(rows[budget], rows["accuracy"], label=name, **look_of(name, results))
+    axes.set_xlabel({"n_views": "mean views", "travel_all": "mean travel, grid cells"}[budget])
+    axes.set_ylabel("accuracy")
+    percent_axis(axes.yaxis)
+    legend(axes)
+    return figure
+
+
+def differences(results: Results, threshold: float) -> Figure:
+    """Difference of every policy to the reference in accuracy with its 95 % interval; filled where Holm's p < 0.05."""
+    rows = results.tables.tests.query("threshold == @threshold and measure == 'accuracy'").iloc[::-1]
+    figure, axes = new_figure(4.6, 0.6 + 0.24 * max(3, len(rows)))
+    row: Any  # a named tuple
+    for y, row in enumerate(rows.itertuples()):
+        colour = look_of(row.policy, results)["color"]
+        axes.hlines(y, 100 * row.low, 100 * row.high, color=colour, linewidth=1.6)
+        inside = colour if row.p_holm < SIGNIFICANT else "white"
+        axes.plot(100 * row.difference, y, "o", color=colour, markersize=5, markerfacecolor=inside)
+    axes.axvline(0, color=INK, linewidth=0.9)
+    axes.set_yticks(np.arange(len(rows)), rows["policy"])
+    axes.grid(axis="y", visible=False)
+    axes.tick_params(axis="y", length=0)
+    axes.set_xlabel(f"accuracy, percentage points: difference to {results.settings['reference']}")
+    return figure
+
+
+def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Figure:
+    """Percent of each true class, rows, that was taken for each class (thesis, figure 12); counts (C, C)."""
+    share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+    figure, axes = new_figure(4.6, 4.4)
+    axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
+    few, ticks, names = len(classes) <= 15, np.arange(len(classes)), [words(name) for name in classes]
+    for i, j in np.argwhere(share >= 0.01) if few else ():
+        text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7.5}
+        axes.text(j, i, f"{100 * share[i, j]:.0f}", color="white" if share[i, j] > 0.55 else INK, **text)
+    size = 8.5 if few else 5
+    axes.set_xticks(ticks, names, rotation=50, ha="right", rotation_mode="anchor", fontsize=size)
+    axes.set_yticks(ticks, names, fontsize=size)
+    axes.grid(visible=False)
+    axes.tick_params(length=0)
+    axes.set(xlabel="answer", ylabel="true class")
+    axes.set_title(title, fontsize=10, loc="left")
+    return figure
+
+
+def confusion(episodes: pd.DataFrame, classes: Sequence[str], title: str) -> Figure:
+    """Confusion matrix of episodes."""
+    label, answer = (pd.Categorical(episodes[c], categories=list(classes)) for c in ("label", "answer"))
+    return confusion_matrix(pd.crosstab(label, answer, dropna=False).to_numpy(), classes, title)
+
+
+def reliability_diagram(results: Results, policies: Sequence[str], threshold: float) -> Figure:
+    """Reliability of the confidence at which the episodes stopped; bins of fewer than 20 episodes are left out."""
+    error = results.tables.summary.query("measure == 'calibration_error' and threshold == @threshold")
+    errors = error.set_index("policy")["value"]
+    table = results.tables.reliability.query("threshold == @threshold").rename(columns={"episodes": "answers"})
+    curves = {f"{n}  {errors[n]:.3f}": (table[table["policy"] == n], look_of(n, results)) for n in policies}
+    return _reliability(curves, "when it stopped", "policy  calibration error")
+
+
+def _reliability(curves: dict[str, tuple[pd.DataFrame, dict]], when: str, title: str) -> Figure:
+    """Share of right answers against confidence, a bin a row, with dots as large as its answers are many."""
+    figure, axes = new_figure(4.6, 3.9)
+    axes.plot([0, 1], [0, 1], color=INK, linewidth=0.9)
+    axes.set(xlim=(0, 1.03), ylim=(0, 1.03), xlabel=f"confidence {when}", ylabel="share that was right")
+    axes.set_aspect("equal")
+    for label, (table, look) in curves.items():
+        rows = table[table["answers"] >= 20]
+        axes.plot(rows["confidence"], rows["accuracy"], linewidth=1.1, label=label, **look)
+        size, colour = 8 + 220 * rows["answers"] / rows["answers"].sum(), look["color"]
+        axes.scatter(rows["confidence"], rows["accuracy"], size, colour, alpha=0.55, linewidths=0, clip_on=False)
+    legend(axes, title)
+    return figure
+
+
+def evaluated_confusion(e: Evaluation, n_views: int, classes: Sequence[str]) -> Figure:
+    """Confusion matrix of that many views."""
+    table = e.confusion[e.confusion["n_views"] == n_views].pivot(index="label", columns="answer", values="answers")
+    title = "one view" if n_views == 1 else f"all {n_views} views fused"
+    return confusion_matrix(table.loc[list(classes), list(classes)].to_numpy(), classes, title)
+
+
+def fusion_curve(e: Evaluation) -> Figure:
+    """Accuracy, with 95 % intervals, and mean confidence against the number of random views fused."""
+    figure, axes = new_figure(4.6, 3.5)
+    table = e.fusion
+    axes.fill_between(table["n_views"], table["low"], table["high"], color=BLUE, alpha=0.15, linewidth=0)
+    axes.plot(table["n_views"], table["accuracy"], color=BLUE, label="over objects, 95 % interval")
+    axes.plot(table["n_views"], table["class_accuracy"], color=INK, linestyle="--", linewidth=1.1, label="over classes")
+    axes.plot(table["n_views"], table["confidence"], color=ACCENT, linestyle=":", label="mean confidence")
+    published = e.accuracy.query("n_views == 1 and label == '' and measure == 'accuracy'")["published"].iloc[0]
+    if np.isfinite(published):
+        axes.plot(1, published, "D", color=ACCENT, markersize=5, clip_on=False, label="published, one view")
+    axes.set_xscale("log")
+    ticks = [k for k in (1, 2, 3, 5, 10, 20, 40, 80) if k <= len(table)]
+    axes.set_xticks(ticks, [str(k) for k in ticks])
+    axes.minorticks_off()
+    axes.set(xlabel="random views fused", ylabel="share")
+    percent_axis(axes.yaxis)
+    legend(axes)
+    return figure
+
+
+def evaluated_reliability(e: Evaluation) -> Figure:
+    """Reliability after one view and more, in random order; bins of fewer than 20 answers are left out."""
+    errors, curves = e.fusion.set_index("n_views")["calibration_error"], {}
+    n: Any
+    for (n, rows), colour in zip(e.reliability.groupby("n_views"), ("#7cc4ec", LIGHT_BLUE, BLUE, INK), strict=False):
+        curves[f"{n} view{'s' * (n > 1)}  {errors[n]:.3f}"] = rows, {"color": colour}
+    return _reliability(curves, "in the answer", "calibration error")
+
+
+def example_maps(p: Predictions, name: str, rng: np.random.Generator) -> Figure:
+    """True maps (left) beside predicted ones (thesis, figures 25 to 28), a row a class, from the best to the worst.
+
+    One random view of every object is drawn; those shown stand at equal steps of its squared error. Of many classes,
+    those shown stand at equal steps of the class's mean error.
+    """
+    kept = judged_objects(p, name)
+    view, labels = rng.integers(len(p.sphere), size=len(kept)), p.labels[kept]
+    true, predicted = true_map(p, name)[kept, view], p.maps[name][kept, view]
+    error = ((true.astype(np.float64) - predicted) ** 2).mean((1, 2))
+    classes = np.unique(labels)
+    order = np.argsort([error[labels == index].mean() for index in classes], kind="stable")
+    classes = classes[np.sort(order[_steps(len(classes), ROWS)])]
+    gap = np.full((true.shape[1], 1), np.nan)
+    with matplotlib.rc_context(style.STYLE):
+        figure = style.PlainFigure((9.6, 0.6 + 1.3 * len(classes)))
+        grid = figure.subplots(len(classes), EXAMPLES, squeeze=False, gridspec_kw={"hspace": 0.35, "wspace": 0.12})
+    for axes in grid.flat:
+        axes.set_axis_off()
+    for row, index in zip(grid, classes, strict=True):
+        row[0].text(-0.1, 0.5, words(p.classes[index]), ha="right", va="center", transform=row[0].transAxes)
+        here = np.flatnonzero(labels == index)
+        here = here[np.argsort(error[here], kind="stable")]
+        for axes, at in zip(row, here[_steps(len(here), EXAMPLES)], strict=False):
+            pair = np.hstack([true[at], gap, predicted[at]])
+            axes.imshow(pair, cmap="viridis", vmin=0, vmax=1, origin="lower", aspect="auto")
+            for values, look in ((true[at], TRUE_PEAK), (predicted[at], PREDICTED_PEAK)):
+                ring, column = np.unravel_index(values.argmax(), values.shape)
+                axes.plot([column, column + values.shape[1] + 1], [ring, ring], linestyle="", **look)
+            thing = p.names[kept[at]].removeprefix(p.classes[index]).strip("_") or p.names[kept[at]]
+            axes.set_title(f"{thing[-12:]} view {view[at]}: {error[at]:.3f}", fontsize=7.5)
+    marks = [Line2D([], [], linestyle="", **look) for look in (TRUE_PEAK, PREDICTED_PEAK)]
+    figure.legend(marks, ["true peak", "predicted peak"], loc="upper right", ncols=2, bbox_to_anchor=(0.9, 1))
+    return figure
+
+
+def _steps(n: int, most: int) -> NDArray[np.int64]:
+    return np.unique(np.rint(np.linspace(0, n - 1, min(n, most))).astype(np.int64))

@@ -1,1 +1,0 @@
-"""What is fitted to predictions instead of images, in seconds and without torch: calibration, tables of policies."""

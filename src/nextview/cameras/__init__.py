@@ -1,1 +1,0 @@
-"""Cameras: what can look at an object from a pose."""

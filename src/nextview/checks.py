@@ -1,0 +1,119 @@
+"""What users hand in, checked once at the door: numbers, points, and plugins, which are code of their own."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import sysconfig
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from importlib.metadata import entry_points
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import NextviewError, UsageError
+
+TRACEBACK = "NEXTVIEW_TRACEBACK"
+"""An environment variable: set, the whole traceback of a plugin's error is printed too."""
+_NOT_PLUGINS = (f"{Path(__file__).parent}{os.sep}", "<frozen ", *map(sysconfig.get_path, ("stdlib", "purelib")))
+
+
+def one_line(text: str, most: int = 80) -> str:
+    r"""A text for a sentence: on one line, at most so long, what cannot be printed escaped.
+
+    >>> print(one_line("a\n  b\x1b[31m"))
+    a b\x1b[31m
+    """
+    text = " ".join(text[: 10 * most].split())
+    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def whole(value: Any, what: str, least: int = 0, most: int = 2**31 - 1) -> int:
+    """A whole number within limits.
+
+    Raises:
+        UsageError: it is none.
+    """
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Integral) or not least <= int(value) <= most:
+        reach = f"from {least} on" if most == 2**31 - 1 else f"from {least} to {most}"
+        raise UsageError(f"{what} is a whole number {reach}, not {one_line(repr(value))}")
+    return int(value)
+
+
+def number(value: Any, what: str, least: float = -np.inf, most: float = np.inf, above: float = -np.inf) -> float:
+    """A finite number within limits, ``above`` the last excluded.
+
+    Raises:
+        UsageError: it is none.
+    """
+    fits = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+    if not fits or not np.isfinite(float(value)) or not (least <= value <= most and value > above):
+        reach = [f"of at least {least:g}"] * (least > -np.inf) + [f"above {above:g}"] * (above > -np.inf)
+        reach += [f"of at most {most:g}"] * (most < np.inf)
+        raise UsageError(f"{what} is a number{' ' if reach else ''}{', '.join(reach)}, not {one_line(repr(value))}")
+    return float(value)
+
+
+def points(value: Any, what: str) -> NDArray[np.float64]:
+    """Points in space, (N, 3) float64.
+
+    Raises:
+        UsageError: they are none.
+    """
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
+        raise UsageError(f"{what} are points, (N, 3) finite numbers, not {one_line(repr(value))}")
+    return array
+
+
+def plugin(path: str) -> Any:
+    """What MODULE:NAME means, seen from the working folder. Raises whatever importing it raises."""
+    module, _, name = path.partition(":")
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.insert(0, here)
+    return getattr(importlib.import_module(module), name)
+
+
+@cache
+def plugins(group: str) -> dict[str, str]:
+    """What installed packages add, MODULE:NAME by name: the entry points of a group, "nextview.policies"."""
+    return {entry.name: entry.value for entry in entry_points(group=group)}
+
+
+@contextmanager
+def plugin_errors(error: Callable[[str], NextviewError]) -> Iterator[None]:
+    """Run a plugin: what it raises, an exit too, becomes one sentence. A Ctrl-C passes.
+
+    Args:
+        error: makes the error from what is said of the exception: its kind, its message, and the plugin's last line.
+
+    Raises:
+        NextviewError: what ``error`` makes; its cause is the plugin's exception.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as raised:
+        if os.environ.get(TRACEBACK):
+            traceback.print_exception(raised)
+        raise error(_sentence(raised)) from raised
+
+
+def _sentence(raised: BaseException) -> str:
+    message = one_line(str(raised), 300)
+    text = f"{type(raised).__name__}: {message}" if message else type(raised).__name__
+    frames = [f for f in traceback.extract_tb(raised.__traceback__) if not f.filename.startswith(_NOT_PLUGINS)]
+    return f"{text}, at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else text

@@ -1,0 +1,116 @@
+"""View measures: depth entropy and the recogniser's confidence, and those of users by their import path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.checks import plugin, plugin_errors, plugins
+from nextview.data.measured_view import MeasuredView
+from nextview.errors import MeasureError
+from nextview.geometry.depth import object_depth
+from nextview.geometry.observation import depth_image
+from nextview.recognition.map_names import Good
+
+QUANTUM = 1e-3
+"""Depth values closer than this count as equal, object radii."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A view measure, and what is to be known of it.
+
+    Attributes:
+        function: from a view to a finite number.
+        needs: "depth", or "mesh": the mesh and which face of it each pixel shows.
+        source: where it comes from.
+        good: which values are those of good views, by its source.
+    """
+
+    function: Callable[[MeasuredView], float]
+    needs: Literal["depth", "mesh"] = "depth"
+    source: str = "your own"
+    good: Good = "peak"
+
+    def __call__(self, view: MeasuredView) -> float:
+        """The measure of a view."""
+        return self.function(view)
+
+
+MEASURES: dict[str, Measure] = {
+    "depth_entropy": Measure(
+        lambda view: entropy_of_depths(view.depths, view.depth.size), "depth", "Parisotto et al.; eq. 3"
+    )
+}
+"""The thesis's own. Packages add theirs by entry points of the group GROUP."""
+GROUP = "nextview.measures"
+
+
+def all_measures() -> dict[str, Measure]:
+    """Every measure that has a name: MEASURES, and those that installed packages add."""
+    return MEASURES | {name: find_measure(name) for name in plugins(GROUP)}
+
+
+def find_measure(name: str) -> Measure:
+    """A measure by name: one of ``all_measures``, or "MODULE:FUNCTION" for a function or a ``Measure`` of your own."""
+    if name in MEASURES:
+        return MEASURES[name]
+    path = plugins(GROUP).get(name, name)
+    if ":" not in path:
+        known = ", ".join([*MEASURES, *plugins(GROUP)])
+        raise MeasureError(f"no measure is called {name!r}; there are {known}, or MODULE:FUNCTION")
+    with plugin_errors(lambda said: MeasureError(f"measure {name} cannot be imported ({said})")):
+        found = plugin(path)
+    if not callable(found):
+        raise MeasureError(f"measure {name} is no function of a view")
+    return found if isinstance(found, Measure) else Measure(found)
+
+
+def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
+    """The measures that are meant."""
+    if not names:
+        return tuple(name for name, measure in all_measures().items() if meshes or measure.needs == "depth")
+    names = tuple(dict.fromkeys(each for name in names for each in (all_measures() if name == "all" else (name,))))
+    for name in names:
+        if find_measure(name).needs == "mesh" and not meshes:
+            raise MeasureError(f"the measure {name} needs the meshes: name the folder that the store was rendered from")
+    return names
+
+
+def depth_entropy(depth: NDArray[np.floating]) -> float:
+    """Shannon entropy, bits, of the values in a depth image (H, W), object radii, 0 where there is no object."""
+    depth = object_depth(depth_image(depth).astype(np.float64, copy=False))
+    return entropy_of_depths(depth[depth > 0], depth.size)
+
+
+def entropy_of_depths(seen: NDArray[np.floating], pixels: int) -> float:
+    """The same, of the depth where there is an object, (n,), and how many pixels the image has."""
+    counts = np.bincount(np.rint(seen / QUANTUM).astype(np.int64), minlength=1)
+    counts[0] += pixels - seen.size
+    share = counts[counts > 0] / pixels
+    return float((share * np.log2(1 / share)).sum())
+
+
+def normalise_per_object(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Scale (..., V) over an object's views to [0, 1] float32; all 0 where the views do not differ."""
+    values = np.asarray(values)
+    low = values.min(-1, keepdims=True)
+    span = values.max(-1, keepdims=True) - low
+    return np.where(span > 0, (values - low) / np.where(span > 0, span, 1), 0).astype(np.float32)
+
+
+def confidence_maps(logits: NDArray[np.floating], labels: NDArray[np.integer]) -> NDArray[np.float32]:
+    """Confidence in each view alone where it is recognised rightly, 0 where it is not: (N, V) float32.
+
+    An object that is right from no view has a row of zeros; the thesis leaves it out. Of equal logits the lower index
+    wins.
+    """
+    from scipy.special import softmax
+
+    logits = np.asarray(logits, np.float64)
+    right = logits.argmax(2) == labels[:, None]
+    return np.where(right, softmax(logits, axis=2).max(2), 0).astype(np.float32)

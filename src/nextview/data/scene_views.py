@@ -1,0 +1,168 @@
+"""What a store keeps of scenes, and what a robot in them would expect to see from each view."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.predictions import Predictions
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError
+from nextview.geometry.observation import SceneView
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.policies.base import EpisodeState
+from nextview.sensing.expected_visibility import GRID, Occupancy, SeenScene, expected_visibility, sight_lines
+from nextview.session.episode import Visible, unconstrained
+from nextview.simulation.scene import Scene
+from nextview.simulation.scene_layout import clutter_level
+from nextview.simulation.simulated import TARGET, SceneCamera, visible_shares
+
+SIDE = 80
+"""Of the pictures of the whole scene, pixels."""
+HALF = 2.0
+"""They show so many object radii to each side of the target's centre."""
+SCENE_UNIT = 2e-4
+"""Their depth is stored as uint16 in steps of this many object radii: up to 13.1."""
+SHARE_SIZE = 112
+"""Side of the picture in which the share that shows is measured, pixels; as when the scene was drawn."""
+
+
+def scene_intrinsics(distance: float, side: int = SIDE) -> NDArray[np.float64]:
+    """Pinhole matrix of the pictures of a scene, (3, 3), pixels; the first pixel's centre is at 0.5."""
+    focal = side / 2 * distance / HALF
+    return np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]])
+
+
+def render_scene(scene: Scene, sphere: ViewSphere) -> dict[str, NDArray]:
+    """All that is kept of a scene beside its target's views, without errors of a sensor, by the names of the arrays."""
+    camera = SceneCamera(scene, scene_intrinsics(sphere.distance), (SIDE, SIDE))
+    looks = [camera.look(pose) for pose in sphere.poses]
+    positions = sphere.poses[:, :3, 3]
+    depth = np.rint(np.stack([depth for depth, _ in looks]) / SCENE_UNIT)
+    return {
+        "scene/depth": depth.clip(max=np.iinfo(np.uint16).max).astype(np.uint16),
+        "scene/owner": np.stack([owner for _, owner in looks]),
+        "scene/reachable": scene.reachable(positions),
+        "measures/visible_share": visible_shares(scene, sphere.poses, SHARE_SIZE, sphere.distance).astype(np.float32),
+        "measures/clearance": scene.clearance(positions).astype(np.float32),
+    }
+
+
+@dataclass(frozen=True)
+class SceneViews:
+    """One scene of a store, as it is from all V views.
+
+    ``depth`` (V, S, S) float32, object radii, 0 = nothing, with ``intrinsics``; ``owner`` of each pixel: NOTHING,
+    TARGET, OTHER or TABLE_TOP; ``poses`` (V, 4, 4); ``reachable`` (V,); ``visible_share`` of the target (V,), the
+    truth; ``clearance`` (V,), object radii.
+    """
+
+    depth: NDArray[np.float32]
+    owner: NDArray[np.uint8]
+    intrinsics: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    reachable: NDArray[np.bool_]
+    visible_share: NDArray[np.float32]
+    clearance: NDArray[np.float32]
+
+    def scene_view(self, view: int) -> SceneView:
+        """What a camera sees from there: things and table alike are no target."""
+        return SceneView(self.depth[view], self.owner[view] == TARGET, self.poses[view], self.intrinsics, True)
+
+
+def scene_views(store: ViewStore, i: int) -> SceneViews:
+    """Scene i of a store that was rendered of scenes."""
+    if store.attributes.scene is None:
+        raise DatasetError(f"{store.path}: holds single objects, no scenes; nextview scenes draws some")
+    return SceneViews(
+        store.read("scene/depth", i) * np.float32(SCENE_UNIT),
+        store.read("scene/owner", i),
+        scene_intrinsics(store.sphere.distance, store.attributes.scene),
+        store.sphere.poses,
+        store.read("scene/reachable", i),
+        store.read("measures/visible_share", i),
+        store.read("measures/clearance", i),
+    )
+
+
+Constrain = Callable[[EpisodeState], EpisodeState]
+
+
+def sight_of(scenes: SceneSight | None, objects: NDArray[np.int64]) -> tuple[Constrain, Visible]:
+    """What ``run_episodes`` needs of scenes: where cameras can be, and what is expected to show."""
+    if scenes is None:
+        return unconstrained, lambda state: np.ones(state.visited.shape)
+    return (
+        lambda state: replace(state, reachable=scenes.reachable[objects[state.episodes]]),
+        lambda state: scenes.visibility(objects[state.episodes], state.visited),
+    )
+
+
+def scenes_of(p: Predictions) -> SceneSight | None:
+    """The scenes that predictions are of; None if they are of single objects, whose store need not be there."""
+    try:
+        store = ViewStore.open(p.store) if p.store else None
+    except DatasetError:
+        store = None
+    if store is not None:
+        return SceneSight.of(store, p.names)
+    if any(map(clutter_level, p.names)):
+        lost = f"there is no view store at {p.store} any more; put it back, or" if p.store else "name no view store;"
+        raise DatasetError(f"these predictions are of scenes, and {lost} predict again")
+    return None
+
+
+@dataclass(frozen=True)
+class SceneSight:
+    """Of N scenes, ``rows`` of a store: where cameras can be, and what is expected to show after some views."""
+
+    store: ViewStore
+    rows: NDArray[np.int64]
+    reachable: NDArray[np.bool_]
+    _found: dict[tuple[int, bytes], NDArray[np.float32]] = field(default_factory=dict, repr=False, compare=False)
+    _frames: dict[tuple[int, int], tuple[bytes, float]] = field(default_factory=dict, repr=False, compare=False)
+
+    @classmethod
+    def of(cls, store: ViewStore, names: Sequence[str]) -> SceneSight | None:
+        """Of some of a store's objects; None if it holds no scenes."""
+        if store.attributes.scene is None:
+            return None
+        row = {name: i for i, name in enumerate(store.names)}
+        lost = [name for name in names if name not in row]
+        if lost:
+            raise DatasetError(f"{store.path}: holds no scene {lost[0]}")
+        rows = np.array([row[name] for name in names])
+        return cls(store, rows, np.stack([store.read("scene/reachable", i) for i in rows]))
+
+    def of_scenes(self, kept: NDArray[np.int64]) -> SceneSight:
+        """Some of the scenes, by their index; also the same one several times."""
+        return replace(self, rows=self.rows[kept], reachable=self.reachable[kept])
+
+    def visibility(self, scenes: NDArray[np.int64], visited: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Share of the target that is expected to show from each view."""
+        keys = [(int(self.rows[scene]), np.packbits(row).tobytes()) for scene, row in zip(scenes, visited, strict=True)]
+        new = {key: row for key, row in zip(keys, visited, strict=True) if key not in self._found}
+        views: tuple[int, SceneViews] | None = None
+        for key in sorted(new):  # scene by scene, each read once
+            scene = SeenScene.unseen()
+            for view in np.flatnonzero(new[key]):
+                if (key[0], int(view)) not in self._frames and (views is None or views[0] != key[0]):
+                    views = key[0], scene_views(self.store, key[0])
+                scene = scene.and_also(self._frame(key[0], int(view), views))
+            self._found[key] = expected_visibility(scene, self.store.sphere.poses[:, :3, 3]).expected.astype(np.float32)
+        return np.stack([self._found[key] for key in keys]).astype(np.float64)
+
+    def _frame(self, row: int, view: int, views: tuple[int, SceneViews] | None) -> SeenScene:
+        """What the frame from one view says alone of what lies on a line of sight; kept packed, a hundredth or so."""
+        if (row, view) not in self._frames:
+            assert views is not None
+            asked = sight_lines(GRID, self.store.sphere.poses[:, :3, 3].tobytes()).asked
+            seen = SeenScene(Occupancy.unseen(GRID, asked)).seen(views[1].scene_view(view))
+            self._frames[row, view] = zlib.compress(seen.occupancy.cells.tobytes(), 1), seen.floor
+        packed, floor = self._frames[row, view]
+        cells = np.frombuffer(zlib.decompress(packed), np.uint8).reshape((GRID.n,) * 3)
+        return SeenScene(Occupancy(GRID, cells), floor)

@@ -1,0 +1,248 @@
+"""Files that nextview writes and reads: outputs whole or not at all, typed JSON records, checked weights.
+
+One rule holds for every output. What exists is refused; with ``overwrite`` exactly the files that are written are
+replaced. A file is written under a temporary name beside its place and then renamed, so a run that is killed leaves
+what was there before.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import shlex
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+import numpy as np
+from filelock import FileLock, Timeout
+
+from nextview.errors import DatasetError, ModelError, NextviewError, ResultsError
+
+T = TypeVar("T")
+Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+"""A field of a record: a hash in hexadecimal digits."""
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of a full disk."""
+LARGEST_RECORD = 64 * 2**20
+"""Bytes of a JSON record; a card takes some hundred thousand."""
+
+
+def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None:
+    """Refuse, before any work is done, an output that cannot be written or must not be replaced.
+
+    Args:
+        path: of the output.
+        overwrite: whether it may replace what is there.
+        folder: whether the output is a folder; an empty one may be there.
+
+    Raises:
+        ResultsError: it exists, is a link, or its place cannot be written.
+    """
+    if path.is_symlink():
+        raise ResultsError(f"{path}: is a link; give what it points to")
+    if path.exists():
+        if path.is_dir() != folder:
+            raise ResultsError(f"{path}: is a {'folder' if path.is_dir() else 'file'}; give another name")
+        if not overwrite and not (folder and not any(path.iterdir())):
+            raise ResultsError(f"{path}: exists; give another name, or --overwrite to replace it")
+    above = next(p for p in path.absolute().parents if p.exists())
+    if not above.is_dir():
+        raise ResultsError(f"{path}: cannot be written ({above} is not a folder)")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise ResultsError(f"{path}: cannot be written (no permission to write in {above})")
+
+
+@contextmanager
+def new_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
+    """Write a file whole or not at all: yields a temporary path beside it, of the same suffix.
+
+    Raises:
+        ResultsError: see ``check_new``; or the disk is full. What was at ``path`` is still there.
+    """
+    check_new(path, overwrite)
+    with _beside(path) as temporary:
+        part = temporary / path.name
+        yield part
+        _sync(part)
+        check_new(path, overwrite)  # it may have appeared meanwhile
+        os.replace(part, path)
+
+
+@contextmanager
+def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
+    """Write a folder of files: yields a temporary folder beside it.
+
+    An existing folder with files in it is refused. With ``overwrite`` each file that was written replaces the one of
+    its name, and all others stay.
+
+    Raises:
+        ResultsError: see ``check_new``; or the disk is full.
+    """
+    check_new(path, overwrite, folder=True)
+    there = path.is_dir()
+    place = path / "new" if there else path  # the folder above one that is there may not be writable
+    with _beside(place) as temporary:
+        part = temporary / place.name
+        part.mkdir()
+        yield part
+        written = [file for file in part.rglob("*") if file.is_file()]
+        for file in written:
+            _sync(file)
+        if not there:
+            check_new(path, overwrite, folder=True)
+            if not path.exists():
+                os.rename(part, path)
+                return
+        for file in written:
+            place = path / file.relative_to(part)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            check_new(place, overwrite)
+            os.replace(file, place)
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """A temporary folder on the same disk, removed at the end; what the disk refuses becomes one sentence."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name[:40]}-", dir=path.parent))
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written ({error.strerror})") from None
+    try:
+        yield temporary
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        raise ResultsError(f"{path}: cannot be written ({error.strerror})") from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _sync(path: Path) -> None:
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def only_one(path: Path) -> Iterator[None]:
+    """One writer of ``path`` at a time, among processes. The lock file beside it is removed at the end.
+
+    Raises:
+        DatasetError: another run is writing it, or its folder cannot be written.
+    """
+    place = path.absolute()
+    file = place.with_name(f".{place.name}.lock")
+    lock = FileLock(file, timeout=0)
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except Timeout:
+        raise DatasetError(f"{path}: another run is writing it; wait for that one or stop it") from None
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be written ({error.strerror})") from None
+    try:
+        yield
+    finally:
+        file.unlink(missing_ok=True)  # while it is held: whoever opened it before sees that it is gone, and tries anew
+        lock.release()
+
+
+def regular_file(path: Path, what: str, error: type[NextviewError], largest: int | None = None) -> None:
+    """See that a path names a regular file: a pipe would wait for its writer, a device might never end.
+
+    Args:
+        path: of the file.
+        what: it should be, "a model card".
+        error: to raise.
+        largest: size in bytes.
+
+    Raises:
+        NextviewError: an ``error``: it does not exist, is something else, or is too large.
+    """
+    if not path.exists():
+        raise error(f"{path}: no such file")
+    if not path.is_file():
+        raise error(f"{path}: is no file, so not {what}")
+    if largest is not None and path.stat().st_size > largest:
+        raise error(f"{path}: not {what}, which takes {largest >> 20} MB at most")
+
+
+def read_record(path: Path, record: type[T], what: str, error: type[NextviewError] = ModelError) -> T:
+    """A typed record from a JSON file; see ``decode_record``.
+
+    Raises:
+        NextviewError: an ``error``: the file is missing, too large, or no such record.
+    """
+    regular_file(path, what, error, LARGEST_RECORD)
+    try:
+        content = path.read_bytes()
+    except OSError as raised:
+        raise error(f"{path}: cannot be read ({raised.strerror})") from None
+    return decode_record(content, record, f"{path}: not {what}", error)
+
+
+def decode_record(content: bytes | dict[str, Any], record: type[T], where: str, error: type[NextviewError]) -> T:
+    """A typed record from JSON, or from the objects that JSON was read to.
+
+    Args:
+        content: JSON, or a dictionary of plain values.
+        record: a ``msgspec.Struct``; forbid its unknown fields with ``forbid_unknown_fields=True``.
+        where: the beginning of the sentence that is raised.
+        error: to raise.
+
+    Raises:
+        NextviewError: an ``error`` that names the field.
+    """
+    try:
+        if isinstance(content, bytes):
+            return msgspec.json.decode(content, type=record)
+        return msgspec.convert(content, record)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as raised:
+        raise error(f"{where} ({raised})") from None
+
+
+def write_record(path: Path, record: Any, overwrite: bool = False) -> None:
+    """Write a record as indented JSON, whole or not at all.
+
+    Raises:
+        ResultsError: see ``new_file``.
+    """
+    with new_file(path, overwrite) as part:
+        part.write_bytes(msgspec.json.format(msgspec.json.encode(record, enc_hook=_plain), indent=1) + b"\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise NotImplementedError(f"{type(value).__name__} in a record")
+
+
+def sha256_of(path: Path) -> str:
+    """The SHA-256 of a file, 64 hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def checked_bytes(path: Path, sha256: str, what: str = "weights") -> bytes:
+    """The content of a file whose hash a card holds.
+
+    Raises:
+        ModelError: the file is missing, or is not the one that the card describes.
+    """
+    regular_file(path, what, ModelError)
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise ModelError(f"{path}: is not the file that its card describes (the SHA-256 differs)")
+    return content
+
+
+def command() -> str:
+    """The command that runs now, one line for a shell: noted by what it makes."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])

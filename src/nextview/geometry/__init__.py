@@ -1,0 +1,1 @@
+"""Viewpoints, poses, meshes, what one view yields, and ray casting."""

@@ -1,0 +1,86 @@
+"""Depth images in object radii, 0 where there is no object: their points, and how they look under a headlight."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+FARTHEST = 50.0
+"""Depth at which nothing counts as an object any more, object radii: depth cameras have large numbers for "nothing"."""
+AMBIENT = 0.15
+"""Brightness of a surface seen edge-on, so that it stays apart from the black background."""
+POINTS = 1024
+"""Points in the partial cloud of one view (thesis, section 4.1.2)."""
+
+
+def object_depth(depth: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Depth with 0 where a sensor gives NaN, infinity, a negative or a huge number; itself if there is none."""
+    if depth.min() >= 0 and depth.max() < FARTHEST:  # not so if there is a NaN
+        return depth
+    return np.where((depth > 0) & (depth < FARTHEST), depth, 0)
+
+
+def slope(before: NDArray, here: NDArray, after: NDArray) -> NDArray[np.float32]:
+    """Change of depth per pixel, from the side where it is smaller: the one on the same surface. 0 if alone."""
+    back = np.where(before > 0, here - before, np.inf)
+    forth = np.where(after > 0, after - here, np.inf)
+    slope = np.where(np.abs(back) < np.abs(forth), back, forth)
+    return np.where(np.isfinite(slope), slope, 0).astype(np.float32)
+
+
+def headlight(depth: NDArray[np.float32], intrinsics: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """The surface as a lamp at the camera lights it, (H, W) uint8: as bright as the cosine of ray and surface normal.
+
+    Normals come from differences between neighbouring pixels.
+    """
+    height, width = depth.shape
+    padded = np.pad(depth, 1)
+    (fx, _, cx), (_, fy, cy) = intrinsics[:2]
+    across = fx * slope(padded[1:-1, :-2], depth, padded[1:-1, 2:])
+    down = fy * slope(padded[:-2, 1:-1], depth, padded[2:, 1:-1])
+    x = (np.arange(width) + 0.5 - cx) / fx
+    y = ((np.arange(height) + 0.5 - cy) / fy)[:, None]
+    # The surface is P = (x z, y z, z); the cross product of its derivatives, scaled:
+    length = np.sqrt(across**2 + down**2 + (depth + x * across + y * down) ** 2)
+    cosine = depth / (length * np.sqrt(x**2 + y**2 + 1) + 1e-30)
+    return np.where(depth > 0, 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5, 0).astype(np.uint8)
+
+
+@lru_cache(maxsize=8)
+def pixel_order(pixels: int, seed: int) -> NDArray[np.int32]:
+    """A fixed shuffle of an image's pixels, (pixels,) int32; earlier ones are preferred when points are drawn."""
+    return np.random.default_rng(seed).permutation(pixels).astype(np.int32)
+
+
+def visible_points(
+    depth: NDArray[np.float32],
+    pose: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    seed: int = 0,
+) -> NDArray[np.float32]:
+    """Points on the visible surface, (1024, 3) float32, object frame; all zero if nothing is visible.
+
+    A uniform draw from the pixels that show the object, by the seed and these pixels alone; few pixels repeat.
+    """
+    flat = object_depth(depth).ravel()
+    order = pixel_order(flat.size, seed)
+    for first in (4 * POINTS, 8 * POINTS, 16 * POINTS, flat.size):  # most often the beginning of the order holds enough
+        visible = np.flatnonzero(flat[order[:first]])
+        if len(visible) >= POINTS:
+            break
+    chosen = order[visible[:POINTS]]
+    if len(chosen) == 0:
+        return np.zeros((POINTS, 3), np.float32)
+    chosen = np.resize(chosen, POINTS)
+    rows, columns = np.divmod(chosen, depth.shape[1])
+    rays = np.stack(
+        [
+            (columns + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0],
+            (rows + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1],
+            np.ones(POINTS),
+        ],
+        -1,
+    )
+    return ((rays * flat[chosen, None]) @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)

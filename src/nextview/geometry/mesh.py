@@ -1,0 +1,168 @@
+"""Read a mesh file and bring it into the object frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.checks import one_line, whole
+from nextview.errors import MeshError
+from nextview.files import regular_file
+from nextview.geometry.mesh_file import check_faces, read_by_trimesh, read_obj, read_off
+
+MAX_FACES = 10_000_000
+"""Triangles that a mesh may have if nothing else is asked for."""
+BYTES_PER_FACE = 60
+"""How many bytes a mesh file may have for each triangle that it may have."""
+FORMATS = (".off", ".obj", ".ply", ".stl", ".glb")
+UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}
+"""What a file's unit of length may be, and how many metres it is."""
+FLAT = 1e-12
+"""Twice the area of a face below which it counts as a line, square object radii: rounding makes up to 1e-15."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex at radius 1.
+
+    Attributes:
+        vertices: (V, 3) float64, object radii.
+        faces: (F, 3) int32, indices into the vertices.
+        centre: bounding-box centre in the file's frame, (3,) float64, the file's units.
+        radius: object radius in the file's units; ``vertices * radius + centre`` are the file's positions.
+        name: what to call it in messages.
+        unit: the file's unit, one of UNITS; None if it is not known.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    centre: NDArray[np.float64]
+    radius: float
+    name: str = "mesh"
+    unit: str | None = None
+
+    @property
+    def metres(self) -> float | None:
+        """Object radius in metres; None if the unit is not known."""
+        return None if self.unit is None else self.radius * UNITS[self.unit]
+
+
+def make_mesh(
+    vertices: NDArray[np.floating], faces: NDArray[np.integer], name: str = "mesh", unit: str | None = None
+) -> Mesh:
+    """Check raw arrays and normalise them.
+
+    Args:
+        vertices: (V, 3), any unit.
+        faces: (F, 3), indices into the vertices.
+        name: used in messages.
+        unit: of the positions, one of UNITS; None if it is not known.
+
+    Returns:
+        The mesh in the object frame, without the vertices that no face uses, and each triangle once: copies in the same
+        place show nothing new, and a great many of them take a minute a view.
+
+    Raises:
+        MeshError: no faces, not triangles, an index out of range, a position that is not finite, no extent, or no area.
+    """
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
+    for array, what in ((vertices, "vertices"), (faces, "faces")):
+        if len(array) == 0:
+            raise MeshError(f"{name}: the mesh has no {what}")
+        if array.shape != (len(array), 3):
+            raise MeshError(f"{name}: {what} have the shape {array.shape}, not (n, 3)")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        worst = int(faces.min() if faces.min() < 0 else faces.max())
+        raise MeshError(f"{name}: a face refers to vertex {worst}, but there are only {len(vertices)} vertices")
+    places = np.sort(_first_of_equals(vertices)[faces], 1)
+    faces = faces[_first_of_equals(places) == np.arange(len(faces))]
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    if not used.all():
+        faces = (np.cumsum(used) - 1)[faces]
+        vertices = vertices[used]
+    if not np.isfinite(vertices).all():
+        raise MeshError(f"{name}: {int((~np.isfinite(vertices)).any(1).sum())} vertices are NaN or infinite")
+    low, high = vertices.min(0), vertices.max(0)
+    # Halves first: the sum or difference of two very large finite numbers may not be finite.
+    centre = low / 2 + high / 2
+    vertices = vertices - centre
+    reach = np.abs(vertices).max()
+    if not reach > 1e-9 * np.abs(centre).max() or reach < np.finfo(float).tiny:
+        raise MeshError(f"{name}: the mesh has no extent, all its vertices are in one place")
+    vertices /= reach
+    radius = np.sqrt((vertices**2).sum(1).max())
+    if reach > np.finfo(float).max / radius:
+        raise MeshError(f"{name}: the mesh is too large, its radius is not a finite number")
+    normalised: NDArray[np.float64] = vertices / radius
+    if not _has_area(normalised, faces):
+        raise MeshError(f"{name}: the mesh has no area, all its faces are lines or points")
+    return Mesh(normalised, faces.astype(np.int32), centre, float(radius * reach), name, unit)
+
+
+def _has_area(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> bool:
+    """Whether any face is more than a line; most often the first few tell."""
+    parts = (faces[first : first + 4096].T for first in range(0, len(faces), 4096))
+    areas = (np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a]) for a, b, c in parts)
+    return any(np.abs(area).max() > FLAT for area in areas)
+
+
+def _first_of_equals(rows: NDArray) -> NDArray[np.int64]:
+    """For each of some rows, (N, 3), the index of the first that is equal to it, (N,)."""
+    order = np.lexsort(rows.T)  # stable: the first of equals comes first
+    first = np.ones(len(rows), bool)
+    first[1:] = (rows[order[1:]] != rows[order[:-1]]).any(1)
+    found = np.empty(len(rows), np.int64)
+    found[order] = order[first][np.cumsum(first) - 1]
+    return found
+
+
+def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None, max_faces: int = MAX_FACES) -> Mesh:
+    """Read an OFF, OBJ, PLY, STL or GLB file; the parts of a scene are joined.
+
+    Args:
+        path: the file; its suffix tells the format.
+        up: the file's up axis, "y" or "z". By default z, but y for GLB, whose standard says so.
+        unit: the file's unit of length, one of UNITS; None if it is not known.
+        max_faces: refuse a mesh of more triangles, or in a file of more than BYTES_PER_FACE bytes for each.
+
+    Returns:
+        The mesh in the object frame.
+
+    Raises:
+        MeshError: what is wrong with the file, in one sentence.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if up not in (None, "y", "z"):
+        raise MeshError(f"{path}: the up axis is y or z, not {one_line(repr(up))}")
+    if unit is not None and unit not in UNITS:
+        raise MeshError(f"{path}: the unit is one of {', '.join(UNITS)}, not {one_line(repr(unit))}")
+    if suffix not in FORMATS and not path.is_dir():
+        raise MeshError(f"{path}: not a mesh format nextview reads ({', '.join(FORMATS)})")
+    regular_file(path, "a mesh", MeshError)
+    most = BYTES_PER_FACE * whole(max_faces, "the largest number of faces", 1)
+    if path.stat().st_size > most:
+        raise MeshError(f"{path}: has more than {most:,} bytes; --max-faces (max_faces) allows more")
+    try:
+        data = path.read_bytes()
+        if not data.strip():
+            raise MeshError("the file is empty")
+        if suffix in (".off", ".obj"):
+            vertices, faces = read_off(data) if suffix == ".off" else read_obj(data)
+        else:
+            vertices, faces = read_by_trimesh(data, suffix[1:], max_faces)
+        check_faces(len(faces), max_faces)
+    except OSError as error:
+        raise MeshError(f"{path}: cannot be read ({error.strerror})") from None
+    except MemoryError:
+        raise MeshError(f"{path}: too large for this machine's memory") from None
+    except Exception as error:  # trimesh raises whatever a broken file leads to
+        reason = str(error) if isinstance(error, MeshError) else f"{type(error).__name__}: {error}"
+        raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({one_line(reason, 160)})") from None
+    if (up or ("y" if suffix == ".glb" else "z")) == "y":
+        vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)
+    return make_mesh(vertices, faces, str(path), unit)

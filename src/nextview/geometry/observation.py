@@ -1,0 +1,279 @@
+"""What one view yields, and what can take a view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from numbers import Real
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.checks import number, one_line
+from nextview.errors import ObservationError
+from nextview.geometry.depth import FARTHEST, headlight, object_depth, visible_points
+
+LEAST_SHARE = 0.006
+"""An object is seen if one connected part of it fills this share of the image. In the networks' images of 112 pixels a
+side, less are specks of 8 x 9 pixels. The thinnest object of ModelNet10, a screen seen from its edge, fills 0.011."""
+SPECKS = 8
+"""Or if all its parts together fill so many times as much."""
+LEAST_PIXELS = 9
+"""The least share in pixels, for small images."""
+LARGEST = 1e9
+"""Numbers of poses and intrinsics are smaller."""
+RIGID = 1e-3
+"""How far a pose may be from a rigid motion: numbers may have been written with four digits."""
+
+
+@dataclass(frozen=True)
+class SceneView:
+    """All that one frame shows, the object and what stands around it, in the object frame and object radii.
+
+    It may be of another pinhole than the observation that it goes with, and from another distance.
+
+    Attributes:
+        depth: along the optical axis, (H, W) float32, object radii, 0 where nothing was measured.
+        target: pixels that show the object, (H, W) bool.
+        pose: camera-to-world, (4, 4) float64, OpenCV axes; the world is the object frame.
+        intrinsics: pinhole matrix, (3, 3) float64, pixels; the first pixel's centre is at 0.5.
+        background_free: whether nothing is there where nothing was measured, as in renders. A sensor may measure
+            nothing on what is black or shiny.
+
+    Raises:
+        ObservationError: depth and target are no images of one shape.
+    """
+
+    depth: NDArray[np.float32]
+    target: NDArray[np.bool_]
+    pose: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
+    background_free: bool = False
+
+    def __post_init__(self) -> None:
+        if self.depth.ndim != 2 or self.target.shape != self.depth.shape:
+            raise ObservationError(
+                f"the depth of a scene and the object's pixels are images of one shape, not {self.depth.shape} and "
+                f"{self.target.shape}"
+            )
+
+
+@dataclass(frozen=True, eq=False)  # each is itself, and can be the key of what is made of it
+class Observation:
+    """One view of an object. Lists are converted; arrays of the right type are not copied.
+
+    Attributes:
+        depth: distance along the optical axis, (H, W) float32, object radii, 0 where there is no object. What a sensor
+            gives for nothing else (see ``object_depth``) becomes 0 here.
+        pose: camera-to-world, (4, 4) float64, OpenCV axes (x right, y down, z forward); the world is the object frame.
+        intrinsics: pinhole matrix, (3, 3) float64, pixels; pixel (row, column) has its centre at
+            (column + 0.5, row + 0.5).
+        radius: the object radius, metres: what positions were divided by. None if the camera does not know its scale.
+        image: grey picture, (H, W) uint8, 0 where there is no object. None if the camera has none.
+        scene: all that the camera saw. None where only the object is known: then nothing is taken to hide it.
+
+    Raises:
+        ObservationError: shapes that are not these, or numbers that no camera can have: what is wrong, and what it
+            looks like.
+    """
+
+    depth: NDArray[np.float32]
+    pose: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
+    radius: float | None = None
+    image: NDArray[np.uint8] | None = None
+    scene: SceneView | None = None
+
+    def __post_init__(self) -> None:
+        given = _depth(self.depth)
+        depth = object_depth(given)
+        if depth is not given:
+            _check_unit(given, int(np.count_nonzero(depth)))
+        checked = {
+            "depth": depth,
+            "pose": checked_pose(self.pose),
+            "intrinsics": checked_intrinsics(self.intrinsics, depth.shape),
+            "image": None if self.image is None else _image(self.image, depth.shape),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        if self.radius is not None:
+            if not (isinstance(self.radius, Real) and 0 < self.radius < LARGEST):
+                shown = one_line(repr(self.radius))
+                raise ObservationError(f"the object radius is a positive number of metres, or None, not {shown}")
+            object.__setattr__(self, "radius", float(self.radius))
+
+    @cached_property
+    def visible(self) -> int:
+        """Pixels that show the object."""
+        return int(np.count_nonzero(self.depth))
+
+    @cached_property
+    def seen(self) -> bool:
+        """Whether enough of the object is visible to say anything of it. A view without it is no evidence."""
+        return enough_shows(self.depth > 0)
+
+    @cached_property
+    def points(self) -> NDArray[np.float32]:
+        """On the visible surface, (1024, 3) float32, object frame, object radii; all zero if nothing is visible."""
+        return visible_points(self.depth, self.pose, self.intrinsics)
+
+    @cached_property
+    def picture(self) -> NDArray[np.uint8]:
+        """The image; where the camera has none, the depth as a headlight would show it. (H, W) uint8."""
+        return headlight(self.depth, self.intrinsics) if self.image is None else self.image
+
+
+def enough_shows(mask: NDArray[np.bool_]) -> bool:
+    """Whether the pixels that show the object, (H, W) bool, are enough to say anything of it: see LEAST_SHARE."""
+    least, n = max(LEAST_PIXELS, LEAST_SHARE * mask.size), np.count_nonzero(mask)
+    if not least <= n < SPECKS * least:
+        return bool(n >= least)
+    from scipy.ndimage import label  # only where little is seen: importing it takes time
+
+    parts, _ = label(mask, np.ones((3, 3)))
+    return bool(np.bincount(parts.ravel())[1:].max() >= least)
+
+
+class Camera(Protocol):
+    """Anything that can look at the object from a given pose."""
+
+    def observe(self, pose: NDArray[np.float64]) -> Observation:
+        """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""
+        ...
+
+
+def checked_pose(pose: Any) -> NDArray[np.float64]:
+    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii, if it is one.
+
+    Raises:
+        ObservationError: not a rigid motion, or one to a place from which no object can be seen.
+    """
+    pose = numbers(pose, "the pose").astype(np.float64, copy=False)
+    if pose.shape != (4, 4):
+        raise ObservationError(f"the pose is a camera-to-world matrix of the shape (4, 4), not {pose.shape}")
+    if not (np.abs(pose) < LARGEST).all():  # not so if there is a NaN
+        raise ObservationError("the pose holds NaN or infinity, or a number that no camera has")
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID:
+        raise ObservationError(f"the last row of the pose is {pose[3].tolist()}, not 0 0 0 1: is it transposed?")
+    rotation = pose[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID:
+        raise ObservationError("the pose is not rigid: its rotation does not keep lengths and angles")
+    if np.linalg.det(rotation) < 0:
+        raise ObservationError("the pose is mirrored: an axis is reversed (OpenCV axes are x right, y down, z forward)")
+    distance = float(np.sqrt((pose[:3, 3] ** 2).sum()))
+    if distance > 2 * FARTHEST:
+        raise ObservationError(
+            f"the camera stands {distance:.4g} object radii from the object: is its position in millimetres? "
+            "Divide it by the object radius"
+        )
+    return pose
+
+
+def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """A pinhole matrix, (3, 3) float64, pixels, of an image of some shape, if it is one.
+
+    Raises:
+        ObservationError: another shape, or numbers that no camera has.
+    """
+    intrinsics = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64, copy=False)
+    if intrinsics.shape != (3, 3):
+        raise ObservationError(f"the intrinsics are a pinhole matrix of the shape (3, 3), not {intrinsics.shape}")
+    if not (np.abs(intrinsics) < LARGEST).all():  # not so if there is a NaN
+        raise ObservationError("the intrinsics hold NaN, infinity or a number that no camera has")
+    if np.abs(intrinsics[2] - (0, 0, 1)).max() > RIGID:
+        raise ObservationError(
+            f"the last row of the intrinsics is {intrinsics[2].tolist()}, not 0 0 1: are they transposed?"
+        )
+    focal = intrinsics[0, 0], intrinsics[1, 1]
+    if not min(focal) > 0.01 * max(shape):  # less would show all that lies ahead: metres, say
+        raise ObservationError(
+            f"the focal lengths are positive numbers of pixels, about as many as the image has a side ({max(shape)}), "
+            f"not {focal[0]:g} and {focal[1]:g}"
+        )
+    return intrinsics
+
+
+def numbers(values: Any, what: str) -> NDArray[Any]:
+    """An array of real numbers; ``what`` says in the message what it should be.
+
+    Raises:
+        ObservationError: it is none.
+    """
+    array = array_of(values, what)
+    if array.dtype.kind not in "fiu":
+        raise ObservationError(f"{what} is an array of numbers, not of {array.dtype}")
+    return array
+
+
+def array_of(values: Any, what: str) -> NDArray[Any]:
+    """An array of anything.
+
+    Raises:
+        ObservationError: it cannot become one.
+    """
+    try:
+        return np.asarray(values)
+    except (ValueError, TypeError) as error:  # rows of different lengths, or what cannot become an array at all
+        raise ObservationError(f"{what} cannot be taken for an array of numbers ({error})") from None
+
+
+def depth_image(depth: Any) -> NDArray[Any]:
+    """A depth image, (H, W), of numbers in any unit.
+
+    Raises:
+        ObservationError: it is none.
+    """
+    depth = numbers(depth, "the depth")
+    if depth.ndim != 2 or depth.size == 0:
+        raise ObservationError(f"the depth is one image of the shape (H, W), not {depth.shape}")
+    return depth
+
+
+def _depth(depth: Any) -> NDArray[np.float32]:
+    depth = depth_image(depth)
+    with np.errstate(over="ignore"):  # what is too large becomes infinity, and so 0
+        return depth.astype(np.float32, copy=False)
+
+
+def _check_unit(given: NDArray[np.float32], near: int) -> None:
+    """Refuse depth of which next to nothing is near enough to be an object. One large number is that for nothing."""
+    if 99 * near >= given.size:
+        return
+    far = given[np.isfinite(given) & (given >= FARTHEST)]
+    varied = np.count_nonzero(far < far.max()) if len(far) else 0
+    if varied > max(LEAST_PIXELS, 99 * near):
+        raise ObservationError(
+            f"the depth looks like millimetres, or metres, not object radii (its median is {np.median(far):.4g}, and "
+            f"{FARTHEST:g} and more counts as nothing): divide it by the object radius, and set all else to 0"
+        )
+
+
+def _image(image: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    image = numbers(image, "the image")
+    if image.shape != shape:
+        raise ObservationError(f"the image is grey and of the depth's shape {shape}, not {image.shape}")
+    if image.dtype != np.uint8 and (image.dtype.kind == "f" or image.min() < 0 or image.max() > 255):
+        raise ObservationError(f"the image holds whole numbers from 0 to 255 (uint8), not {image.dtype}")
+    return image.astype(np.uint8, copy=False)
+
+
+def pinhole(size: int, distance: float) -> NDArray[np.float64]:
+    """Intrinsics of a square image that just holds the unit sphere seen from a distance.
+
+    Args:
+        size: side of the image, pixels.
+        distance: from the sphere's centre, object radii, greater than 1.
+
+    Returns:
+        (3, 3) float64.
+
+    Raises:
+        ObservationError: the camera stands inside the sphere.
+    """
+    distance = number(distance, "the distance")
+    if not 1 < distance < LARGEST:
+        raise ObservationError(f"the camera has to stand more than one object radius from the centre, not {distance:g}")
+    focal = size / 2 * np.sqrt(distance**2 - 1)  # size/2 over the tangent of the half angle asin(1/distance)
+    return np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])

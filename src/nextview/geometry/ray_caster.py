@@ -1,0 +1,56 @@
+"""Several things in one Embree scene: how far rays go, and which thing they end on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Triangles = tuple[NDArray[np.floating], NDArray[np.int32]]
+"""Vertices, (N, 3), and faces, (F, 3)."""
+
+
+def embree_scene(things: Sequence[Triangles]) -> Any:
+    """An Embree scene of some things, each with its number."""
+    from embreex.mesh_construction import TriangleMesh  # only who casts rays pays for the import
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    for vertices, faces in things:
+        TriangleMesh(scene, vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32))
+    return scene
+
+
+class RayCaster:
+    """Casts rays at some things of one frame.
+
+    Args:
+        things: at least one.
+    """
+
+    def __init__(self, things: Sequence[Triangles]) -> None:
+        self._scene = embree_scene(things)
+
+    def cast(
+        self, origins: NDArray[np.floating], rays: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Where rays, (N, 3), of any length, end first, from (N, 3) points or one for all, (3,).
+
+        Returns:
+            How many times its length each ray goes, (N,), infinity if it ends nowhere; and on which thing, -1 for none.
+        """
+        origins = np.ascontiguousarray(np.broadcast_to(origins, rays.shape), np.float32)
+        hits = self._scene.run(origins, np.ascontiguousarray(rays, np.float32), output=1)
+        hit = hits["primID"] >= 0
+        return np.where(hit, hits["tfar"], np.float32(np.inf)), np.where(hit, hits["geomID"].astype(np.int64), -1)
+
+
+def pixel_rays(intrinsics: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Rays through the pixels of a pinhole camera, camera frame, (H, W, 3), z = 1: their lengths are depths."""
+    across, down = (
+        (np.arange(side) + 0.5 - intrinsics[axis, 2]) / intrinsics[axis, axis] for axis, side in enumerate(shape[::-1])
+    )
+    x, y = np.meshgrid(across, down)
+    return np.stack([x, y, np.ones_like(x)], -1).astype(np.float32)

@@ -1,0 +1,1 @@
+"""What is fitted to predictions and views; training and export."""

@@ -1,0 +1,278 @@
+"""The networks: ResNet with torchvision's parameter names, PointNet with its two transforms, and a ResNet of maps."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.learning.inputs import CHANNELS_OF
+from nextview.learning.recipes import MapRecipe, RecogniserRecipe
+
+STAGES = (
+    (1, 16, 3, 1, 1),
+    (6, 24, 3, 2, 2),
+    (6, 40, 5, 2, 2),
+    (6, 80, 3, 2, 3),
+    (6, 112, 5, 1, 3),
+    (6, 192, 5, 2, 4),
+    (6, 320, 3, 1, 1),
+)
+"""Expansion, width, kernel, stride and blocks of the seven stages (Tan and Le, EfficientNet, ICML 2019, table 1)."""
+BLOCKS = sum(length for *_, length in STAGES)
+FEATURES = 1280
+
+
+class Depthwise(nn.Conv2d):
+    """A kernel for each channel, always in float32: in bfloat16 its gradient is slow on a CPU."""
+
+    def __init__(self, width: int, kernel: int, stride: int) -> None:
+        super().__init__(width, width, kernel, stride, kernel // 2, groups=width, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.float())
+
+
+class InvertedBottleneck(nn.Module):
+    """Widen, filter each channel, narrow; with a shortcut where nothing changes its shape."""
+
+    def __init__(self, inputs: int, expansion: int, width: int, kernel: int, stride: int, skip: float = 0.0) -> None:
+        super().__init__()
+        wide = inputs * expansion
+        self.expand = nn.Conv2d(inputs, wide, 1, bias=False) if expansion > 1 else nn.Identity()
+        self.norm0 = _norm(wide) if expansion > 1 else nn.Identity()
+        self.depthwise, self.norm1 = Depthwise(wide, kernel, stride), _norm(wide)
+        self.project, self.norm2 = nn.Conv2d(wide, width, 1, bias=False), _norm(width)
+        self.relu, self.expands = nn.ReLU6(inplace=True), expansion > 1
+        self.has_shortcut, self.skip = stride == 1 and inputs == width, skip
+
+    def forward(self, x: Tensor) -> Tensor:
+        past = x
+        if self.expands:
+            x = self.relu(self.norm0(self.expand(x)))
+        x = self.relu(self.norm1(self.depthwise(x)))
+        x = self.norm2(self.project(x))
+        if not self.has_shortcut:
+            return x
+        if self.training and self.skip:
+            x = x * (torch.rand(len(x), 1, 1, 1, device=x.device) >= self.skip) / (1 - self.skip)
+        return x + past
+
+
+class RecogniserNetwork(nn.Module):
+    """Images (B, channels, H, W) in 0 .. 1 to the logits (B, classes), in a tuple.
+
+    With ``azimuths``, also the log-likelihoods of so many azimuth bins given each class, (B, classes, azimuths).
+    """
+
+    dropout = 0.0
+
+    def finish(self, features: int, classes: int, azimuths: int) -> None:
+        """Add the last layers, and draw the first weights of all convolutions."""
+        self.avgpool = nn.AdaptiveAvgPool2d(1)
+        self.fc = nn.Linear(features, classes)
+        self.azimuths = azimuths
+        self.side = nn.Linear(features, classes * azimuths) if azimuths else None
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, x: Tensor) -> tuple[Tensor, ...]:
+        return self.answers(self.features(x))
+
+    def answers(self, features: Tensor) -> tuple[Tensor, ...]:
+        """What ``forward`` returns, by features (B, F)."""
+        features = F.dropout(features, self.dropout, self.training)
+        logits = self.fc(features)
+        if self.side is None:
+            return (logits,)
+        return logits, self.side(features).unflatten(1, (-1, self.azimuths)).log_softmax(2)
+
+
+class LiteNet(RecogniserNetwork):
+    """EfficientNet-Lite0: EfficientNet-B0 without squeeze and excitation, with ReLU6 for swish (TensorFlow, 2020)."""
+
+    name = "EfficientNet-Lite0"
+
+    def __init__(self, classes: int, channels: int, azimuths: int = 0, dropout: float = 0.0) -> None:
+        super().__init__()
+        self.dropout, inputs = dropout, 32
+        self.stem, self.norm0 = nn.Conv2d(channels, inputs, 3, 2, 1, bias=False), _norm(inputs)
+        stages: list[nn.Module] = []
+        for expansion, width, kernel, stride, length in STAGES:
+            for index in range(length):
+                step, skip = 1 if index else stride, dropout * len(stages) / BLOCKS
+                stages.append(InvertedBottleneck(inputs, expansion, width, kernel, step, skip))
+                inputs = width
+        self.stages = nn.Sequential(*stages)
+        self.head, self.norm1 = nn.Conv2d(inputs, FEATURES, 1, bias=False), _norm(FEATURES)
+        self.relu = nn.ReLU6(inplace=True)
+        self.finish(FEATURES, classes, azimuths)
+
+    def features(self, x: Tensor) -> Tensor:
+        """Of images, (B, F)."""
+        x = self.stages(self.relu(self.norm0(self.stem(x))))
+        return self.avgpool(self.relu(self.norm1(self.head(x)))).flatten(1)
+
+
+def _norm(width: int) -> nn.BatchNorm2d:
+    return nn.BatchNorm2d(width, eps=1e-3)  # EfficientNet's epsilon: checkpoints count on it
+
+
+RESNETS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3), 152: (3, 8, 36, 3)}
+"""Blocks in the four stages of each ResNet (He et al., CVPR 2016, table 1)."""
+
+
+class Residual(nn.Module):
+    """A shortcut around two 3x3 convolutions; or, ``narrow``, around 1x1, 3x3 with the stride, and 1x1."""
+
+    def __init__(self, inputs: int, width: int, stride: int, narrow: bool) -> None:
+        super().__init__()
+        self.relu, outputs = nn.ReLU(inplace=True), width * (4 if narrow else 1)
+        kernels = (
+            ((1, width, 1), (3, width, stride), (1, outputs, 1)) if narrow else ((3, width, stride), (3, width, 1))
+        )
+        self.length, before = len(kernels), inputs
+        for k, (kernel, after, step) in enumerate(kernels, 1):
+            setattr(self, f"conv{k}", nn.Conv2d(before, after, kernel, step, kernel // 2, bias=False))
+            setattr(self, f"bn{k}", nn.BatchNorm2d(after))
+            before = after
+        self.downsample = None
+        if stride > 1 or inputs != outputs:
+            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+
+    def forward(self, x: Tensor) -> Tensor:
+        past = x if self.downsample is None else self.downsample(x)
+        for k in range(1, self.length):
+            x = self.relu(getattr(self, f"bn{k}")(getattr(self, f"conv{k}")(x)))
+        return self.relu(getattr(self, f"bn{self.length}")(getattr(self, f"conv{self.length}")(x)) + past)
+
+
+class ResNet(RecogniserNetwork):
+    """A ResNet with torchvision's parameter names."""
+
+    def __init__(self, depth: int, classes: int, channels: int, azimuths: int = 0) -> None:
+        super().__init__()
+        self.name, narrow = f"ResNet-{depth}", depth >= 50
+        self.conv1 = nn.Conv2d(channels, 64, 7, 2, 3, bias=False)
+        self.bn1, self.relu, self.maxpool = nn.BatchNorm2d(64), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2, 1)
+        inputs = 64
+        for stage, length in enumerate(RESNETS[depth]):
+            layer = []
+            for index in range(length):
+                layer.append(Residual(inputs, 64 << stage, 2 if stage and not index else 1, narrow))
+                inputs = (64 << stage) * (4 if narrow else 1)
+            setattr(self, f"layer{stage + 1}", nn.Sequential(*layer))
+        self.finish(inputs, classes, azimuths)
+        for module in self.modules():  # each block begins as the identity, which steadies large rates
+            if isinstance(module, Residual):
+                nn.init.zeros_(getattr(module, f"bn{module.length}").weight)
+
+    def features(self, x: Tensor) -> Tensor:
+        """Of images, (B, F)."""
+        x = self.maxpool(self.relu(self.bn1(self.conv1(x))))
+        for stage in (self.layer1, self.layer2, self.layer3, self.layer4):
+            x = stage(x)
+        return self.avgpool(x).flatten(1)
+
+
+def recogniser_network(recipe: RecogniserRecipe, classes: int, azimuths: int) -> ResNet | LiteNet:
+    """The untrained network of a recipe, with so many azimuth bins."""
+    channels = CHANNELS_OF[recipe.input]
+    if recipe.network == "lite0":
+        return LiteNet(classes, channels, azimuths, recipe.dropout)
+    return ResNet(recipe.depth, classes, channels, azimuths)
+
+
+def _dense(between: tuple[nn.Module, ...]) -> nn.Sequential:
+    """The fully connected layers after the points of a cloud are pooled."""
+    first, second = (nn.Linear(1024, 512), nn.BatchNorm1d(512)), (nn.Linear(512, 256), *between, nn.BatchNorm1d(256))
+    return nn.Sequential(*first, nn.ReLU(inplace=True), *second, nn.ReLU(inplace=True))
+
+
+class PointLayer(nn.Module):
+    """The same fully connected layer, with batch norm over all points, for every point of clouds (B, P, inputs)."""
+
+    def __init__(self, inputs: int, outputs: int, relu: bool = True) -> None:
+        super().__init__()
+        self.linear = nn.Linear(inputs, outputs)
+        self.norm = nn.BatchNorm1d(outputs)
+        self.relu = relu
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.norm(self.linear(x).flatten(0, 1)).unflatten(0, x.shape[:2])
+        return torch.relu(x) if self.relu else x
+
+
+class Transform(nn.Module):
+    """T-Net: a k x k matrix from a cloud of k-dimensional points (B, P, k), beginning as the identity."""
+
+    def __init__(self, k: int) -> None:
+        super().__init__()
+        self.k = k
+        self.points = nn.Sequential(PointLayer(k, 64), PointLayer(64, 128), PointLayer(128, 1024))
+        self.head = _dense(())
+        self.matrix = nn.Linear(256, k * k)
+        nn.init.zeros_(self.matrix.weight)
+        with torch.no_grad():
+            self.matrix.bias.copy_(torch.eye(k).flatten())
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.matrix(self.head(self.points(x).amax(1))).unflatten(1, (self.k, self.k))
+
+
+class PointNet(nn.Module):
+    """PointNet (Qi et al., CVPR 2017) that predicts a map (rings x columns) from a cloud (B, P, 3) in [0, 1]."""
+
+    def __init__(self, rings: int, columns: int = 3, dropout: float = 0.3) -> None:
+        super().__init__()
+        self.input_transform = Transform(3)
+        self.first = PointLayer(3, 64)
+        self.feature_transform = Transform(64)
+        self.second = PointLayer(64, 128)
+        self.third = PointLayer(128, 1024, relu=False)
+        self.head = _dense((nn.Dropout(dropout),)).append(nn.Linear(256, rings * columns))
+        # A ReLU whose input begins below zero stays dead: begin inside the range of the targets.
+        nn.init.constant_(self.head[-1].bias, 0.5)
+        self.shape = (rings, columns)
+
+    def forward(self, cloud: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        a = self.input_transform(cloud)
+        x = self.first(torch.bmm(cloud, a))
+        b = self.feature_transform(x)
+        x = self.third(self.second(torch.bmm(x, b))).amax(1)
+        return torch.relu(self.head(x)).unflatten(1, self.shape), a, b
+
+
+class ViewMap(nn.Module):
+    """A ResNet that predicts a map of rings x columns values in 0 .. 1 from a view, (B, channels, H, W) in 0 .. 1."""
+
+    def __init__(self, rings: int, columns: int, depth: int, channels: int) -> None:
+        super().__init__()
+        self.resnet, self.shape = ResNet(depth, rings * columns, channels), (rings, columns)
+
+    def forward(self, view: Tensor) -> tuple[Tensor]:
+        return (self.resnet(view)[0].sigmoid().unflatten(1, self.shape),)
+
+
+def map_network(recipe: MapRecipe, sphere: ViewSphere) -> nn.Module:
+    """The network of a recipe, untrained. The columns of its map are ``map_columns``."""
+    columns = len(map_columns(recipe, sphere))
+    if recipe.input == "cloud":
+        return PointNet(sphere.rings, columns)
+    network = ViewMap(sphere.rings, columns, recipe.depth, CHANNELS_OF[recipe.input])
+    return network.to(memory_format=torch.channels_last)
+
+
+def map_columns(recipe: MapRecipe, sphere: ViewSphere) -> list[int]:
+    """Azimuth steps from the view to each column of a map: -1, 0, +1, or 0, 1, ... once round."""
+    return [-1, 0, 1] if recipe.output == "window" else list(range(sphere.azimuths))
+
+
+def orthogonality(matrix: Tensor) -> Tensor:
+    """How far matrices (B, k, k) are from orthogonal: mean Frobenius norm of I - A A^T (thesis, equation 2)."""
+    gram = torch.bmm(matrix, matrix.transpose(1, 2))
+    eye = torch.eye(matrix.shape[1], device=matrix.device)
+    return (gram - eye).flatten(1).norm(dim=1).mean()

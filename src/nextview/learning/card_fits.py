@@ -1,0 +1,365 @@
+"""What is fitted into a card from held-out predictions: calibration and promised error rates, sizes, valleys."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.stats import beta, gaussian_kde
+
+from nextview.checks import number
+from nextview.data.predictions import Predictions
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, ModelError, PredictionsError, UsageError
+from nextview.files import command
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.learning.fitting_set import (
+    FittingSet,
+    blind_walks,
+    card_to_fit,
+    described,
+    fitting_set,
+    held_out_by,
+    load_sensed,
+    recogniser_of,
+)
+from nextview.policies.base import EpisodeState, Evidence
+from nextview.policies.baselines import Random, RandomAll
+from nextview.policies.maps import MapPeak
+from nextview.recognition.belief import PLAIN_SUM, Calibration, RiskBounds, SizeEvidence, fuse, of_true_class
+from nextview.recognition.model_card import ModelCard
+
+Float = NDArray[np.float64]
+
+THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
+"""Of the belief, from 0.5 to 0.998: those for which error rates are promised."""
+
+
+@dataclass(frozen=True)
+class FittedCalibration:
+    """What ``fit_calibration`` wrote into the card."""
+
+    calibration: Calibration
+    objects: int
+    before: float
+    after: float
+
+
+def fit_calibration(
+    predictions: Path,
+    card: Path,
+    validation: float | None = None,
+    split_seed: int = 0,
+    sensed: tuple[Path, ...] = (),
+    delta: float = 0.1,
+    seed: int = 0,
+) -> FittedCalibration:
+    """Calibrate a recogniser: how far to trust the sum of several views, and which error rates can be promised.
+
+    Both go into its card; nextview predict takes them into predictions made before, without predicting again. The size
+    of the objects is not used.
+
+    Args:
+        predictions: of the training split (nextview predict --held-out, or --split train).
+        card: of the recogniser; "calibration" is written into it. Fitted to the objects that it calls held out.
+        validation: take this part of every class instead, as training kept it out; 1 for out-of-fold predictions.
+        split_seed: the recogniser's seed, which decided that part.
+        sensed: predictions of the same objects through sensors (nextview render --sensor mix), fitted to as well.
+        delta: how often a promised error rate may not hold.
+        seed: decides the walks over which is fitted.
+
+    Raises:
+        UsageError, ModelError, PredictionsError: the arguments make no sense, or do not fit together.
+    """
+    if not 0 < number(delta, "--delta") < 1:
+        raise UsageError(f"delta is a probability between 0 and 1, not {delta}")
+    table = Predictions.load(predictions).by_shape()
+    with card_to_fit(card) as (model, write):
+        if not model.is_recogniser:
+            raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
+        if validation != 1:
+            recogniser_of(card, model, predictions, table)
+        data, table = _calibration_set(predictions, table, card, model, validation, split_seed, sensed)
+        walks = 1 + 8000 // len(data)  # few objects are walked over more often
+        calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=walks)
+        risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
+        calibration = replace(calibration, risk=risk)
+        about = described(len(data) // (1 + len(sensed))) + ", clean and through sensors" * bool(sensed)
+        model = replace(model, calibration=calibration, fitted_to={**model.fitted_to, "calibration": about})
+        write(model.made_by(*table.commands, command()))
+    before, after = (loss(data, c, np.random.default_rng([seed, 2]), walks=walks) for c in (PLAIN_SUM, calibration))
+    return FittedCalibration(calibration, len(data), before, after)
+
+
+def _calibration_set(
+    path: Path,
+    table: Predictions,
+    card: Path,
+    model: ModelCard,
+    validation: float | None,
+    split_seed: int,
+    sensed: tuple[Path, ...],
+) -> tuple[FittingSet, Predictions]:
+    if validation is not None:
+        if sensed:
+            raise UsageError(
+                "predictions through sensors are of the objects that the card calls held out: no --validation"
+            )
+        return fitting_set(table, validation, split_seed), table
+    FittingSet.of_all(table)  # refuses the test split
+    kept = held_out_by(model, table)
+    if len(kept) == 0:
+        raise PredictionsError(f"{path}: holds no object that {card} calls held out; see --validation")
+    table = table.of_objects(kept)
+    return FittingSet.joined([FittingSet.of_all(part) for part in (table, *load_sensed(sensed, table))]), table
+
+
+def fit_temperature(data: FittingSet, rng: np.random.Generator, n_views: int = 5, walks: int = 4) -> Calibration:
+    """Temperature of one view and correlations of several, by maximum likelihood over 1 to ``n_views`` views."""
+    measure = _loss(data, rng, n_views, walks)
+
+    def calibration(parameters: Float) -> Calibration:
+        temperature, correlation, *of_bins = parameters.tolist()
+        return Calibration(temperature, correlation, bin_correlation=of_bins[0] if of_bins else None)
+
+    def lost(parameters: Float) -> float:
+        return measure(calibration(parameters))
+
+    begin = np.array([1.0, 0.5] if data.azimuth_bins is None else [1.0, 0.5, 0.1])
+    bounds = [(0.01, 100.0), (0.0, 5.0), (0.0, 5.0)][: len(begin)]
+    fitted = minimize(lost, begin, method="L-BFGS-B", bounds=bounds)
+    return calibration(np.round(fitted.x, 4))
+
+
+def loss(
+    data: FittingSet, calibration: Calibration, rng: np.random.Generator, n_views: int = 5, walks: int = 4
+) -> float:
+    """Mean negative log-likelihood of the true class over 1 to ``n_views`` views; see ``fit_temperature``."""
+    return _loss(data, rng, n_views, walks)(calibration)
+
+
+def _loss(data: FittingSet, rng: np.random.Generator, n_views: int, walks: int) -> Callable[[Calibration], float]:
+    """That loss as a function of the calibration, over the same walks each time."""
+    n_views = min(n_views, len(data.sphere))
+    objects, views = _walks(data, n_views, walks, rng)
+    totals = np.cumsum(data.log_evidence[objects[:, None], views].astype(np.float64), axis=1)
+    numbers, labels = np.arange(1, n_views + 1), data.labels[objects]
+    weights = data.weights[objects] / data.weights[objects].sum() / n_views
+
+    def measure(calibration: Calibration) -> float:
+        logs = calibration.log_belief(totals, numbers, len(data.classes))
+        return -float(weights @ of_true_class(logs, labels).sum(1))
+
+    return measure
+
+
+def fit_risk(
+    data: FittingSet,
+    calibration: Calibration,
+    rng: np.random.Generator,
+    delta: float = 0.1,
+    n_views: int = 8,
+    walks: int = 4,
+) -> RiskBounds:
+    """Error rates that can be promised among those who stop at a threshold, on either half of the walks."""
+    n_views = min(n_views, len(data.sphere))
+    objects, views = _walks(data, n_views, walks, rng)
+    totals = np.cumsum(data.log_evidence[objects[:, None], views].astype(np.float64), axis=1)
+    belief = calibration.belief(totals, np.arange(1, n_views + 1), len(data.classes))
+    sure, wrong = belief.max(2), belief.argmax(2) != data.labels[objects][:, None]
+    promised = np.zeros((n_views, len(THRESHOLDS)))
+    for k in range(n_views):
+        for half in np.split(np.arange(len(objects)), 2):
+            promise = _promise(sure[half, : k + 1], wrong[half, : k + 1], data.weights, delta)
+            promised[k] = np.maximum(promised[k], promise)
+    return RiskBounds(THRESHOLDS, tuple(map(tuple, np.round(promised, 5).tolist())), delta)
+
+
+def _promise(sure: Float, wrong: NDArray[np.bool_], weights: Float, delta: float) -> Float:
+    """Promised error rate of each threshold, (T,), from confidences and mistakes (walks * N, views)."""
+    promised, worst = np.ones(len(THRESHOLDS)), 0.0
+    for t in reversed(range(len(THRESHOLDS))):
+        reached = sure >= THRESHOLDS[t]
+        failed = wrong[np.arange(len(wrong)), reached.argmax(1)] & reached.any(1)
+        failed, stopped = (x.reshape(-1, len(weights)).mean(0) for x in (failed, reached.any(1)))
+        if worst > 0 or weights @ stopped >= weights.sum() / 2:
+            worst = max(worst, error_bound(failed, stopped, weights, delta))
+            promised[t] = worst
+    return promised
+
+
+def error_bound(failed: Float, stopped: Float, weights: Float, delta: float) -> float:
+    """Upper bound of a weighted share of failures: Clopper and Pearson's for an effective number of objects."""
+    total = float(weights @ stopped)
+    if total == 0:
+        return 1.0
+    rate = float(weights @ failed) / total
+    objects = total**2 / float(((weights * stopped) ** 2).sum())
+    variance = float(((weights * (failed - rate * stopped)) ** 2).sum()) / total**2
+    effective = min(objects, rate * (1 - rate) / variance) if variance > 0 else objects
+    return float(beta.ppf(1 - delta, effective * rate + 1, max(effective * (1 - rate), 1e-9)))
+
+
+def _walks(
+    data: FittingSet, n_views: int, walks: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Objects (2 * walks * N,) and views (2 * walks * N, views): the first half local, the second over the sphere."""
+    objects, views = np.tile(np.arange(len(data)), 2 * walks), []
+    for policy in (Random(data.sphere), RandomAll(data.sphere)):
+        starts = rng.integers(len(data.sphere), size=walks * len(data))
+        views.append(blind_walks(data.sphere, policy, starts, n_views, rng))
+    return objects, np.concatenate(views)
+
+
+RADII = np.geomspace(0.02, 20, 93)
+"""Metres; steps of 7.8 %."""
+ANY_SIZE = 0.05
+"""Share of the objects of a class that may have any size: toys, and models in wrong units."""
+
+
+@dataclass(frozen=True)
+class FittedSize:
+    """What ``fit_size`` wrote into the card."""
+
+    size: SizeEvidence
+    objects: int
+    weighed_on: int
+    before: float
+    after: float
+
+
+def fit_size(store: Path, predictions: Path, card: Path) -> FittedSize:
+    """Learn how large the objects of each class are, for stores and cameras that know the scale.
+
+    It goes into the recogniser's card; nextview predict takes it into predictions made before, without predicting
+    again.
+
+    Args:
+        store: view store that knows the unit of its meshes (nextview render --unit). Its training objects teach, except
+            those in the predictions.
+        predictions: of training objects that the recogniser has not seen (nextview predict --held-out); they decide the
+            weight of the size beside the shape.
+        card: of the recogniser; "size" is written into it.
+
+    Raises:
+        DatasetError, ModelError, PredictionsError: the arguments do not fit together.
+    """
+    views, predicted = ViewStore.open(store), Predictions.load(predictions)
+    table = predicted.deduplicate().by_shape()
+    radii, labels = views.radii, views.labels
+    if np.isnan(radii[views.done]).any():
+        raise DatasetError(f"{store}: does not know the unit of its meshes; tell it with nextview render --unit")
+    row = {name: i for i, name in enumerate(views.names)}
+    unknown = [name for name in predicted.names if name not in row]
+    if unknown:
+        raise PredictionsError(f"{predictions}: holds {unknown[0]!r}, which {store} does not")
+    with card_to_fit(card) as (model, write):
+        recogniser_of(card, model, predictions, table)
+        data, judged = FittingSet.of_all(table), [row[name] for name in table.names]
+        of_training = views.done & (views.splits == "train") & np.isin(views.attributes.labels, table.classes)
+        taught = np.setdiff1d(np.flatnonzero(of_training), [row[name] for name in predicted.names])
+        classes = np.array([table.classes.index(name) if name in table.classes else -1 for name in views.classes])
+        log_density = densities(radii[taught], classes[labels[taught]], len(table.classes))
+        size, before, after = fit_weight(data, radii[judged], log_density)
+        about = f"{len(taught)} objects of the training split, weighed on {len(data)} others"
+        model = replace(model, size=size, fitted_to={**model.fitted_to, "size": about})
+        write(model.made_by(*views.commands, *table.commands, command()))
+    return FittedSize(size, len(taught), len(data), before, after)
+
+
+def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
+    """Logarithm of the density of each class over log radius, at ``RADII``, (classes, R)."""
+    at, span = np.log(RADII), np.log(RADII[-1] / RADII[0])
+    density = np.empty((classes, len(RADII)))
+    for c in range(classes):
+        logs = np.log(radii[labels == c])
+        if len(logs) < 2 or np.ptp(logs) == 0:
+            raise DatasetError("every class needs objects of several sizes")
+        middle = np.subtract(*np.percentile(logs, (75, 25))) / 1.34  # the deviation of a Gaussian with these quartiles
+        deviation = logs.std(ddof=1)
+        width = len(logs) ** -0.2 * (min(middle, deviation) or deviation)
+        density[c] = np.log((1 - ANY_SIZE) * gaussian_kde(logs, width / deviation)(at) + ANY_SIZE / span)
+    return density
+
+
+def fit_weight(data: FittingSet, radii: Float, log_density: Float) -> tuple[SizeEvidence, float, float]:
+    """The most likely weight beside the logits, over single views, at the temperature most likely with it."""
+    of_size = SizeEvidence.from_arrays(RADII, log_density, 1.0).logits(radii)[:, None]
+
+    def loss(parameters: Float) -> float:
+        temperature, weight = parameters
+        logs = (data.logits + weight * of_size).astype(np.float64) / temperature
+        return -float(np.average(of_true_class(logs, data.labels).mean(1), weights=data.weights))
+
+    fitted = minimize(loss, np.ones(2), method="L-BFGS-B", bounds=[(0.01, 100.0), (0.0, 10.0)])
+    size = SizeEvidence.from_arrays(RADII.round(5), log_density.round(3), round(float(fitted.x[1]), 4))
+    return size, loss(np.array([1.0, 0.0])), float(fitted.fun)
+
+
+@dataclass(frozen=True)
+class FittedValleys:
+    """What ``fit_valleys`` wrote into the card."""
+
+    classes: tuple[str, ...]
+    gains: dict[str, float]
+    objects: int
+
+
+def fit_valleys(predictions: Path, card: Path) -> FittedValleys:
+    """Choose the classes for which the valley of a predicted map is the better view than its peak.
+
+    They go into the map network's card; nextview predict takes them into predictions made before, without predicting
+    again.
+
+    Args:
+        predictions: of the training split, by a recogniser that was not trained on the objects (nextview predict
+            --held-out). Fitted to the objects that the map network was not trained on either.
+        card: of the map network; "valley_classes" is written into it.
+
+    Raises:
+        ModelError, PredictionsError: the arguments do not fit together.
+    """
+    table = Predictions.load(predictions)
+    with card_to_fit(card) as (model, write):
+        if model.kind not in table.maps or table.models[model.kind] != (model.name, model.sha256):
+            raise PredictionsError(f"{predictions}: holds no maps by {card}")
+        kept = held_out_by(model, table)
+        data = FittingSet.of_all(table).select(kept)
+        if len(kept) == 0:
+            raise PredictionsError(f"{predictions}: holds no object of which {card} says that it was not trained on it")
+        by_class = valley_gains(data.sphere, data.logits, table.maps[model.kind][kept], data.labels)
+        classes = tuple(table.classes[c] for c, gain in by_class.items() if gain > 0)
+        gains = {table.classes[c]: round(gain, 4) for c, gain in by_class.items()}
+        about = f"{len(kept)} objects of the training split, judged by {table.models['recogniser'][0]}"
+        fitted_to = {**model.fitted_to, "valleys": about}
+        model = replace(model, valley_classes=classes, valley_gain=gains, fitted_to=fitted_to)
+        write(model.made_by(*table.commands, command()))
+    return FittedValleys(classes, gains, len(kept))
+
+
+def valley_gains(
+    sphere: ViewSphere, logits: NDArray[np.floating], maps: NDArray[np.floating], labels: NDArray[np.int64]
+) -> dict[int, float]:
+    """For each class, what the second view gains in belief in the truth at the valley rather than at the peak."""
+    n, v, classes = logits.shape
+    objects, first = np.repeat(np.arange(n), v), np.tile(np.arange(v), n)
+    state = EpisodeState(
+        current=first,
+        visited=np.eye(v, dtype=bool)[first],
+        belief=fuse(logits[objects, first][:, None]),
+        evidence=Evidence(logits[objects, first], {"map": maps[objects, first]}),
+        step=1,
+    )
+    rng = np.random.default_rng(0)  # the policies draw nothing
+    truth = []
+    for valley_classes in (tuple(range(classes)), ()):
+        second = MapPeak(sphere, "map", valley_classes).next_views(state, rng)
+        belief = fuse(np.stack([logits[objects, first], logits[objects, second]], 1))
+        truth.append(belief[np.arange(n * v), labels[objects]])
+    gain = truth[0] - truth[1]
+    return {int(c): float(gain[labels[objects] == c].mean()) for c in np.unique(labels)}

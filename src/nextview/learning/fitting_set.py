@@ -1,0 +1,165 @@
+"""The predictions that something may be fitted to: never of the test split, nor of objects the recogniser learned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.predictions import SAME, Predictions
+from nextview.data.splits import deduplicated, divide, duplicate_groups
+from nextview.errors import DatasetError, ModelError, PredictionsError
+from nextview.files import only_one
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.policies.base import Evidence, Policy
+from nextview.recognition.belief import FixedLength, log_evidence_of
+from nextview.recognition.model_card import ModelCard, read_card, write_card
+from nextview.session.episode import run_episodes
+
+
+def hold_out(
+    labels: NDArray[np.int64], measured: NDArray[np.floating], folds: int, seed: int
+) -> list[NDArray[np.int64]]:
+    """Divide objects into parts, each to be held out from one network; every class is spread evenly."""
+    if not 2 <= folds <= len(labels):
+        raise DatasetError(f"{len(labels)} objects cannot be divided into {folds} folds")
+    rng = np.random.default_rng([seed, folds])
+    group = duplicate_groups(measured)
+    _, first = np.unique(group, return_index=True)  # one object stands for its group
+    first = rng.permutation(first)
+    first = first[np.argsort(labels[first], kind="stable")]  # dealt out class by class
+    fold_of_group = np.empty(len(first), np.int64)
+    fold_of_group[group[first]] = np.arange(len(first)) % folds
+    fold = fold_of_group[group]
+    return [np.flatnonzero(fold == k) for k in range(folds)]
+
+
+@dataclass(frozen=True)
+class FittingSet:
+    """What a held-out recogniser says of N objects from V views."""
+
+    logits: NDArray[np.float32]  # (N, V, C)
+    labels: NDArray[np.int64]  # (N,)
+    sphere: ViewSphere
+    classes: tuple[str, ...]
+    azimuth_bins: NDArray[np.float32] | None = None  # (N, V, C, bins)
+
+    @classmethod
+    def of_all(cls, predictions: Predictions) -> FittingSet:
+        """All objects of predictions, in their order."""
+        if (predictions.splits == "test").any():
+            raise PredictionsError("these predictions hold objects of the test split, to which nothing may be fitted")
+        p = predictions
+        return cls(p.logits, p.labels, p.sphere, p.classes, p.azimuth_bins)
+
+    @classmethod
+    def joined(cls, parts: Sequence[FittingSet]) -> FittingSet:
+        """All objects of some sets of the same classes and viewpoints, one set after the other."""
+        bins = [part.azimuth_bins for part in parts if part.azimuth_bins is not None]
+        return replace(
+            parts[0],
+            logits=np.concatenate([part.logits for part in parts]),
+            labels=np.concatenate([part.labels for part in parts]),
+            azimuth_bins=np.concatenate(bins) if len(bins) == len(parts) else None,
+        )
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @cached_property
+    def log_evidence(self) -> NDArray[np.float32]:
+        """Evidence of every view, which can be summed, (N, V, D); see ``log_evidence_of``."""
+        return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.azimuth)
+
+    @cached_property
+    def seen(self) -> NDArray[np.bool_]:
+        """Whether anything was seen in each view, (N, V)."""
+        return np.ptp(self.logits, axis=2) > SAME
+
+    def select(self, kept: NDArray) -> FittingSet:
+        """Some of the objects, by index."""
+        azimuth_bins = None if self.azimuth_bins is None else self.azimuth_bins[kept]
+        return replace(self, logits=self.logits[kept], labels=self.labels[kept], azimuth_bins=azimuth_bins)
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Of the objects, (N,), sum N: all classes that occur count the same."""
+        count = np.bincount(self.labels, minlength=len(self.classes))
+        return len(self) / ((count > 0).sum() * count[self.labels])
+
+
+def fitting_set(predictions: Predictions, validation: float, seed: int) -> FittingSet:
+    """The objects of the training split that the recogniser was not trained on, duplicates left out."""
+    data = FittingSet.of_all(predictions)
+    if not 0 < validation <= 1:
+        raise PredictionsError(f"the validation part lies between 0 and 1, not {validation}")
+    _, kept = divide(predictions.labels, predictions.depth_entropy, validation, seed)
+    if len(kept) == 0:
+        raise PredictionsError("no object is left to fit to")
+    return data.select(kept[deduplicated(predictions.labels[kept], predictions.depth_entropy[kept])])
+
+
+def held_out_by(card: ModelCard, predictions: Predictions) -> NDArray[np.int64]:
+    """Indices of the objects that a card calls held out of its training, without duplicates."""
+    once = deduplicated(predictions.labels, predictions.depth_entropy)
+    return once[np.isin(np.array(predictions.names)[once], card.held_out)]
+
+
+def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
+    """Predictions of the objects of ``table`` through sensors, in its order."""
+    loaded = []
+    for path in paths:
+        other = Predictions.load(path).by_shape()
+        row = {name: i for i, name in enumerate(other.names)}
+        missing = [name for name in table.names if name not in row]
+        if missing:
+            raise PredictionsError(f"{path}: lacks {len(missing)} of the {len(table)} objects, {missing[0]} among them")
+        if (other.classes, other.sphere, other.models) != (table.classes, table.sphere, table.models):
+            raise PredictionsError(f"{path}: is of other models, classes or viewpoints")
+        loaded.append(other.of_objects(np.array([row[name] for name in table.names])))
+    return loaded
+
+
+def blind_walks(
+    sphere: ViewSphere, policy: Policy, starts: NDArray[np.int64], n_views: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Views in order, (E, views) int64, of a policy that knows only where it has been; ``starts`` is (E,)."""
+
+    def nothing(episodes: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
+        return Evidence(np.zeros((len(episodes), 1)))
+
+    return run_episodes(nothing, sphere, policy, starts, FixedLength(max_views=n_views), rng).outcome.views
+
+
+@contextmanager
+def card_to_fit(path: Path) -> Iterator[tuple[ModelCard, Callable[[ModelCard], None]]]:
+    """A card and the function that writes it back; nobody else fits the same card meanwhile."""
+    with only_one(path):
+        card, known = read_card(path), path.read_bytes()
+
+        def write(fitted: ModelCard) -> None:
+            nonlocal known
+            if path.read_bytes() != known:
+                raise ModelError(f"{path}: was changed while this ran, and is left as it is; run the command again")
+            write_card(path, fitted)
+            known = path.read_bytes()
+
+        yield card, write
+
+
+def recogniser_of(path: Path, card: ModelCard, predictions: Path, table: Predictions) -> None:
+    """Refuse a card that is no recogniser's, and predictions by another recogniser."""
+    if not card.is_recogniser:
+        raise ModelError(f"{path}: is a {card.kind}, not a recogniser")
+    if table.models["recogniser"][1] != card.sha256:
+        raise PredictionsError(f"{predictions}: comes from another recogniser than {path}")
+
+
+def described(objects: int) -> str:
+    """Words for a card."""
+    return f"{objects} objects of the training split, classes weighted evenly"

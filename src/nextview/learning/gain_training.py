@@ -1,0 +1,398 @@
+"""From predictions to the gain policy: its networks, their training, and its card with the ONNX file beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from nextview.data.predictions import Predictions
+from nextview.data.progress import Track, silently
+from nextview.data.scene_views import scenes_of
+from nextview.errors import ModelError, PredictionsError, UsageError
+from nextview.files import check_new, command, new_folder, sha256_of
+from nextview.learning.export import export_onnx
+from nextview.learning.fitting_set import hold_out, load_sensed
+from nextview.learning.recipes import GainRecipe
+from nextview.learning.rollout import (
+    ReplayTable,
+    Value,
+    candidate_values,
+    fit_travel_weight,
+    judge,
+    mean_value,
+    rollout,
+)
+from nextview.policies.base import Policy
+from nextview.policies.baselines import Random, RandomAll
+from nextview.policies.gain import (
+    FEATURES_INPUT,
+    INPUTS,
+    VISIBILITY,
+    Gain,
+    GainTable,
+    features,
+    maps_of,
+    mirrored,
+    mirrored_features,
+    origin,
+)
+from nextview.policies.learned_tables import cells_from
+from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
+from nextview.recognition.inference import open_onnx
+from nextview.recognition.map_names import in_order
+
+BOUND = 1e-5
+"""Largest difference of the file's answers from those of the networks in double precision, relative to the largest
+answer beyond 1. For gains a fiftieth of the lowest travel weight that is tried."""
+Layers = Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
+"""Weights (in, out) and biases (out,) of one perceptron, ReLU between them."""
+
+
+class Perceptrons(nn.Module):
+    """Several perceptrons, averaged over an object and its mirror: features (B, D) to the value of cells (B, V)."""
+
+    def __init__(
+        self, weights: Sequence[Tensor], biases: Sequence[Tensor], features_flip: NDArray, cells_flip: NDArray
+    ) -> None:
+        super().__init__()
+        self.weights, self.biases = nn.ParameterList(weights), nn.ParameterList(biases)
+        self.register_buffer("features_flip", torch.as_tensor(features_flip))
+        self.register_buffer("cells_flip", torch.as_tensor(cells_flip))
+
+    @classmethod
+    def from_layers(cls, networks: Sequence[Layers], features_flip: NDArray, cells_flip: NDArray) -> Perceptrons:
+        """Of equally shaped perceptrons, in single precision."""
+        layers = list(zip(*networks, strict=True))
+        weights = [torch.from_numpy(np.stack([w for w, _ in layer])).float() for layer in layers]
+        biases = [torch.from_numpy(np.stack([b[None] for _, b in layer])).float() for layer in layers]
+        return cls(weights, biases, features_flip, cells_flip)
+
+    def each(self, x: Tensor) -> Tensor:
+        """Of each perceptron, without the mirror image, (E, B, V)."""
+        x = x.expand(len(self.weights[0]), *x.shape)
+        for i, (weights, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = torch.baddbmm(bias, torch.relu(x) if i else x, weights)
+        return x
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (self.each(x) + self.each(x[:, self.features_flip])[..., self.cells_flip]).mean(0) / 2
+
+
+class RowByRow(nn.Module):
+    """``Perceptrons`` as they ship: every row is a product of its own, (1, in) by (in, out)."""
+
+    def __init__(self, networks: Perceptrons) -> None:
+        super().__init__()
+        self.networks = networks
+
+    def forward(self, told: Tensor) -> Tensor:
+        n = self.networks
+        x = torch.stack([told, told[:, n.features_flip]], 1)[:, :, None, None]
+        for i, (weights, bias) in enumerate(zip(n.weights, n.biases, strict=True)):
+            # Twice the weights: with one perceptron they would be a matrix, and all rows one product.
+            x = torch.matmul(torch.relu(x) if i else x, weights.expand(2, *weights.shape)) + bias
+        return (x[:, 0, :, 0] + x[:, 1, :, 0][..., n.cells_flip]).mean(1) / 2
+
+
+@dataclass(frozen=True)
+class Score:
+    """The score of a ``Gain`` by networks in torch."""
+
+    networks: Perceptrons
+
+    def __call__(self, features: NDArray[np.floating]) -> NDArray[np.floating]:
+        with torch.inference_mode():
+            return self.networks(torch.from_numpy(features).to(self.networks.weights[0].dtype)).numpy()
+
+
+@dataclass(frozen=True)
+class States:
+    """S states on walks, and the value of each choice there; cells as in ``policies.learned_tables``."""
+
+    features: NDArray[np.float32]  # (S, D)
+    values: NDArray[np.float32]  # less the mean over the free cells, (S, V)
+    free: NDArray[np.bool_]  # (S, V)
+    objects: NDArray[np.int64]  # (S,)
+
+
+def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np.random.Generator) -> States:
+    """The states met when each of the policies is followed once over every object."""
+    sphere, parts = table.data.sphere, []
+    for policy in policies:
+        for moment in rollout(table, policy, recipe.n_views - 1, rng, VISIBILITY in recipe.inputs):
+            state = moment.state
+            view = cells_from(sphere)[origin(sphere, state, recipe.frame)]
+            value = np.take_along_axis(candidate_values(table, moment, recipe.objective), view, 1)
+            free = np.take_along_axis(state.free, view, 1)
+            mean = (value * free).sum(1, keepdims=True) / np.maximum(free.sum(1, keepdims=True), 1)
+            seen = features(sphere, state, recipe.inputs, recipe.frame)
+            parts.append((seen.astype(np.float32), (value - mean).astype(np.float32), free, state.episodes))
+    return States(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
+    """Train the networks: after every epoch, the policy as it then is, at travel weight 0 and over all views."""
+    rng, data = np.random.default_rng([recipe.seed, fold]), table.data
+    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+    sphere, c = data.sphere, len(data.classes)
+    networks = _untrained(
+        mirrored_features(sphere, c, recipe.inputs, recipe.frame), mirrored(sphere), recipe, generator
+    )
+    drawn = rng.multinomial(len(data), np.full(len(data), 1 / len(data)), size=recipe.networks)
+    weights = torch.from_numpy(drawn * data.weights).float()
+    optimiser = torch.optim.AdamW(networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay)
+    states_each = recipe.walks * (recipe.n_views - 1) * len(data)
+    steps = recipe.epochs * -(-states_each // recipe.batch)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.lr, total_steps=steps)
+    policy: Policy = RandomAll(sphere)
+    for _ in range(recipe.epochs):
+        blind: list[Policy] = [Random(sphere), RandomAll(sphere)]
+        policies = [blind[i % 2] for i in range(recipe.walks)]
+        if isinstance(policy, Gain):
+            policies[::2] = [policy] * len(policies[::2])
+        states = walk(table, policies, recipe, rng)
+        order = rng.permutation(len(states.objects))
+        for batch in np.array_split(order, -(-states_each // recipe.batch)):
+            seen, value, free = (torch.from_numpy(a[batch]) for a in (states.features, states.values, states.free))
+            flipped = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
+            seen = torch.where(flipped, seen[:, networks.features_flip], seen)
+            value, free = (torch.where(flipped, a[:, networks.cells_flip], a) for a in (value, free))
+            error = (((networks.each(seen) - value) ** 2) * free).sum(-1) / free.sum(-1).clamp(min=1)
+            loss = (weights[:, states.objects[batch]] * error).sum() / len(batch)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+        policy = Gain(sphere, c, Score(deepcopy(networks)), recipe.inputs, frame=recipe.frame)
+        yield policy
+
+
+def _untrained(
+    features_flip: NDArray[np.int64], cells_flip: NDArray[np.int64], recipe: GainRecipe, generator: torch.Generator
+) -> Perceptrons:
+    widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(cells_flip)]))
+    scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
+    weights = [
+        scale * torch.randn(recipe.networks, *width, generator=generator)
+        for scale, width in zip(scales, widths, strict=True)
+    ]
+    biases = [torch.zeros(recipe.networks, 1, outputs) for _, outputs in widths]
+    return Perceptrons(weights, biases, features_flip, cells_flip)
+
+
+def best_epoch(
+    folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], recipe: GainRecipe
+) -> Iterator[tuple[tuple[Gain, ...], Value]]:
+    """After every epoch, the policies of the best epoch so far, and their mean value over all objects."""
+    best = None
+    for policies in zip(*folds, strict=True):
+        values = [
+            judge(table, policy, recipe.n_views, recipe.objective, np.random.default_rng([recipe.seed, 2]), rounds=4)
+            for table, policy in zip(tables, policies, strict=True)
+        ]
+        value = mean_value(values, [len(table.data) for table in tables])
+        if best is None or value.mean.mean() > best[1].mean.mean():
+            best = policies, value
+        yield best
+
+
+def averaged(policies: Sequence[Gain]) -> Gain:
+    """One policy whose networks are those of all."""
+    networks = [policy.score.networks for policy in policies if isinstance(policy.score, Score)]
+    weights, biases = (
+        [torch.cat([getattr(n, part)[i].detach() for n in networks]) for i in range(len(networks[0].weights))]
+        for part in ("weights", "biases")
+    )
+    joined = Perceptrons(weights, biases, networks[0].features_flip, networks[0].cells_flip)
+    return replace(policies[0], score=Score(joined))
+
+
+def write_gain(
+    card: Path, policy: Gain, about: PolicyCard, features: NDArray[np.float32], overwrite: bool = False
+) -> float:
+    """Write a policy that was trained: NAME.onnx and NAME.json."""
+    assert isinstance(policy.score, Score)
+    weights, networks = card.with_suffix(".onnx"), policy.score.networks
+    for path in (weights, card):
+        check_new(path, overwrite)
+    expected = Score(deepcopy(networks).double())(features.astype(np.float64))
+    with new_folder(card.parent, overwrite=True) as part:
+        made = part / weights.name
+        export_onnx(RowByRow(networks), features[:2].astype(np.float32), FEATURES_INPUT, ["cells"], made, bits=32)
+        sha256 = sha256_of(made)
+        answers = open_onnx(made, sha256, threads=1).run(["cells"], {FEATURES_INPUT: features.astype(np.float32)})[0]
+        difference = float(np.abs(answers - expected).max())
+        if not difference <= BOUND * max(1.0, float(np.abs(expected).max())):
+            raise ModelError(
+                f"{weights}: ONNX Runtime's answers differ by {difference:.2g} from the networks'; not written"
+            )
+        table = msgspec.to_builtins(GainTable(policy.classes, policy.inputs, policy.travel_weight, policy.frame))
+        about = msgspec.structs.replace(about, sha256=sha256, table=table, scope=policy.scope)
+        write_policy_card(part / card.name, about)
+    return difference
+
+
+@dataclass(frozen=True)
+class TrainedGain:
+    """A gain policy that was trained and written."""
+
+    card: Path
+    objects: int
+    validated_on: str
+    value: NDArray[np.float64]
+    travel_weight: float
+    states: int
+    difference: float
+
+
+def train_gain(
+    predictions: Path,
+    out: Path,
+    validation: Path | None = None,
+    folds: int = 20,
+    travel_weight: float | None = None,
+    local: bool = False,
+    sensed: tuple[Path, ...] = (),
+    recipe: GainRecipe = GainRecipe(),
+    overwrite: bool = False,
+    track: Track = silently,
+) -> TrainedGain:
+    """Train the gain policy, which predicts what a view from each viewpoint brings. When stopped, it begins anew.
+
+    Args:
+        predictions: of objects of the training split that the recogniser has not seen (nextview predict --held-out).
+        out: card to write (NAME.json); the networks are written beside it (NAME.onnx).
+        validation: predictions of other such objects, which choose the epoch and the travel weight; those among them
+            are left out of the training. By default PREDICTIONS choose them, in folds.
+        folds: without VALIDATION, so many policies are trained, each without its share of the objects, which validate
+            it; the result is the mean of all.
+        travel_weight: of a grid cell of travel; by default the lowest at which the policy travels no farther than a
+            random walk in the local window.
+        local: let it choose in the local window only.
+        sensed: predictions of the same objects through sensors (nextview render --sensor mix), to learn from as well.
+        recipe: how to train.
+        overwrite: replace files of these names.
+        track: follows the epochs.
+
+    Raises:
+        UsageError: the card is not called NAME.json.
+        ResultsError: it exists.
+        PredictionsError: the predictions lack what the recipe takes, are of the test split or do not belong together.
+        DatasetError: the objects cannot be divided into so many folds.
+        ModelError: the ONNX file does not answer as the networks do; nothing is written then.
+    """
+    if out.suffix != ".json":
+        raise UsageError(f"{out}: the card of a policy is called NAME.json")
+    for path in (out, out.with_suffix(".onnx")):
+        check_new(path, overwrite)
+    data = _Data(predictions, validation, sensed, recipe, folds)
+    best, value = _best_epoch(data.learned, data.validated, recipe, track)
+    policies = [replace(policy, scope="local" if local else "global") for policy in best]
+    if travel_weight is None:
+        judged = list(zip(data.validated, policies, strict=True))
+        travel_weight = fit_travel_weight(judged, recipe.n_views, recipe.objective, recipe.seed)
+    policy = replace(averaged(policies), travel_weight=travel_weight)
+    states = np.concatenate([walk(part, [policy], recipe, data.rng).features for part in data.validated])
+    difference = write_gain(out, policy, data.card(policy, recipe), states, overwrite)
+    return TrainedGain(out, data.objects, data.validated_on, value.mean, travel_weight, len(states), difference)
+
+
+class _Data:
+    """What is learned from, and what validates: tables side by side, one pair for each fold."""
+
+    def __init__(
+        self, predictions: Path, validation: Path | None, sensed: tuple[Path, ...], recipe: GainRecipe, folds: int
+    ) -> None:
+        table = Predictions.load(predictions).deduplicate()
+        other = table if validation is None else Predictions.load(validation).deduplicate()
+        if (other.classes, other.sphere) != (table.classes, table.sphere):
+            raise PredictionsError(f"{validation}: is of other classes or viewpoints than {predictions}")
+        if sensed and validation is not None:
+            raise UsageError("predictions through sensors choose with those that are learned from: no --validation")
+        self.sources = [(path, p) for path, p in ((predictions, table), (validation, other)) if path is not None]
+        variants, self.sensed = load_sensed(sensed, table), bool(sensed)
+        self.sources += list(zip(sensed, variants, strict=True))
+        for path, p in self.sources:
+            _check(path, p, recipe)
+        everything = np.arange(len(table))
+        if validation is None:
+            validating = hold_out(table.labels, _shapes(table), folds, recipe.seed)
+            learning = [np.setdiff1d(everything, part) for part in validating]
+            self.validated_on = f"the same, each judged by networks of {folds - 1} other folds"
+        else:
+            validating, learning = [np.arange(len(other))], [everything[~np.isin(_targets(table), _targets(other))]]
+            self.validated_on = f"{len(other)} others"
+        self.rng = np.random.default_rng([recipe.seed, 1])
+        scenes = scenes_of(table)
+        others = scenes if validation is None else scenes_of(other)
+        self.learned = [ReplayTable.select(table, part, self.rng, variants, scenes) for part in learning]
+        self.validated = [ReplayTable.select(other, part, self.rng, variants, others) for part in validating]
+        self.objects = len(np.unique(np.concatenate(learning)))
+
+    def card(self, policy: Gain, recipe: GainRecipe) -> PolicyCard:
+        return PolicyCard(
+            "gain",
+            policy.scope,
+            policy.sphere.elevations,
+            policy.sphere.azimuths,
+            self.sources[0][1].classes,
+            {},
+            f"{self.objects} objects of the training split{', clean and through sensors' * self.sensed}, "
+            f"classes weighted evenly; epoch and travel weight chosen on {self.validated_on}",
+            tuple(LearnedFrom(sha256_of(path), p.models) for path, p in self.sources),
+            tuple((part.calibration.temperature, part.calibration.correlation) for part in self.learned),
+            asdict(recipe),
+            tuple(dict.fromkeys((*(line for _, p in self.sources for line in p.commands), command()))),
+        )
+
+
+def _targets(p: Predictions) -> list[str]:
+    """Names of the objects, without their scenes."""
+    return [name.partition("@")[0] for name in p.names]
+
+
+def _shapes(p: Predictions) -> NDArray[np.floating]:
+    """Rows that are the same where the shape is, (N, ...): by what is seen of it, or in scenes by its name."""
+    if scenes_of(p) is None:
+        return p.depth_entropy
+    return np.unique(_targets(p), return_inverse=True)[1][:, None].astype(np.float64)
+
+
+def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
+    """Refuse predictions without what the policy is to take from them."""
+    lacking = [name for name in maps_of(recipe.inputs) if name not in p.maps]
+    if lacking:
+        known = ", ".join((*INPUTS, VISIBILITY, *in_order(p.maps)))
+        raise PredictionsError(f"{path}: holds no map {lacking[0]!r}; predict it, or choose --inputs among {known}")
+    if VISIBILITY in recipe.inputs and scenes_of(p) is None:
+        raise PredictionsError(f"{path}: is of no scenes, in which all would show; choose other --inputs")
+    if p.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
+        raise PredictionsError(
+            f"{path}: holds no azimuth bins; train the recogniser with --azimuth-bins-weight, or give --frame camera "
+            "and --inputs without azimuth_bin"
+        )
+
+
+def _best_epoch(
+    learned: list[ReplayTable], validated: list[ReplayTable], recipe: GainRecipe, track: Track
+) -> tuple[tuple[Gain, ...], Value]:
+    """Train on each table; the policies of the best epoch by their value on the table of the same place."""
+    best: list[tuple[tuple[Gain, ...], Value]] = []
+
+    def epochs() -> Iterator[int]:
+        trainings = [train(part, recipe, fold) for fold, part in enumerate(learned)]
+        for policies in best_epoch(trainings, validated, recipe):
+            best.append(policies)
+            yield len(best)
+
+    track(epochs(), recipe.epochs, "training")
+    return best[-1]

@@ -1,0 +1,117 @@
+"""The networks' inputs of a whole store: computed once and kept beside the store, each view packed for itself."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numcodecs import Blosc
+from numpy.typing import NDArray
+
+from nextview.data.pool import WorkerDied, each
+from nextview.data.progress import Track, silently
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError
+from nextview.files import new_folder, only_one
+from nextview.recognition.network_input import CHANNELS_OF, InputKind, InputSpec, from_store
+
+PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)
+"""Views of objects are mostly background and flat faces: a sixth is left or less, which fits into memory."""
+AGAIN = "delete it, and it is made again"
+
+
+@dataclass(frozen=True)
+class PackedViews:
+    """Views of all objects, (N, V, C, H, W) uint8, read like an array: ``views[i, v]``, ``views[i, 2:5]``."""
+
+    packed: NDArray[np.uint8]
+    places: NDArray[np.int64]
+    size: tuple[int, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """N, V, C, H, W."""
+        return (*self.places.shape[:2], *self.size)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __getitem__(self, at: int | tuple[int, int | slice]) -> NDArray[np.uint8]:
+        places = self.places[at]
+        views = np.zeros((*places.shape[:-1], *self.size), np.uint8)
+        for (start, count), view in zip(places.reshape(-1, 2), views.reshape(-1, *self.size), strict=True):
+            if count:
+                PACKING.decode(self.packed[start : start + count], view)
+        return views
+
+
+def inputs_path(store: Path, size: int, kind: InputKind = "geometry") -> Path:
+    """The folder where the inputs of a store are kept."""
+    store = Path(os.path.realpath(store)) if store.name in ("", "..") else store  # "." has no name
+    return store.with_name(f"{store.name}.{'inputs' if kind == 'geometry' else kind}{size}")
+
+
+def ready_inputs(path: Path, size: int, kind: InputKind = "geometry", track: Track = silently) -> PackedViews:
+    """The inputs of a store, (N, V, C, size, size) uint8, computed if they are not there."""
+    from nextview.learning.loop import is_first  # not above: the processes that compute inputs need no torch
+
+    target = inputs_path(path, size, kind)
+    if is_first() and not target.exists():
+        with only_one(target):
+            track(
+                _compute(path, target, InputSpec(kind, size)),
+                int(ViewStore.open(path).done.sum()),
+                f"inputs of {path.name}",
+            )
+    while not target.exists():
+        time.sleep(1)
+    return load_inputs(path, size, kind)
+
+
+def _compute(path: Path, target: Path, spec: InputSpec) -> Iterator[int]:
+    """Compute and write the inputs of all objects; yields how many are done."""
+    store = ViewStore.open(path)
+    chosen = np.flatnonzero(store.done).tolist()
+    for first in chosen[:1]:  # a size that the views do not have is refused before anything is made
+        from_store(spec, store, first)
+    shape = len(store), len(store.sphere)
+    places = np.zeros((*shape, 2), np.int64)
+    with new_folder(target) as part:
+        with open(part / "views.lz4", "wb") as file:
+            for done, (i, packed) in enumerate(each(partial(_packed, path, spec), chosen), 1):
+                if isinstance(packed, WorkerDied):
+                    raise DatasetError(f"{path}: the inputs of {store.names[i]} cannot be computed: {packed}")
+                counts = np.array([len(view) for view in packed])
+                places[i] = np.stack([file.tell() + np.cumsum(counts) - counts, counts], 1)
+                file.writelines(packed)
+                yield done
+        size = (CHANNELS_OF[spec.kind], spec.size, spec.size)
+        np.savez(part / "index.npz", places=places, size=size)
+
+
+def _packed(path: Path, spec: InputSpec, i: int) -> list[bytes]:
+    views = from_store(spec, ViewStore.open(path), i)
+    return [PACKING.encode(np.ascontiguousarray(view)) for view in views]
+
+
+def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedViews:
+    """The inputs of a store, (N, V, C, size, size) uint8, as ``ready_inputs`` computed them."""
+    target, store = inputs_path(path, size, kind), ViewStore.open(path)
+    file = target / "views.lz4"
+    try:
+        with open(target / "index.npz", "rb") as index_file, np.load(index_file) as index:
+            places, shape = index["places"], tuple(index["size"].tolist())
+        packed = np.memmap(file, np.uint8, "r") if file.stat().st_size else np.zeros(0, np.uint8)
+    except Exception as error:  # zip files and NumPy raise whatever a damaged file makes them raise
+        raise DatasetError(f"{target}: is damaged ({error}); {AGAIN}") from None
+    if len(packed) != places[..., 1].sum():
+        raise DatasetError(f"{target}: is damaged; {AGAIN}")
+    there = places[..., 1].all(1)
+    if there.shape != (len(store),) or (store.done & ~there).any():
+        raise DatasetError(f"{target}: lacks objects that {path} holds by now; {AGAIN}")
+    return PackedViews(packed, places, shape)

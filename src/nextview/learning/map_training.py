@@ -1,0 +1,208 @@
+"""The stage from a view store to a trained map network: it learns one value for every view of an object."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.utils.data import IterableDataset
+
+from nextview.data.measures import confidence_maps, normalise_per_object
+from nextview.data.predictions import Predictions
+from nextview.data.progress import Track, silently
+from nextview.data.splits import check_any, deduplicate, split_training
+from nextview.data.store import ViewStore
+from nextview.errors import ModelError, PredictionsError, UsageError
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.learning.architectures import map_columns, map_network, orthogonality
+from nextview.learning.inputs import PackedViews, ready_inputs
+from nextview.learning.loop import fit, optimiser
+from nextview.learning.recipes import Hardware, MapRecipe
+from nextview.learning.runs import new_run, read_run, refuse_seen, start_from, train_once
+from nextview.recognition.map_names import CONFIDENCE
+from nextview.recognition.network_input import cloud_input
+
+
+class Windows(IterableDataset):
+    """Batches of (what the network sees, map (B, rings, columns)), new draws each epoch."""
+
+    def __init__(
+        self,
+        seen: NDArray[Any] | PackedViews,
+        values: NDArray[np.float32],
+        sphere: ViewSphere,
+        objects: NDArray[np.int64],
+        recipe: MapRecipe,
+        training: bool,
+    ) -> None:
+        self.seen, self.values, self.poses, self.objects = seen, values, sphere.poses, objects
+        steps, n = np.array(map_columns(recipe, sphere)), sphere.azimuths
+        azimuths = (sphere.azimuth_index[:, None] + steps) % n
+        self.around = np.arange(sphere.rings)[None, :, None] * n + azimuths[:, None, :]  # (V, rings, columns)
+        self.mirror = [list(steps % n).index(-step % n) for step in steps]
+        self.recipe, self.training, self.epoch, self.share = recipe, training, 0, slice(None)
+        self.batch = min(recipe.batch, len(objects) * recipe.views)
+
+    def __len__(self) -> int:
+        return len(self.objects) * self.recipe.views // self.batch
+
+    def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
+        rng = np.random.default_rng([self.recipe.seed, self.epoch])
+        n, v, batch = len(self) * self.batch, len(self.poses), self.batch
+        if self.training:  # every object as often as any other, and each of its views before one comes again
+            turns = np.argsort(rng.random((v, len(self.objects))), axis=0)
+            views = np.resize(turns, (self.recipe.views, len(self.objects))).flatten()
+            objects, order = np.tile(self.objects, self.recipe.views), rng.permutation(len(views))[:n]
+            objects, views = objects[order], views[order]
+        else:  # the same spread of views every time
+            objects, views = np.repeat(self.objects, self.recipe.views)[:n], (np.arange(n) * 7) % v
+        mirrored = rng.random(n) < 0.5 * (self.training and self.recipe.mirror)
+        batches = np.arange(n).reshape(-1, batch)[:, self.share]
+        for here in batches:
+            points = rng.permutation(1024)[: self.recipe.points] if self.training else np.arange(1024)
+            o, w, m = objects[here], views[here], mirrored[here]
+            seen: NDArray[Any] = np.stack([self.seen[i, k] for i, k in zip(o, w, strict=True)])
+            target = self.values[o[:, None, None], self.around[w]]
+            if self.recipe.input == "cloud":
+                seen = cloud_input(seen[:, points].astype(np.float32), self.poses[w])
+                # y runs to the left of the camera; the mirror stands in the cloud's own middle.
+                y = seen[m][..., 1]
+                seen[m, :, 1] = y.max(1, keepdims=True) + y.min(1, keepdims=True) - y
+            else:
+                seen[m] = seen[m][..., ::-1]
+            target[m] = target[m][..., self.mirror]
+            yield torch.from_numpy(seen), torch.from_numpy(target)
+
+
+def peak_loss(logits: Tensor, goal: Tensor, reach: int) -> Tensor:
+    """Mean negative log-likelihood that a cell drawn by its logit lies within ``reach`` of the highest of ``goal``."""
+    _, rings, columns = goal.shape
+    ring, column = torch.meshgrid(torch.arange(rings), torch.arange(columns), indexing="ij")
+    ring, column = ring.flatten().to(goal.device), column.flatten().to(goal.device)
+    highest = goal.flatten(1).argmax(1)
+    away = torch.hypot((ring - ring[highest, None]).float(), (column - column[highest, None]).float())
+    likely = logits.flatten(1).log_softmax(1)
+    return -likely.masked_fill(away > reach, -torch.inf).logsumexp(1).mean()
+
+
+class MapModule(L.LightningModule):
+    """AdamW on the squared error, plus the regulariser of the PointNet's transforms (thesis, section 2.2.3)."""
+
+    def __init__(self, recipe: MapRecipe, sphere: ViewSphere, steps: int) -> None:
+        super().__init__()
+        self.recipe, self.steps = recipe, steps
+        self.net = map_network(recipe, sphere)
+        columns = [step % sphere.azimuths for step in map_columns(recipe, sphere)]
+        self.window = [columns.index(step % sphere.azimuths) for step in (-1, 0, 1)]
+
+    def forward(self, seen: Tensor) -> tuple[Tensor, ...]:
+        if self.recipe.input == "cloud":
+            return self.net(seen)
+        return self.net((seen.float() / 255).to(memory_format=torch.channels_last))
+
+    def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
+        predicted, *transforms = self(batch[0])
+        predicted, true = predicted.float(), batch[1]
+        near, goal = predicted[..., self.window], true[..., self.window]
+        error = F.mse_loss(near, goal)
+        self.log("mse", error, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True)
+        if self.recipe.output == "sphere":
+            error = (error + F.mse_loss(predicted, true)) / 2
+        if self.recipe.peak:
+            lost = peak_loss(near / self.recipe.sharpness, goal, self.recipe.reach)
+            error = error + self.recipe.peak * lost
+        return error + self.recipe.regular * sum(orthogonality(t.float()) for t in transforms)
+
+    def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
+        error = F.mse_loss(self(batch[0])[0].float()[..., self.window], batch[1][..., self.window])
+        self.log("validation_mse", error, prog_bar=True, batch_size=len(batch[1]), sync_dist=True)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        return optimiser(self.parameters(), self.recipe, self.steps, 0.1)
+
+
+def train_map(
+    store: Path,
+    out: Path,
+    predictions: Path | None = None,
+    weights: Path | None = None,
+    recipe: MapRecipe = MapRecipe(),
+    hardware: Hardware = Hardware(),
+    track: Track = silently,
+) -> list[Path]:
+    """Train a network that predicts a measure of the views around one. Resumes if OUT holds a run that was cut off.
+
+    Args:
+        store: view store made by nextview render, with the 40 views and the measure (nextview measure).
+        out: folder for checkpoints, logs and network.pt, the network of the epoch with the lowest squared error.
+        predictions: for --measure confidence, of the store's training split, by the recogniser whose confidence is to
+            be predicted; or out-of-fold ones (nextview train recogniser --folds, export each, nextview predict
+            --held-out --recogniser CARD CARD).
+        weights: folder of a finished run of the same depth and input from which a ResNet starts: a recogniser's, or a
+            map network's to go on with.
+        recipe: how to train.
+        hardware: on what.
+        track: follows the preparation of the inputs.
+
+    Returns:
+        The folder of the finished run.
+
+    Raises:
+        DatasetError: the store cannot be used, lacks the measure or has nothing to train on, or another process trains
+            in the same folder.
+        PredictionsError: the predictions are of other views.
+        ModelError: the weights cannot be used, or have seen what validates; or ``out`` holds another run.
+    """
+    views = ViewStore.open(store)
+    predicted = None if predictions is None else Predictions.load(predictions)
+    values, there = target_of(recipe.measure, views, predicted)
+    aside = split_training(views, recipe.validation, recipe.seed)
+    training, validation = (part[there[part]] for part in aside)
+    check_any(views, training, validation, "" if there.all() else ": of the others no map is known")
+    held_out = [views.names[i] for i in aside[1]]  # those without values too
+    refuse_seen(weights, held_out)
+    run = new_run(recipe, weights, held_out, held_out, [views] if predicted is None else [views, predicted])
+    parts = training, deduplicate(views, validation)  # copies of one mesh count once
+
+    def fitted() -> nn.Module:
+        cloud = recipe.input == "cloud"
+        seen = views.all_points() if cloud else ready_inputs(store, recipe.size, recipe.input, track)
+        windows, judging = (Windows(seen, values, views.sphere, part, recipe, part is training) for part in parts)
+        L.seed_everything(recipe.seed, verbose=False)
+        module = MapModule(recipe, views.sphere, recipe.epochs * len(windows))
+        if weights and cloud:
+            raise ModelError(f"{weights}: a PointNet cannot start from a ResNet")
+        if weights:
+            start_from(module.net.resnet, weights, head=weights.is_dir() and "measure" in read_run(weights).recipe)
+        return fit(module, windows, judging, out, "validation_mse", "min", hardware).net.eval()
+
+    train_once(out, run, fitted)
+    return [out]
+
+
+def target_of(
+    measure: str, store: ViewStore, predictions: Predictions | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """A measure of all views, scaled to 0 .. 1 over each object's, or the confidence; and which objects have it."""
+    if (measure == CONFIDENCE) != (predictions is not None):
+        raise UsageError(
+            "a map of the confidence is learned from predictions: give those of the recogniser"
+            if predictions is None
+            else f"a map of {measure} is learned from the store alone: predictions are for a map of the {CONFIDENCE}"
+        )
+    if predictions is None:
+        return normalise_per_object(store.measure(measure)), store.done
+    row = {name: i for i, name in enumerate(store.names)}
+    here = np.array([row.get(name, -1) for name in predictions.names])
+    if (here < 0).all() or predictions.sphere != store.sphere:
+        raise PredictionsError(f"these predictions are not of the views of {store.path}")
+    values = np.zeros((len(store), len(store.sphere)), np.float32)
+    values[here[here >= 0]] = confidence_maps(predictions.logits, predictions.labels)[here >= 0]
+    return values, values.any(1) & store.done

@@ -1,0 +1,196 @@
+"""The tables of ``nextview.policies.learned_tables``: those after whose views the true class is believed most."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.predictions import Predictions
+from nextview.errors import UsageError
+from nextview.files import check_new, command, sha256_of
+from nextview.learning.card_fits import fit_temperature
+from nextview.learning.fitting_set import FittingSet, blind_walks, described, fitting_set
+from nextview.policies.base import Scope
+from nextview.policies.learned_tables import FixedRing, cells_from, cells_to
+from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
+from nextview.recognition.belief import PLAIN_SUM, Calibration, of_true_class
+
+Float = NDArray[np.float64]
+VARIANTS: tuple[tuple[str, Scope], ...] = (("", "global"), ("-local", "local"), ("-near", "global"))
+
+
+@dataclass(frozen=True)
+class FittedPolicies:
+    """What ``fit_policies`` wrote."""
+
+    cards: tuple[Path, ...]
+    objects: int
+
+
+def fit_policies(
+    predictions: Path,
+    out: Path,
+    validation: float = 0.1,
+    split_seed: int = 0,
+    length: int = 7,
+    n_views: int = 5,
+    shrinkage: float = 20.0,
+    travel_weight: float = 0.01,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> FittedPolicies:
+    """Learn the policies that follow a table: fixed sequence, fixed ring, class table.
+
+    Each in three variants: over the whole sphere (NAME), in the local window (NAME-local), and over the whole sphere at
+    a travel weight (NAME-near; a ring has none).
+
+    Args:
+        predictions: of the training split (nextview predict --split train).
+        out: folder for NAME.json; run one with --policy OUT/NAME.json.
+        validation: part of every class that the recogniser was not trained on; 1 for out-of-fold predictions.
+        split_seed: the recogniser's seed, which decided which.
+        length: moves of the fixed sequence.
+        n_views: over which the ring and the class table are chosen.
+        shrinkage: objects by whose weight the gains of one believed class are drawn towards those of all.
+        travel_weight: of one cell of travel for NAME-near, in units of the logarithm of the belief in the true class.
+        seed: decides the walks behind the class table.
+        overwrite: replace cards of these names.
+
+    Raises:
+        UsageError, PredictionsError: the arguments make no sense, or nothing can be fitted to the predictions.
+        ResultsError: a card exists.
+    """
+    if length < 1 or n_views < 2 or shrinkage < 0 or travel_weight < 0:
+        raise UsageError("length has to be at least 1, views at least 2, shrinkage and travel weight not negative")
+    names = [f"{kind}{suffix}" for suffix, _ in VARIANTS for kind in ("fixed-sequence", "class-table", "fixed-ring")]
+    cards = {name: out / f"{name}.json" for name in names if name != "fixed-ring-near"}
+    for path in cards.values():
+        check_new(path, overwrite)
+    table = Predictions.load(predictions)
+    data = fitting_set(table, validation, split_seed)
+    calibration, sphere = table.calibration, data.sphere
+    if calibration == PLAIN_SUM:  # its recogniser was not calibrated when these were made
+        calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=1 + 8000 // len(data))
+    values = fit_class_table(data, n_views, shrinkage, calibration, np.random.default_rng(seed))
+    travel = sphere.travel[:: sphere.azimuths]  # from each ring to each cell
+    settings = {"length": length, "n_views": n_views, "shrinkage": shrinkage, "seed": seed}
+    source = LearnedFrom(sha256_of(predictions), table.models)
+    for suffix, scope in VARIANTS:
+        paid = travel_weight if suffix == "-near" else 0.0
+        card = PolicyCard(
+            "fixed-ring",
+            scope,
+            sphere.elevations,
+            sphere.azimuths,
+            data.classes,
+            {},
+            described(len(data)),
+            (source,),
+            ((calibration.temperature, calibration.correlation),),
+            settings | {"travel_weight": paid},
+            (*table.commands, command()),
+        )
+        moves = fit_sequence(data, scope, length, calibration, paid)
+        tables = {"fixed-sequence": {"moves": moves.tolist()}}
+        tables["class-table"] = {"values": np.round(values - paid * travel, 5).tolist()}
+        if f"fixed-ring{suffix}" in cards:
+            ring, steps = fit_ring(data, scope, n_views, calibration)
+            tables["fixed-ring"] = {"ring": ring, "steps": steps}
+        for kind, entries in tables.items():
+            write_policy_card(cards[f"{kind}{suffix}"], msgspec.structs.replace(card, kind=kind, table=entries), True)
+    return FittedPolicies(tuple(cards.values()), len(data))
+
+
+def log_belief(data: FittingSet, calibration: Calibration, total: NDArray[np.floating], n_views: int) -> Float:
+    """Logarithm of the belief in the true class, (N, ...), after so many views with that sum, (N, ..., D)."""
+    return of_true_class(calibration.log_belief(total, n_views, len(data.classes)), data.labels)
+
+
+def fit_sequence(
+    data: FittingSet, scope: Scope, length: int, calibration: Calibration, travel_weight: float = 0.0
+) -> NDArray[np.int64]:
+    """The greedily best moves from each ring, for all objects and azimuths together: (rings, length) cells, int64."""
+    n = data.sphere.azimuths
+    rings = [n * ring + np.arange(n) for ring in range(data.sphere.rings)]
+    paths = [greedy_path(data, starts, scope, length, calibration, travel_weight) for starts in rings]
+    return np.array([cells_to(data.sphere)[path[:-1], path[1:]] for path in paths])
+
+
+def greedy_path(
+    data: FittingSet,
+    starts: NDArray[np.int64],
+    scope: Scope,
+    length: int,
+    calibration: Calibration,
+    travel_weight: float = 0.0,
+) -> NDArray[np.int64]:
+    """The greedily best path from ``starts``, views of one ring, for all objects and starts together."""
+    sphere = data.sphere
+    path = [int(sphere.ring[starts[0]]) * sphere.azimuths]
+
+    def log_evidence(place: int) -> Float:
+        return data.log_evidence[:, cells_from(sphere)[starts, place]].astype(np.float64)
+
+    total = log_evidence(path[0])
+    for k in range(2, min(length, len(sphere) - 1) + 2):
+        reachable = np.arange(len(sphere)) if scope == "global" else sphere.windows[path[-1]].ravel()
+        free = np.setdiff1d(reachable, path)
+        free = free if len(free) else np.setdiff1d(np.arange(len(sphere)), path)
+        beliefs = [log_belief(data, calibration, total + log_evidence(v), k).mean(1) for v in free]
+        value = np.array(beliefs) @ data.weights / len(data) - travel_weight * sphere.travel[path[-1], free]
+        path.append(int(free[np.argmax(value)]))
+        total += log_evidence(path[-1])
+    return np.array(path)
+
+
+def fit_ring(data: FittingSet, scope: Scope, n_views: int, calibration: Calibration) -> tuple[int, int]:
+    """The best ring to go to and the azimuth steps along it, over all starts, after 2 to ``n_views`` views."""
+    everywhere, nothing_drawn = np.arange(len(data.sphere)), np.random.default_rng(0)
+
+    def walks_from_everywhere(walk: tuple[int, int]) -> NDArray[np.int64]:
+        policy = FixedRing(data.sphere, *walk)
+        return blind_walks(data.sphere, policy, everywhere, min(n_views, len(data.sphere)), nothing_drawn)
+
+    def value(walk: tuple[int, int]) -> float:
+        total, sum_over_views = np.zeros(data.log_evidence.shape), 0.0
+        for k, views in enumerate(walks_from_everywhere(walk).T, 1):
+            total += data.log_evidence[:, views]
+            if k > 1:
+                belief = log_belief(data, calibration, total, k)
+                sum_over_views += float(data.weights @ belief.mean(1))
+        return sum_over_views
+
+    steps = range(1, data.sphere.azimuths // 2 + 1) if scope == "global" else (1,)
+    return max(((ring, step) for ring in range(data.sphere.rings) for step in steps), key=value)
+
+
+def fit_class_table(
+    data: FittingSet, n_views: int, shrinkage: float, calibration: Calibration, rng: np.random.Generator, walks: int = 8
+) -> Float:
+    """Mean gain of views 2 to ``n_views`` by believed class, current ring and cell: (classes, rings, V) float64."""
+    sphere, c, n = data.sphere, len(data.classes), len(data)
+    gains, weight = np.zeros((c, sphere.rings, len(sphere))), np.zeros((c, sphere.rings, len(sphere)))
+    cell = cells_to(sphere)
+    for _ in range(walks):
+        walk = rng.permuted(np.tile(np.arange(len(sphere)), (n, 1)), axis=1)
+        total = np.zeros((n, data.log_evidence.shape[2]))
+        for k in range(1, min(n_views, len(sphere))):
+            current = walk[:, k - 1]
+            total += data.log_evidence[np.arange(n), current]
+            now = log_belief(data, calibration, total, k)
+            after = log_belief(data, calibration, total[:, None] + data.log_evidence, k + 1)
+            free = np.ones((n, len(sphere)), bool)
+            free[np.arange(n)[:, None], walk[:, :k]] = False
+            believed = calibration.log_belief(total, k, c).argmax(1)
+            at = (believed[:, None], sphere.ring[current][:, None], cell[current])
+            each = free * data.weights[:, None]
+            np.add.at(gains, at, each * (after - now[:, None]))
+            np.add.at(weight, at, each)
+    shared = gains.sum(0) / np.maximum(weight.sum(0), 1e-12)
+    # A cell is met once in so many views of a walk: what one object weighs in the sums over all walks.
+    met = walks * (min(n_views, len(sphere)) - 1) / sphere.rings
+    return (gains + shrinkage * met * shared) / np.maximum(weight + shrinkage * met, 1e-12)

@@ -1,0 +1,305 @@
+"""The stage from a view store to a trained recogniser, or to one for each fold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.utils.data import IterableDataset
+
+from nextview.data.progress import Track, silently
+from nextview.data.rendering import rotations
+from nextview.data.splits import check_any, deduplicate, split_training
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, UsageError
+from nextview.learning.architectures import recogniser_network
+from nextview.learning.fitting_set import hold_out
+from nextview.learning.inputs import PackedViews, ready_inputs
+from nextview.learning.loop import fit, optimiser
+from nextview.learning.recipes import Hardware, RecogniserRecipe
+from nextview.learning.runs import new_run, refuse_seen, start_from, train_once
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where views of the training objects come from: their own store or one of deformed copies."""
+
+    inputs: NDArray[np.uint8] | PackedViews  # (rows, V, C, S, S)
+    row: NDArray[np.int64]  # of each object in the inputs, -1 for none
+    azimuth_bins: NDArray[np.float32] | None = None  # (rows, V)
+
+
+class Views(IterableDataset):
+    """Batches of (input (B, C, S, S) uint8, label (B,), and azimuth bin (B,) where sources have it), new each epoch."""
+
+    def __init__(
+        self, sources: list[Source], objects: NDArray[np.int64], labels: NDArray[np.int64], recipe: RecogniserRecipe
+    ) -> None:
+        self.sources, self.objects, self.labels, self.recipe = sources, objects, labels, recipe
+        count = np.bincount(labels[objects])[labels[objects]]
+        self.weights = count**-0.5 / (count**-0.5).sum()
+        self.epoch, self.share = 0, slice(None)
+        views = recipe.views if recipe.balanced else min(recipe.views, sources[0].inputs.shape[1])
+        self.drawn = len(objects) * views
+        self.batch = min(recipe.batch, self.drawn)
+
+    def __len__(self) -> int:
+        return self.drawn // self.batch
+
+    def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
+        rng = np.random.default_rng([self.recipe.seed, self.epoch, self.recipe.ensemble_seed])
+        n, v = len(self) * self.batch, self.sources[0].inputs.shape[1]
+        if self.recipe.balanced:
+            objects = rng.choice(self.objects, n, p=self.weights)
+            turn = rng.random(n)  # of the view, as a part of all views
+        else:
+            objects, views = np.divmod(rng.permutation(len(self.objects) * v)[:n], v)
+            objects, turn = self.objects[objects], (views + 0.5) / v
+        deformed = (rng.random(n) < self.recipe.deformed_share) & (len(self.sources) > 1)
+        source = np.where(deformed, rng.integers(1, max(2, len(self.sources)), n), 0)
+        rows = np.stack([own.row for own in self.sources])
+        source[rows[source, objects] < 0] = 0
+        row = rows[source, objects]
+        view = (turn * np.array([own.inputs.shape[1] for own in self.sources])[source]).astype(int)
+        batches = np.arange(n).reshape(-1, self.batch)[:, self.share]
+        for batch in batches:
+            images = [self.sources[source[k]].inputs[row[k], view[k]] for k in batch]
+            drawn = [np.stack(images), self.labels[objects[batch]]]
+            if self.sources[0].azimuth_bins is not None:
+                drawn.append(np.array([self.sources[source[k]].azimuth_bins[row[k], view[k]] for k in batch]))
+            yield tuple(map(torch.from_numpy, drawn))
+
+
+def augment(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Vary inputs (B, C, S, S) in 0 .. 1: mirror, shift, stretch, roll, hide a part, add noise; and which were."""
+    (b, _, _, s), on = x.shape, {"device": x.device}
+    scale = torch.empty(b, 2, **on).uniform_(0.8, 1.25)
+    mirrored = torch.randint(0, 2, (b,), **on) == 0
+    scale[:, 0] *= torch.where(mirrored, -1.0, 1.0)
+    roll = torch.empty(b, **on).normal_(0, 0.05)
+    theta = torch.zeros(b, 2, 3, **on)
+    theta[:, 0, 0], theta[:, 0, 1] = scale[:, 0] * roll.cos(), -scale[:, 0] * roll.sin()
+    theta[:, 1, 0], theta[:, 1, 1] = scale[:, 1] * roll.sin(), scale[:, 1] * roll.cos()
+    theta[:, :, 2] = torch.empty(b, 2, **on).uniform_(-0.1, 0.1)
+    x = F.grid_sample(x, F.affine_grid(theta, list(x.shape), align_corners=False), align_corners=False)
+    # A rectangle of background, in half of the images, as if something stood in front.
+    side = torch.empty(b, 2, **on).uniform_(0.1, 0.4)
+    corner = torch.rand(b, 2, **on) * (1 - side)
+    grid = (torch.arange(s, **on) + 0.5) / s
+    rows = (grid > corner[:, :1]) & (grid < corner[:, :1] + side[:, :1])
+    columns = (grid > corner[:, 1:]) & (grid < corner[:, 1:] + side[:, 1:])
+    hidden = (rows[:, :, None] & columns[:, None, :] & (torch.rand(b, 1, 1, **on) < 0.5))[:, None]
+    seen = (x > 0) & ~hidden
+    return torch.where(seen, x + 0.02 * torch.randn_like(x), 0.0), mirrored
+
+
+class RecogniserModule(L.LightningModule):
+    """AdamW on cross-entropy; validates on the class mean of single-view accuracy."""
+
+    def __init__(self, recipe: RecogniserRecipe, classes: int, steps: int, azimuths: int = 0) -> None:
+        super().__init__()
+        self.recipe, self.steps = recipe, steps
+        self.net = recogniser_network(recipe, classes, azimuths).to(memory_format=torch.channels_last)
+        for name in ("hits", "seen", "lost"):  # of each class in validation
+            self.register_buffer(name, torch.zeros(classes), persistent=False)
+
+    def training_step(self, batch: tuple[Tensor, ...], _: int) -> Tensor:
+        x, label = batch[0].float() / 255, batch[1]
+        mirrored = torch.zeros_like(label, dtype=torch.bool)
+        if self.recipe.augment:
+            x, mirrored = augment(x)
+        x = x.to(memory_format=torch.channels_last)
+        logits, *likely = self.net(x)
+        loss = F.cross_entropy(logits.float(), label, label_smoothing=self.recipe.smoothing)
+        if likely:
+            side = torch.where(mirrored, -batch[2] % likely[0].shape[2], batch[2])
+            lost = side_loss(likely[0].float(), label, side)
+            self.log("side_loss", lost, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))
+            loss = loss + self.recipe.azimuth_bins_weight * lost
+        self.log("loss", loss, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))
+        return loss
+
+    def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
+        x = (batch[0].float() / 255).to(memory_format=torch.channels_last)
+        logits, label = self.net(x)[0].float(), batch[1]
+        right = (logits.argmax(1) == label).float()
+        self.hits.scatter_add_(0, label, right)
+        self.seen.scatter_add_(0, label, torch.ones_like(right))
+        self.lost.scatter_add_(0, label, F.cross_entropy(logits, label, reduction="none"))
+
+    def on_validation_epoch_end(self) -> None:
+        hits, seen, lost = (self.trainer.strategy.reduce(x, reduce_op="sum") for x in (self.hits, self.seen, self.lost))
+        there = seen > 0
+        self.log("class_accuracy", (hits[there] / seen[there]).mean(), prog_bar=True)
+        self.log("validation_loss", lost.sum() / seen.sum())
+        for total in (self.hits, self.seen, self.lost):
+            total.zero_()
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        plain = [p for p in self.net.parameters() if p.ndim <= 1]
+        groups = [{"params": [p for p in self.net.parameters() if p.ndim > 1]}, {"params": plain, "weight_decay": 0.0}]
+        return optimiser(groups, self.recipe, self.steps, 0.5)
+
+
+class ValidationViews(IterableDataset):
+    """Every fifth view of the validation objects, shifted by one from object to object: all views get their turn."""
+
+    def __init__(
+        self, inputs: NDArray[np.uint8] | PackedViews, objects: NDArray[np.int64], labels: NDArray[np.int64]
+    ) -> None:
+        self.inputs, self.objects, self.labels, self.share = inputs, objects, labels, slice(None)
+
+    def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
+        for k, i in list(enumerate(self.objects))[self.share]:
+            views = self.inputs[i, k % 5 :: 5]
+            yield torch.from_numpy(views), torch.full((len(views),), int(self.labels[i]))
+
+
+def fit_recogniser(
+    sources: list[Source],
+    labels: NDArray[np.int64],
+    parts: tuple[NDArray[np.int64], NDArray[np.int64]],
+    recipe: RecogniserRecipe,
+    out: Path,
+    weights: Path | None = None,
+    hardware: Hardware = Hardware(),
+    azimuths: int = 0,
+) -> nn.Module:
+    """Train and return the network of the best epoch; checkpoints in ``out``, from which a second call resumes."""
+    own = np.random.SeedSequence([recipe.seed, recipe.ensemble_seed])
+    L.seed_everything(int(own.generate_state(1)[0]), verbose=False)
+    views = Views(sources, parts[0], labels, recipe)
+    module = RecogniserModule(recipe, int(labels.max()) + 1, recipe.epochs * len(views), azimuths)
+    if weights:
+        start_from(module.net, weights)
+    start = {name: values.clone() for name, values in module.net.state_dict().items()}
+    validation = ValidationViews(sources[0].inputs, parts[1], labels)
+    best = fit(module, views, validation, out, "class_accuracy", "max", hardware)
+    best.net.load_state_dict(part_way(start, best.net.state_dict(), recipe.way))
+    return best.net.eval()
+
+
+def part_way(start: dict[str, Tensor], end: dict[str, Tensor], way: float) -> dict[str, Tensor]:
+    """Parameters a part of the way between two states of one network; counters are those of the end."""
+    return {
+        name: torch.lerp(start[name].to(values), values, way) if values.is_floating_point() else values
+        for name, values in end.items()
+    }
+
+
+def mirror_planes(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Azimuth of the plane of symmetry of each class, steps of the store's viewpoints, (classes,)."""
+    n = store.sphere.azimuths
+    measured = store.measure()[objects].reshape(len(objects), -1, n).astype(np.float64)
+    measured -= measured.mean((1, 2), keepdims=True)
+    planes = np.arange(n)[: max(1, n // 2)]  # the plane through a view also holds the one opposite
+    symmetry = np.stack(
+        [(measured * measured[:, :, (2 * plane - np.arange(n)) % n]).sum((1, 2)) for plane in planes], 1
+    )
+    labels = store.labels[objects]
+    return np.array([planes[symmetry[labels == c].sum(0).argmax()] for c in range(len(store.classes))], np.float64)
+
+
+def azimuth_bins(store: ViewStore, azimuths: int, planes: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The azimuth bin, 0 .. azimuths, from which each view sees its object, (N, V), given the ``mirror_planes``."""
+    sphere = store.sphere
+    steps = sphere.azimuth_index * (azimuths / sphere.azimuths)
+    rotated = rotations(store) * azimuths / (2 * np.pi) + planes[store.labels]
+    return ((steps - rotated[:, None]) % azimuths).astype(np.float32)
+
+
+def side_loss(likely: Tensor, label: Tensor, side: Tensor) -> Tensor:
+    """Mean cross-entropy of the azimuth bin given the true class; between two bins, both count by their nearness."""
+    own = likely[torch.arange(len(label), device=label.device), label]
+    low, n = side.floor(), own.shape[1]
+    share = (side - low)[:, None]
+    low = low.long()[:, None]
+    return -((1 - share) * own.gather(1, low % n) + share * own.gather(1, (low + 1) % n)).mean()
+
+
+def train_recogniser(
+    store: Path,
+    out: Path,
+    deformed: tuple[Path, ...] = (),
+    weights: Path | None = None,
+    folds: int = 0,
+    fold: int | None = None,
+    recipe: RecogniserRecipe = RecogniserRecipe(),
+    hardware: Hardware = Hardware(),
+    track: Track = silently,
+) -> list[Path]:
+    """Train the recogniser on a store's training split. Resumes if OUT holds a run that was cut off.
+
+    Args:
+        store: view store made by nextview render.
+        out: folder for checkpoints, logs and network.pt, the network of the epoch with the best class mean.
+        deformed: stores of the same objects or some of them, stretched and rotated (nextview render --stretch .25
+            --rotated --seed 1 and so on) or through sensors (--sensor mix); their views may be others.
+        weights: start from a published checkpoint, torchvision's of the same depth or EfficientNet-Lite0's, or go on
+            from the run in this folder, on other data or for longer.
+        folds: train so many recognisers instead, OUT/fold0 and so on, each without its share of the training objects,
+            for out-of-fold predictions.
+        fold: train only this one of them, 0 the first.
+        recipe: how to train.
+        hardware: on what.
+        track: follows the preparation of the inputs.
+
+    Returns:
+        Folders of the finished runs.
+
+    Raises:
+        UsageError: there is no such fold.
+        DatasetError: a store cannot be used, or another process trains in the same folder.
+        ModelError: the weights cannot be used, or have seen what is held out; or ``out`` holds another run.
+    """
+    if fold is not None and not 0 <= fold < folds:
+        raise UsageError(f"there is no fold {fold} of {folds}: they are counted from 0")
+    views = ViewStore.open(store)
+    training, validation = split_training(views, recipe.validation, recipe.seed)
+    check_any(views, training, validation)
+    held_out = {out: training[:0]}
+    if folds:
+        parts = hold_out(views.labels[training], views.measure()[training], folds, recipe.seed)
+        held_out = {out / f"fold{k}": training[part] for k, part in enumerate(parts) if fold in (None, k)}
+    validating = deduplicate(views, validation)  # copies of one mesh count once
+    azimuths, planes = 0, None
+    if recipe.azimuth_bins_weight:
+        azimuths, planes = views.sphere.azimuths, mirror_planes(views, training)
+    aside = [views.names[i] for i in validation]
+    for held in held_out.values():
+        refuse_seen(weights, [*aside, *(views.names[i] for i in held)])
+    sources = [_source(path, views, training, recipe, planes, track) for path in (store, *deformed)]
+    made = [ViewStore.open(path) for path in (store, *deformed)]
+    for folder, held in held_out.items():
+        run = new_run(recipe, weights, [*aside, *(views.names[i] for i in held)], aside, made)
+        split = np.setdiff1d(training, held), validating
+        fitted = sources, views.labels, split, recipe, folder, weights, hardware, azimuths
+        train_once(folder, run, partial(fit_recogniser, *fitted))
+    return list(held_out)
+
+
+def _source(
+    path: Path,
+    views: ViewStore,
+    needed: NDArray[np.int64],
+    recipe: RecogniserRecipe,
+    planes: NDArray[np.float64] | None,
+    track: Track,
+) -> Source:
+    """Inputs of a store, and the row of each object of ``views`` in them, -1 for none."""
+    store = ViewStore.open(path)
+    row = {name: i for i, name in enumerate(store.names)}
+    rows = np.array([row.get(name, -1) for name in views.names])
+    if (rows[needed] < 0).all():
+        raise DatasetError(f"{path}: holds none of the training objects")
+    inputs = ready_inputs(path, recipe.size, recipe.input, track)
+    return Source(inputs, rows, None if planes is None else azimuth_bins(store, views.sphere.azimuths, planes))

@@ -1,0 +1,175 @@
+"""Decision states on the way of a policy, and the value of every next view there, by replay of predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.data.predictions import Predictions
+from nextview.data.scene_views import SceneSight, scenes_of, sight_of
+from nextview.errors import PredictionsError
+from nextview.learning.card_fits import fit_temperature
+from nextview.learning.fitting_set import FittingSet
+from nextview.policies.base import EpisodeState, Evidence, Policy
+from nextview.policies.baselines import Random
+from nextview.policies.gain import Gain
+from nextview.recognition.belief import PLAIN_SUM, Calibration, FixedLength, of_true_class
+from nextview.session.episode import run_episodes
+
+Float = NDArray[np.float64]
+
+OBJECTIVES = ("belief", "log-belief", "right")
+"""Value of the views so far: the belief in the true class, its logarithm, or whether the answer is right."""
+
+
+@dataclass(frozen=True)
+class ReplayTable:
+    """What held-out models say of N objects."""
+
+    data: FittingSet
+    maps: dict[str, NDArray[np.float32]]  # each (N, V, R, 3)
+    calibration: Calibration
+    scenes: SceneSight | None = None
+
+    @cached_property
+    def weights(self) -> Float:
+        """Weight of each view in the sum, (N, V); 0 where nothing is seen."""
+        return self.data.seen.astype(np.float64)
+
+    @classmethod
+    def select(
+        cls,
+        predictions: Predictions,
+        kept: NDArray,
+        rng: np.random.Generator,
+        sensed: Sequence[Predictions] = (),
+        scenes: SceneSight | None = None,
+    ) -> ReplayTable:
+        """Some of the objects of predictions, by index; calibrated here where their recogniser is not."""
+        if len(kept) == 0:
+            raise PredictionsError("no object is left to learn from")
+        parts = [part.of_objects(kept) for part in (predictions, *sensed)]
+        data = FittingSet.joined([FittingSet.of_all(part) for part in parts])
+        maps = {name: np.concatenate([part.maps[name] for part in parts]) for name in predictions.maps}
+        known = predictions.calibration != PLAIN_SUM
+        calibration = predictions.calibration if known else fit_temperature(data, rng)
+        scenes = scenes or scenes_of(predictions)
+        return cls(data, maps, calibration, None if scenes is None else scenes.of_scenes(np.tile(kept, len(parts))))
+
+
+@dataclass(frozen=True)
+class DecisionState:
+    """N episodes, one for each object, when the next view is to be chosen."""
+
+    state: EpisodeState
+    total: Float
+    travel: Float
+    seen: Float
+
+
+def rollout(
+    table: ReplayTable, policy: Policy, n_views: int, rng: np.random.Generator, visibility: bool = False
+) -> Iterator[DecisionState]:
+    """Every object once, from a random first view to where the policy leads: the decision state after each view."""
+    data, sphere, everything = table.data, table.data.sphere, np.arange(len(table.data))
+    starts = rng.integers(len(sphere), size=len(data))
+    if table.scenes is not None:
+        starts = np.where(table.scenes.reachable, rng.random(table.scenes.reachable.shape), -1).argmax(1)
+    constrain, visible = sight_of(table.scenes, everything)
+
+    def observe(objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
+        return Evidence(
+            data.logits[objects, views],
+            {name: values[objects, views] for name, values in table.maps.items()},
+            azimuth_bins=None if data.azimuth_bins is None else data.azimuth_bins[objects, views],
+            seen=data.seen[objects, views],
+        )
+
+    length = FixedLength(max_views=n_views)
+    steps = run_episodes(observe, sphere, policy, starts, length, rng, table.calibration, constrain, visible).steps
+    visited, travel = np.zeros((len(data), len(sphere)), bool), np.zeros(len(data))
+    for k, step in enumerate(steps, 1):
+        visited[step.episodes, step.views] = True
+        azimuth, seen = sphere.azimuth[step.views], np.maximum(step.seen, 1)
+        azimuth_bins = table.calibration.azimuth_bins(step.total, seen, len(data.classes), azimuth)
+        state = EpisodeState(step.views, visited.copy(), step.belief, step.evidence, k, step.episodes, azimuth_bins)
+        state = constrain(replace(state, visibility=visible(state) if visibility else None))
+        yield DecisionState(state, step.total, travel, step.seen)
+        if k < len(steps):
+            travel = travel + sphere.travel[step.views, step.next_views]
+
+
+def value_after(table: ReplayTable, total: Float, n_views: NDArray | int, kind: str) -> Float:
+    """The value, (N, ...), of sums of the log-evidence, (N, ..., D), after ``n_views`` views, by one of OBJECTIVES."""
+    logs = table.calibration.log_belief(total, n_views, len(table.data.classes))
+    return value_of(logs, table.data.labels, kind)
+
+
+def value_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
+    """The value of beliefs."""
+    if kind == "right":
+        return np.equal(logs.argmax(-1).T, labels).T.astype(np.float64)
+    of_truth = of_true_class(logs, labels)
+    return of_truth if kind == "log-belief" else np.exp(of_truth)
+
+
+def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Float:
+    """The value of looking from every view next, (N, V) float64."""
+    n_views = np.maximum(moment.seen[:, None] + table.weights, 1)
+    evidence = table.weights[..., None] * table.data.log_evidence
+    return value_after(table, moment.total[:, None] + evidence, n_views, kind)
+
+
+@dataclass(frozen=True)
+class Value:
+    """Mean objective, and travel in cells, after 2, 3, ... views, (views - 1,); classes weighted evenly."""
+
+    mean: Float
+    travel: Float
+
+
+def judge(
+    table: ReplayTable, policy: Policy, n_views: int, kind: str, rng: np.random.Generator, rounds: int = 8
+) -> Value:
+    """Follow a policy ``rounds`` times over every object."""
+    data = table.data
+    weights = data.weights / len(data) / rounds
+    reached = np.zeros((2, n_views - 1))
+    for _ in range(rounds):
+        for moment in rollout(table, policy, n_views, rng):
+            k = moment.state.step
+            if k > 1:
+                value = value_after(table, moment.total, np.maximum(moment.seen, 1), kind)
+                reached[:, k - 2] += weights @ value, weights @ moment.travel
+    return Value(*reached)
+
+
+TRAVEL_WEIGHTS = (0.0, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.012, 0.015, 0.02, 0.03, 0.05, 0.1)
+"""Of a grid cell of travel, in the unit of the objective."""
+
+
+def mean_value(parts: Sequence[Value], sizes: Sequence[int]) -> Value:
+    """Mean over all objects of values of policies that were judged on ``sizes`` objects each."""
+    return Value(*(np.average([getattr(p, name) for p in parts], 0, sizes) for name in ("mean", "travel")))
+
+
+def fit_travel_weight(judged: Sequence[tuple[ReplayTable, Gain]], n_views: int, kind: str, seed: int) -> float:
+    """The lowest of TRAVEL_WEIGHTS at which policies never travel farther than a random walk in the local window."""
+
+    def travel(policies: Iterable[Policy]) -> Float:
+        tables = [table for table, _ in judged]
+        values = [
+            judge(table, policy, n_views, kind, np.random.default_rng(seed))
+            for table, policy in zip(tables, policies, strict=True)
+        ]
+        return mean_value(values, [len(table.data) for table in tables]).travel
+
+    limit = travel(Random(table.data.sphere) for table, _ in judged)
+    for travel_weight in TRAVEL_WEIGHTS:
+        if (travel(replace(policy, travel_weight=travel_weight) for _, policy in judged) <= limit).all():
+            return travel_weight
+    return TRAVEL_WEIGHTS[-1]

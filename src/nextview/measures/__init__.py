@@ -1,1 +1,0 @@
-"""What makes a view good: measures by name, one file a family."""

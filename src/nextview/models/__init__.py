@@ -1,1 +1,0 @@
-"""Inference with ONNX Runtime: the bundled models, their cards and inputs."""

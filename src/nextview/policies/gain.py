@@ -1,0 +1,282 @@
+"""The policy that has learned what a view from each viewpoint brings, and weighs it against the travel there.
+
+It decides by numbers that do not depend on where the object's azimuth zero is. It knows the ring (from gravity), never
+the absolute azimuth: all views are written as cells (see ``policies.learned_tables``), seen from where the camera
+stands, or from where the recogniser believes the object's own zero to be. An object and its mirror image are alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import ModelError, PolicyError
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.policies.base import (
+    EpisodeState,
+    Scope,
+    best_view,
+    check_weight,
+    considered,
+    travel_from,
+    visibility_of,
+)  # fmt: skip
+from nextview.policies.learned_tables import cells_from, cells_to
+from nextview.recognition.inference import check_end, open_onnx, run_onnx
+from nextview.recognition.map_names import SPHERE, in_order, maps_among
+
+Float = NDArray[np.float64]
+
+INPUTS = ("belief", "view", "place", "azimuth_bin")
+"""What a network may take: the belief over all views; that by the last view alone; the ring and the views visited; and
+the azimuth bin that is seen, of the class believed most and over all classes. Any other name is that of a map."""
+VISIBILITY = "visibility"
+"""One more input, for cluttered scenes: the share of the object that is expected to show from each view."""
+Frame = Literal["camera", "object"]
+"""From where azimuths of cells are counted: the camera's, or that at which the object, if of the class believed most,
+most likely shows its azimuth bin 0."""
+FLOOR = np.log(1e-4)
+"""Logarithm of the smallest belief that is told apart from none."""
+FEATURES_INPUT = "told"
+"""The name that the features have in the ONNX file."""
+
+
+# What it decides by
+
+
+def maps_of(inputs: Sequence[str]) -> tuple[str, ...]:
+    """The predicted maps among some inputs, in the order of ``map_names.in_order``."""
+    return tuple(in_order(name for name in inputs if name not in (*INPUTS, VISIBILITY)))
+
+
+def ordered(inputs: Sequence[str]) -> tuple[str, ...]:
+    """Some inputs, each once, in the order of ``features``, whatever theirs: the maps stand behind the place."""
+    *before, azimuth_bin = INPUTS
+    return tuple(name for name in (*before, *maps_of(inputs), azimuth_bin, VISIBILITY) if name in inputs)
+
+
+def mirrored(sphere: ViewSphere) -> NDArray[np.int64]:
+    """The cell that lies as far behind as each lies ahead, (V,) int64."""
+    n = sphere.azimuths
+    return sphere.ring * n + (-sphere.azimuth_index) % n
+
+
+def origin(sphere: ViewSphere, state: EpisodeState, frame: Frame) -> NDArray[np.int64]:
+    """The view from which the cells of each episode are counted, (B,) int64."""
+    if frame == "camera":
+        return state.current
+    azimuth_bin = _most_believed(state.belief, _bin_belief(sphere, state)).argmax(1)
+    n = sphere.azimuths
+    return sphere.ring[state.current] * n + (sphere.azimuth_index[state.current] - azimuth_bin) % n
+
+
+def _bin_belief(sphere: ViewSphere, state: EpisodeState) -> Float:
+    """Belief in the azimuth bin that is seen from the current view, for each class, (B, C, azimuths)."""
+    if state.azimuth_bins is None or state.azimuth_bins.shape[2] != sphere.azimuths:
+        raise PolicyError(f"this policy needs a recogniser that discriminates {sphere.azimuths} azimuth bins")
+    return state.azimuth_bins
+
+
+def _most_believed(belief: Float, azimuth_bins: Float) -> Float:
+    """The azimuth bins of the class that is believed most, (B, azimuths)."""
+    return azimuth_bins[np.arange(len(belief)), belief.argmax(1)]
+
+
+def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], frame: Frame = "camera") -> Float:
+    """What a network takes of B episodes, none of it depending on the absolute azimuth."""
+    n, start = sphere.azimuths, origin(sphere, state, frame)
+    ahead = (sphere.azimuth_index[state.current] - sphere.azimuth_index[start]) % n
+    rows = np.arange(len(state.current))
+    parts: list[NDArray] = []
+    if "belief" in inputs:
+        parts += _facets(state.belief)
+    if "view" in inputs:
+        shifted = state.evidence.logits - state.evidence.logits.max(1, keepdims=True)
+        alone = np.exp(shifted.astype(np.float64))
+        parts += _facets(alone / alone.sum(1, keepdims=True))
+    if "place" in inputs:
+        parts.append(np.eye(sphere.rings)[sphere.ring[state.current]])
+        parts.append(state.visited[rows[:, None], cells_from(sphere)[start]])
+    for name in maps_of(inputs):
+        values = np.asarray(state.evidence.maps[name])
+        if name.endswith(SPHERE):  # its columns are counted from the camera
+            columns = (np.arange(n) - ahead[:, None]) % n
+            values = np.take_along_axis(values, columns[:, None], 2)
+        parts.append(values)
+    if "azimuth_bin" in inputs:
+        parts += [np.eye(n)[ahead]] if frame == "object" else []
+        azimuth_bins = _bin_belief(sphere, state)
+        over_all = (state.belief[:, :, None] * azimuth_bins).sum(1)
+        for believed in (_most_believed(state.belief, azimuth_bins), over_all):
+            parts.append(np.take_along_axis(believed, (np.arange(n) + ahead[:, None]) % n, 1))
+    if VISIBILITY in inputs:
+        parts.append(visibility_of(state)[rows[:, None], cells_from(sphere)[start]])
+    return np.concatenate([np.asarray(part, np.float64).reshape(len(rows), -1) for part in parts], 1)
+
+
+def _facets(belief: Float) -> list[Float]:
+    """A belief, its logarithm, and the three highest logarithms in order."""
+    logs = np.maximum(np.log(np.maximum(belief, 1e-300)), FLOOR) / -FLOOR + 1
+    return [belief, logs, -np.sort(-logs, 1)[:, :3]]
+
+
+def mirrored_features(
+    sphere: ViewSphere, classes: int, inputs: Sequence[str], frame: Frame = "camera"
+) -> NDArray[np.int64]:
+    """Which of the numbers of ``features`` stands in each place for the mirror image of an object, (D,) int64."""
+    n, facets = sphere.azimuths, 2 * classes + min(3, classes)
+    window = np.arange(sphere.rings * 3).reshape(-1, 3)[:, ::-1].ravel()
+    blocks = {
+        "belief": np.arange(facets),
+        "view": np.arange(facets),
+        "place": np.concatenate([np.arange(sphere.rings), sphere.rings + mirrored(sphere)]),
+        "azimuth_bin": np.concatenate([k * n + -np.arange(n) % n for k in range(2 if frame == "camera" else 3)]),
+        VISIBILITY: mirrored(sphere),
+    } | {name: mirrored(sphere) if name.endswith(SPHERE) else window for name in maps_of(inputs)}
+    chosen = [blocks[name] for name in ordered(inputs)]
+    begins = np.cumsum([0, *map(len, chosen)])
+    return np.concatenate([begin + block for begin, block in zip(begins, chosen, strict=False)])
+
+
+# The policy
+
+
+@dataclass(frozen=True)
+class Gain:
+    """The unvisited view whose predicted value, less the travel weight of the way there, is highest.
+
+    Small networks learn by replay of predictions what the belief in the true class becomes after each possible next
+    view (``nextview train gain``): fitted one-step lookahead, as in the value functions for sensor planning of Denzler
+    and Brown, "Information theoretic sensor data selection for active object recognition", PAMI 24 (2002), but
+    regressed from the decision state instead of simulated. They decide by ``features`` alone.
+
+    Attributes:
+        sphere: the viewpoints.
+        classes: how many, C.
+        score: from the features, (B, D) float32, to the value of each cell, (B, V) float32: the mean over some
+            networks and over the object and its mirror image. Each row by itself, to the last bit.
+        inputs: of which the features are made.
+        travel_weight: of a grid cell of travel, in the unit of the values: log-belief for the bundled one.
+        scope: where it may go.
+        frame: in which cells are counted.
+    """
+
+    sphere: ViewSphere
+    classes: int
+    score: Callable[[NDArray[np.float32]], NDArray[np.floating]]
+    inputs: tuple[str, ...]
+    travel_weight: float = 0.0
+    scope: Scope = "global"
+    frame: Frame = "camera"
+
+    def __post_init__(self) -> None:
+        maps = maps_of(self.inputs)
+        unknown = [name for name in maps if name not in maps_among(maps)]  # other needs of policies
+        if unknown or not self.inputs:
+            known, other = ", ".join((*INPUTS, VISIBILITY)), ", ".join(unknown) or "nothing"
+            raise PolicyError(f"a gain policy takes some of {known} and of the maps that are predicted, not {other}")
+        check_weight(self.travel_weight)
+        if self.frame not in get_args(Frame):
+            raise PolicyError(f"cells are counted from one of {', '.join(get_args(Frame))}, not {self.frame!r}")
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The maps that the features are made of, the azimuth bins, and what shows."""
+        azimuth_bins = "azimuth_bin" in self.inputs or self.frame == "object"
+        others = {"azimuth_bins": azimuth_bins, VISIBILITY: VISIBILITY in self.inputs}
+        return (*maps_of(self.inputs), *(name for name, taken in others.items() if taken))
+
+    def gains(self, state: EpisodeState) -> Float:
+        """The predicted value of each view, (B, V) float64; only differences between views mean anything."""
+        given = features(self.sphere, state, self.inputs, self.frame).astype(np.float32)
+        cells = self.score(given).astype(np.float64)
+        cells -= 1e-9 * np.arange(len(self.sphere))  # cells that are mirror images may tie; the first of them is taken
+        return np.take_along_axis(cells, cells_to(self.sphere)[origin(self.sphere, state, self.frame)], 1)
+
+    def view_values(self, state: EpisodeState) -> Float:
+        """Predicted gain of each view less the weighted travel there, (B, V); differences between views count."""
+        return self.gains(state) - self.travel_weight * travel_from(self.sphere, state)
+
+    def scores(self, state: EpisodeState) -> Float:
+        """The gains of the views where it may go; see ``ScoresViews``."""
+        return considered(self.sphere, state, self.gains(state), self.scope)
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        return best_view(self.sphere, state, self.view_values(state), self.scope)
+
+
+@dataclass(frozen=True)
+class VisibleGain:
+    """The free view with the highest product of what shows from it and its value if all shows.
+
+    The learned gain of a view tells only how much better it is than others. So a clear view is taken to bring, on the
+    average, all that the belief still lacks: its entropy. Where everything shows it goes where the gain policy goes.
+    """
+
+    gain: Gain
+    travel_weight: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_weight(self.travel_weight)
+
+    @property
+    def sphere(self) -> ViewSphere:
+        """The viewpoints."""
+        return self.gain.sphere
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Those of the gain policy, and what shows."""
+        return (*(name for name in self.gain.needs if name != "visibility"), "visibility")
+
+    def scores(self, state: EpisodeState) -> Float:
+        """The products, (B, V); see ``ScoresViews``."""
+        gains, free = self.gain.gains(state), state.free
+        mean = (gains * free).sum(1, keepdims=True) / np.maximum(free.sum(1, keepdims=True), 1)
+        lacking = -(state.belief * np.log(np.maximum(state.belief, 1e-300))).sum(1, keepdims=True)
+        return visibility_of(state) * (lacking + gains - mean)
+
+    def view_values(self, state: EpisodeState) -> Float:
+        """The products less the weighted travel there, (B, V)."""
+        return self.scores(state) - self.travel_weight * travel_from(self.sphere, state)
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        return best_view(self.sphere, state, self.view_values(state))
+
+
+# Its file
+
+
+class GainTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the card of a gain policy holds beside the sphere; attributes as those of ``Gain``."""
+
+    classes: int
+    inputs: tuple[str, ...]
+    travel_weight: float
+    frame: Frame
+
+
+def read_gain(sphere: ViewSphere, table: GainTable, scope: Scope, weights: Path, sha256: str) -> Gain:
+    """The policy that a card describes."""
+    session = open_onnx(weights, sha256, threads=1)
+
+    def score(features: NDArray[np.float32]) -> NDArray[np.float32]:
+        return run_onnx(weights, session, ["cells"], features)[0]
+
+    policy = Gain(sphere, table.classes, score, table.inputs, table.travel_weight, scope, table.frame)
+    width = len(mirrored_features(sphere, policy.classes, policy.inputs, policy.frame))
+    ends = [*session.get_inputs(), *session.get_outputs()]
+    if [end.name for end in ends] != [FEATURES_INPUT, "cells"]:
+        names = ", ".join(end.name for end in ends)
+        raise ModelError(f"{weights}: has {names}, not {FEATURES_INPUT} and cells")
+    for end, size in zip(ends, (width, len(sphere)), strict=True):
+        check_end(weights, end, "tensor(float)", (size,))
+    # The graph answers with what is not a number if any weight is not finite, whatever it is given.
+    score(np.zeros((1, width), np.float32))
+    return policy

@@ -1,0 +1,1 @@
+"""Evidence, belief, calibration, novelty; ONNX models and their cards."""

@@ -1,0 +1,296 @@
+"""Fuse the evidence of several views: belief over classes, calibration, size, and when to stop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.checks import number, whole
+from nextview.errors import ModelError, RiskError, UsageError
+
+Float = NDArray[np.float64]
+Floating = NDArray[np.floating]
+
+
+def fuse(logits: Floating, temperature: float = 1.0) -> Float:
+    """Belief after several views: softmax of the sum of their logits (thesis, section 4.4), over a temperature.
+
+    From logits (..., views, classes), finite; (..., classes) float64, sums to 1.
+    """
+    logits = np.asarray(logits, np.float64)
+    if not np.isfinite(logits).all():
+        raise ModelError("the recogniser gave a logit that is not a finite number")
+    return _softmax(logits.sum(-2) / temperature)
+
+
+def _softmax(logs: Floating) -> Float:
+    values = np.exp(logs - logs.max(-1, keepdims=True))
+    return values / values.sum(-1, keepdims=True)
+
+
+def _pointing(total: Floating, classes: int) -> Floating:
+    """Sums of log-evidence of the azimuths to which azimuth bin 0 points, (..., azimuth bins, classes)."""
+    return total[..., classes:].reshape(*total.shape[:-1], -1, classes)
+
+
+def reorient(azimuth_bins: Floating, azimuth: Floating) -> Floating:
+    """Log-evidence of the bins seen from an azimuth as log-evidence of the azimuths to which bin 0 points; or back.
+
+    From azimuth a, bin s is seen if bin 0 points to a - s: the same sum turns either into the other. Between two steps
+    the likelihoods are interpolated, not their logarithms, so that they sum to the same over all azimuths. From (...,
+    classes, azimuth bins), in even steps of azimuth, and azimuths of the views, radians, (...).
+    """
+    n = azimuth_bins.shape[-1]
+    steps = np.asarray(azimuth, np.float64)[..., None, None] / (2 * np.pi) * n
+    low = np.floor(steps + 1e-9)
+    share = np.maximum(steps - low, 0)
+
+    def turned(by: Float) -> Floating:
+        source = (by.astype(np.int64) - np.arange(n)) % n
+        return np.take_along_axis(azimuth_bins, np.broadcast_to(source, azimuth_bins.shape), -1)
+
+    before = turned(low)
+    if not (share > 1e-9).any():
+        return before
+    after = turned(low + 1)
+    top = np.maximum(before, after)
+    mixed = top + np.log((1 - share) * np.exp(before - top) + share * np.exp(after - top))
+    return np.where(share > 1e-9, mixed, before)
+
+
+def log_evidence_of(logits: Floating, azimuth_bins: Floating | None, azimuth: Floating) -> Floating:
+    """Log-evidence of views in a form that can be summed over views: see ``Calibration.belief``.
+
+    From logits (..., classes), log-likelihoods of the azimuth bins seen, (..., classes, azimuth bins), or None,
+    and azimuths, radians, (...): the logits, then for each azimuth the log-evidence that azimuth bin 0 points there,
+    given each class, (..., (1 + azimuth bins) * classes). The logits alone without azimuth bins.
+    """
+    if azimuth_bins is None:
+        return logits
+    pointing = reorient(azimuth_bins, np.broadcast_to(azimuth, logits.shape[:-1])).swapaxes(-1, -2)
+    return np.concatenate([logits, pointing.reshape(*logits.shape[:-1], -1)], -1)
+
+
+def of_true_class(logs: Float, labels: NDArray[np.int64]) -> Float:
+    """Log-belief in the true class, (N, ...), from logits (N, ..., C) up to a constant and labels (N,)."""
+    top = logs.max(-1)
+    of_truth = logs[np.arange(len(labels)), ..., labels]
+    return of_truth - top - np.log(np.exp(logs - top[..., None]).sum(-1))
+
+
+class RiskBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Upper bounds of the error rate of those who stop at a threshold, from validation objects.
+
+    Of T ascending ``thresholds``, by the views that may be taken (1, 2, ...), (views, T); such a promise fails with the
+    probability ``delta``.
+    """
+
+    thresholds: tuple[float, ...]
+    bounds: tuple[tuple[float, ...], ...]
+    delta: float
+
+    def __post_init__(self) -> None:
+        ascending = all(a < b for a, b in zip(self.thresholds, self.thresholds[1:], strict=False))
+        fits = self.thresholds and self.bounds and all(len(row) == len(self.thresholds) for row in self.bounds)
+        rates = all(0 <= rate <= 1 for row in self.bounds for rate in row) and 0 < self.delta < 1
+        if not (ascending and fits and rates):
+            raise ModelError("error rates that cannot be promised: they do not fit their thresholds")
+
+    def threshold(self, risk: float, max_views: int) -> float:
+        """The lowest threshold that promises an error rate of at most ``risk``; RiskError if none does."""
+        if not 0 < risk < 1:
+            raise RiskError(f"the risk is an error rate between 0 and 1, not {risk}")
+        if max_views > len(self.bounds):
+            raise RiskError(f"error rates were calibrated for at most {len(self.bounds)} views, not {max_views}")
+        row = self.bounds[max_views - 1]
+        for threshold, bound in zip(self.thresholds, row, strict=True):
+            if bound <= risk:
+                return threshold
+        raise RiskError(f"this recogniser cannot promise an error rate of {risk}, only {min(row):.3f} and more")
+
+
+class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """How far to trust a sum of logits. Views of one object err together, so k of them are not k pieces of evidence.
+
+    The sum over k views is divided by ``temperature * (1 + correlation * (k - 1))``: what the variance of a sum of k
+    equally correlated terms grows by, beyond k. Correlation 0 trusts the sum, 1 the mean.
+
+    Azimuth bins count too, if the recogniser knows them: an object stands still, so views from different azimuths have
+    to agree on where its azimuth bin 0 points. The belief in a class is multiplied by the likelihood of that agreement,
+    summed over all azimuths.
+
+    Attributes:
+        temperature: of a single view.
+        correlation: of the evidence of two views, 0 .. 1.
+        risk: for stopping with a promise; None if not known.
+        bin_correlation: of the azimuth bins of two views, 0 .. 1; None where these shall not count for the class.
+
+    Raises:
+        ModelError: a temperature that is not positive, or a negative number.
+    """
+
+    temperature: float = 1.0
+    correlation: float = 0.0
+    risk: RiskBounds | None = None
+    bin_correlation: float | None = None
+
+    def __post_init__(self) -> None:
+        numbers = (self.correlation, self.bin_correlation or 0.0)
+        if not 0 < self.temperature < np.inf or not all(0 <= x < np.inf for x in numbers):
+            raise ModelError(
+                f"no calibration: temperature {self.temperature}, correlation {self.correlation}, of azimuth bins "
+                f"{self.bin_correlation}"
+            )
+
+    def temperature_after(self, n_views: int) -> float:
+        """What the sum of the logits of so many views is divided by."""
+        return self.temperature * (1 + self.correlation * (n_views - 1))
+
+    def log_belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
+        """Logarithm of the belief in each class, up to a constant for all classes, (..., classes) float64.
+
+        ``total`` is the sum over ``n_views`` views, one number or (...), of ``log_evidence_of``.
+        """
+        if not np.isfinite(total).all():
+            raise ModelError("the recogniser said something that is not a finite number")
+        more = np.asarray(n_views)[..., None] - 1
+        total = np.asarray(total, np.float64)
+        logs = total[..., :classes] / (self.temperature * (1 + self.correlation * more))
+        if self.bin_correlation is None or total.shape[-1] == classes:
+            return logs
+        pointing = _pointing(total, classes) / (1 + self.bin_correlation * more)[..., None]
+        top = pointing.max(-2)
+        pointing -= top[..., None, :]
+        return logs + top + np.log(np.exp(pointing, out=pointing).sum(-2))
+
+    def belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
+        """Belief in each class, (..., classes) float64, sums to 1; arguments as for ``log_belief``."""
+        return _softmax(self.log_belief(total, n_views, classes))
+
+    def azimuth_bins(self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating) -> Float | None:
+        """Belief in the azimuth bin seen from an azimuth, radians, given each class: (..., classes, azimuth bins).
+
+        None without azimuth bins; ``total`` as for ``log_belief``.
+        """
+        if total.shape[-1] == classes:
+            return None
+        correlation = self.correlation if self.bin_correlation is None else self.bin_correlation
+        more = np.asarray(n_views)[..., None, None] - 1
+        pointing = _pointing(np.asarray(total, np.float64), classes) / (1 + correlation * more)
+        return _softmax(reorient(pointing.swapaxes(-1, -2), azimuth))
+
+    def threshold(self, risk: float, max_views: int) -> float:
+        """The lowest threshold of the belief that promises an error rate; RiskError if none does."""
+        if self.risk is None:
+            raise RiskError("this recogniser promises no error rate; calibrate it with nextview fit calibration")
+        return self.risk.threshold(risk, max_views)
+
+
+PLAIN_SUM = Calibration()
+"""Trusts the sum of the logits as it stands, as the thesis did."""
+
+
+class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
+    """How likely each size is for an object of each class; it is added to the logits of views whose scale is known.
+
+    ``radii_m`` are object radii, metres, ascending, (R,); ``log_density`` that of their logarithm, (C, R); ``weight``
+    that of it beside the logits.
+    """
+
+    radii_m: tuple[float, ...]
+    log_density: tuple[tuple[float, ...], ...]
+    weight: float
+
+    def __post_init__(self) -> None:
+        radii, fits = np.array(self.radii_m), {len(row) for row in self.log_density} == {len(self.radii_m)}
+        if not fits or not len(radii) or radii[0] <= 0 or not (np.diff(radii) > 0).all() or not self.weight >= 0:
+            raise ModelError("sizes that do not fit together")
+
+    @classmethod
+    def from_arrays(cls, radii: Float, log_density: Float, weight: float) -> SizeEvidence:
+        """From arrays (R,) and (C, R)."""
+        return cls(tuple(radii.tolist()), tuple(map(tuple, log_density.tolist())), float(weight))
+
+    @cached_property
+    def _table(self) -> tuple[Float, Float]:
+        return np.log(np.array(self.radii_m)), np.array(self.log_density)
+
+    def logits(self, radii: Floating) -> NDArray[np.float32]:
+        """What is added to the logits, (B, C) float32, for object radii in metres, (B,); zero where these are NaN."""
+        at = np.log(np.where(np.isfinite(radii), radii, 1.0))
+        grid, table = self._table
+        densities = np.stack([np.interp(at, grid, row) for row in table], 1)
+        return np.where(np.isfinite(radii)[:, None], self.weight * densities, 0).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """Stop when the belief's peak reaches a threshold, or after ``max_views`` views.
+
+    The threshold is ``threshold`` at the first view. With a ``threshold_decay`` its log-odds are then divided by
+    ``1 + threshold_decay * (views - 1)``: what is unclear after several views is seldom cleared up by another one. A
+    calibrated belief whose threshold decay is its correlation stops where the plain sum of logits does.
+
+    Raises:
+        UsageError: a threshold outside 0 .. 1, fewer than one view, or a negative threshold decay.
+    """
+
+    threshold: float = 0.97
+    max_views: int = 5
+    threshold_decay: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= number(self.threshold, "the threshold") <= 1:
+            raise UsageError(f"the threshold is a probability between 0 and 1, not {self.threshold}")
+        if whole(self.max_views, "the number of views", -(2**31)) < 1:
+            raise UsageError(f"at least one view has to be taken, not {self.max_views}")
+        number(self.threshold_decay, "the threshold decay", 0)
+
+    @classmethod
+    def of(
+        cls, calibration: Calibration, threshold: float = 0.97, risk: float | None = None, max_views: int = 5
+    ) -> Stopping:
+        """The rule that goes with a recogniser's calibration: the threshold decays with its correlation.
+
+        With a ``risk`` instead, the lowest threshold at which at most this share of those who stop early is wrong; it
+        does not decay. RiskError if that cannot be promised.
+        """
+        if risk is not None:
+            return cls(calibration.threshold(risk, max_views), max_views)
+        return cls(threshold, max_views, calibration.correlation)
+
+    def reached(self, belief: Floating, n_views: NDArray | int) -> NDArray[np.bool_]:
+        """Whether beliefs, (..., classes), after so many views, (...), are sure enough to stop, (...)."""
+        return belief.max(-1) >= self.threshold_at(n_views)
+
+    def threshold_at(self, n_views: NDArray | int) -> Float:
+        """The belief at which to stop after so many views, same shape."""
+        if self.threshold_decay == 0 or self.threshold in (0, 1):
+            return np.full(np.shape(n_views), float(self.threshold))
+        odds = np.log(self.threshold / (1 - self.threshold)) / (1 + self.threshold_decay * (np.asarray(n_views) - 1))
+        return 1 / (1 + np.exp(-odds))
+
+    def __str__(self) -> str:
+        """The thresholds in words: "threshold 0.97 at the first view, 0.86 at the second"."""
+        if self.threshold_decay == 0 or self.max_views == 1:
+            return f"threshold {self.threshold:.3g}"
+        first, second = self.threshold_at(np.arange(1, 3))
+        last = f", {float(self.threshold_at(self.max_views)):.2g} at view {self.max_views}" * (self.max_views > 2)
+        return f"threshold {first:.3g} at the first view, {second:.2g} at the second{last}"
+
+
+@dataclass(frozen=True)
+class FixedLength(Stopping):
+    """Stop after ``max_views`` views and never before, however sure the belief is; the threshold counts for nothing."""
+
+    def threshold_at(self, n_views: NDArray | int) -> Float:
+        """Infinity, which no belief reaches, same shape."""
+        return np.full(np.shape(n_views), np.inf)
+
+    def __str__(self) -> str:
+        """In words."""
+        return f"{self.max_views} views"

@@ -1,0 +1,54 @@
+"""What the models say of views: the evidence that belief and policies work with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.geometry.observation import Observation
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the models say of one view in each of B episodes.
+
+    Attributes:
+        logits: (B, classes) float.
+        maps: the maps that the policy needs, by name: local maps ("lem"), (B, rings, 3) float, and maps of the whole
+            sphere ("lem-sphere"), (B, rings, azimuths), columns once round from the view.
+        azimuth_bins: log-likelihood of each azimuth bin being the one that is seen, given each class, (B, classes,
+            azimuth bins) float. None if the recogniser cannot tell.
+        seen: whether anything was seen, (B,) bool; None if something was in all. A view without is no evidence: in
+            episodes all the above counts as zero there.
+        novelty: score of each view, (B,) float, see ``nextview.recognition.novelty``; None if the recogniser has none.
+        observations: the views themselves, B of them; None where only what the models say is known.
+    """
+
+    logits: NDArray[np.floating]
+    maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
+    azimuth_bins: NDArray[np.floating] | None = None
+    seen: NDArray[np.bool_] | None = None
+    novelty: NDArray[np.floating] | None = None
+    observations: Sequence[Observation] | None = None
+
+    def select(self, rows: Any) -> Evidence:
+        """Evidence of some of the episodes, by index or mask."""
+
+        def some(values: Any) -> Any:
+            return None if values is None else values[rows]
+
+        maps, observations = (
+            {name: values[rows] for name, values in self.maps.items()},
+            items_at(self.observations, rows),
+        )
+        bins, seen, novelty = map(some, (self.azimuth_bins, self.seen, self.novelty))
+        return Evidence(self.logits[rows], maps, bins, seen, novelty, observations)
+
+
+def items_at(items: Sequence[Any] | None, rows: Any) -> list[Any] | None:
+    """Some items of a sequence, by index or mask; None of None."""
+    return None if items is None else [items[i] for i in np.arange(len(items))[rows]]

@@ -1,0 +1,224 @@
+"""Run the networks with ONNX Runtime: the recogniser, map networks, and any file that a card describes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from nextview.checks import one_line
+from nextview.errors import ModelError
+from nextview.files import checked_bytes
+from nextview.geometry.observation import Observation
+from nextview.recognition.evidence import Evidence
+from nextview.recognition.map_names import SPHERE, maps_among
+from nextview.recognition.model_card import MAPS, RECOGNISER, ModelCard, find_card
+from nextview.recognition.network_input import from_observations
+from nextview.recognition.novelty import novelty_path, read_novelty
+
+INPUT = "input"
+BINS_OUTPUT = "sides"
+FEATURES_OUTPUT = "features"
+"""Ends of a recogniser's ONNX file: the last is what its last layers make the logits of, (B, F)."""
+LONGEST = 300
+"""Letters of what the runtime says."""
+Shape = tuple[int | None, ...]
+"""Without the batch; None for a size that is free."""
+
+
+def open_onnx(path: Path, sha256: str, threads: int = 0) -> ort.InferenceSession:
+    """Check the hash of an ONNX file, which holds all its weights, and hand it to ONNX Runtime."""
+    content = checked_bytes(path, sha256)
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    # Threads that wait for more work of one network would take the cores from the next: a third of the time of a view.
+    options.add_session_config_entry("session.force_spinning_stop", "1")
+    # The hash is of this file alone: weights that it refers to in others, of the working folder say, are not found.
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(path))
+    try:
+        return ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # the runtime has a class of exception for every reason
+        raise ModelError(f"{path}: not a usable ONNX model ({one_line(str(error), LONGEST)})") from None
+
+
+def run_onnx(
+    path: Path, session: ort.InferenceSession, names: Sequence[str], inputs: NDArray[Any]
+) -> list[NDArray[Any]]:
+    """The named outputs of a network with one input, (B, ...); ModelError if they are not B rows of finite numbers."""
+    try:
+        answers = session.run(list(names), {session.get_inputs()[0].name: inputs})
+    except Exception as error:  # as above
+        raise ModelError(f"{path}: fails when it is run ({one_line(str(error), LONGEST)})") from None
+    declared = {end.name: end.shape for end in session.get_outputs()}
+    for name, values in zip(names, answers, strict=True):
+        wanted = (len(inputs), *declared[name][1:])
+        fits = zip(wanted, values.shape, strict=False)
+        if values.ndim != len(wanted) or any(isinstance(w, int) and w != there for w, there in fits):
+            raise ModelError(f"{path}: gives {name} of the shape {values.shape} for {len(inputs)} inputs")
+        if not np.isfinite(values).all():
+            raise ModelError(f"{path}: gives {name} that are not finite numbers")
+    return answers
+
+
+def check_input(path: Path, session: ort.InferenceSession, name: str | None, kind: str, shape: Shape) -> None:
+    """Refuse a network that takes anything but one input of a name (None: any), see ``check_end``."""
+    ends = session.get_inputs()
+    if len(ends) != 1 or name not in (None, ends[0].name):
+        wants = ", ".join(end.name for end in ends) or "nothing"
+        raise ModelError(f"{path}: takes {wants}, not one input{f' called {name}' if name else ''}")
+    check_end(path, ends[0], kind, shape)
+
+
+def check_end(path: Path, end: ort.NodeArg, kind: str, shape: Shape) -> None:
+    """Refuse an input or output that is not of this type ("tensor(float)") and shape, after a free batch dimension."""
+    there = end.shape[1:]
+    fits = len(end.shape) == len(shape) + 1 and all(w in (None, f) for w, f in zip(shape, there, strict=True))
+    if not fits or end.type != kind or isinstance(end.shape[0], int):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        sizes = ", ".join(map(str, end.shape))
+        raise ModelError(f"{path}: has {end.name} ({sizes}) {end.type}, not (batch, {wanted}) {kind} as its card says")
+
+
+def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
+    """Open a model's file and check its inputs and outputs against its card."""
+    session = open_onnx(card.path, card.sha256, threads)
+    kind = "tensor(float)" if card.input.kind == "cloud" else "tensor(uint8)"
+    ends = {end.name: end for end in session.get_outputs()}
+    shapes: dict[str, Shape]
+    if card.is_recogniser:
+        shapes = {"logits": (len(card.classes),)}
+        if card.azimuth_bins:
+            shapes[BINS_OUTPUT] = (len(card.classes), card.azimuth_bins)
+        if card.novelty_sha256:
+            shapes[FEATURES_OUTPUT] = (None,)
+    else:
+        shapes = {"map": (None, 3)} | ({"sphere": (None, None)} if card.output == "sphere" else {})
+    check_input(card.path, session, INPUT if card.is_recogniser else None, kind, card.input.shape)
+    for name, shape in shapes.items():
+        if name not in ends:
+            raise ModelError(f"{card.path}: gives no {name}, which its card promises")
+        check_end(card.path, ends[name], "tensor(float)", shape)
+    return session
+
+
+class Recogniser:
+    """Classifies the object in each view, by its shape and, where the camera knows it, by its size.
+
+    ``model`` is the name of a bundled model, or the path of a card, ``threads`` those of ONNX Runtime, 0 for one on
+    each core. It discriminates so many ``azimuth_bins``, 0 for none; ``novelty`` is None if that was not fitted.
+    """
+
+    def __init__(self, model: str | Path = RECOGNISER, threads: int = 0) -> None:
+        self.card = find_card(model)
+        if not self.card.is_recogniser:
+            raise ModelError(f"model {self.card.name} is a {self.card.kind}, not a recogniser")
+        self.classes = self.card.classes
+        self.azimuth_bins = self.card.azimuth_bins
+        self.calibration = self.card.calibration
+        self._session = open_weights(self.card, threads)
+        sha256 = self.card.novelty_sha256
+        self.novelty = read_novelty(novelty_path(self.card.path), sha256) if sha256 else None
+
+    def __call__(self, observations: Sequence[Observation]) -> Evidence:
+        """Evidence of B views from one camera; views in which nothing is seen are marked, see ``Evidence.seen``."""
+        inputs = from_observations(self.card.input, observations)
+        evidence = replace(self.from_inputs(inputs), seen=np.array([o.seen for o in observations]))
+        if self.card.size is None:
+            return evidence
+        radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
+        return replace(evidence, logits=evidence.logits + self.card.size.logits(radii))
+
+    def from_inputs(self, inputs: NDArray[Any]) -> Evidence:
+        """Evidence by shape alone, from what the network takes, see ``network_input``."""
+        names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins) + [FEATURES_OUTPUT] * (self.novelty is not None)
+        outputs = dict(zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True))
+        novelty = None if self.novelty is None else self.novelty.scores(outputs[FEATURES_OUTPUT])
+        return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT), novelty=novelty)
+
+    def features(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
+        """What the last layer makes the logits of, (B, F), from what the network takes."""
+        if FEATURES_OUTPUT not in [end.name for end in self._session.get_outputs()]:
+            raise ModelError(f"{self.card.path}: gives no {FEATURES_OUTPUT}; export the recogniser again")
+        return run_onnx(self.card.path, self._session, [FEATURES_OUTPUT], inputs)[0]
+
+
+class MapNetwork:
+    """Predicts the local map around each view from the geometry seen, or from its partial cloud, as its card says.
+
+    ``rings`` is how many rings of views the map has, None if its file leaves that open. Arguments as of ``Recogniser``.
+    """
+
+    def __init__(self, model: str | Path, threads: int = 0) -> None:
+        self.card = find_card(model)
+        if self.card.is_recogniser:
+            raise ModelError(f"model {self.card.name} is a recogniser, not a map network")
+        self._session = open_weights(self.card, threads)
+        rings = next(end.shape[1] for end in self._session.get_outputs() if end.name == "map")
+        self.rings: int | None = rings if isinstance(rings, int) else None
+
+    def __call__(self, observations: Sequence[Observation]) -> dict[str, NDArray[np.float32]]:
+        """Maps of views from one camera, by name: see ``Evidence.maps``."""
+        return self.from_inputs(from_observations(self.card.input, observations))
+
+    def from_inputs(self, inputs: NDArray[Any]) -> dict[str, NDArray[np.float32]]:
+        """The same from what the network takes, see ``network_input``."""
+        names = self.card.maps
+        outputs = run_onnx(self.card.path, self._session, ["map", "sphere"][: len(names)], inputs)
+        return dict(zip(names, outputs, strict=True))
+
+
+@dataclass(frozen=True)
+class Models:
+    """The recogniser and the map networks that a policy needs."""
+
+    recogniser: Recogniser
+    maps: dict[str, MapNetwork]
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of the logits."""
+        return self.recogniser.classes
+
+    @property
+    def map_names(self) -> tuple[str, ...]:
+        """Names of the maps that the networks predict."""
+        return names_of(self.maps)
+
+    def valley_classes(self, map_name: str) -> tuple[int, ...]:
+        """Classes (indices) for which a map's valley is the better view, as its card says; none without that map."""
+        network = self.maps.get(map_name)
+        valleys = () if network is None else network.card.valleys(self.classes)
+        return tuple(self.classes.index(c) for c in valleys if c in self.classes)
+
+    def evidence(self, observations: Sequence[Observation]) -> Evidence:
+        """Evidence and maps of views from one camera."""
+        maps = {name: values for network in self.maps.values() for name, values in network(observations).items()}
+        return replace(self.recogniser(observations), maps=maps, observations=observations)
+
+
+def names_of(networks: Mapping[str, MapNetwork]) -> tuple[str, ...]:
+    """Names of the maps that some networks predict."""
+    return tuple(name for network in networks.values() for name in network.card.maps)
+
+
+def open_maps(cards: Mapping[str, str | Path], needs: Sequence[str], threads: int = 0) -> dict[str, MapNetwork]:
+    """The networks, of some cards, that predict the maps among a policy's needs, by the name of the local map."""
+    wanted = maps_among(needs)
+    names = dict.fromkeys(name.removesuffix(SPHERE) for name in wanted)
+    networks = {name: MapNetwork(cards[name], threads) for name in names if name in cards}
+    missing = [name for name in wanted if name not in names_of(networks)]
+    if missing:
+        known = (name for card in cards.values() for name in find_card(card).maps)
+        raise ModelError(f"no network predicts the map {missing[0]!r}; there are {', '.join(known)}")
+    return networks
+
+
+def load_models(maps: Sequence[str] = (), recogniser: str | Path = RECOGNISER, threads: int = 0) -> Models:
+    """The bundled recogniser, or that of a card, and the bundled map networks of some names or of a policy's needs."""
+    return Models(Recogniser(recogniser, threads), open_maps(MAPS, maps, threads))

@@ -1,0 +1,49 @@
+"""Names of the maps of measures, in cards, predictions and policies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+Good = Literal["peak", "valley"]
+"""Where a measure's map has the better views: at its highest values or its lowest."""
+
+CONFIDENCE = "confidence"
+"""The recogniser's confidence where it is right, as a measure of views; it takes predictions instead of views."""
+
+LEM, LCM = "lem", "lcm"
+MAP_NAMES = {"depth_entropy": LEM, CONFIDENCE: LCM}
+"""The maps of two measures have the thesis's names; those of all others are called as the measure."""
+
+SPHERE = "-sphere"
+"""How the name of a map of the whole sphere ends; without this it is the map of the local window."""
+
+
+def map_name(measure: str) -> str:
+    """The name of the map of a measure."""
+    return MAP_NAMES.get(measure, measure)
+
+
+def measure_of(name: str) -> str:
+    """The measure of the map of this name."""
+    return next((measure for measure, own in MAP_NAMES.items() if own == name), name)
+
+
+def maps_among(needs: Sequence[str]) -> list[str]:
+    """Those of a policy's needs that are maps."""
+    return [name for name in needs if name not in ("azimuth_bins", "observations", "visibility")]
+
+
+def in_order(maps: Iterable[str]) -> list[str]:
+    """Names of maps, each once, in the order of networks and tables.
+
+    Maps of local windows stand before those of whole spheres; of each kind the thesis's come first, then the others by
+    the alphabet.
+    """
+    own = list(MAP_NAMES.values())
+
+    def place(name: str) -> tuple[bool, int, str]:
+        window = name.removesuffix(SPHERE)
+        return window != name, own.index(window) if window in own else len(own), window
+
+    return sorted(set(maps), key=place)

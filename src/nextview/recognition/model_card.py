@@ -1,0 +1,182 @@
+"""The card of a model: what it is, how it was made, how good it is, and which file holds its weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec.structs import replace
+
+from nextview.errors import ModelError
+from nextview.files import Sha256, read_record, regular_file, write_record
+from nextview.recognition.belief import PLAIN_SUM, Calibration, SizeEvidence
+from nextview.recognition.map_names import LCM, LEM, SPHERE, Good
+from nextview.recognition.network_input import InputSpec
+
+BUNDLED = Path(__file__).parent / "bundled"
+RECOGNISER = "recogniser-modelnet10"
+MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}
+"""The map networks that are bundled, by the name of the map."""
+NOWHERE = Path()
+
+
+class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a network learned from, in words, the settings of each training, and every command that made it."""
+
+    data: str = ""
+    recipes: tuple[dict[str, Any], ...] = ()
+    commands: tuple[str, ...] = ()
+
+
+class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="schema", tag=2):
+    """One model; as a file, a JSON object of these fields beside the ONNX file of the same name.
+
+    Attributes:
+        name: what users call it.
+        kind: "recogniser" or the name of the map that it predicts ("lem").
+        input: what it takes of a view.
+        sha256: of its ONNX file.
+        path: of that file; it does not stand in the card.
+        network: which architecture, in words.
+        classes: of a recogniser, unique, in the order of its logits.
+        azimuth_bins: of an object that a recogniser discriminates; 0 for none.
+        calibration: of a recogniser.
+        size: what a recogniser knows of the sizes of objects; None if nothing.
+        novelty_sha256: of the novelty score beside the card; "" if there is none.
+        measure: of which a map network predicts the map.
+        good: where such a map has the better views.
+        output: of a map network: the local window, or the whole sphere, of which the window is a part.
+        valley_classes: for which the valley of its map was found to be the better view.
+        valley_gain: by how much, for each class.
+        training: how it was made.
+        scores: on each set of objects.
+        largest_difference_to_torch: of the file's answers; None if it was not measured.
+        note: what else is to be said.
+        held_out: objects of the training split that it was not trained on; () if it does not say.
+        fitted_to: what calibration, size, novelty and valleys were fitted to, in words, by their names.
+
+    Raises:
+        ModelError: a recogniser without classes, sizes of other classes than these, or a network of no input.
+    """
+
+    name: str
+    kind: str
+    input: InputSpec
+    sha256: Sha256
+    path: Path = NOWHERE
+    network: str = ""
+    classes: tuple[str, ...] = ()
+    azimuth_bins: int = 0
+    calibration: Calibration = PLAIN_SUM
+    size: SizeEvidence | None = None
+    novelty_sha256: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")] = ""
+    measure: str = ""
+    good: Good = "peak"
+    output: Literal["window", "sphere"] = "window"
+    valley_classes: tuple[str, ...] = ()
+    valley_gain: dict[str, float] = {}
+    training: Training = Training()
+    scores: dict[str, Any] = {}
+    largest_difference_to_torch: float | None = None
+    note: str = ""
+    held_out: tuple[str, ...] = ()
+    fitted_to: dict[str, str] = {}
+
+    def __post_init__(self) -> None:
+        if not self.name or not self.kind:
+            raise ModelError("a model has a name and a kind")
+        if self.is_recogniser and (not self.classes or self.input.kind == "cloud"):
+            raise ModelError("a recogniser has classes, and takes geometry or images")
+        if len(set(self.classes)) < len(self.classes):
+            raise ModelError("two classes have the same name")
+        if self.size is not None and len(self.size.log_density) != len(self.classes):
+            raise ModelError(f"sizes of {len(self.size.log_density)} classes, not {len(self.classes)}")
+
+    @property
+    def is_recogniser(self) -> bool:
+        """Whether it is a recogniser, and not a map network."""
+        return self.kind == "recogniser"
+
+    @property
+    def maps(self) -> tuple[str, ...]:
+        """Names of the maps that a map network predicts: of the local window and, if it knows it, of the sphere."""
+        return (self.kind, self.kind + SPHERE)[: 2 if self.output == "sphere" else 1]
+
+    def valleys(self, classes: Sequence[str]) -> tuple[str, ...]:
+        """The classes for which the valley of its map is the better view: as was fitted, or else all or none."""
+        return tuple(classes) if self.good == "valley" and not self.valley_gain else self.valley_classes
+
+    def made_by(self, *commands: str) -> ModelCard:
+        """The same with further commands; one that it names already is not named again."""
+        commands = tuple(dict.fromkeys((*self.training.commands, *commands)))
+        return replace(self, training=replace(self.training, commands=commands))
+
+
+def read_card(path: Path) -> ModelCard:
+    """Read a card; the weights are the file beside it with the same name. ModelError if one is missing."""
+    path = Path(path)
+    card = replace(read_record(path, ModelCard, "a model card"), path=path.with_suffix(".onnx"))
+    if not card.path.exists():
+        raise ModelError(f"{card.path}: the weights of model {card.name} are missing")
+    return card
+
+
+def write_card(path: Path, card: ModelCard) -> None:
+    """Write a card, or replace it by one that says more."""
+    write_record(path, replace(card, path=NOWHERE), overwrite=True)
+
+
+def bundled_cards() -> dict[str, ModelCard]:
+    """The models that ship with the package, by name."""
+    return {path.stem: read_card(path) for path in sorted(BUNDLED.glob("*.json"))}
+
+
+def find_card(model: str | Path) -> ModelCard:
+    """A bundled model by name, or any model by the path of its card."""
+    names = [path.stem for path in sorted(BUNDLED.glob("*.json"))]
+    if str(model) in names:
+        return read_card(BUNDLED / f"{model}.json")
+    if Path(model).suffix != ".json":
+        raise ModelError(f"no bundled model is called {str(model)!r}; there are {', '.join(names)}")
+    return read_card(Path(model))
+
+
+@dataclass(frozen=True)
+class Collection:
+    """Cards of models that belong together: maps by their names, policies, without the bundled ones, by theirs."""
+
+    recogniser: Path
+    maps: dict[str, Path]
+    policies: dict[str, Path]
+
+
+def find_models(models: str | Path) -> Collection:
+    """The bundled models by name ("modelnet10"), or those in a folder.
+
+    A folder holds the card of one recogniser. Maps that it lacks are the bundled ones: they know no classes.
+    """
+    bundled = {name: BUNDLED / f"{card}.json" for name, card in MAPS.items()}
+    name, folder = RECOGNISER.removeprefix("recogniser-"), Path(models)
+    if str(models) == name:
+        return Collection(BUNDLED / f"{RECOGNISER}.json", bundled, {})
+    if not folder.is_dir():
+        raise ModelError(f"{folder}: is neither a folder with models nor the name of bundled ones ({name})")
+    networks: dict[str, list[Path]] = {}
+    policies: dict[str, Path] = {}
+    for path in sorted(folder.glob("*.json")):
+        regular_file(path, "a card", ModelError)
+        # A policy's card names the viewpoints that it was learned for.
+        if path.with_suffix(".onnx").exists() and b'"elevations"' not in path.read_bytes():
+            networks.setdefault(read_card(path).kind, []).append(path)
+        else:
+            policies[path.stem] = path
+    for kind, paths in networks.items():
+        if len(paths) > 1:
+            raise ModelError(f"{folder}: holds several models of the kind {kind}: {paths[0].name}, {paths[1].name}")
+    if "recogniser" not in networks:
+        raise ModelError(f"{folder}: holds no card of a recogniser; nextview export recogniser makes one")
+    own = {kind: paths[0] for kind, paths in networks.items()}
+    return Collection(own.pop("recogniser"), bundled | own, policies)

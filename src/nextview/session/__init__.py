@@ -1,0 +1,1 @@
+"""Episodes, sessions and the front door."""

@@ -1,0 +1,393 @@
+"""The loop: observe, believe, stop or choose, move. One for a robot and for a hundred thousand replays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.checks import plugin_errors
+from nextview.errors import PolicyError, SessionError, UsageError
+from nextview.geometry.observation import Observation, SceneView
+from nextview.geometry.viewsphere import SNAP, Viewpoints, angle_between, azimuth_of
+from nextview.policies.base import EpisodeState, Evidence, Policy
+from nextview.policies.off_grid import OffGrid
+from nextview.recognition.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
+from nextview.sensing.expected_visibility import SeenScene, expected_visibility
+
+Float = NDArray[np.float64]
+VISITED = np.radians(6.0)
+"""Views within this angle of where a camera stood count as visited, beside the nearest one: it saw what they show."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One view in the episodes that were still running, A of them."""
+
+    episodes: NDArray[np.int64]  # which ones, (A,)
+    views: NDArray[np.int64]  # the view taken, or the one nearest to where the camera stood, (A,)
+    evidence: Evidence
+    belief: Float  # fused after it, (A, classes)
+    stopped: NDArray[np.bool_]  # whether the episode ended here, (A,)
+    next_views: NDArray[np.int64]  # where it goes next, (A,); -1 where it ended
+    total: Float  # sum of the log-evidence in it and before, (A, D), see ``belief.log_evidence_of``
+    seen: Float  # views so far in which anything was seen, each by its weight, (A,), see ``Calibration.weights``
+    state: EpisodeState | None = None  # what the policy was shown of the episodes that go on; None where all ended
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How B episodes ended, (B,) each."""
+
+    answer: NDArray[np.int64]  # most believed class
+    confidence: Float  # its belief
+    n_views: NDArray[np.int64]
+    confident: NDArray[np.bool_]  # whether the threshold was reached; else no view was left
+    travel: Float  # over the moves between these views, grid cells
+    arc: Float  # the same in radians
+    views: NDArray[np.int64]  # in order, (B, max views), -1 after the end
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A step that is not taken in yet, and what goes with it in its A episodes."""
+
+    step: Step
+    counts: NDArray[np.bool_]  # whether anything is seen in the view, (A,)
+    visited: NDArray[np.bool_]  # views that count as visited after it, (A, V)
+    azimuth: Float  # of the cameras, radians, (A,)
+    places: Float | None  # where they stood so far, (A, step, 3); None where these are the views themselves
+
+
+Visible = Callable[[EpisodeState], Float]
+"""Expected share of the object that shows from each view in the episodes of a state, (B, V)."""
+Constrain = Callable[[EpisodeState], EpisodeState]
+"""The state with where robots can go (``reachable``) and what that costs them (``travel``)."""
+
+
+def unconstrained(state: EpisodeState) -> EpisodeState:
+    """Every view can be reached, and travel costs what it is."""
+    return state
+
+
+class Episodes:
+    """B episodes side by side. Give ``update`` what was seen from ``current``, until ``running`` is empty.
+
+    Args:
+        sphere: the viewpoints.
+        policy: chooses where to go.
+        starts: first view of each episode, (B,).
+        stopping: when an episode ends; a sphere with fewer views than ``max_views`` ends it too.
+        rng: for policies that draw.
+        calibration: how far to trust the sum of the logits; fully by default.
+        visibility: for policies that need it; by default from the scenes in the observations, see ``SeenScene``.
+    """
+
+    def __init__(
+        self,
+        sphere: Viewpoints,
+        policy: Policy,
+        starts: NDArray[np.int64],
+        stopping: Stopping,
+        rng: np.random.Generator,
+        calibration: Calibration = PLAIN_SUM,
+        visibility: Visible | None = None,
+    ) -> None:
+        self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
+        self.calibration, self.visibility = calibration, visibility
+        self.running = np.arange(len(starts))
+        self.current = np.array(starts, np.int64)
+        if ((self.current < 0) | (self.current >= len(sphere))).any():
+            raise UsageError(f"a first view has to be one of the {len(sphere)} views, 0 to {len(sphere) - 1}")
+        self.steps: list[Step] = []
+        self._last: Taken | None = None
+        self._scenes: dict[int, tuple[list[SceneView], SeenScene]] = {}
+
+    def update(
+        self,
+        evidence: Evidence,
+        directions: Float | None = None,
+        constrain: Constrain = unconstrained,
+    ) -> Step:
+        """Take in the evidence of one view in every running episode; stop or choose its next view.
+
+        A view in which nothing was seen is taken, but changes no belief and ends no episode as a confident one. Where
+        this raises, nothing is taken in: the same view can be handed in again.
+
+        Args:
+            evidence: of the A running episodes.
+            directions: unit vectors towards where the cameras really stood, (A, 3); in all updates or in none. The
+                nearest views then count as taken, those within VISITED as visited too, and azimuths and travel are
+                measured from the places. By default the cameras stood at ``current``.
+            constrain: asked before the policy. An episode without a free view ends.
+        """
+        taken = self.next_step(evidence, directions, constrain)
+        self.keep(taken)
+        return taken.step
+
+    def next_step(
+        self,
+        evidence: Evidence,
+        directions: Float | None = None,
+        constrain: Constrain = unconstrained,
+    ) -> Taken:
+        """What ``update`` would take in. Nothing is changed; ``keep`` takes it in."""
+        taken = self._taken(evidence, directions)
+        step, n_views = taken.step, len(self.steps) + 1
+        stopped = self.stopping.reached(step.belief, np.maximum(step.seen, 1)) & taken.counts
+        if n_views >= min(self.stopping.max_views, len(self.sphere)):
+            stopped[:] = True
+        if not stopped.all():
+            going = ~stopped
+            state, chosen = self._move(self._state(taken, going), constrain)
+            step.next_views[going] = chosen
+            step = replace(step, state=state)
+        return replace(taken, step=replace(step, stopped=step.next_views < 0))
+
+    def take(self, evidence: Evidence, directions: Float | None = None) -> None:
+        """Take in a view after which it is known that the episodes went on: neither stop nor choose."""
+        self.keep(self._taken(evidence, directions))
+
+    def keep(self, taken: Taken) -> None:
+        """Take in what ``next_step`` made."""
+        self._last = taken
+        self.steps.append(taken.step)
+        self._go(taken.step)
+
+    def next_choice(self, constrain: Constrain = unconstrained) -> Step:
+        """Ask the policy once more where to go from here, for what ``constrain`` says has changed; see ``update``.
+
+        Nothing is changed; ``keep_choice`` takes in the last step with other ``next_views``. Where no view is free any
+        more the episode ends.
+        """
+        if not self.steps or self.steps[-1].state is None or len(self.running) == 0:
+            raise SessionError("there is nothing to choose: no view was taken yet, or the episodes have ended")
+        step, running = self.steps[-1], np.isin(self.steps[-1].episodes, self.running)
+        state, chosen = self._move(
+            self.steps[-1].state.select(np.isin(self.steps[-1].state.episodes, self.running)), constrain
+        )
+        next_views = np.full(len(step.episodes), -1)
+        next_views[running] = chosen
+        return replace(step, next_views=next_views, stopped=next_views < 0, state=state)
+
+    def keep_choice(self, step: Step) -> None:
+        """Go where ``next_choice`` says."""
+        self.steps[-1] = step
+        self._go(step)
+
+    def _go(self, step: Step) -> None:
+        moved = step.next_views >= 0
+        self.current[step.episodes[moved]] = step.next_views[moved]
+        self.running = step.episodes[~step.stopped]
+
+    def _state(self, taken: Taken, going: NDArray[np.bool_]) -> EpisodeState:
+        """What the policy may see of the episodes that go on."""
+        step, needs, azimuth_bins = taken.step, self.policy.needs, None
+        if "azimuth_bins" in needs:
+            classes, weighed = step.belief.shape[1], np.maximum(step.seen, 1)[going]
+            azimuth_bins = self.calibration.azimuth_bins(step.total[going], weighed, classes, taken.azimuth[going])
+        state = EpisodeState(
+            step.views[going],
+            taken.visited[going],
+            step.belief[going],
+            step.evidence.select(going),
+            len(self.steps) + 1,
+            step.episodes[going],
+            azimuth_bins,
+            places=None if taken.places is None else taken.places[going],
+            observations=self._observations(step, step.episodes[going]) if "observations" in needs else None,
+        )
+        return replace(state, visibility=self._visibility(step, state)) if "visibility" in needs else state
+
+    def _taken(self, evidence: Evidence, directions: Float | None) -> Taken:
+        """The next step, as if no episode ended and none moved on. Nothing is changed yet."""
+        now = self.running
+        if len(evidence.logits) != len(now):
+            raise UsageError(f"evidence of {len(evidence.logits)} views for {len(now)} running episodes")
+        evidence, seen = _without_unseen(evidence)
+        visited, earlier = np.zeros((len(now), len(self.sphere)), bool), []
+        before, counted = np.zeros((len(now), 1)), np.zeros(len(now))
+        if self._last is not None:
+            last, going = self._last, ~self.steps[-1].stopped
+            visited, before, counted = last.visited[going], last.step.total[going], last.step.seen[going]
+            earlier = [] if last.places is None else [last.places[going]]
+            if (directions is None) != (last.places is None):
+                raise UsageError("where the cameras stood is told of all views or of none")
+        views, azimuth, places = self.current[now], self.sphere.azimuth[self.current[now]], None
+        if directions is not None:
+            arc = angle_between(directions[:, None], self.sphere.directions[None])
+            views, there = arc.argmin(1), arc.min(1) < SNAP
+            azimuth = np.where(there, self.sphere.azimuth[views], azimuth_of(directions))
+            place = np.where(there[:, None], self.sphere.directions[views], directions)[:, None]
+            places = np.concatenate([*earlier, place], 1)
+            visited |= arc <= VISITED
+        visited[np.arange(len(now)), views] = True
+        said = np.asarray(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64)
+        total, counted = before + seen[:, None] * said, counted + seen
+        # Before anything is seen the total is zero, whatever it is divided by.
+        belief = self.calibration.belief(total, np.maximum(counted, 1), evidence.logits.shape[1])
+        stopped, nowhere = np.zeros(len(now), bool), np.full(len(now), -1)
+        step = Step(now, views, evidence, belief, stopped, nowhere, total, counted)
+        return Taken(step, seen, visited, azimuth, places)
+
+    def _visibility(self, last: Step, state: EpisodeState) -> Float:
+        """What is expected to show from each view in the episodes of a state."""
+        if self.visibility is not None:
+            return self.visibility(state)
+        if any(step.evidence.observations is None for step in (*self.steps, last)):
+            return np.ones(state.visited.shape)
+        positions, found = self.sphere.poses[:, :3, 3], []
+        for episode, views in zip(state.episodes, self._observations(last, state.episodes), strict=True):
+            scenes = [seen.scene for seen in views if seen.scene is not None]
+            found.append(expected_visibility(self._seen_scene(int(episode), scenes), positions).expected)
+        return np.stack(found)
+
+    def _seen_scene(self, episode: int, scenes: list[SceneView]) -> SeenScene:
+        """What the frames of an episode say together; what all but the new ones say is kept."""
+        known, seen = self._scenes.get(episode, ([], SeenScene.unseen()))
+        if any(old is not new for old, new in zip(known, scenes, strict=False)):
+            known, seen = [], SeenScene.unseen()
+        for scene in scenes[len(known) :]:
+            seen = seen.seen(scene)
+        self._scenes[episode] = scenes, seen
+        return seen
+
+    def _observations(self, last: Step, episodes: NDArray[np.int64]) -> list[list[Observation]]:
+        """All that was seen so far in some episodes, the last step included."""
+        found: dict[int, list[Observation]] = {int(episode): [] for episode in episodes}
+        for step in (*self.steps, last):
+            if step.evidence.observations is None:
+                raise UsageError("this policy needs the depth that was seen, and only evidence is given")
+            for episode, seen in zip(step.episodes, step.evidence.observations, strict=True):
+                if int(episode) in found:
+                    found[int(episode)].append(seen)
+        return list(found.values())
+
+    def _move(self, state: EpisodeState, constrain: Constrain) -> tuple[EpisodeState, NDArray[np.int64]]:
+        """What the policy is shown, and where it goes, -1 where no view is free."""
+        state = constrain(replace(state, reachable=None, travel=self._travel(state)))
+        chosen, free = np.full(len(state.current), -1), state.free.any(1)
+        if free.all():
+            chosen = self._choose(state)
+        elif free.any():
+            chosen[free] = self._choose(state.select(free))
+        return state, chosen
+
+    def _travel(self, state: EpisodeState) -> Float | None:
+        """Cells to each view from the places, (B, V); None where these are views."""
+        if state.places is None:
+            return None
+        here = state.places[:, -1]
+        there = (here == self.sphere.directions[state.current]).all(1)
+        if there.all():
+            return None
+        cells = self.sphere.travel_between(here[:, None], self.sphere.directions[None])
+        return np.where(there[:, None], self.sphere.travel[state.current], cells)
+
+    def _choose(self, state: EpisodeState) -> NDArray[np.int64]:
+        """What the policy chooses, checked. If a view is out of reach it is asked again, as if it had been there."""
+        name, free, rows = self._name, state.free, np.arange(len(state.current))
+        chosen = self._ask(state)
+        barred = ~free[rows, chosen] & ~state.visited[rows, chosen]
+        if barred.any():
+            some = state.select(barred)
+            chosen = chosen.copy()
+            chosen[barred] = self._ask(replace(some, visited=~some.free))
+        wrong = ~free[rows, chosen]
+        if wrong.any():
+            view, where = int(chosen[wrong][0]), int(state.episodes[wrong][0])
+            why = "was visited before" if state.visited[wrong][0, view] else "cannot be reached"
+            raise PolicyError(f"policy {name} chose view {view}, which {why}", where)
+        return chosen
+
+    def _ask(self, state: EpisodeState) -> NDArray[np.int64]:
+        """What the policy answers: views of the sphere, whichever."""
+        name = self._name
+        with plugin_errors(lambda said: PolicyError(f"policy {name} raised {said}", self._first_to_fail(state))):
+            chosen = np.asarray(self.policy.next_views(state, self.rng))
+        if chosen.shape != state.current.shape or not np.issubdtype(chosen.dtype, np.integer):
+            raise PolicyError(f"policy {name} has to return {len(state.current)} integers, one for each episode")
+        off = (chosen < 0) | (chosen >= len(self.sphere))
+        if off.any():
+            where = int(state.episodes[off][0])
+            raise PolicyError(f"policy {name} chose view {chosen[off][0]}, which is not on the sphere", where)
+        return chosen
+
+    @property
+    def _name(self) -> str:
+        policy = self.policy.policy if isinstance(self.policy, OffGrid) else self.policy
+        return type(policy).__name__
+
+    def _first_to_fail(self, state: EpisodeState) -> int | None:
+        """The first episode for which the policy raises even if asked for it alone."""
+        for episode in state.episodes:
+            alone = state.select(state.episodes == episode)
+            try:
+                self.policy.next_views(alone, self.rng)
+            except (Exception, SystemExit):
+                return int(episode)
+        return None
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the episodes ended."""
+        if len(self.running):
+            raise SessionError("the episodes are still running")
+        b = len(self.current)
+        views = np.full((b, len(self.steps)), -1)
+        answer, n_views, confidence = np.zeros(b, np.int64), np.zeros(b, np.int64), np.zeros(b)
+        confident = np.zeros(b, bool)
+        for k, step in enumerate(self.steps):
+            views[step.episodes, k] = step.views
+            answer[step.episodes] = step.belief.argmax(1)
+            confidence[step.episodes] = step.belief.max(1)
+            n_views[step.episodes] = k + 1
+            reached = self.stopping.reached(step.belief, np.maximum(step.seen, 1))
+            confident[step.episodes] = reached & (step.seen > 0)
+        moved = views[:, 1:] >= 0
+        legs = (views[:, :-1], views[:, 1:])
+        return Outcome(
+            answer,
+            confidence,
+            n_views,
+            confident,
+            (self.sphere.travel[legs] * moved).sum(1),
+            (self.sphere.arc[legs] * moved).sum(1),
+            views,
+        )
+
+
+def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
+    """The evidence with zeros where nothing was seen, and where anything was, (B,) bool."""
+    seen = evidence.seen
+    if seen is None or seen.all():
+        return evidence, np.ones(len(evidence.logits), bool)
+
+    def kept(values: NDArray[np.floating]) -> NDArray[np.floating]:
+        return np.where(seen.reshape(-1, *[1] * (values.ndim - 1)), values, 0)
+
+    azimuth_bins = None if evidence.azimuth_bins is None else kept(evidence.azimuth_bins)
+    maps = {name: kept(values) for name, values in evidence.maps.items()}
+    novelty = None if evidence.novelty is None else kept(evidence.novelty)
+    logits = kept(evidence.logits)
+    return replace(evidence, logits=logits, maps=maps, azimuth_bins=azimuth_bins, novelty=novelty), seen
+
+
+def run_episodes(
+    observe: Callable[[NDArray[np.int64], NDArray[np.int64]], Evidence],
+    sphere: Viewpoints,
+    policy: Policy,
+    starts: NDArray[np.int64],
+    stopping: Stopping,
+    rng: np.random.Generator,
+    calibration: Calibration = PLAIN_SUM,
+    constrain: Constrain = unconstrained,
+    visibility: Visible | None = None,
+) -> Episodes:
+    """Run episodes to their end."""
+    episodes = Episodes(sphere, policy, starts, stopping, rng, calibration, visibility)
+    while len(episodes.running):
+        episodes.update(observe(episodes.running, episodes.current[episodes.running]), constrain=constrain)
+    return episodes

@@ -1,0 +1,105 @@
+"""What a robot can do: where it can bring the camera, and what that costs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nextview.checks import one_line
+from nextview.errors import UsageError
+from nextview.geometry.viewsphere import Viewpoints
+from nextview.policies.base import EpisodeState, travel_from
+
+Float = NDArray[np.float64]
+Reachable = NDArray[np.bool_] | Callable[[Float], bool]
+"""Which candidate views the camera can be brought to: (V,) bool; or a function of a pose of ``Session.poses``."""
+TravelCost = Float | Callable[[Float, Float], float]
+"""What it costs to go from one view to another, in any unit: (V, V), row from, column to; or a function of two poses in
+the frame of ``Session.poses``, the first that where the camera stands. Infinity where there is no way."""
+Poses = Callable[[], Float]
+"""Gives the candidate poses, (V, 4, 4); called only where a function has to be asked."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Where the camera can go, and what that costs."""
+
+    failed: NDArray[np.bool_]
+    reachable: Reachable | None = None
+    cost: TravelCost | None = None
+
+    def can_reach(self, views: NDArray[np.int64], poses: Poses) -> NDArray[np.bool_]:
+        """Which of some views have not failed and can be reached."""
+        there = ~self.failed[views]
+        if callable(self.reachable):
+            at = poses()
+            for k in np.flatnonzero(there):
+                there[k] = _truth(self.reachable(at[views[k]]))
+        elif self.reachable is not None:
+            there &= self.reachable[views]
+        return there
+
+    def constrain(self, state: EpisodeState, sphere: Viewpoints, here: Float, poses: Poses) -> EpisodeState:
+        """The state of one episode with where the camera, which stands at ``here``, can go, and what that costs."""
+        views = np.flatnonzero(state.free[0])
+        views = views[self.can_reach(views, poses)]
+        if self.cost is not None:
+            if callable(self.cost):
+                at = poses()
+                cost = np.array([_cost(self.cost(here, at[view])) for view in views], np.float64)
+            else:
+                cost = self.cost[state.current[0], views]
+            views, cost = views[cost < np.inf], cost[cost < np.inf]
+            mean = cost.mean() if len(cost) else 0.0
+            unit = travel_from(sphere, state)[0, views].mean() / mean if mean > 0 else 0.0
+            cells = np.full(len(sphere), np.nan)
+            cells[views] = unit * cost
+            state = replace(state, travel=cells[None])
+        reachable = np.zeros(len(sphere), bool)
+        reachable[views] = True
+        if reachable[state.free[0]].all() and self.cost is None:
+            return state
+        return replace(state, reachable=reachable[None])
+
+
+def _cost(answer: Any) -> float:
+    """What a function says that a way costs; infinity is a cost, too."""
+    try:
+        cost = float(answer)
+    except (TypeError, ValueError):
+        cost = np.nan
+    if not cost >= 0:
+        raise UsageError(f"a travel cost is a number from 0 on, not {one_line(repr(answer))}")
+    return cost
+
+
+def _truth(answer: Any) -> bool:
+    """What a function says of a pose. None is no answer: a function that forgets to return gives it."""
+    if not isinstance(answer, bool | np.bool_ | int):
+        raise UsageError(f"whether a view can be reached is true or false, not {one_line(repr(answer))}")
+    return bool(answer)
+
+
+def as_reachable(given: ArrayLike | Callable[[Float], bool] | None, views: int) -> Reachable | None:
+    """What a user hands in as reachable."""
+    if given is None or callable(given):
+        return given
+    mask = np.asarray(given)
+    if mask.shape != (views,) or mask.dtype != bool:
+        wanted = f"reachable is a mask, ({views},) bool, or a callable on poses"
+        raise UsageError(f"{wanted}, not {mask.dtype} {mask.shape}")
+    return mask
+
+
+def as_travel_cost(given: ArrayLike | Callable[[Float, Float], float] | None, views: int) -> TravelCost | None:
+    """What a user hands in as travel cost."""
+    if given is None or callable(given):
+        return given
+    costs = np.asarray(given)
+    if costs.dtype.kind not in "fiu" or costs.shape != (views, views) or not (costs >= 0).all():
+        raise UsageError(f"a travel cost is a matrix, ({views}, {views}) of numbers from 0 on, or a callable on poses")
+    return costs.astype(np.float64)

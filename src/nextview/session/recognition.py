@@ -1,0 +1,111 @@
+"""How an episode ended: the answer, how sure it is, and its picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nextview.geometry.viewsphere import Viewpoints
+from nextview.recognition.belief import Stopping
+from nextview.recognition.novelty import Novelty
+from nextview.session.view import View
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """The end of an episode.
+
+    Attributes:
+        views: in order.
+        classes: their names.
+        confident: whether the threshold was reached (else the views ran out); never if nothing was seen.
+        sphere: the candidate viewpoints.
+        stopping: the rule that ended it.
+        stranded: whether it ended because no view that was left could be reached; then it is not confident.
+        score: gives the novelty of views; None if the recogniser has none.
+        unknown_rate: share of objects of known classes that may be called unknown; 0: none.
+    """
+
+    views: tuple[View, ...]
+    classes: tuple[str, ...]
+    confident: bool
+    sphere: Viewpoints
+    stopping: Stopping
+    stranded: bool = False
+    score: Novelty | None = None
+    unknown_rate: float = 0.0
+
+    @property
+    def seen(self) -> bool:
+        """Whether the object was seen from any of the views."""
+        return any(view.observation.seen for view in self.views)
+
+    @property
+    def novelty(self) -> float | None:
+        """Share of known objects that are at least as novel (a p-value); None if the recogniser has no score.
+
+        It holds for objects seen as the known ones were, see ``nextview.recognition.novelty``.
+        """
+        if self.score is None or not self.seen:
+            return None
+        return self.score.of_views([view.novelty for view in self.views if view.novelty is not None])
+
+    @property
+    def unknown(self) -> bool:
+        """Whether the object is called one of no known class."""
+        return self.novelty is not None and self.novelty < self.unknown_rate
+
+    @property
+    def most_like(self) -> str | None:
+        """The class believed most, also of an unknown object; None if nothing was seen."""
+        return self.classes[int(self.views[-1].belief.argmax())] if self.seen else None
+
+    @property
+    def answer(self) -> str | None:
+        """The class believed most; None if nothing was seen, or the object is unknown."""
+        return None if self.unknown else self.most_like
+
+    @property
+    def confidence(self) -> float:
+        """The belief in the answer; 0 if there is none."""
+        return 0.0 if self.answer is None else float(self.views[-1].belief.max())
+
+    @property
+    def travel(self) -> float:
+        """Of the whole episode, grid cells."""
+        return self.views[-1].travel
+
+    def __repr__(self) -> str:
+        """One line: ``chair (belief 0.998, 2 views, 1.41 cells of travel, confident)``."""
+        views = f"{len(self.views)} view{'s' * (len(self.views) > 1)}, {self.travel:.2f} cells of travel"
+        if not self.seen:
+            return f"nothing is seen ({views})"
+        if self.unknown:
+            belief = self.views[-1].belief.max()
+            return f"unknown (most like {self.most_like}, {belief:.2f}; novelty p {self.novelty:.3f}, {views})"
+        sure = "confident" if self.confident else "not confident" + ", no other view in reach" * self.stranded
+        names = dict.fromkeys(warning.name for view in self.views for warning in view.warnings)
+        warnings = f", warnings: {', '.join(names)}" if names else ""
+        return f"{self.answer} (belief {self.confidence:.3f}, {views}, {sure}{warnings})"
+
+    def plot(self, path: str | Path | None = None, title: str = "") -> Figure:
+        """Draw the episode: images, what the policy valued the views at, beliefs and the path on the sphere.
+
+        Args:
+            path: write it to this file too (PNG, PDF or SVG).
+            title: of the picture.
+
+        Raises:
+            UsageError: the file cannot be written, or its suffix is not a picture's.
+        """
+        from nextview.session.episode_figure import draw_episode, save_figure
+
+        heading = f"{title}: {self!r}" if title else repr(self)
+        figure = draw_episode(self.views, self.classes, self.sphere, self.stopping, heading)
+        if path is not None:
+            save_figure(figure, Path(path))
+        return figure

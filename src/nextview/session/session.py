@@ -1,0 +1,437 @@
+"""Live use: hand in what the camera sees, get told what it is or where to look next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import ThreadpoolController
+
+from nextview.checks import number, one_line, plugin_errors, whole
+from nextview.errors import NoViewLeftError, ObservationError, PolicyError, SessionError, UsageError
+from nextview.geometry.observation import Camera, Observation
+from nextview.geometry.viewsphere import Viewpoints, angle_between, azimuth_of, direction_of
+from nextview.policies.base import EpisodeState, Policy, ValuesViews
+from nextview.policies.off_grid import anywhere
+from nextview.recognition.belief import Stopping, fuse
+from nextview.recognition.inference import Models
+from nextview.recognition.map_names import maps_among
+from nextview.sensing.frame import Frame
+from nextview.sensing.plausibility import ViewWarning, check_observation, check_views
+from nextview.session.episode import Episodes, Step
+from nextview.session.reach import Reach, Reachable, TravelCost, as_reachable, as_travel_cost
+from nextview.session.recognition import Recognition
+from nextview.session.view import View
+
+if TYPE_CHECKING:
+    from nextview.sensing.observed_object import ObservedObject
+
+Float = NDArray[np.float64]
+CONTRADICTABLE = 3
+"""Views before the last with whose geometry it is compared."""
+
+
+@runtime_checkable
+class FrameCamera(Protocol):
+    """A camera in the world, with what it is to look at: it gives frames, and need not be where it was asked to be."""
+
+    @property
+    def object(self) -> ObservedObject:
+        """The object that it is to look at."""
+        ...
+
+    def observe(self, pose: Float) -> Frame:
+        """Look from a pose in the object frame, object radii, or from near it; or raise a ``NoViewLeftError``."""
+        ...
+
+    def refused(self, error: ObservationError) -> None:
+        """The object is not found in the last frame. Returns if there may be another one; else raises the error."""
+        ...
+
+
+@lru_cache(maxsize=1)
+def _blas() -> ThreadpoolController:
+    """The libraries below NumPy. Their threads wait for more work in a loop, and take the cores from the networks."""
+    return ThreadpoolController().select(user_api="blas")
+
+
+class Session:
+    """One object under way; the caller moves the camera.
+
+    A camera that goes where it is told, in the object frame and object radii:
+
+    >>> session = nextview.load().session()                                     # doctest: +SKIP
+    >>> while not session.done:                                                 # doctest: +SKIP
+    ...     view = session.update(my_camera.observe(session.pose))
+    >>> session.result                                                          # doctest: +SKIP
+
+    A depth camera on a robot, in the world and metres, beginning wherever it stands:
+
+    >>> session = nextview.load().session(distance=0.6)                         # doctest: +SKIP
+    >>> session.update(look())                                                  # doctest: +SKIP
+    >>> while not session.done:                                                 # doctest: +SKIP
+    ...     if go_to(session.target):
+    ...         session.update(look())  # a Frame, with the pose that was reached
+    ...     else:
+    ...         session.failed()
+
+    Args:
+        models: recogniser and map networks.
+        policy: chooses the next view; it may know other viewpoints, see ``policies.off_grid``.
+        sphere: the viewpoints.
+        start: where to look first; a camera that stands elsewhere is as welcome.
+        stopping: when to stop; by default the rule that goes with the recogniser, see ``Stopping.of``.
+        rng: for policies that draw; seed 0 by default.
+        object: which object to find in frames; the largest on the support plane by default.
+        distance: of the camera from the object's centre, metres; ``sphere.distance`` object radii by default.
+        unknown: share of objects of known classes that may be called unknown; 0: none.
+
+    Raises:
+        SessionError: the models lack what the policy needs.
+    """
+
+    def __init__(
+        self,
+        models: Models,
+        policy: Policy,
+        sphere: Viewpoints,
+        start: int = 0,
+        stopping: Stopping | None = None,
+        rng: np.random.Generator | None = None,
+        object: ObservedObject | None = None,
+        distance: float | None = None,
+        unknown: float = 0.0,
+    ) -> None:
+        _check_needs(policy, models)
+        if number(unknown, "the share of known objects called unknown", 0) >= 1:
+            raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
+        if distance is not None:
+            number(distance, "the distance, in metres,", above=0)
+        self.models, self.policy, self.sphere, self.distance = models, policy, sphere, distance
+        self.object = _new_object() if object is None and distance is not None else object
+        self.stopping, self.unknown = stopping or Stopping.of(models.recogniser.calibration), unknown
+        self.views: list[View] = []
+        self.observers: list[Callable[[Session], None]] = []
+        """Called, in order, after each view that was taken in, and when another next view was chosen."""
+        self._before = 0 if object is None else len(object.sightings)
+        self._chooser, self._rng = anywhere(policy, sphere), rng or np.random.default_rng(0)
+        self._reach = Reach(np.zeros(len(sphere), bool))
+        self._episodes = self._begin(whole(start, "the first view", 0, len(sphere) - 1))
+
+    def _begin(self, start: int) -> Episodes:
+        calibration = self.models.recogniser.calibration
+        return Episodes(self.sphere, self._chooser, np.array([start]), self.stopping, self._rng, calibration)
+
+    # Where to look
+
+    @property
+    def done(self) -> bool:
+        """Whether the episode has ended."""
+        return len(self._episodes.running) == 0
+
+    @property
+    def view(self) -> int:
+        """Where to look now."""
+        return int(self._episodes.current[0])
+
+    @property
+    def pose(self) -> Float:
+        """Where to look now, as a camera-to-world pose (4, 4), OpenCV axes, object frame, object radii."""
+        return self.sphere.poses[self.view]
+
+    @property
+    def poses(self) -> Float:
+        """Where the candidate views are in your world: camera-to-world, (V, 4, 4), OpenCV axes, metres.
+
+        At ``distance`` from the object, looking at its centre, the horizon level. They move when a frame shows better
+        where the object is. Without frames they are those of ``sphere``, in object radii.
+        """
+        return self._poses_around(self.object)
+
+    def _poses_around(self, object: ObservedObject | None) -> Float:
+        if object is None:
+            return self.sphere.poses
+        if not object.sightings and object.known is None:
+            raise SessionError("where the object is in the world is not known before the first frame: update with one")
+        return object.object_frame.pose_in_world(self.sphere.poses, self.distance)
+
+    @property
+    def target(self) -> Float:
+        """Where to look now, one of ``poses``, (4, 4)."""
+        return self.poses[self.view]
+
+    # What the robot can do
+
+    @property
+    def reachable(self) -> Reachable | None:
+        """Which views the camera can be brought to, see ``session.reach.Reachable``; None for all.
+
+        No policy chooses another one. What is set here counts from now on: if the view that was chosen is not
+        reachable, another one is. A callable is asked anew for each choice, of unvisited views, after the first view.
+        """
+        return self._reach.reachable
+
+    @reachable.setter
+    def reachable(self, given: ArrayLike | Callable[[Float], bool] | None) -> None:
+        self._set_reach(replace(self._reach, reachable=as_reachable(given, len(self.sphere))))
+
+    @property
+    def travel_cost(self) -> TravelCost | None:
+        """What it costs to go from view to view, see ``session.reach.TravelCost``; None for the travel in grid cells.
+
+        Policies that weigh travel weigh this instead from the next choice on: seconds of your planner for instance. Its
+        unit does not matter: its mean over the free views counts as much as their mean travel in cells.
+        """
+        return self._reach.cost
+
+    @travel_cost.setter
+    def travel_cost(self, given: ArrayLike | Callable[[Float, Float], float] | None) -> None:
+        self._reach = replace(self._reach, cost=as_travel_cost(given, len(self.sphere)))
+
+    def failed(self, view: int | None = None) -> None:
+        """The camera could not be brought to a view, by default the one that was asked for: it is offered no more.
+
+        Where no reachable view is left the session ends, not confident: ``Recognition.stranded``.
+        """
+        if self.done:
+            raise SessionError("this session has ended; begin another one")
+        view = self.view if view is None else whole(view, "a view", 0, len(self.sphere) - 1)
+        self._set_reach(replace(self._reach, failed=self._reach.failed | (np.arange(len(self.sphere)) == view)))
+
+    def _set_reach(self, reach: Reach) -> None:
+        """Choose another view if the one that was chosen can no longer be reached."""
+        if self.done or (self.views and reach.can_reach(np.array([self.view]), lambda: self.poses)[0]):
+            self._reach = reach
+        elif self.views:
+            step = self._episodes.next_choice(lambda state: self._constrained(state, reach, self.object))
+            view = replace(self.views[-1], next_view=_next_of(step), values=self._values(step))
+            self._episodes.keep_choice(step)
+            self._reach, self.views[-1] = reach, view
+            self._tell_observers()
+        else:  # with frames it begins where the camera is
+            episodes = self._begin_nearest(reach) if self.object is None else self._episodes
+            self._reach, self._episodes = reach, episodes
+
+    def _begin_nearest(self, reach: Reach) -> Episodes:
+        """Before the first view: begin at the nearest view that can be reached. A callable is not asked yet."""
+        order = np.argsort(self.sphere.arc[self.view], kind="stable")
+        there = ~reach.failed[order]
+        if isinstance(reach.reachable, np.ndarray):
+            there &= reach.reachable[order]
+        if not there.any():
+            raise SessionError("none of the candidate views can be reached")
+        return self._begin(int(order[there.argmax()]))
+
+    def _constrained(
+        self, state: EpisodeState, reach: Reach, object: ObservedObject | None, here: Float | None = None
+    ) -> EpisodeState:
+        """The state with where the camera can go from here, by default from where the last view was taken."""
+        if here is None:
+            seen = self.views[-1].observation
+            here = seen.pose if object is None else object.sightings[-1].frame.camera_to_world
+        return reach.constrain(state, self.sphere, here, lambda: self._poses_around(object))
+
+    # What is seen
+
+    def update(self, seen: Observation | Frame) -> View:
+        """Take in what was seen, from ``pose``, from ``target`` or from anywhere else: its own pose counts.
+
+        Where this raises, nothing is taken in: the session is as it was, and goes on with the next view.
+
+        Args:
+            seen: an observation in the object frame; or a frame of a depth camera in the world. If a frame shows better
+                where the object is, the earlier ones are expressed anew, and ``views`` with them: all but what was
+                chosen after them, and what they were warned of.
+
+        Raises:
+            SessionError: the episode has ended, or a session mixes frames and observations.
+            ObservationError: the object is not found in the frame, or the image does not suit the networks.
+            PolicyError: the policy failed.
+        """
+        if self.done:
+            raise SessionError("this session has ended; begin another one")
+        with _blas().limit(limits=1):
+            view = self._add_frame(seen) if isinstance(seen, Frame) else self._add_observation(seen)
+        self._tell_observers()
+        return view
+
+    def _tell_observers(self) -> None:
+        for observer in self.observers:
+            observer(self)
+
+    def _add_observation(self, seen: Observation) -> View:
+        if not isinstance(seen, Observation):
+            raise ObservationError(f"what a camera gave is an Observation, or a Frame, not {one_line(repr(seen))}")
+        if self.object is not None:
+            raise SessionError("this session takes frames: it has an observed object")
+        warnings = check_observation(seen)
+        for view in self.views[-CONTRADICTABLE:]:
+            warnings = warnings or check_views(view.observation, seen)
+        return self._take([*(view.observation for view in self.views), seen], warnings, seen.pose, None)
+
+    def _add_frame(self, frame: Frame) -> View:
+        if self.object is None and self.views:
+            raise SessionError("this session has taken observations; begin another one for frames")
+        object = self.object or _new_object()
+        if len(object.sightings) != self._before + len(self.views):
+            raise SessionError("frames were added to this object outside of the session; begin another one")
+        before = object.state
+        try:
+            object.add(frame)
+            observations = object.observations[self._before :]
+            return self._take(observations, object.warnings, frame.camera_to_world, object)
+        except BaseException:
+            object.state = before
+            raise
+
+    def _take(
+        self,
+        observations: Sequence[Observation],
+        warnings: Sequence[ViewWarning],
+        here: Float,
+        object: ObservedObject | None,
+    ) -> View:
+        """Take in the last of some observations, and whichever of the others has changed."""
+        last = len(observations) - 1
+        changed = [k for k, seen in enumerate(observations) if k == last or seen is not self.views[k].observation]
+        found = self.models.evidence([observations[k] for k in changed])
+        evidence = {k: found.select([row]) for row, k in enumerate(changed)}
+        directions = [self._snapped(direction_of(observation.pose)) for observation in observations]
+        episodes = self._episodes
+        if changed != [last]:
+            episodes = self._begin(self.view)
+            for k, step in enumerate(self._episodes.steps):
+                episodes.take(evidence.get(k, step.evidence), directions[k][None])
+        reach = self._reach
+        taken = episodes.next_step(
+            evidence[last], directions[last][None], lambda state: self._constrained(state, reach, object, here)
+        )
+        steps, views = [*episodes.steps, taken.step], list(self.views)
+        travel = self._travelled([int(step.views[0]) for step in steps], directions)
+        for k in changed[:-1]:
+            was, seen = views[k], self._view(steps[k], observations[k], directions[k], travel[k])
+            views[k] = replace(
+                seen, next_view=was.next_view, values=was.values, warnings=was.warnings, degrees_off=was.degrees_off
+            )
+        view = self._view(taken.step, observations[last], directions[last], travel[last])
+        off = angle_between(self.sphere.directions[self.view], directions[last])
+        asked = bool(self.views) or object is None or object.known is not None
+        view = replace(
+            view,
+            next_view=_next_of(taken.step),
+            values=self._values(taken.step),
+            warnings=tuple(warnings),
+            degrees_off=float(np.degrees(off)) if asked else 0.0,
+        )
+        episodes.keep(taken)
+        self._episodes, self.views, self.object = episodes, [*views, view], object
+        return view
+
+    def _view(self, step: Step, observation: Observation, direction: Float, travel: tuple[float, float]) -> View:
+        """What a step says of its view, but for what was chosen after it."""
+        calibration, (nearest, there) = self._episodes.calibration, self.sphere.nearest(direction)
+        azimuth = self.sphere.azimuth[[nearest]] if there else azimuth_of(direction[None])
+        bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), len(self.models.classes), azimuth)
+        novelty = step.evidence.novelty
+        return View(
+            int(step.views[0]),
+            observation,
+            alone=fuse(step.evidence.logits[:, None], calibration.temperature_after(1))[0],
+            belief=step.belief[0],
+            maps={name: values[0] for name, values in step.evidence.maps.items()},
+            next_view=None,
+            travel=travel[0],
+            arc=travel[1],
+            direction=direction,
+            azimuth_bins=None if bins is None else bins[0],
+            novelty=float(novelty[0]) if novelty is not None and observation.seen else None,
+        )
+
+    def _snapped(self, direction: Float) -> Float:
+        view, there = self.sphere.nearest(direction)
+        return self.sphere.directions[view] if there else direction
+
+    def _travelled(self, views: Sequence[int], directions: Sequence[Float]) -> list[tuple[float, float]]:
+        """Cells and radians on the way to each view, from the places where the camera stood."""
+        sphere, found = self.sphere, [(0.0, 0.0)]
+        at = [np.array_equal(d, sphere.directions[view]) for view, d in zip(views, directions, strict=True)]
+        for k in range(1, len(views)):
+            if at[k - 1] and at[k]:
+                leg = sphere.travel[views[k - 1], views[k]], sphere.arc[views[k - 1], views[k]]
+            else:
+                before, now = directions[k - 1], directions[k]
+                leg = sphere.travel_between(before, now), angle_between(before, now)
+            found.append((found[-1][0] + float(leg[0]), found[-1][1] + float(leg[1])))
+        return found
+
+    def _values(self, step: Step) -> Float | None:
+        """What the policy valued the views at when it chose."""
+        chooser = self._chooser
+        if step.stopped[0] or step.state is None or not isinstance(self.policy, ValuesViews):
+            return None
+        assert isinstance(chooser, ValuesViews)
+        name = type(self.policy).__name__
+        with plugin_errors(lambda said: PolicyError(f"policy {name}, asked what it values views at, raised {said}")):
+            values = np.asarray(chooser.view_values(step.state), np.float64)
+        if values.shape != (1, len(self.sphere)):
+            raise PolicyError(f"policy {name} values views by (B, V) numbers, here (1, {len(self.sphere)})")
+        return values[0]
+
+    def run(self, camera: Camera | FrameCamera) -> Recognition:
+        """Go on to the end with a camera that goes where it is told, or until it has no view left to offer."""
+        while not self.done:
+            try:
+                seen = camera.observe(self.pose)
+            except NoViewLeftError:
+                if not self.views:
+                    raise
+                self.reachable = np.zeros(len(self.sphere), bool)
+                break
+            try:
+                self.update(seen)
+            except ObservationError as error:
+                if not isinstance(camera, FrameCamera):
+                    raise
+                camera.refused(error)
+        return self.result
+
+    @property
+    def result(self) -> Recognition:
+        """How it ended."""
+        confident = bool(self._episodes.outcome.confident[0])
+        all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
+        return Recognition(
+            tuple(self.views),
+            self.models.classes,
+            confident,
+            self.sphere,
+            self.stopping,
+            stranded=not confident and not all_taken,
+            score=self.models.recogniser.novelty,
+            unknown_rate=self.unknown,
+        )
+
+
+def _next_of(step: Step) -> int | None:
+    return None if step.stopped[0] else int(step.next_views[0])
+
+
+def _new_object() -> ObservedObject:
+    from nextview.sensing.observed_object import ObservedObject
+
+    return ObservedObject()
+
+
+def _check_needs(policy: Policy, models: Models) -> None:
+    """See that the models give what a policy needs."""
+    if not (hasattr(policy, "needs") and hasattr(policy, "next_views")):
+        raise UsageError(f"a policy has needs and next_views, see nextview.Policy, not {one_line(repr(policy))}")
+    if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:
+        raise SessionError("this policy needs the azimuth bin that is seen, and the recogniser was not taught it")
+    missing = [name for name in maps_among(policy.needs) if name not in models.map_names]
+    if missing:
+        raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")

@@ -1,0 +1,251 @@
+"""The front door: a recogniser, maps, a policy, candidate viewpoints and a stopping rule that belong together.
+
+>>> system = load()
+>>> system.recognise("chair.off")                                               # doctest: +SKIP
+chair (belief 0.998, 2 views, 1.41 cells of travel, confident)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nextview.checks import number, one_line, whole
+from nextview.errors import MeshError, ModelError, OtherUseError, PolicyError, UsageError
+from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.geometry.observation import Camera
+from nextview.geometry.viewsphere import LAYOUTS, Viewpoints, ViewSphere, viewpoints_of
+from nextview.policies.base import Policy
+from nextview.policies.maps import MapPeak, SpherePeak
+from nextview.policies.registry import make_policy_anywhere, with_cards
+from nextview.recognition.belief import Stopping
+from nextview.recognition.inference import MapNetwork, Models, Recogniser, open_maps
+from nextview.recognition.map_names import SPHERE
+from nextview.recognition.model_card import find_models
+from nextview.session.recognition import Recognition
+from nextview.session.session import FrameCamera, Session
+
+if TYPE_CHECKING:
+    from nextview.sensing.observed_object import ObservedObject
+    from nextview.simulation.captured_camera import CapturedCamera
+    from nextview.simulation.sensor import Sensor
+
+MOST_THREADS = 1024
+DEFAULT = "modelnet10"
+"""The models that ship with the package."""
+
+
+@dataclass(frozen=True, repr=False)
+class System:
+    """All that is needed to recognise an object. ``load`` makes one. It is pickled as how it was loaded."""
+
+    models: Models
+    policy: Policy
+    policy_name: str
+    sphere: Viewpoints  # the candidates
+    stopping: Stopping
+    unknown: float  # share of objects of known classes that may be called unknown
+    loaded: dict[str, Any] = field(repr=False)  # the arguments of ``load`` that make it
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes that it knows."""
+        return self.models.classes
+
+    def session(
+        self,
+        start: int | None = None,
+        seed: int = 0,
+        object: ObservedObject | None = None,
+        distance: float | None = None,
+    ) -> Session:
+        """One object under way, for whoever moves the camera. Those for a robot need no more than a distance.
+
+        Args:
+            start: where to look first, an index of ``sphere``; drawn by the seed if not given.
+            seed: decides the first view and whatever the policy draws.
+            object: which object to find in the frames of a depth camera; the largest on the support plane by default.
+            distance: how far from the object the camera shall stand, metres; 3 object radii by default. With an object
+                or a distance the session takes frames, else what it is given first.
+        """
+        rng = np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1))
+        drawn = int(rng.integers(len(self.sphere)))
+        first, options = drawn if start is None else start, (self.stopping, rng, object, distance, self.unknown)
+        return Session(self.models, self.policy, self.sphere, first, *options)
+
+    def session_with(self, camera: Camera | FrameCamera, start: int | None = None, seed: int = 0) -> Session:
+        """A session for a camera: where it gives frames, for its object."""
+        return self.session(start, seed, camera.object if isinstance(camera, FrameCamera) else None)
+
+    def recognise(
+        self,
+        what: str | Path | Mesh | Camera | FrameCamera,
+        start: int | None = None,
+        seed: int = 0,
+        up: str | tuple[float, float, float] | None = None,
+        unit: str | None = None,
+        sensor: str | Sensor | None = None,
+    ) -> Recognition:
+        """Look at an object until it is clear what it is, or the views run out.
+
+        Args:
+            what: a mesh file (OFF, OBJ, PLY, STL or GLB), a mesh, a folder of captured views, or a camera: anything
+                with ``observe(pose)``.
+            start: the first view, an index of ``sphere``; drawn by the seed if not given.
+            seed: decides the first view and whatever the policy draws.
+            up: the up axis of a mesh file, "y" or "z"; z if not given, but y for GLB. Of a folder, the direction
+                against gravity in its world, (3,); by default as its layout has it.
+            unit: the unit of length of a file, one of ``mesh.UNITS``, if it is known: size says something of the class.
+            sensor: look at a mesh through this one, or through NAME or NAME:STRENGTH of ``known_sensors.SENSORS``; its
+                errors are drawn by the seed. None for clean renders.
+
+        Raises:
+            MeshError, DatasetError: the file or the folder cannot be used.
+            UsageError: there is no such sensor, or ``what`` is nothing to look at.
+            ObservationError: the object is found in none of the captured views.
+        """
+        if isinstance(what, str | Path):
+            if Path(what).is_dir():
+                what = _camera_of(Path(what), up)
+            elif up is None or isinstance(up, str):
+                what = load_mesh(what, up, unit)
+            else:
+                raise MeshError(f"{what}: the up axis of a mesh file is y or z, not {up}")
+        if isinstance(what, Mesh):
+            what = simulated(what, sensor, seed)
+        elif sensor is not None:
+            raise UsageError("a sensor is for meshes: a camera has its own errors")
+        if not hasattr(what, "observe"):
+            wanted = "a mesh file, a Mesh, a folder of views, or a camera with observe(pose)"
+            raise UsageError(f"what is looked at is {wanted}, not {one_line(repr(what))}")
+        return self.session_with(what, start, seed).run(what)
+
+    def __repr__(self) -> str:
+        name, views = self.models.recogniser.card.name, len(self.sphere)
+        return f"System({name}, policy {self.policy_name}, {views} viewpoints, {self.stopping})"
+
+    def __reduce__(self) -> tuple[Callable[..., System], tuple[dict[str, Any]]]:
+        return _load, (self.loaded,)
+
+
+def simulated(mesh: Mesh, sensor: str | Sensor | None = None, seed: int = 0) -> Camera:
+    """A simulated camera before a mesh, with the errors of a sensor, if any, drawn by the seed."""
+    if sensor is None:
+        from nextview.simulation.simulated import SimulatedCamera
+
+        return SimulatedCamera(mesh)
+    from nextview.simulation.sensed_camera import SensedCamera
+
+    return SensedCamera(mesh, sensor, np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1)))
+
+
+def load(
+    models: str | Path = DEFAULT,
+    policy: str | None = None,
+    threshold: float = 0.97,
+    risk: float | None = None,
+    max_views: int = 5,
+    viewpoints: str | Viewpoints | ArrayLike = "40",
+    threads: int = 0,
+    unknown: float = 0.0,
+    stopping: Stopping | None = None,
+) -> System:
+    """Open models, and what belongs to them.
+
+    Args:
+        models: the name of bundled models, or a folder with the card of a recogniser, and of maps and policies of its
+            own if there are any. Maps that it lacks are the bundled ones, which know no classes.
+        policy: how the next view is chosen; "gain" by default, where one was learned for these classes, else "spread".
+            Names are those of ``nextview.policies.registry``, of policy cards in the folder, or "MODULE:CLASS".
+        threshold: stop when the belief in one class reaches this after one view, and less after several.
+        risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
+        max_views: stop after so many views.
+        viewpoints: the candidates: "40", "12", "rings:0,30,60x12", "fibonacci:60", or directions or poses of your own,
+            see ``viewsphere.viewpoints_of``.
+        threads: of ONNX Runtime, 0 for one on each core.
+        unknown: answer None where an object is as novel as at most this share of the objects of known classes: so
+            often one of these is called unknown. 0 always names a class.
+        stopping: a rule of your own instead of ``threshold``, ``risk`` and ``max_views``: a ``Stopping`` with another
+            ``reached``.
+
+    Raises:
+        ModelError: there are no such models, one cannot be used, or the recogniser has no novelty score.
+        PolicyError: there is no such policy, or it cannot be made.
+        RiskError: the error rate cannot be promised.
+        UsageError: a threshold, a rate or a number of views makes no sense.
+    """
+    given = {k: v for k, v in locals().items() if k != "models"} | {"models": str(models)}
+    whole(threads, "the number of threads", 0, MOST_THREADS)
+    if number(unknown, "the share of known objects called unknown", 0) >= 1:
+        raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
+    Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
+    found = find_models(models)
+    sphere = viewpoints_of(viewpoints)
+    recogniser = Recogniser(found.recogniser, threads)
+    if unknown and recogniser.novelty is None:
+        raise ModelError(f"{found.recogniser}: cannot tell unknown objects; nextview fit unknown teaches it")
+    if policy is None:
+        policy, made = _default_policy(found.policies, sphere, recogniser)
+    else:
+        name = with_cards(policy, found.policies)
+        made = make_policy_anywhere(name, sphere, (), recogniser.classes, found.maps)
+    opened = Models(recogniser, open_maps(found.maps, made.needs, threads))
+    if policy in opened.maps:  # a map's own policy goes to the valley for some classes, which the map's card names
+        made = make_policy_anywhere(policy, sphere, opened.valley_classes(policy), recogniser.classes, found.maps)
+    if isinstance(made, MapPeak | SpherePeak):
+        made = replace(made, sphere=_grid_of(opened.maps[made.map_name.removesuffix(SPHERE)], made.sphere))
+    rule = stopping or Stopping.of(recogniser.calibration, threshold, risk, max_views)
+    return System(opened, made, policy, sphere, rule, unknown, given)
+
+
+def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
+    """The grid whose local maps a network predicts: that of the views if it has as many rings, else the 40 views."""
+    for grid in (sphere, *LAYOUTS.values()):
+        if network.rings in (None, grid.rings):
+            return grid
+    raise PolicyError(
+        f"the map {network.card.name} has {network.rings} rings, and the {len(sphere)} viewpoints {sphere.rings}"
+    )
+
+
+def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> CapturedCamera:
+    from nextview.simulation.captured import read_capture
+    from nextview.simulation.captured_camera import UP, CapturedCamera
+
+    if isinstance(up, str) and up not in UP:
+        raise UsageError(f"{folder}: up is {', '.join(UP)} or a direction, three numbers, not {up!r}")
+    return CapturedCamera(read_capture(folder), UP[up] if isinstance(up, str) else up)
+
+
+def _default_policy(own: dict[str, Path], sphere: Viewpoints, recogniser: Recogniser) -> tuple[str, Policy]:
+    """ "gain", where one fits, else "spread", which asks for nothing."""
+    try:
+        gain = make_policy_anywhere(str(own.get("gain", "gain")), sphere, (), recogniser.classes)
+        grid = getattr(gain, "sphere", None)
+        if "azimuth_bins" not in gain.needs or recogniser.azimuth_bins == getattr(grid, "azimuths", None):
+            return "gain", gain
+    except OtherUseError:
+        pass
+    return "spread", make_policy_anywhere("spread", sphere)
+
+
+def _load(given: dict[str, Any]) -> System:
+    return load(**given)
+
+
+_bundled = lru_cache(maxsize=1)(load)
+
+
+def recognise(what: str | Path | Mesh | Camera | FrameCamera, **options: Any) -> Recognition:
+    """What an object is, by the bundled models, in one call. Options as for ``System.recognise``.
+
+    >>> recognise("chair.off")                                                  # doctest: +SKIP
+    chair (belief 0.998, 2 views, 1.41 cells of travel, confident)
+    """
+    return _bundled().recognise(what, **options)

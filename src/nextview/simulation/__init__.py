@@ -1,0 +1,1 @@
+"""The simulated camera, sensor models, cluttered scenes, captured folders."""

@@ -1,0 +1,342 @@
+"""Captured objects: folders of depth images with poses, in the layouts of BOP, TUM RGB-D and 7-Scenes.
+
+BOP: Hodan et al., ECCV 2018. TUM RGB-D: Sturm et al., IROS 2012. 7-Scenes: Shotton et al., CVPR 2013.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta, Struct
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from nextview.errors import DatasetError, ObservationError, UsageError
+from nextview.files import read_record, regular_file
+from nextview.sensing.frame import Frame, check_pose
+from nextview.sensing.object_frame import Box
+
+NOTHING = np.iinfo(np.uint16).max  # what some sensors give for "nothing" besides 0
+DEEP = ("I;16", "I;16B", "I")  # Pillow's names of grey images of 16 bits
+INTRINSICS = "camera-intrinsics.txt"  # the pinhole matrix in a folder of TUM or 7-Scenes, as in 3DMatch
+LARGEST_TEXT = 2**28  # bytes of a list of images or poses
+MILLIMETRES = 0.001
+TUM_STEP = 1 / 5000  # metres that one step of TUM's depth images stands for
+TOGETHER = 0.02  # seconds that an image and its pose, or depth and colour, may be apart
+KINECT = (585.0, 585.0, 320.0, 240.0)  # fx, fy, cx, cy of the depth camera of 7-Scenes, for all of its scenes
+
+Float = NDArray[np.float64]
+Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
+Nine = Annotated[list[float], Meta(min_length=9, max_length=9)]
+
+
+@dataclass(frozen=True)
+class CapturedFrame:
+    """A captured view, as yet unread."""
+
+    name: str  # in the folder
+    depth: Path  # 16-bit PNG of distances along the optical axis; 0 and 65535 mean nothing
+    scale: float  # metres that one step of the depth image stands for
+    intrinsics: Float  # pinhole matrix, (3, 3) float64, pixels, first pixel's centre at 0 (OpenCV)
+    pose: Float  # camera-to-world, (4, 4) float64, metres, OpenCV axes
+    mask: Path | None = None  # picture that is not black where the object is, if there is one
+    image: Path | None = None  # grey or colour picture registered to the depth, if there is one
+
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the depth image, pixels, from its header alone."""
+        return _open(self.depth, ("PNG",), load=False).size
+
+    def read(self, masked: bool = True) -> Frame:
+        """Read the images, the mask only if ``masked``; ObservationError if they show nothing of use."""
+        deep = _open(self.depth, ("PNG",))
+        if deep.mode not in DEEP:
+            raise DatasetError(f"{self.depth}: depth is a grey PNG of 16 bits, this one has 8 (mode {deep.mode})")
+        raw = np.asarray(deep).astype(np.uint16)
+        depth = np.where(raw == NOTHING, 0, raw) * np.float32(self.scale)
+        mask = _as_grey(self.mask, raw.shape) > 0 if masked and self.mask is not None else None
+        image = None if self.image is None else _as_grey(self.image, raw.shape)
+        return Frame(depth, self.intrinsics, self.pose, mask, image)
+
+
+Frames = tuple[list[CapturedFrame], list[str]]  # and what was assumed or left out, a phrase each
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A folder of captured views of one scene."""
+
+    folder: Path
+    layout: str  # "BOP", "TUM RGB-D" or "7-Scenes"
+    frames: tuple[CapturedFrame, ...]  # in the folder's order, at least one
+    up: tuple[float, float, float] | None  # direction against gravity in its world; None if the layout says nothing
+    notes: tuple[str, ...]  # what was assumed or left out, a phrase each
+
+    def __repr__(self) -> str:
+        return f"{self.folder}: {self.layout} layout, {len(self.frames)} frames; " + "; ".join(self.notes)
+
+
+def read_capture(
+    folder: str | Path,
+    intrinsics: tuple[float, float, float, float] | str | Path | None = None,
+    object_id: int | None = None,
+) -> Capture:
+    """Find out which layout a folder has, and read its poses and intrinsics; the images are read when they are used.
+
+    Args:
+        folder: one scene.
+        intrinsics: fx, fy, cx, cy, pixels, first pixel's centre at 0; or a file with the pinhole matrix. By default
+            those of the folder.
+        object_id: which object of a BOP scene with several, its obj_id.
+
+    Raises:
+        DatasetError: what is missing or wrong, and in which file.
+        UsageError: ``object_id`` is given for another layout.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DatasetError(f"{folder}: there is no such folder")
+    found = [layout for layout, (files, _) in LAYOUTS.items() if next(folder.glob(files), None)]
+    if len(found) > 1:
+        raise DatasetError(f"{folder}: has the files of two layouts, {found[0]} and {found[1]}; move one of them away")
+    if not found:
+        known = ", ".join(f"{files} ({layout})" for layout, (files, _) in LAYOUTS.items())
+        raise DatasetError(f"{folder}: no captured views are found; there is none of {known}")
+    layout, k, said = found[0], None, list[str]()
+    if object_id is not None and layout != "BOP":
+        raise UsageError(f"objects have numbers in BOP's layout only, and {folder} has the layout of {layout}")
+    path = folder / INTRINSICS if intrinsics is None or isinstance(intrinsics, tuple) else Path(intrinsics)
+    if isinstance(intrinsics, tuple):
+        k, said = pinhole_of(*intrinsics), ["intrinsics as given"]
+    elif intrinsics is not None or path.exists():
+        k, said = _table(path, "the pinhole matrix", 3), [f"intrinsics of {path.name}"]
+    frames, notes = LAYOUTS[layout][1](folder, k, object_id)
+    if not frames:
+        raise DatasetError(f"{folder}: no image shows the object")
+    up = None if layout == "7-Scenes" else (0.0, 0.0, 1.0)  # the world of 7-Scenes is that of its first camera
+    return Capture(folder, layout, tuple(frames), up, (*said, *notes))
+
+
+class _BoxFile(Struct, forbid_unknown_fields=True):
+    low: Three
+    high: Three
+    axes: Annotated[list[Three], Meta(min_length=3, max_length=3)] | None = None
+
+
+def read_box(path: Path) -> Box:
+    """An upright box in a JSON file: "low" and "high", its corners, metres, and "axes", rows, if not the world's."""
+    box = read_record(path, _BoxFile, "a box", DatasetError)
+    try:
+        return Box(np.array(box.low), np.array(box.high), np.eye(3) if box.axes is None else np.array(box.axes))
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
+
+
+def pinhole_of(fx: float, fy: float, cx: float, cy: float) -> Float:
+    """Pinhole matrix, (3, 3), of focal lengths and principal point, pixels."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+# The three layouts
+
+
+class _Camera(Struct):
+    cam_K: Nine
+    depth_scale: Annotated[float, Meta(gt=0)]
+    cam_R_w2c: Nine | None = None
+    cam_t_w2c: Three | None = None
+
+
+class _Object(Struct):
+    obj_id: int
+    cam_R_m2c: Nine | None = None
+    cam_t_m2c: Three | None = None
+
+
+def _read_bop(folder: Path, intrinsics: Float | None, object_id: int | None) -> Frames:
+    """Views of scene_camera.json. Without camera poses, the world is the object's model, by scene_gt.json."""
+    path, truth = folder / "scene_camera.json", folder / "scene_gt.json"
+    cameras = read_record(path, dict[int, _Camera], "the cameras of a BOP scene", DatasetError)
+    all_objects: dict[int, list[_Object]] = {}
+    if truth.exists():
+        all_objects = read_record(truth, dict[int, list[_Object]], "the objects of a BOP scene", DatasetError)
+    numbers = sorted({one.obj_id for many in all_objects.values() for one in many})
+    named = ", ".join(map(str, numbers))
+    if object_id is not None and object_id not in numbers:
+        known = f"there are {named}" if numbers else "there is no scene_gt.json"
+        raise DatasetError(f"{folder}: no object has the number {object_id}; {known}")
+    single = numbers[0] if object_id is None and len(numbers) == 1 else object_id
+    notes = ["intrinsics of scene_camera.json"] if intrinsics is None else []
+    if single is None and numbers:
+        notes.append(f"objects {named}: name one with --object-id, and its masks are used")
+    frames, from_model = [], False
+    for number, camera in sorted(cameras.items()):
+        objects, name = all_objects.get(number, []), f"{number:06d}"
+        here = [i for i, one in enumerate(objects) if one.obj_id == single]
+        if single is not None and numbers and not here:
+            continue  # it does not show the object
+        rotation, translation, where = camera.cam_R_w2c, camera.cam_t_w2c, f"image {number} of {path}"
+        if rotation is None and here:
+            thing, from_model, where = objects[here[0]], True, f"image {number} of {truth}"
+            rotation, translation = thing.cam_R_m2c, thing.cam_t_m2c
+        if rotation is None or translation is None:
+            raise DatasetError(
+                f"{where}: lacks the camera's pose (cam_R_w2c, cam_t_w2c); an object's pose in scene_gt.json will do, "
+                "named with --object-id if there are several"
+            )
+        pose, turn = np.eye(4), np.reshape(rotation, (3, 3))
+        pose[:3, :3], pose[:3, 3] = turn.T, -turn.T @ (np.array(translation) * MILLIMETRES)
+        k = np.reshape(camera.cam_K, (3, 3)) if intrinsics is None else intrinsics
+        masks: list[Path] = []  # those of the object; without scene_gt.json, all that there are
+        if len(here) == 1 or not numbers:
+            masks = list(folder.glob(f"mask_visib/{name}_{f'{here[0]:06d}' if here else '*'}.png"))
+        mask = masks[0] if len(masks) == 1 else None
+        images = (folder / file for file in (f"rgb/{name}.png", f"rgb/{name}.jpg", f"gray/{name}.png"))
+        image, depth = next(filter(Path.exists, images), None), folder / f"depth/{name}.png"
+        step = camera.depth_scale * MILLIMETRES
+        frames.append(CapturedFrame(name, depth, step, k, _rigid(pose, where), mask, image))
+    if from_model:
+        notes.append("there are no camera poses: the world is the object's model in scene_gt.json")
+    if any(frame.mask for frame in frames):
+        notes.append("masks of mask_visib")
+    return frames, notes
+
+
+def _read_tum(folder: Path, intrinsics: Float | None, _: int | None) -> Frames:
+    """Views by depth.txt and groundtruth.txt; images of rgb.txt, and masks of the depth images' names in mask/."""
+    if intrinsics is None:
+        raise DatasetError(
+            f"{folder}: the intrinsics are missing, which this layout does not hold; put the pinhole matrix into "
+            "camera-intrinsics.txt or give --intrinsics FX FY CX CY (TUM's recordings: 525 525 319.5 239.5)"
+        )
+    times, depths = _images(folder / "depth.txt")
+    moments, poses = _trajectory(folder / "groundtruth.txt")
+    colour_times, colours = _images(folder / "rgb.txt") if (folder / "rgb.txt").exists() else (np.zeros(0), [])
+    frames = []
+    for time, depth in zip(times, depths, strict=True):
+        at, colour, mask = _nearest(time, moments), _nearest(time, colour_times), folder / "mask" / depth.name
+        if at is not None:
+            beside = mask if mask.exists() else None, None if colour is None else colours[colour]
+            frames.append(CapturedFrame(depth.stem, depth, TUM_STEP, intrinsics, poses[at], *beside))
+    if not frames:
+        raise DatasetError(
+            f"{folder}: no image of depth.txt has a pose in groundtruth.txt within {TOGETHER} s; are the times of one "
+            "clock, in seconds?"
+        )
+    lost = len(times) - len(frames)
+    return frames, [f"{lost} depth images have no pose within {TOGETHER} s and are left out"] if lost else []
+
+
+def _read_seven_scenes(folder: Path, intrinsics: Float | None, _: int | None) -> Frames:
+    """Views by frame-*.depth.png and .pose.txt, and masks in .mask.png. The colour images are not registered."""
+    notes = []
+    if intrinsics is None:
+        intrinsics = pinhole_of(*KINECT)
+        notes.append("there is no camera-intrinsics.txt: the Kinect's fx = fy = 585, cx = 320, cy = 240 are assumed")
+    frames = []
+    for depth in sorted(folder.glob("frame-*.depth.png")):
+        name = depth.name.removeprefix("frame-").removesuffix(".depth.png")
+        path, mask = folder / f"frame-{name}.pose.txt", folder / f"frame-{name}.mask.png"
+        pose = _rigid(_table(path, "the camera's pose", 4), str(path))
+        frames.append(CapturedFrame(name, depth, MILLIMETRES, intrinsics, pose, mask if mask.exists() else None))
+    return frames, notes
+
+
+LAYOUTS = {  # a file that tells each, and what reads its views
+    "BOP": ("scene_camera.json", _read_bop),
+    "TUM RGB-D": ("depth.txt", _read_tum),
+    "7-Scenes": ("frame-*.depth.png", _read_seven_scenes),
+}
+
+
+def _rigid(pose: ArrayLike, where: str) -> Float:
+    try:
+        return check_pose(pose)
+    except ObservationError as error:
+        raise DatasetError(f"{where}: {error}") from None
+
+
+def _nearest(time: float, others: Float) -> int | None:
+    """Which of other times, (N,) seconds, is nearest, if it is near enough; a gap of just the limit counts."""
+    gaps = np.abs(others - time)
+    return int(gaps.argmin()) if len(gaps) and gaps.min() <= TOGETHER + 1e-6 else None
+
+
+def _images(path: Path) -> tuple[Float, list[Path]]:
+    """Times, (N,) seconds, and the images beside the list."""
+    lines = _lines(path, 2, "times and names of images")
+    for outside in (word for _, word in lines if Path(word).is_absolute() or ".." in Path(word).parts):
+        raise DatasetError(f"{path}: {outside} is no file of this folder")
+    return _numbers(path, [line[:1] for line in lines])[:, 0], [path.parent / word for _, word in lines]
+
+
+def _trajectory(path: Path) -> tuple[Float, Float]:
+    """Times, (N,) seconds, and camera-to-world poses, (N, 4, 4)."""
+    values = _numbers(path, _lines(path, 8, "times, positions and quaternions (x, y, z, w)"))
+    length = np.linalg.norm(values[:, 4:], axis=1)
+    worst = max(length, key=lambda n: abs(n - 1))
+    if abs(worst - 1) > 0.01:
+        raise DatasetError(f"{path}: a quaternion has the length {worst:.3g}, not 1")
+    poses = np.tile(np.eye(4), (len(values), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(values[:, 4:]).as_matrix()
+    poses[:, :3, 3] = values[:, 1:4]
+    return values[:, 0], poses
+
+
+def _lines(path: Path, columns: int, what: str) -> list[list[str]]:
+    """The words of each line that is no comment: at least one line, of so many words."""
+    regular_file(path, f"a list of {what}", DatasetError, LARGEST_TEXT)
+    try:
+        lines = [(n, line.split()) for n, line in enumerate(path.read_text().splitlines(), 1)]
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: cannot be read as text ({error})") from None
+    lines = [(n, words) for n, words in lines if words and not words[0].startswith("#")]
+    for n, words in ((n, words) for n, words in lines if len(words) != columns):
+        raise DatasetError(f"{path}: line {n} has {len(words)} words; it lists {what}, {columns} words a line")
+    if not lines:
+        raise DatasetError(f"{path}: lists nothing; it should list {what}")
+    return [words for _, words in lines]
+
+
+def _numbers(path: Path, words: list[list[str]]) -> Float:
+    try:
+        values = np.array(words, np.float64)
+    except ValueError as error:
+        raise DatasetError(f"{path}: a number is expected ({error})") from None
+    if not np.isfinite(values).all():
+        raise DatasetError(f"{path}: holds NaN or infinity; was the camera lost here? Remove this frame")
+    return values
+
+
+def _table(path: Path, what: str, side: int) -> Float:
+    """A square table of numbers."""
+    values = _numbers(path, _lines(path, side, what))
+    if len(values) != side:
+        raise DatasetError(f"{path}: not {what}, {side} x {side} numbers")
+    return values
+
+
+def _as_grey(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """A mask or a picture, (H, W) uint8 (ITU-R BT.601)."""
+    image = _open(path, ("PNG", "JPEG"))
+    if (image.height, image.width) != shape:
+        raise DatasetError(f"{path}: is {image.width} x {image.height} pixels, the depth image {shape[1]} x {shape[0]}")
+    if image.mode in DEEP:
+        raise DatasetError(f"{path}: has 16 bits where 8 are expected; is it a depth image?")
+    return np.asarray(image.convert("L"))
+
+
+def _open(path: Path, formats: tuple[str, ...], load: bool = True) -> Image.Image:
+    regular_file(path, "an image", DatasetError)
+    try:
+        with Image.open(path, formats=formats) as image:
+            if load:
+                image.load()
+            return image  # its file is closed, its pixels stay
+    except Exception as error:  # Pillow raises many kinds
+        raise DatasetError(f"{path}: the image is damaged or cannot be read ({error})") from None

@@ -1,0 +1,100 @@
+"""A robot's camera in a scene: frames in metres, through a sensor, of a target that is named as a user would."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.checks import one_line
+from nextview.errors import NoViewLeftError, ObservationError, UsageError
+from nextview.geometry.viewsphere import DISTANCE, Viewpoints, ViewSphere, angle_between, direction_of, level_pose
+from nextview.sensing import Frame, ObservedObject
+from nextview.sensing.object_frame import Box, ObjectFrame
+from nextview.simulation.scene import TABLE, Scene
+from nextview.simulation.sensed_camera import SensedCamera
+from nextview.simulation.sensor import Sensor, SensorMix, sensor_named
+
+Float = NDArray[np.float64]
+Named = Literal["point", "box", "known", "mask"]
+SAME = 1e-6  # radians between directions that are the same
+
+
+def sensed_camera(
+    scene: Scene, sensor: Sensor | SensorMix | str, rng: np.random.Generator, denoise: bool = True
+) -> SensedCamera:
+    """A ``SensedCamera`` before a scene's target; what hides it is told from it exactly.
+
+    The sensor stands three object radii from the target, whose size follows, and brings no boxes of its own.
+    """
+    drawn = sensor_named(sensor).draw(rng.spawn(1)[0])
+    drawn = replace(drawn, radius=drawn.distance / DISTANCE, boxes=0.0)
+    return SensedCamera(scene.target, drawn, rng, denoise, scene.around, TABLE)
+
+
+class RobotCamera:
+    """Gives frames of a scene, metres, to a session that runs in it live.
+
+    The scene's frame is the target's object frame, in metres. The target is named to the session by a "point" in its
+    middle, by the upright "box" that it just fits into, by its "known" object frame, with the errors of the sensor's
+    setup, or by a "mask" that tells it from all else.
+
+    A pose that cannot be reached, or from which too little of the target is measured, is answered from the nearest
+    other viewpoint where it has not stood yet. Ask only for what ``reachable`` allows to be answered from near.
+
+    Its errors are drawn by ``rng``, seed 0 by default; ``viewpoints`` are the 40 by default.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        sensor: Sensor | SensorMix | str = "none",
+        rng: np.random.Generator | None = None,
+        named: Named = "point",
+        viewpoints: Viewpoints | None = None,
+    ) -> None:
+        if named not in get_args(Named):
+            raise UsageError(f"a target is named by {', '.join(get_args(Named))}, not by {one_line(repr(named))}")
+        self.scene, self.named = scene, named
+        self._directions = (viewpoints or ViewSphere.named("40")).directions
+        self._camera = sensed_camera(scene, sensor, rng or np.random.default_rng(0))
+        self._truth = ObjectFrame(np.zeros(3), self._camera.sensor.radius, np.eye(3))
+        denoise = self._camera.sensor.name != "none"
+        corners = scene.target.vertices * self._truth.radius
+        asked = {
+            "point": {"point": np.zeros(3)},
+            "box": {"box": Box(corners.min(0) - SAME, corners.max(0) + SAME)},
+            "known": {"known": self._camera.object_frame, "support": False},
+            "mask": {},
+        }[named]
+        self.object = ObservedObject(denoise=denoise, life_size=False, **asked)  # type: ignore[arg-type]
+        self._refused: list[Float] = []
+        self._taken: list[Float] = []
+
+    def reachable(self, pose: Float) -> bool:
+        """Whether the camera can be brought to a pose of the scene, (4, 4), metres: for ``Session.reachable``."""
+        return bool(self.scene.reachable(self._truth.pose_in_object(pose)[None, :3, 3])[0])
+
+    def observe(self, pose: Float) -> Frame:
+        """Look from a pose, (4, 4), in the object frame as it is believed to be; from near it where that cannot be."""
+        believed = self.object.object_frame if self.object.sightings or self.object.known else self._truth
+        asked = direction_of(self._truth.pose_in_object(believed.pose_in_world(pose)))
+        order = np.argsort(angle_between(np.broadcast_to(asked, self._directions.shape), self._directions))
+        for direction in (asked, *self._directions[order]):
+            there = level_pose(direction)
+            tried = self._refused if direction is asked else [*self._refused, *self._taken]
+            used = any(angle_between(direction, other) < SAME for other in tried)
+            if used or not self.scene.reachable(there[None, :3, 3])[0]:
+                continue
+            frame = self._camera.frame(there)
+            if frame is not None:
+                self._taken.append(direction)
+                return frame if self.named in ("known", "mask") else replace(frame, mask=None, pixel_centre=0.5)
+            self._refused.append(direction)
+        raise NoViewLeftError("the target shows from no other place that can be reached")
+
+    def refused(self, error: ObservationError) -> None:
+        """The target is not found in the last frame: no other one is taken from there."""
+        self._refused.append(self._taken.pop())

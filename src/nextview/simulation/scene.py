@@ -1,0 +1,191 @@
+"""A scene as geometry: upright things on a table, in the target's object frame, and where a camera can be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from nextview.checks import points
+from nextview.errors import DatasetError, MeshError
+from nextview.files import regular_file, sha256_of
+from nextview.geometry.mesh import MAX_FACES, Mesh, load_mesh
+from nextview.simulation.scene_layout import Block, Placement, SceneLayout
+
+Float = NDArray[np.float64]
+
+TABLE = 3.4  # half the side of the square table, object radii: what stands around the target stands on it
+CLEARANCE = 0.2  # what a camera needs to each side, object radii
+
+GAP, FOOTPRINT, HEIGHT = (0.02, 0.3), (0.3, 0.9), (0.6, 2.6)  # of a box: from the object's circle, sides, height
+_CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
+_FACES = np.reshape([int(i) for i in "021123456576014154263367042246135375"], (-1, 3))
+EDGE = 1e-3  # every footprint is wider by this on each side, object radii: so the thinnest sheet has one too
+_AROUND = EDGE * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+
+
+@dataclass(frozen=True)
+class Item:
+    """One thing beside the target, in its object frame: (V, 3), (F, 3) int32, and counter-clockwise (K, 2)."""
+
+    vertices: Float
+    faces: NDArray[np.int32]
+    footprint: Float
+    wall: bool = False
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The object that is meant, and the other things that stand on its table."""
+
+    target: Mesh
+    items: tuple[Item, ...] = ()
+
+    @property
+    def floor(self) -> float:
+        """Height of the table, z, object radii."""
+        return float(self.target.vertices[:, 2].min())
+
+    @cached_property
+    def around(self) -> Mesh | None:
+        """All items as one mesh, in the target's frame and radii, not normalised; None if there is none."""
+        if not self.items:
+            return None
+        first = np.cumsum([0, *(len(item.vertices) for item in self.items)])
+        faces = np.concatenate([item.faces + at for item, at in zip(self.items, first, strict=False)])
+        vertices = np.concatenate([item.vertices for item in self.items])
+        return Mesh(vertices, faces.astype(np.int32), np.zeros(3), 1.0, "items")
+
+    @cached_property
+    def table(self) -> Mesh:
+        """Its top, a square."""
+        square = np.array([[-TABLE, -TABLE], [TABLE, -TABLE], [TABLE, TABLE], [-TABLE, TABLE]])
+        square = np.column_stack([square, np.full(4, self.floor)])
+        return Mesh(square, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(3), 1.0, "table")
+
+    def clearance(self, positions: Float) -> Float:
+        """Distance of cameras, (V, 3), from the nearest item, as a prism on its footprint, or the table, object radii.
+
+        (V,) float64; 0 inside of an item, negative below the table.
+        """
+        found = positions[:, 2] - self.floor
+        for item in self.items:
+            above = np.maximum(positions[:, 2] - item.vertices[:, 2].max(), 0)
+            found = np.minimum(found, np.hypot(distances(item.footprint, positions[:, :2]), above))
+        return found
+
+    def reachable(self, positions: Float) -> NDArray[np.bool_]:
+        """Whether a camera can be brought to each position, (V, 3), object frame, object radii; (V,) bool.
+
+        Not nearer than CLEARANCE to an item or the table, nor to where a wall stands before the target from above.
+        """
+        positions = points(positions, "the positions of cameras")
+        free = self.clearance(positions) >= CLEARANCE
+        for wall in (item.footprint for item in self.items if item.wall):
+            free &= [separation(np.array([p, (0.0, 0.0)]), wall) > 0 for p in positions[:, :2]]
+        return free
+
+
+def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FACES) -> Scene:
+    """A scene as geometry, of the mesh files below a folder, with at most so many faces together.
+
+    Raises:
+        DatasetError: a mesh file is not the one that the scene was made with.
+        MeshError: it cannot be used, or there are too many faces.
+    """
+    loaded: list[Mesh] = []
+    for placed in (layout.target, *layout.objects):
+        path = Path(meshes) / placed.mesh
+        if mesh_hash(path) != placed.sha256:
+            raise DatasetError(f"{path}: is not the mesh that this scene was made with")
+        loaded.append(cached_mesh(path, max_faces))
+        if (faces := sum(len(mesh.faces) for mesh in loaded)) > max_faces:
+            most = f"more than {max_faces:,}; --max-faces (max_faces) allows more"
+            raise MeshError(f"scene {layout.name}: its meshes have {faces:,} triangles, {most}")
+    target, *others = loaded
+    floor = float(target.vertices[:, 2].min())
+    objects = [place(mesh, at, floor) for mesh, at in zip(others, layout.objects, strict=True)]
+    return Scene(target, (*objects, *(block_item(block, floor) for block in layout.blocks)))
+
+
+def place(mesh: Mesh, at: Placement, floor: float) -> Item:
+    """A mesh, in its own frame and radii, rotated, scaled and stood on the table."""
+    c, s = np.cos(at.azimuth), np.sin(at.azimuth)
+    vertices = at.radius * mesh.vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
+    vertices += (at.x, at.y, floor - vertices[:, 2].min())
+    return Item(vertices, mesh.faces, footprint(vertices))
+
+
+def block_item(block: Block, floor: float) -> Item:
+    """A box on the table."""
+    size, middle = np.array([[block.width, block.depth, block.height]]), np.array([[block.x, block.y]])
+    mesh = upright_boxes(size, np.array([block.azimuth]), middle, floor)
+    return Item(mesh.vertices, mesh.faces, footprint(mesh.vertices), block.wall)
+
+
+@lru_cache(maxsize=64)
+def cached_mesh(path: Path, max_faces: int = MAX_FACES) -> Mesh:
+    """A mesh, read once: the same ones stand in many scenes. See ``load_mesh``."""
+    return load_mesh(path, max_faces=max_faces)
+
+
+@lru_cache(maxsize=4096)
+def mesh_hash(path: Path) -> str:
+    """SHA-256 of a mesh file in hexadecimal."""
+    regular_file(path, "a mesh", DatasetError)
+    return sha256_of(path)
+
+
+def boxes_around(vertices: Float, count: int, rng: np.random.Generator) -> Mesh:
+    """So many upright boxes on the ground of an object, outside of its outline's circle; they may overlap."""
+    floor, reach = vertices[:, 2].min(), np.hypot(vertices[:, 0], vertices[:, 1]).max()
+    size = np.concatenate([rng.uniform(*FOOTPRINT, (count, 2)), rng.uniform(*HEIGHT, (count, 1))], 1)
+    azimuth, towards = rng.uniform(0, 2 * np.pi, (2, count))
+    away = reach + np.hypot(size[:, 0], size[:, 1]) / 2 + rng.uniform(*GAP, count)
+    at = away[:, None] * np.stack([np.cos(towards), np.sin(towards)], 1)
+    return upright_boxes(size, azimuth, at, float(floor))
+
+
+def upright_boxes(size: Float, azimuth: Float, at: Float, floor: float) -> Mesh:
+    """Boxes of width, depth and height, (N, 3), on the ground at some height, as one mesh, not normalised."""
+    corners = _CORNERS * size[:, None]
+    c, s = np.cos(azimuth)[:, None], np.sin(azimuth)[:, None]
+    x = c * corners[..., 0] - s * corners[..., 1] + at[:, :1]
+    y = s * corners[..., 0] + c * corners[..., 1] + at[:, 1:]
+    places = np.stack([x, y, corners[..., 2] + floor], -1).reshape(-1, 3)
+    faces = (_FACES + 8 * np.arange(len(size))[:, None, None]).reshape(-1, 3)
+    return Mesh(places, faces.astype(np.int32), np.zeros(3), 1.0, "boxes")
+
+
+def footprint(vertices: Float) -> Float:
+    """Convex hull of what lies under some points, (V, 3) or (V, 2), counter-clockwise, (K, 2)."""
+    around = (vertices[:, None, :2] + _AROUND).reshape(-1, 2)
+    return around[ConvexHull(around).vertices]
+
+
+def separation(a: Float, b: Float) -> float:
+    """How far apart two convex polygons are along the edge normal that parts them most; negative if they overlap.
+
+    Corner to corner they are farther apart, never nearer. Counter-clockwise, (K, 2) and (L, 2); two points are a line.
+    """
+    return max(_gap(a, b), _gap(b, a))
+
+
+def _gap(a: Float, b: Float) -> float:
+    edges = np.roll(a, -1, axis=0) - a
+    outward = np.stack([edges[:, 1], -edges[:, 0]], 1) / np.maximum(np.linalg.norm(edges, axis=1), 1e-12)[:, None]
+    return float(((b @ outward.T).min(0) - (a * outward).sum(1)).max())
+
+
+def distances(polygon: Float, points: Float) -> Float:
+    """Distance of points, (N, 2), from a convex polygon, counter-clockwise, (K, 2); 0 inside. (N,) float64."""
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    towards = points[:, None] - polygon
+    along = np.clip((towards * edges).sum(-1) / (edges**2).sum(-1), 0, 1)
+    off = np.linalg.norm(towards - along[..., None] * edges, axis=-1).min(1)
+    inside = (edges[:, 0] * towards[..., 1] - edges[:, 1] * towards[..., 0] >= 0).all(1)
+    return np.where(inside, 0.0, off)

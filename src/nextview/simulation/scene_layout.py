@@ -1,0 +1,95 @@
+"""What stands where on the table of a cluttered scene: one small JSON file, of which it is built to the bit."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+from nextview.errors import DatasetError
+from nextview.files import read_record, write_record
+
+LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}
+"""Share of the target that shows, on the average over the 40 views."""
+NAMED = re.compile(r".*@(\w+)-\d+")  # names of scenes that were drawn: target, level and number
+SUFFIX = ".json"
+VIEWS = 40
+
+Length = Annotated[float, Meta(ge=-1000, le=1000)]  # or radians: what is computed with more has no precision left
+Size = Annotated[float, Meta(gt=0, le=1000)]
+Hash = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
+MOST = Meta(max_length=1000)
+
+
+def clutter_level(name: str) -> str:
+    """The level of a scene by its name; "" for what is none, such as a single object."""
+    match = NAMED.fullmatch(name)
+    return match[1] if match else ""
+
+
+class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """An object that stands on the table: a mesh file below the folder of meshes, its hash, and where it stands.
+
+    x and y are those of its bounding box's centre; lengths are in object radii of the target, angles in radians.
+    """
+
+    mesh: str
+    sha256: Hash
+    x: Length = 0.0
+    y: Length = 0.0
+    azimuth: Length = 0.0
+    radius: Size = 1.0
+
+    def __post_init__(self) -> None:
+        paths = PurePosixPath(self.mesh), PureWindowsPath(self.mesh)
+        if not self.mesh.isprintable() or any(path.anchor or ".." in path.parts for path in paths):
+            raise ValueError("a mesh is a path below the folder of meshes")
+
+
+class Block(Struct, frozen=True, forbid_unknown_fields=True):
+    """An upright box that stands on the table, lengths in object radii of the target, angles in radians.
+
+    A ``wall`` ends the space in which the camera can move: what lies beyond cannot be reached.
+    """
+
+    x: Length
+    y: Length
+    azimuth: Length
+    width: Size
+    depth: Size
+    height: Size
+    wall: bool = False
+
+
+class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
+    """A target at rest on a table, and what stands around it.
+
+    Its frame is the target's object frame. The table is as high as the target's lowest point.
+    """
+
+    name: str  # unique in its folder, "chair_0890@medium-1"
+    level: str  # one of LEVELS, or another word for scenes of one's own
+    seed: int  # with which it was drawn
+    target: Placement  # in the middle, not rotated
+    objects: Annotated[tuple[Placement, ...], MOST] = ()  # others
+    blocks: Annotated[tuple[Block, ...], MOST] = ()  # boxes and walls
+    # of the 40 views: the share of the target's picture that nothing hides, () if not measured; those out of reach
+    visible: Annotated[tuple[Annotated[float, Meta(ge=0, le=1)], ...], Meta(max_length=VIEWS)] = ()
+    unreachable: Annotated[tuple[Annotated[int, Meta(ge=0, lt=VIEWS)], ...], Meta(max_length=VIEWS)] = ()
+
+    def __post_init__(self) -> None:
+        if self.target != Placement(self.target.mesh, self.target.sha256):
+            raise ValueError("the target stands in the middle as it is")
+        if len(self.visible) not in (0, VIEWS):
+            raise ValueError(f"visible has {VIEWS} numbers")
+
+    def save(self, path: Path) -> None:
+        """Write its file, whole or not at all. The same scene makes the same bytes."""
+        write_record(path, self)
+
+    @classmethod
+    def load(cls, path: str | Path) -> SceneLayout:
+        """Read what ``save`` wrote; DatasetError if there is nothing, or something else."""
+        return read_record(Path(path), cls, "a scene", DatasetError)

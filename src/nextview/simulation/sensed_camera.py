@@ -1,0 +1,168 @@
+"""A simulated camera behind a sensor: true depth in metres, the sensor's errors, then the product's own way in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from nextview.errors import ObservationError
+from nextview.geometry.mesh import Mesh
+from nextview.geometry.observation import Observation, pinhole
+from nextview.geometry.viewsphere import DISTANCE
+from nextview.sensing import Frame, ObjectFrame, ObservedObject
+from nextview.sensing.facets import virtual_pose
+from nextview.sensing.observed_object import FEWEST, SIZE
+from nextview.sensing.segmentation import inside_sphere
+from nextview.simulation.scene import boxes_around
+from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, uniform_field
+from nextview.simulation.simulated import SimulatedCamera
+
+Float = NDArray[np.float64]
+
+TABLE = 1.5  # radius of the table that the object stands on, if nothing else is said, object radii
+REACH = 1.3  # the object is looked for in a sphere so many radii large: with a wrong pose it sticks out of its own
+LEFTOVER = 4.0  # size of the patches of the table that are taken for the object, pixels
+OBJECT, TABLE_TOP, BOX = 0, 1, 2  # what a pixel shows; where it shows nothing, the first
+
+
+class SensedCamera:
+    """Looks at a mesh through a sensor, as a robot would see the object.
+
+    The object stands on a table, among boxes if the sensor's setup has any. Each frame goes through ``ObservedObject``,
+    which knows the object's frame up to the errors of the setup. The mask is what was measured near the object, without
+    boxes and most of the table.
+
+    Args:
+        mesh: a normalised mesh.
+        sensor: a sensor, or the name of one, see ``sensor_named``. Of a mix, one is drawn now.
+        rng: for all errors; those of the object's frame, and the boxes, are drawn now.
+        denoise: as in ``ObservedObject``.
+        around: what hides parts of the object, object frame, object radii, instead of the setup's boxes.
+        table: radius of the table, object radii.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        sensor: Sensor | SensorMix | str,
+        rng: np.random.Generator,
+        denoise: bool = True,
+        around: Mesh | None = None,
+        table: float = TABLE,
+    ) -> None:
+        known = sensor_named(sensor)
+        self.sensor = known.draw(rng.spawn(1)[0]) if isinstance(known, SensorMix) else known
+        self.denoise, self._rng = denoise, rng
+        self._camera = self._looking_at(mesh)
+        self._floor = float(mesh.vertices[:, 2].min())
+        self._metres = mesh.metres
+        self._truth = ObjectFrame(np.zeros(3), self.sensor.radius, np.eye(3))
+        setup, draws = self.sensor, rng.spawn(1)[0]
+        centre = draws.normal(0, setup.centre * setup.radius, 3)
+        radius = setup.radius * np.exp(draws.normal(0, setup.size))
+        lean = Rotation.from_rotvec([*draws.normal(0, setup.tilt, 2), 0], degrees=True).as_matrix()
+        self.object_frame = ObjectFrame(centre, float(radius), lean)  # where the robot takes the object to be
+        self._reach = table
+        if around is None and self.sensor.boxes:
+            draws = rng.spawn(1)[0]
+            if count := int(draws.poisson(self.sensor.boxes)):
+                around = boxes_around(mesh.vertices, count, draws)
+        self._around = None if around is None else self._looking_at(around)
+
+    def _looking_at(self, mesh: Mesh) -> SimulatedCamera:
+        return SimulatedCamera(mesh, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)
+
+    def observe(self, pose: Float) -> Observation:
+        """Look from the direction of a pose, (4, 4), object frame, at the sensor's own distance.
+
+        A frame in which too little of the object is found is a view in which nothing is seen.
+        """
+        frame = self.frame(pose)
+        try:
+            thing = ObservedObject(known=self.object_frame, support=False, denoise=self.denoise, life_size=False)
+            if frame is None:
+                raise ObservationError("nothing is seen")
+            observation = thing.add(frame)
+        except ObservationError:
+            asked = virtual_pose(self.object_frame.pose_in_object(self._truth.pose_in_world(pose)))
+            observation = Observation(np.zeros((SIZE, SIZE), np.float32), asked, pinhole(SIZE, DISTANCE))
+        if self._metres is None:
+            return observation
+        return replace(observation, radius=self._metres * self.object_frame.radius / self._truth.radius)
+
+    def frame(self, pose: Float) -> Frame | None:
+        """What the sensor gives, with the object's mask and the pose that the robot believes in; None for too little.
+
+        The world is the true object frame, in metres. The pose is as in ``observe``.
+        """
+        rng = self._rng.spawn(1)[0]
+        believed = self._truth.pose_in_world(pose, self.sensor.distance)
+        true = believed.copy()
+        if self.sensor.turned or self.sensor.moved:
+            angles = rng.normal(0, self.sensor.turned, 3)
+            true[:3, :3] = true[:3, :3] @ Rotation.from_rotvec(angles, degrees=True).as_matrix()
+            true[:3, 3] += rng.normal(0, self.sensor.moved, 3)
+        depth, whose = self._scene(true)
+        measured, source = self.sensor.measure(depth, rng)
+        other = (whose.ravel()[source] != OBJECT) & (source >= 0)
+        if self.sensor.table:
+            left_in = uniform_field(rng, depth.shape, LEFTOVER) < self.sensor.table
+            other &= (whose.ravel()[source] != TABLE_TOP) | ~left_in
+        if self.sensor.crop:
+            measured = self._cropped(measured, (measured > 0) & ~other, rng)
+        if np.count_nonzero(measured) < FEWEST:
+            return None
+        frame = Frame(measured, self.sensor.intrinsics, believed, pixel_centre=0.5)
+        mask = inside_sphere(frame, self.object_frame.centre, REACH * self.object_frame.radius) & ~other
+        return replace(frame, mask=mask, pixel_centre=0.5) if np.count_nonzero(mask) >= FEWEST else None
+
+    def _scene(self, pose: Float) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """True depth of object, boxes and table, metres, and what each pixel shows."""
+        inside = self._truth.pose_in_object(pose)
+        depth = self._camera.observe(inside).depth
+        whose = np.full(depth.shape, OBJECT, np.uint8)
+        table, part = self._table(inside)
+        shown = np.isfinite(table) & (depth[part] == 0)
+        depth[part][shown], whose[part][shown] = table[shown], TABLE_TOP
+        if self._around is not None:
+            boxes = self._around.observe(inside).depth
+            nearer = (boxes > 0) & ((depth == 0) | (boxes < depth))
+            depth, whose = np.where(nearer, boxes, depth), np.where(nearer, np.uint8(BOX), whose)
+        return depth * np.float32(self.sensor.radius), whose
+
+    def _table(self, pose: Float) -> tuple[Float, tuple[slice, slice]]:
+        """Depth of the table, object radii, infinite beside it; and the part of the picture that holds it."""
+        height = pose[2, 3] - self._floor
+        x = (np.arange(self.sensor.width) + 0.5 - self.sensor.width / 2) / self.sensor.focal
+        y = (np.arange(self.sensor.height) + 0.5 - self.sensor.height / 2) / self.sensor.focal
+        if height <= 0:
+            return np.zeros((0, 0)), (slice(0), slice(0))
+        ends = (-self._reach, self._reach)
+        corners = np.array([[a, b, self._floor] for a in ends for b in ends])
+        right, down, forward = ((corners - pose[:3, 3]) @ pose[:3, :3]).T
+        rows, columns = slice(None), slice(None)
+        if forward.min() > 0:  # else its border is beside the camera, and it may be anywhere in the picture
+            rows = slice(*np.searchsorted(y, [(down / forward).min(), (down / forward).max()]))
+            columns = slice(*np.searchsorted(x, [(right / forward).min(), (right / forward).max()]))
+        x, y = x[columns], y[rows, None]
+        falls = x * pose[2, 0] + y * pose[2, 1] + pose[2, 2]
+        along = np.where(falls < 0, -height / np.where(falls < 0, falls, -1), np.inf)
+        with np.errstate(invalid="ignore"):
+            across = [pose[i, 3] + along * (x * pose[i, 0] + y * pose[i, 1] + pose[i, 2]) for i in (0, 1)]
+            return np.where(across[0] ** 2 + across[1] ** 2 < self._reach**2, along, np.inf), (rows, columns)
+
+    def _cropped(
+        self, depth: NDArray[np.float32], mask: NDArray[np.bool_], rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """The picture without what lies beyond a line across the object, parallel to one of its borders."""
+        side, share = int(rng.integers(4)), float(rng.uniform(0, self.sensor.crop))
+        lines = np.flatnonzero(mask.any(axis=1 - side // 2))
+        if not len(lines):
+            return depth
+        hidden = round(share * (lines[-1] + 1 - lines[0]))
+        kept = np.arange(mask.shape[side // 2])
+        kept = kept >= lines[0] + hidden if side % 2 else kept <= lines[-1] - hidden
+        return np.where(kept[:, None] if side // 2 == 0 else kept, depth, np.float32(0))

@@ -1,0 +1,364 @@
+"""Depth sensors as numbers: how strong each of their errors is, and those of the setup. Known ones, and a mix."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.special import ndtr
+
+from nextview.checks import number, whole
+from nextview.errors import UsageError
+from nextview.geometry.observation import pinhole
+from nextview.geometry.viewsphere import DISTANCE
+
+Image = NDArray[np.float64]
+
+EDGE = 0.02  # two surfaces differ so much from pixel to pixel, as a part of q, beyond the surface's own slope
+STEEPEST = np.radians(80.0)  # the laws of noise are held here: they grow without bound towards 90 degrees
+NO_GRAIN, NARROWEST = 0.1, 1.0  # pixels: a window that holds one pixel; the narrowest shadow
+WIDEST = 8  # projector columns that two neighbouring pixels of one surface may lie apart
+MOST_COLUMNS = 2**26  # projector columns in all rows together
+LARGEST, SIDE, GRAIN, STRONGEST = 10_000, 4096, 100, 100  # limits of numbers, sides of pictures, grain and strength
+MARGIN = 16  # how far beside what there is a pixel may show it, pixels
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A depth sensor, and the setup that it stands in. Without arguments it has no errors.
+
+    The simulated object is ``radius`` metres large and ``distance`` metres away. ``scaled`` multiplies every strength,
+    that is all but what the sensor is (height to radius). Deviations are standard deviations; those of the setup are
+    drawn for each axis.
+
+    Raises:
+        UsageError: numbers that no sensor has.
+    """
+
+    name: str = "none"
+    height: int = 480  # rows of its pictures
+    width: int = 640  # columns
+    focal: float = 585.0  # pixels, for both axes; the principal point is in the middle
+    baseline: float = 0.075  # between the camera and its projector, or its second camera, along x, metres
+    grain: float = 0.0  # how far pixels err together: the correlation at a distance k is exp(-k^2 / (4 grain^2))
+    nearest: float = 0.0  # least depth that it can measure, metres
+    farthest: float = 60.0  # greatest one
+    distance: float = 0.6  # of the camera from the object's centre, metres
+    radius: float = 0.12  # of the object, metres
+
+    axial: float = 0.0  # deviation of depth, in those of a Kinect: see ``kinect_axial``
+    noise: float = 0.0  # deviation of depth, metres, the same everywhere
+    disparity: float = 0.0  # deviation of disparity, pixels: of depth, z^2 / (focal baseline) times as much
+    step: float = 0.0  # of the disparity, which is measured in whole steps, pixels
+    lateral: float = 0.0  # deviation of where edges are seen, in those of a Kinect: see ``kinect_lateral``
+    grazing: float = 0.0  # cosine of the angle of incidence below which pixels are lost, ever more up to 90 degrees
+    flying: float = 0.0  # share of the pixels at edges that hang in the air between the two surfaces
+    shadow: float = 0.0  # what is hidden from a point so many metres beside the camera, along x, is not measured
+    holes: float = 0.0  # share of the pixels without depth
+
+    turned: float = 0.0  # deviation of the camera's rotation, degrees, anew in every view
+    moved: float = 0.0  # deviation of its place, metres, anew in every view
+    centre: float = 0.0  # deviation of the object's centre, object radii
+    size: float = 0.0  # relative deviation of the object's radius
+    tilt: float = 0.0  # deviation of the vertical, degrees
+    table: float = 0.0  # share of the table around the object that is taken for the object
+    crop: float = 0.0  # up to this share of the object's width, or height, lies outside of the picture
+    boxes: float = 0.0  # so many boxes stand around the object on average: see ``boxes_around``
+
+    def __post_init__(self) -> None:
+        for name in (field.name for field in fields(self) if field.name != "name"):
+            what, value = f"sensor {self.name}: {name}", getattr(self, name)
+            if name in ("height", "width"):
+                whole(value, what, 1, SIDE)
+            else:
+                number(value, what, 0, GRAIN if name == "grain" else LARGEST)
+        if not min(self.focal, self.baseline, self.farthest, self.radius) > 0:
+            raise UsageError(f"sensor {self.name}: focal length, baseline, range and radius are positive")
+        if not self.distance > self.radius:
+            raise UsageError(f"sensor {self.name}: at {self.distance} m it stands inside an object of {self.radius} m")
+
+    def scaled(self, strength: float) -> Sensor:
+        """The same sensor with all errors so many times as strong; 0 for none, STRONGEST at most."""
+        number(strength, "the strength of a sensor", 0, STRONGEST)
+        name = self.name if strength == 1 else f"{self.name}:{strength:g}"
+        return replace(self, name=name, **{error: getattr(self, error) * strength for error in ERRORS})
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of its pictures, pixels."""
+        return self.height, self.width
+
+    @property
+    def intrinsics(self) -> Image:
+        """Pinhole matrix, (3, 3) float64, pixels; the first pixel's centre is at 0.5."""
+        return np.array([[self.focal, 0, self.width / 2], [0, self.focal, self.height / 2], [0, 0, 1.0]])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Its name and all its numbers, for JSON."""
+        return asdict(self)
+
+    def draw(self, rng: np.random.Generator) -> Sensor:
+        """Itself: what ``SensorMix`` draws anew for every object."""
+        return self
+
+    def measure(
+        self, depth: NDArray[np.float32], rng: np.random.Generator
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """What the sensor makes of a true depth image. Errors of strength 0 change nothing, to the bit.
+
+        Each error draws from a generator of its own, so that changing one strength changes no other error.
+
+        Args:
+            depth: (height, width) float32, metres, 0 where there is nothing.
+            rng: for all that is random.
+
+        Returns:
+            Depth, (height, width) float32, 0 where none was measured. And whose surface each pixel shows, its own or
+            that of one nearby: row * width + column, int64, or -1 if it hangs in the air.
+        """
+        measured, sources = depth.copy(), np.arange(depth.size).reshape(depth.shape)
+        rows, columns = np.flatnonzero(depth.any(1)), np.flatnonzero(depth.any(0))
+        if not len(rows):
+            return measured, sources
+        top, left = max(rows[0] - MARGIN, 0), max(columns[0] - MARGIN, 0)
+        part = slice(top, rows[-1] + MARGIN + 1), slice(left, columns[-1] + MARGIN + 1)
+        depth, source = depth[part], sources[part]
+        intrinsics = self.intrinsics - [[0, 0, left], [0, 0, top], [0, 0, 0]]
+        axial, lateral, grazing, flying, holes = rng.spawn(5)
+        q = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
+        slope = slopes(q)
+        angle = incidence(q, slope, intrinsics)
+        lost = (depth < self.nearest) | (depth > self.farthest)
+        if self.shadow:
+            lost |= in_shadow(q, self.focal, self.shadow)
+        if self.grazing:
+            lost |= np.cos(angle) < self.grazing * uniform_field(grazing, q.shape, self.grain)
+        changed = q
+        if self.flying:
+            at, to, other = flying.random(q.shape), flying.random(q.shape), across_edges(q, slope)
+            flies = (at < self.flying) & (other != q)
+            changed = np.where(flies, q + to * (other - q), q)
+            source = np.where(flies, -1, source)
+        if self.lateral:
+            reach = self.lateral * kinect_lateral(angle)
+            right, down = (np.rint(reach * normal_field(lateral, q.shape, self.grain)).astype(int) for _ in "xy")
+            changed, near = shifted(changed, slope, right, down)
+            source, lost = source[near], lost[near]
+        if self.axial or self.noise or self.disparity:
+            z = np.where(changed > 0, 1 / np.where(changed > 0, changed, 1), 1.0)
+            along = (self.axial * kinect_axial(z, angle)) ** 2 + self.noise**2
+            # The published laws were measured on what came out, in steps already: theirs is taken off.
+            steps = (self.disparity**2 - self.step**2 / 12) / (self.focal * self.baseline) ** 2
+            sigma = np.sqrt(np.maximum(along / z**4 + steps, 0))
+            changed = np.where(changed > 0, changed + sigma * normal_field(axial, q.shape, self.grain), 0)
+        if self.step:
+            unit = self.step / (self.focal * self.baseline)
+            changed = np.rint(changed / unit) * unit
+        if self.holes:
+            lost |= uniform_field(holes, q.shape, self.grain) < self.holes
+        sources[part] = source
+        if changed is q:
+            measured[part] = np.where(lost, np.float32(0), depth)
+        else:
+            found = changed > 1 / self.farthest
+            made = np.where(found, 1 / np.where(found, changed, 1), 0)
+            measured[part] = np.where(lost | (made < self.nearest), 0, made)
+        return measured, sources
+
+
+ERRORS = tuple(field.name for field in fields(Sensor))[10:]  # the strengths, from axial on
+
+_SETUP: dict[str, Any] = {
+    "turned": 0.3, "moved": 0.003, "centre": 0.05, "size": 0.05, "tilt": 2.0, "table": 0.05, "crop": 0.1,
+}  # fmt: skip
+_KINECT = Sensor(
+    "kinect", grain=2.0, nearest=0.4, farthest=8.0,
+    axial=1.0, step=1 / 8, lateral=1.0, grazing=0.25, flying=0.2, shadow=0.075, holes=0.01,
+)  # fmt: skip
+_STEREO = Sensor(
+    "stereo", height=480, width=848, focal=424.0, baseline=0.05, grain=2.5, nearest=0.2, farthest=10.0,
+    disparity=0.08, step=1 / 32, lateral=1.5, grazing=0.3, flying=0.3, shadow=0.05, holes=0.03,
+)  # fmt: skip
+_ALL = (Sensor(), _KINECT, _STEREO, Sensor("setup", **_SETUP), replace(_STEREO, name="wrist", **_SETUP))
+SENSORS = {sensor.name: sensor for sensor in _ALL}
+"""Sensors by name: "none" has no errors; "kinect" is the first Kinect; "stereo" is like a RealSense D435 of 848 x 480;
+"setup" has no errors but those of pose, object frame, table and picture; "wrist" is "stereo" in such a setup."""
+
+_SIDE, _RADIUS = 224, SENSORS["none"].radius
+_FOCAL = float(pinhole(_SIDE, DISTANCE)[0, 0])
+RENDER = Sensor("render", _SIDE, _SIDE, _FOCAL, distance=DISTANCE * _RADIUS, radius=_RADIUS)
+"""The camera that the networks take for granted, without errors: noise of its own kind may be added."""
+
+
+@dataclass(frozen=True)
+class SensorMix:
+    """Any sensor, from none to twice the known ones, in any setup, from none wrong to very wrong.
+
+    Half of the draws look as renders do, some with noise up to 0.02 object radii or up to a quarter of the pixels
+    missing; the others are a Kinect or a stereo camera. ``strength`` multiplies every error.
+    """
+
+    strength: float = 1.0
+
+    def __post_init__(self) -> None:
+        SENSORS["none"].scaled(self.strength)  # says what is wrong with it
+
+    @property
+    def name(self) -> str:
+        """Its name and, if it is not 1, its strength."""
+        return "mix" if self.strength == 1 else f"mix:{self.strength:g}"
+
+    def draw(self, rng: np.random.Generator) -> Sensor:
+        """A sensor in a setup, for one object."""
+        kind = rng.choice(["render", "kinect", "stereo"], p=[0.5, 0.2, 0.3])
+        if kind == "render":
+            errors = {"noise": (0.6, 0.02 * _RADIUS), "holes": (0.4, 0.25), "grain": (0.3, 2.0)}
+            sensor = replace(RENDER, **_some(rng, errors))
+        else:
+            sensor = SENSORS[str(kind)].scaled(float(rng.uniform(0, 2)))
+        setup = {
+            "tilt": (0.5, 12.0), "centre": (0.5, 0.1), "size": (0.5, 0.15), "crop": (0.4, 0.4),
+            "boxes": (0.5, 12.0), "table": (0.2, 0.1), "turned": (0.3, 0.5), "moved": (0.3, 0.005),
+        }  # fmt: skip
+        return replace(sensor, **_some(rng, setup)).scaled(self.strength)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Its name and its strength, for JSON."""
+        return {"name": self.name, **asdict(self)}
+
+
+def _some(rng: np.random.Generator, errors: dict[str, tuple[float, float]]) -> dict[str, Any]:
+    """Strengths of some errors, each with its chance of being there and its greatest strength."""
+    there, share = rng.random((2, len(errors)))
+    chance, most = np.array(list(errors.values())).T
+    return dict(zip(errors, (share * most * (there < chance)).tolist(), strict=True))
+
+
+def sensor_named(text: str | Sensor | SensorMix) -> Sensor | SensorMix:
+    """A sensor by NAME or NAME:STRENGTH, or as it is; "mix" is another one for every object."""
+    if isinstance(text, Sensor | SensorMix):
+        return text
+    name, given, strength = text.partition(":")
+    if name not in (*SENSORS, "mix"):
+        raise UsageError(f"no sensor is called {name!r}; there are {', '.join(SENSORS)} and mix")
+    try:
+        times = float(strength) if given else 1.0
+    except ValueError:
+        raise UsageError(f"{text}: a sensor is NAME or NAME:STRENGTH, a number of at least 0") from None
+    return SensorMix(times) if name == "mix" else SENSORS[name].scaled(times)
+
+
+# What the errors are made of: all on inverse depth q = 1/z, (H, W), which changes evenly on a plane
+
+
+def slopes(q: Image) -> tuple[Image, Image]:
+    """Change per pixel along x and y, from the side where it is smaller: the same surface. 0 for a pixel alone."""
+    return _slope(q), _slope(q.T).T
+
+
+def _slope(q: Image) -> Image:
+    here, nothing = q > 0, np.full((len(q), 1), np.inf)
+    difference = np.where(here[:, 1:] & here[:, :-1], q[:, 1:] - q[:, :-1], np.inf)
+    forth, back = np.hstack([difference, nothing]), np.hstack([nothing, difference])
+    smaller = np.where(np.abs(back) < np.abs(forth), back, forth)
+    return np.where(np.isfinite(smaller), smaller, 0.0)
+
+
+def shifted(
+    q: Image, slope: tuple[Image, Image], right: NDArray[np.int64], down: NDArray[np.int64]
+) -> tuple[Image, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Each pixel shows the surface of another one nearby where its own ray meets it: edges move and planes stay."""
+    row, column = np.indices(q.shape)
+    at = np.clip(row + down, 0, len(q) - 1), np.clip(column + right, 0, q.shape[1] - 1)
+    there = q[at]
+    moved = there - slope[0][at] * (at[1] - column) - slope[1][at] * (at[0] - row)
+    # The slope of a surface seen edge-on leads anywhere.
+    moved = np.where(np.abs(moved - there) < 0.1 * there, moved, there)
+    return np.where(there > 0, moved, 0), at
+
+
+def incidence(q: Image, slope: tuple[Image, Image], intrinsics: NDArray[np.float64]) -> Image:
+    """Angle between the surface's normal and the ray of each pixel, (H, W), radians, 0 where there is nothing."""
+    (fx, _, cx), (_, fy, cy) = intrinsics[:2]
+    x = (np.arange(q.shape[1]) + 0.5 - cx) / fx
+    y = ((np.arange(q.shape[0]) + 0.5 - cy) / fy)[:, None]
+    a, b = slope[0] * fx, slope[1] * fy  # n = (a, b, c) with n . (x, y, 1) = q
+    c = q - a * x - b * y
+    length = np.sqrt((a * a + b * b + c * c) * (x * x + y * y + 1))
+    return np.where(q > 0, np.arccos(np.clip(q / np.where(length > 0, length, 1), 0, 1)), 0.0)
+
+
+def across_edges(q: Image, slope: tuple[Image, Image]) -> Image:
+    """Inverse depth of the neighbour, of the four, on the other side of the highest step; a pixel's own if none."""
+    padded, other, highest = np.pad(q, 1), q.copy(), EDGE * q
+    height, width = q.shape
+    for dy, dx in ((0, -1), (0, 1), (-1, 0), (1, 0)):
+        beside = padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+        step = np.abs(beside - q - slope[0] * dx - slope[1] * dy)
+        over = (step > highest) & (beside > 0) & (q > 0)
+        other[over], highest[over] = beside[over], step[over]
+    return other
+
+
+def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
+    """Which pixels lie in the shadow of something nearer, as seen from a projector ``baseline`` metres along x.
+
+    The pixel of column u is lit from the projector's column u - focal * baseline * q, which lights the nearest surface.
+    """
+    height, width = q.shape
+    disparity = focal * baseline * q
+    column = np.arange(width) - disparity
+    offset = int(np.ceil(abs(disparity).max(initial=0.0))) + 1
+    if height * 2 * offset > MOST_COLUMNS:
+        raise UsageError(f"a shadow of {baseline} m reaches {offset:,} pixels here, more than can be drawn")
+    lit = np.zeros((height, width + 2 * offset + 2))  # the largest disparity in each column of the projector
+    row = np.broadcast_to(np.arange(height)[:, None], q.shape)
+    seen = q > 0
+    # A surface covers all projector columns from one of its pixels to the next.
+    along, _ = slopes(q)
+    joined = np.zeros(q.shape, bool)
+    bend = np.abs(q[:, 1:] - q[:, :-1] - along[:, :-1])
+    joined[:, :-1] = seen[:, :-1] & seen[:, 1:] & (bend <= EDGE * q[:, :-1])
+    last = np.where(joined, np.roll(column, -1, 1), column)
+    first_index, last_index = np.rint(column).astype(int) + offset, np.rint(last).astype(int) + offset
+    for k in range(WIDEST):
+        at = first_index + k
+        some = seen & ((k == 0) | (at < last_index))
+        np.maximum.at(lit, (row[some], at[some]), disparity[some])
+    narrow = NARROWEST + focal * abs(baseline) * np.abs(along)
+    return seen & (lit[row, np.where(seen, first_index, 0)] > disparity + narrow)
+
+
+def kinect_axial(depth: NDArray[np.floating], angle: NDArray[np.floating]) -> Image:
+    """Standard deviation of the depth (metres) of a Kinect (v1) along its optical axis, metres.
+
+    0.0012 + 0.0019 (z - 0.4)^2 + 0.0001 / sqrt(z) (angle / (pi/2 - angle))^2, from Nguyen, Izadi and Lovell, "Modeling
+    Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012. The angle is that of incidence.
+    """
+    angle = np.minimum(angle, STEEPEST)
+    return 0.0012 + 0.0019 * (depth - 0.4) ** 2 + 0.0001 / np.sqrt(depth) * (angle / (np.pi / 2 - angle)) ** 2
+
+
+def kinect_lateral(angle: NDArray[np.floating]) -> Image:
+    """Standard deviation of where a Kinect (v1) sees an edge, pixels; same source."""
+    angle = np.minimum(angle, STEEPEST)
+    return 0.8 + 0.035 * angle / (np.pi / 2 - angle)
+
+
+def normal_field(rng: np.random.Generator, shape: tuple[int, int], grain: float) -> Image:
+    """White noise under a Gaussian window of ``grain`` pixels, of variance 1."""
+    white = rng.standard_normal(shape)
+    if grain < NO_GRAIN:
+        return white
+    impulse = np.zeros(8 * int(np.ceil(grain)) + 17)
+    impulse[len(impulse) // 2] = 1
+    power = (gaussian_filter1d(impulse, grain) ** 2).sum()
+    return np.asarray(gaussian_filter(white, grain, mode="wrap")) / power
+
+
+def uniform_field(rng: np.random.Generator, shape: tuple[int, int], grain: float) -> Image:
+    """Numbers between 0 and 1, each as likely, of which neighbours are alike as in ``normal_field``."""
+    return rng.random(shape) if grain == 0 else np.asarray(ndtr(normal_field(rng, shape, grain)))

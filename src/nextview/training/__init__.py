@@ -1,1 +1,0 @@
-"""Networks, training and export; the only room that imports torch."""

@@ -1,1 +1,0 @@
-"""From predictions to a policy by reinforcement learning."""

@@ -1,1 +1,0 @@
-"""From predictions to the gain policy."""

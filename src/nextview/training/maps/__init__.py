@@ -1,1 +1,0 @@
-"""From views to the networks that predict maps of a measure."""

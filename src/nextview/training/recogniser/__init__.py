@@ -1,1 +1,0 @@
-"""From views to a recogniser: its networks, azimuth bins, ensembles and the published comparison."""

@@ -1,0 +1,122 @@
+"""What the last view of a walk showed and changed, as a piece of HTML."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Iterable, Mapping
+from html import escape
+from io import BytesIO
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from nextview.geometry.observation import Observation
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.session.style import ACCENT, FAINT, INK, heat
+from nextview.session.view import View
+from nextview.viewers.exploration import Walk
+
+CELL = 11
+"""Side of a cell of a map, pixels."""
+SHOWN = 5
+"""Classes of which the belief is shown."""
+STYLE = f"""<style>
+.nv {{ font: 13px sans-serif; color: {INK}; padding: 0.4em 0.8em 0.8em }}
+.nv h3 {{ margin: 0 0 0.2em; font-size: 15px }}
+.nv p {{ margin: 0.3em 0 }}
+.nv img {{ image-rendering: pixelated; vertical-align: top; margin: 0 4px 4px 0 }}
+.nv figure {{ display: inline-block; margin: 0 4px 0 0; font-size: 11px; vertical-align: top }}
+.nv figcaption {{ width: 0; min-width: 100% }}
+.nv table {{ border-spacing: 0 3px; width: 100% }}
+.nv td {{ padding: 0 4px; white-space: nowrap; font-variant-numeric: tabular-nums }}
+.nv .bar {{ position: relative; height: 13px; width: 120px; background: #eef1f4 }}
+.nv .bar i {{ position: absolute; left: 0; display: block }}
+.nv .bar b {{ position: absolute; top: -2px; bottom: -2px; border-left: 2px dotted {INK} }}
+</style>"""
+
+
+def walk_card(walk: Walk) -> str:
+    """The walk so far: image, maps and values, belief before and after, and every view."""
+    if not walk.views:
+        return f'{STYLE}<div class="nv"><p>No view was taken yet. The policy begins at view {walk.start}.</p></div>'
+    view, classes = walk.views[-1], walk.session.models.classes
+    best = int(view.belief.argmax())
+    believed = f"{escape(classes[best])} {view.belief[best]:.3f}" if view.observation.seen else "nothing is seen"
+    goes_on = "the rule would stop here" if walk.stopped else "the rule would look on"
+    parts = [f"<h3>{believed}</h3><p>{goes_on}</p>", _figures(walk, view), _beliefs(walk), _steps(walk)]
+    return f'{STYLE}<div class="nv">{"".join(parts)}</div>'
+
+
+def preview_card(observation: Observation) -> str:
+    """What a camera that is being dragged would see."""
+    return f'{STYLE}<div class="nv"><h3>from here</h3>{_image(observation.picture, 200)}</div>'
+
+
+def class_card(label: str) -> str:
+    """What the object is."""
+    return f'{STYLE}<div class="nv">Its class is <b>{escape(label)}</b>; no policy knows.</div>'
+
+
+def gallery(pictures: Mapping[str, NDArray[np.uint8]]) -> str:
+    """Small pictures in a row, with their names."""
+    width = 225 // max(len(pictures), 3)
+    shown = [(name, _image(image, width)) for name, image in pictures.items()]
+    return f'{STYLE}<div class="nv">{_row(shown)}</div>'
+
+
+def _image(pixels: NDArray[np.uint8], width: int) -> str:
+    file = BytesIO()
+    Image.fromarray(pixels).save(file, "png")
+    return f'<img width="{width}" src="data:image/png;base64,{b64encode(file.getvalue()).decode()}">'
+
+
+def _row(pictures: list[tuple[str, str]]) -> str:
+    """Pictures, as HTML, with what stands below each."""
+    return "".join(f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>" for below, image in pictures)
+
+
+def _figures(walk: Walk, view: View) -> str:
+    """The image, local maps, and the value of each view where they lie on rings; the highest ring on top."""
+    elevation, azimuth = view.angles
+    where = f"view {view.index}: {elevation:.0f}° up, {round(azimuth) % 360}° round"
+    found = [(where, _image(view.observation.picture, 120))]
+    for name, values in view.maps.items():
+        found.append((f"{name}, from here", _image(heat(values[::-1]), CELL * values.shape[1])))
+    if view.values is not None and isinstance(walk.sphere, ViewSphere):
+        grid = view.values.reshape(walk.sphere.rings, walk.sphere.azimuths)
+        order = np.argsort(walk.sphere.elevations)[::-1]
+        found.append(("value of each view", _image(heat(grid[order]), CELL * grid.shape[1])))
+    return _row(found)
+
+
+def _table(rows: Iterable[Iterable[str]]) -> str:
+    cells = ("".join(f"<td>{cell}</td>" for cell in row) for row in rows)
+    return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
+
+
+def _beliefs(walk: Walk) -> str:
+    """The classes believed most: belief now, what this view says alone, and the change."""
+    view, classes, rows = walk.views[-1], walk.session.models.classes, []
+    before = walk.views[-2].belief if len(walk.views) > 1 else np.full(len(classes), 1 / len(classes))
+    highest = np.maximum(view.belief, before) if len(walk.views) > 1 else view.belief
+    counted = sum(view.observation.seen for view in walk.views)
+    threshold = 100 * float(walk.stopping.threshold_at(max(counted, 1)))
+    for c in np.argsort(-highest, kind="stable")[:SHOWN]:
+        bars = (
+            f'<div class="bar"><i style="top:0;height:8px;width:{100 * view.belief[c]:.1f}%;background:{ACCENT}"></i>'
+            f'<i style="top:8px;height:5px;width:{100 * view.alone[c]:.1f}%;background:{FAINT}"></i>'
+            f'<b style="left:{threshold:.1f}%"></b></div>'
+        )
+        rows.append((escape(classes[c]), bars, f"{view.belief[c]:.3f}", f"{view.belief[c] - before[c]:+.3f}"))
+    legend = "belief · grey: this view alone · dotted: the threshold · last: change by this view"
+    return f"{_table(rows)}<p><small>{legend}</small></p>"
+
+
+def _steps(walk: Walk) -> str:
+    classes, rows = walk.session.models.classes, []
+    for step, view in enumerate(walk.views, 1):
+        best, warnings = int(view.belief.argmax()), ", ".join(warning.name for warning in view.warnings)
+        believed = escape(classes[best]), f"{view.belief[best]:.3f}"
+        rows.append((f"{step}", f"view {view.index}", *believed, f"{view.travel:.2f} cells", escape(warnings)))
+    return _table(rows)

@@ -1,0 +1,237 @@
+"""What is explored, without any page: an object, one or two walks around it, and what their policies value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.checks import whole
+from nextview.data.folders import list_dataset
+from nextview.data.samples import SAMPLES, sample_mesh
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, NextviewError, UsageError
+from nextview.geometry.mesh import FORMATS, Mesh, load_mesh
+from nextview.geometry.observation import Camera, Observation
+from nextview.geometry.viewsphere import direction_of, level_pose, look_at_origin
+from nextview.recognition.belief import FixedLength
+from nextview.session.session import Session
+from nextview.session.system import System, load, simulated
+from nextview.session.view import View
+
+Float = NDArray[np.float64]
+
+
+class StoredViews:
+    """A camera before one object of a view store: it answers with the stored view nearest to the one asked for."""
+
+    def __init__(self, store: ViewStore, row: int) -> None:
+        self.sphere, self._intrinsics = store.sphere, store.intrinsics
+        self._depth, self._image = store.depth(row), store.image(row)
+        radius = store.radii[row]
+        self._radius = float(radius) if np.isfinite(radius) and radius > 0 else None
+
+    def observe(self, pose: NDArray[np.float64]) -> Observation:
+        """The stored view nearest to a pose, (4, 4), object frame; its own pose comes with it."""
+        view, _ = self.sphere.nearest(direction_of(pose))
+        return Observation(
+            self._depth[view], self.sphere.poses[view], self._intrinsics, self._radius, self._image[view]
+        )
+
+
+@dataclass(frozen=True)
+class ShownObject:
+    """An object by its name; ``open`` reads it: a mesh, or a camera where there are only stored views."""
+
+    name: str
+    open: Callable[[], Mesh | Camera]
+    label: str | None = None
+
+
+def shown_objects(path: Path | None = None, up: str | None = None) -> tuple[ShownObject, ...]:
+    """The objects of a path, in order: of a mesh file, a folder of meshes or a view store; the samples if not given."""
+    if path is None:
+        return tuple(ShownObject(name, partial(sample_mesh, name), name) for name in SAMPLES)
+    if not path.is_dir():
+        return (ShownObject(path.stem, partial(load_mesh, path, up)),)
+    if (path / "zarr.json").exists():
+        return _of_store(path)
+    flat = sorted(file for file in path.iterdir() if file.suffix.lower() in FORMATS and file.is_file())
+    if flat:
+        return tuple(ShownObject(file.name, partial(load_mesh, file, up)) for file in flat)
+    entries = list_dataset(path)
+    return tuple(ShownObject(entry.name, partial(load_mesh, entry.path, up), entry.label) for entry in entries)
+
+
+def _of_store(path: Path) -> tuple[ShownObject, ...]:
+    store = ViewStore.open(path)
+    found = [
+        ShownObject(store.names[row], partial(StoredViews, store, row), store.classes[store.labels[row]])
+        for row in np.flatnonzero(store.done).tolist()
+    ]
+    if not found:
+        raise DatasetError(f"{path}: no object in it is rendered yet")
+    return tuple(found)
+
+
+class Walk:
+    """The views of an object so far, and what is believed after them. It ends after all views only."""
+
+    def __init__(self, system: System, camera: Camera, start: int, seed: int = 0) -> None:
+        self.system, self.camera, self.start, self.seed = system, camera, start, seed
+        self.sphere, self.stopping = system.sphere, system.stopping
+        endless = FixedLength(max_views=len(system.sphere))
+        self.session: Session = replace(system, stopping=endless).session(start, seed)
+
+    @property
+    def views(self) -> list[View]:
+        """Those taken, in order."""
+        return self.session.views
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the stopping rule would have ended it by now."""
+        counted = 0
+        for view in self.views:
+            counted += view.observation.seen
+            if view.observation.seen and view.belief.max() >= self.stopping.threshold_at(counted):
+                return True
+        return len(self.views) >= self.stopping.max_views
+
+    @property
+    def next_view(self) -> int | None:
+        """Where the policy looks next; None after all views."""
+        return None if self.session.done else self.session.view
+
+    @property
+    def values(self) -> Float | None:
+        """The policy's values of the views, (V,), NaN for those not considered; None if there are none yet."""
+        return self.views[-1].values if self.views else None
+
+    @property
+    def visited(self) -> list[int]:
+        """The candidate views that were taken, or are nearest to a pose that was taken."""
+        return [view.index for view in self.views]
+
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """All points seen so far, (N, 3), object frame, object radii."""
+        seen = [view.observation.points for view in self.views if view.observation.seen]
+        return np.concatenate([np.zeros((0, 3), np.float32), *seen])
+
+    def look(self, where: int | Float) -> View:
+        """Take a view: from a candidate viewpoint, or from a pose, (4, 4), object frame."""
+        if self.session.done:
+            raise UsageError("every candidate view was taken: start over")
+        pose = self.sphere.poses[where] if isinstance(where, int) else where
+        return self.session.update(self.camera.observe(pose))
+
+    def step(self) -> View:
+        """Take the view that the policy asks for."""
+        return self.look(self.session.view)
+
+    def with_policy_of(self, system: System) -> Walk:
+        """The same views under another policy: what would it do now?"""
+        other = Walk(system, self.camera, self.start, self.seed)
+        for view in self.views:
+            other.session.update(view.observation)
+        return other
+
+
+class Exploration:
+    """An object among some, a camera before it, a walk for each of one or two policies; options of nextview.load."""
+
+    def __init__(
+        self,
+        objects: Sequence[ShownObject],
+        policies: Sequence[str | None] = (None,),
+        sensor: str | None = None,
+        start: int | None = None,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        whole(seed, "the seed", most=2**63 - 1)
+        self.objects, self.sensor, self.seed = {shown.name: shown for shown in objects}, sensor, seed
+        self._load = lru_cache(maxsize=None)(lambda policy: load(policy=policy, **options))
+        self.systems: list[System] = [self._load(policy) for policy in policies]
+        views = len(self.systems[0].sphere)
+        drawn = int(np.random.default_rng(seed).integers(views))
+        self.start = drawn if start is None else whole(start, "the first view", 0, views - 1)
+        self.show(objects[0].name)
+
+    @property
+    def policies(self) -> list[str]:
+        """Names of the policies that are compared."""
+        return [system.policy_name for system in self.systems]
+
+    @property
+    def mesh(self) -> Mesh | None:
+        """The object; None if there are only stored views of it."""
+        return self._opened if isinstance(self._opened, Mesh) else None
+
+    def show(self, name: str) -> None:
+        """Go to another object, and start over."""
+        self._begin(self.objects[name], self.objects[name].open(), self.sensor)
+
+    def use_sensor(self, sensor: str | None) -> None:
+        """Look through another sensor, and start over."""
+        self._begin(self.shown, self._opened, sensor)
+
+    def restart(self) -> None:
+        """Forget all views; a sensor errs anew in the same way."""
+        self._begin(self.shown, self._opened, self.sensor)
+
+    def _begin(self, shown: ShownObject, opened: Mesh | Camera, sensor: str | None) -> None:
+        if sensor is not None and not isinstance(opened, Mesh):
+            raise UsageError(f"{shown.name} has only stored views: no sensor can look at it")
+        cameras = [simulated(opened, sensor, self.seed) if isinstance(opened, Mesh) else opened for _ in self.systems]
+        walks = [
+            Walk(system, camera, self.start, self.seed) for system, camera in zip(self.systems, cameras, strict=True)
+        ]
+        self.shown, self._opened, self.sensor, self.walks = shown, opened, sensor, walks
+
+    def compare(self, policies: Sequence[str | None]) -> None:
+        """Use one policy, or two side by side; those that walked before keep their views."""
+        systems = [self._load(policy) for policy in policies]
+        walks = [self.walks[min(k, len(self.walks) - 1)].with_policy_of(system) for k, system in enumerate(systems)]
+        self.systems, self.walks = systems, walks
+
+    def step(self) -> None:
+        """Let each policy take its next view, if there is one."""
+        for walk in self.walks:
+            if not walk.session.done:
+                walk.step()
+
+    def walk_on(self) -> bool:
+        """Let each policy that has not stopped take its next view. Returns whether any did."""
+        going = [walk for walk in self.walks if not walk.stopped and not walk.session.done]
+        for walk in going:
+            walk.step()
+        return bool(going)
+
+    def pictures(self) -> dict[str, NDArray[np.uint8]]:
+        """Each object by name as seen from 20 degrees up, (H, W) uint8; without those that cannot be opened."""
+        found = {}
+        for name, shown in self.objects.items():
+            with suppress(NextviewError):  # the page shows it when the object is chosen
+                opened = shown.open()
+                camera = simulated(opened) if isinstance(opened, Mesh) else opened
+                found[name] = camera.observe(look_at_origin(np.radians(20), np.radians(40))).picture
+        return found
+
+    def preview(self, where: Float) -> Observation:
+        """What would be seen from a position, (3,), object radii, without noise; nothing is taken."""
+        pose = self.pose_towards(where)
+        return (simulated(self.mesh) if self.mesh is not None else self.walks[0].camera).observe(pose)
+
+    def pose_towards(self, position: Float) -> Float:
+        """A level pose, (4, 4), in the direction of a position, (3,), as far away as the candidate views are."""
+        length = np.linalg.norm(position)
+        outward = position / length if length > 0 else np.array([1.0, 0, 0])
+        return level_pose(outward, self.walks[0].sphere.distance)

@@ -1,0 +1,225 @@
+"""The explorer's page: what is clicked and dragged goes to an ``Exploration``, and what follows is drawn."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from nextview.errors import NextviewError, UsageError
+from nextview.policies.policy_card import bundled_policies
+from nextview.policies.registry import map_policy_names, policy_names
+from nextview.recognition.model_card import find_models
+from nextview.simulation.sensor import SENSORS
+from nextview.viewers.card import class_card, gallery, preview_card, walk_card
+from nextview.viewers.exploration import Exploration
+from nextview.viewers.server import serve
+from nextview.viewers.walk_scene import WalkScene
+
+NOTHING, CLEAN = "nothing", "clean renders"
+GALLERY = 6
+"""As many objects are shown as pictures; more as a list."""
+APART = 8.5
+"""Between two objects side by side, object radii."""
+PAUSE = 0.5
+"""Between the views of a policy that walks, seconds: long enough to see each."""
+HELP = """Click a **ball** to look from there. Drag the **arrows** to look from anywhere else. Balls are coloured by
+what the policy values them at: yellow most, violet least, grey what it does not consider. It would go to the large red
+one next; small dark ones were visited."""
+
+
+class Page:
+    """A page in the browser on an exploration, served at a host and a port. All who open it see and drive the same."""
+
+    def __init__(self, exploration: Exploration, host: str = "127.0.0.1", port: int = 8080) -> None:
+        self.exploration = exploration
+        self.server = serve(host, port)
+        self._lock, self._quiet = threading.RLock(), False
+        self._scenes: list[WalkScene] = []
+        self._cards: list[viser.GuiHtmlHandle] = []
+        self._panels: list[viser.PanelHandle] = []
+        gui = self.server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(209, 73, 91))
+        gui.set_panel_label("nextview explore")
+        self.server.scene.set_up_direction("+z")
+        self._controls(gui)
+        self._rebuild()
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        host = self.server.get_host()
+        return f"http://{'localhost' if host in ('0.0.0.0', '127.0.0.1') else host}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        """Serve it no more."""
+        self.server.stop()
+
+    # What can be clicked
+
+    def _controls(self, gui: viser.GuiApi) -> None:
+        exploration = self.exploration
+        by_map = map_policy_names(find_models(exploration.systems[0].loaded["models"]).maps)
+        policies = list(dict.fromkeys([*exploration.policies, *bundled_policies(), *policy_names(), *by_map]))
+        self._policies, self._sensors = [NOTHING, *policies], [CLEAN, *SENSORS, "mix"]
+        second = exploration.policies[1] if len(exploration.policies) > 1 else NOTHING
+        gui.main_panel.dock_left()
+        gui.add_markdown(HELP)
+        self._object = gui.add_dropdown("Object", list(exploration.objects), initial_value=exploration.shown.name)
+        if len(exploration.objects) <= GALLERY:
+            self._object.visible = False
+            gui.add_html(gallery(exploration.pictures()))
+            names = gui.add_button_group("Object", list(exploration.objects))
+            names.on_click(lambda event: setattr(self._object, "value", names.value))
+        self._label = gui.add_html("")  # and no Markdown: viser would take a name for HTML
+        self._policy = gui.add_dropdown("Policy", policies, initial_value=exploration.policies[0])
+        self._second = gui.add_dropdown("Compare with", self._policies, initial_value=second)
+        name, _, strength = (exploration.sensor or "").partition(":")
+        self._sensor = gui.add_dropdown("Sensor", self._sensors, initial_value=name or CLEAN)
+        given = float(strength or 1)
+        self._strength = gui.add_slider("Noise strength", 0.0, max(4.0, given), 0.25, initial_value=given)
+        self._hide = gui.add_checkbox("Hide what was not seen", initial_value=exploration.mesh is None)
+        step = gui.add_button("Next view by the policy")
+        walk = gui.add_button("Walk until it stops")
+        restart = gui.add_button("Start over")
+        self._preview = gui.add_html("", visible=False)
+
+        def on(handle: Any, act: Callable[[], None]) -> None:
+            handle.on_update(lambda event: None if self._quiet else self._act(act, event.client))
+
+        on(self._object, self._show_object)
+        on(self._policy, self._use_policies)
+        on(self._second, self._use_policies)
+        on(self._sensor, self._use_sensor)
+        on(self._strength, self._use_sensor)
+        on(self._hide, self._draw)
+        step.on_click(lambda event: self._act(lambda: self._drawn(exploration.step), event.client))
+        walk.on_click(lambda event: self._walk(event.client))
+        restart.on_click(lambda event: self._act(lambda: self._changed(exploration.restart), event.client))
+
+    def _act(self, act: Callable[[], Any], client: viser.ClientHandle | None) -> Any:
+        """Do one thing at a time. An error is shown, and the page stays as it was; then None is returned."""
+        with self._lock:
+            try:
+                return act()
+            except NextviewError as error:
+                with self._silence():
+                    self._show_choices()
+                for one in [client] if client is not None else self.server.get_clients().values():
+                    one.add_notification("This cannot be done", str(error), color="red", auto_close_seconds=8)
+                return None
+
+    @contextmanager
+    def _silence(self) -> Iterator[None]:
+        """Take no notice of choices that the page itself changes."""
+        self._quiet = True
+        try:
+            yield
+        finally:
+            self._quiet = False
+
+    def _show_choices(self) -> None:
+        """Show the exploration's object, policies and sensor."""
+        exploration = self.exploration
+        name, _, strength = (exploration.sensor or CLEAN).partition(":")
+        self._object.value, self._sensor.value = exploration.shown.name, name
+        self._strength.value = float(strength or self._strength.value)
+        self._policy.value, *second = exploration.policies
+        self._second.value = second[0] if second else NOTHING
+
+    def _show_object(self) -> None:
+        name = _listed(self._object.value, self.exploration.objects)
+        self._changed(lambda: self.exploration.show(name))
+
+    def _use_policies(self) -> None:
+        first, second = _listed(self._policy.value, self._policies[1:]), _listed(self._second.value, self._policies)
+        self._changed(lambda: self.exploration.compare([first] if second == NOTHING else [first, second]))
+
+    def _use_sensor(self) -> None:
+        sensor = _listed(self._sensor.value, self._sensors)
+        named = None if sensor == CLEAN else f"{sensor}:{float(self._strength.value):g}"
+        if named != self.exploration.sensor:
+            self._changed(lambda: self.exploration.use_sensor(named))
+
+    def _changed(self, change: Callable[[], None]) -> None:
+        change()
+        self._rebuild()
+
+    def _drawn(self, take: Callable[[], Any]) -> bool:
+        """Take views and draw them. Returns what taking them returns, as a truth."""
+        taken = bool(take())
+        self._draw()
+        return taken
+
+    def _look(self, walk: int, where: int | NDArray[np.float64]) -> None:
+        self._act(lambda: self._drawn(lambda: self.exploration.walks[walk].look(where)), None)
+
+    def _drag(self, walk: int, place: NDArray[np.float64], let_go: bool) -> None:
+        """Show what would be seen while a camera is dragged, as often as there is time; look where it is let go."""
+        if let_go:
+            self._preview.visible = False
+            self._look(walk, self.exploration.pose_towards(place))
+        elif self._lock.acquire(blocking=False):
+            try:
+                self._preview.content = preview_card(self.exploration.preview(place))
+                self._preview.visible = True
+            finally:
+                self._lock.release()
+
+    def _walk(self, client: viser.ClientHandle | None) -> None:
+        while self._act(lambda: self._drawn(self.exploration.walk_on), client):
+            time.sleep(PAUSE)
+
+    # What is shown
+
+    def _rebuild(self) -> None:
+        """Other objects, or another number of walks."""
+        for shown in (*self._scenes, *self._panels):
+            shown.remove()
+        n = len(self.exploration.walks)
+        self._scenes, self._cards, self._panels = [], [], []
+        for k, walk in enumerate(self.exploration.walks):
+            place = ((k - (n - 1) / 2) * APART, 0.0, 0.0)
+            look, drag = partial(self._look, k), partial(self._drag, k)
+            scene = WalkScene(self.server, f"/walk{k}", place, walk, self.exploration.mesh, look, drag)
+            self._scenes.append(scene)
+        for walk in self.exploration.walks:
+            panel = self.server.gui.add_panel()
+            with panel.add_tab(walk.system.policy_name):
+                self._cards.append(self.server.gui.add_html(""))
+            panel.dock_below(self._panels[-1]) if self._panels else panel.dock_right()
+            panel.set_width(400)
+            self._panels.append(panel)
+        self._stand_back(n)
+        label = self.exploration.shown.label
+        self._label.content = "" if label is None else class_card(label)
+        self._draw()
+
+    def _stand_back(self, walks: int) -> None:
+        position, at = np.array([0.0, -1.0, 0.55]) * (7.5 + 4.5 * (walks - 1)), np.array([0.0, 0.0, 0.4])
+        first = self.server.initial_camera
+        if np.allclose(first.position, position):
+            return
+        first.position, first.look_at = position, at
+        for client in self.server.get_clients().values():
+            client.camera.position, client.camera.look_at = position, at
+
+    def _draw(self) -> None:
+        with self.server.atomic():
+            for walk, scene, card in zip(self.exploration.walks, self._scenes, self._cards, strict=True):
+                scene.draw(walk, bool(self._hide.value))
+                card.content = walk_card(walk)
+
+
+def _listed(value: object, options: Collection[str]) -> str:
+    """What was chosen from a list. Whoever reaches the page can send anything, also the name of a plugin: refused."""
+    if not isinstance(value, str) or value not in options:
+        raise UsageError(f"{value!r} is none of the options here")
+    return value

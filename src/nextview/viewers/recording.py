@@ -1,0 +1,150 @@
+"""A session as a recording for the Rerun viewer: what was seen from where, and what was made of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+from uuid import uuid4
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from nextview.errors import UsageError
+from nextview.session.style import ACCENT, INK, heat, rgb
+
+if TYPE_CHECKING:
+    from nextview.session.session import Session
+    from nextview.session.view import View
+
+TIMELINE = "step"
+
+
+class Recorder:
+    """Writes a file as a session goes on; put it among ``Session.observers``, or call it with a session yourself.
+
+    On the timeline ``step`` the file holds, in the object frame and object radii:
+
+    - ``world/camera``: pose and pinhole of the last view; ``depth`` and ``image`` below it.
+    - ``world/views/K`` and ``world/seen/K``: pose of view K, and the points that were seen from there. Where a later
+      frame shows better where the object is, they are written anew.
+    - ``world/candidates``: the candidate views, in the colours of what the policy values them at, and
+      ``world/next``: the one that it chose.
+    - ``belief/CLASS``, ``threshold``, ``travel/cells``, ``travel/radians``: numbers over the steps, as they were then.
+    - ``belief_now``, ``this_view_alone``, ``values``: bars over classes, and over the views that the policy considered.
+    - ``maps/NAME``: predicted maps. ``log``: each step in words, with its warnings.
+
+    The file can be read at any time; it is complete once the session is done, or after ``close``.
+
+    Args:
+        path: of the recording, .rrd.
+
+    Raises:
+        UsageError: another suffix, or the file cannot be written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        if Path(path).suffix != ".rrd":
+            raise UsageError(f"{path}: a recording for Rerun is called .rrd")
+        self._stream = rr.RecordingStream("nextview", recording_id=uuid4())
+        try:
+            self._stream.save(path, default_blueprint=blueprint())
+        except (OSError, RuntimeError, ValueError) as error:
+            raise UsageError(f"{path}: cannot be written ({error})") from None
+        self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._shown: list[object] = []
+        self._open = True
+
+    def __call__(self, session: Session) -> None:
+        """Write what is new in a session."""
+        if not (self._open and session.views):
+            return
+        step, view, new = len(session.views), session.views[-1], len(session.views) > len(self._shown)
+        self._stream.set_time(TIMELINE, sequence=step)
+        for k, earlier in enumerate(session.views):
+            if k >= len(self._shown) or self._shown[k] is not earlier.observation:
+                self._log_place(k + 1, earlier)
+        self._shown = [earlier.observation for earlier in session.views]
+        if new:
+            self._log_belief(session, view, step)
+        self._log_choice(session, view, step)
+        self._stream.flush()
+        if session.done:
+            self._log_text(f"done: {session.result!r}")
+            self.close()
+
+    def close(self) -> None:
+        """Complete the file; nothing more is written."""
+        if self._open:
+            self._stream.disconnect()
+        self._open = False
+
+    def _log_place(self, step: int, view: View) -> None:
+        observation = view.observation
+        height, width = observation.depth.shape
+        pose = rr.Transform3D(translation=observation.pose[:3, 3], mat3x3=observation.pose[:3, :3])
+        pinhole = rr.Pinhole(
+            image_from_camera=observation.intrinsics,
+            resolution=(width, height),
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=0.4,
+        )
+        for name in (f"world/views/{step}", "world/camera"):
+            self._stream.log(name, pose, pinhole)
+        points = observation.points if observation.seen else np.zeros((0, 3), np.float32)
+        self._stream.log(f"world/seen/{step}", rr.Points3D(points, colors=rgb(ACCENT), radii=0.006))
+        self._stream.log("world/camera/depth", rr.DepthImage(observation.depth, meter=1.0))
+        self._stream.log("world/camera/image", rr.Image(observation.picture, color_model="L"))
+
+    def _log_belief(self, session: Session, view: View, step: int) -> None:
+        for name, belief in zip(session.models.classes, view.belief, strict=True):
+            self._stream.log(f"belief/{rr.escape_entity_path_part(name)}", rr.Scalars(float(belief)))
+        self._stream.log("belief_now", rr.BarChart(view.belief))
+        self._stream.log("this_view_alone", rr.BarChart(view.alone))
+        self._stream.log("threshold", rr.Scalars(float(session.stopping.threshold_at(step))))
+        self._stream.log("travel/cells", rr.Scalars(view.travel))
+        self._stream.log("travel/radians", rr.Scalars(view.arc))
+        for name, values in view.maps.items():
+            self._stream.log(f"maps/{name}", rr.Tensor(values, dim_names=("ring", "azimuth")))
+        for warning in view.warnings:
+            self._log_text(f"step {step}: warning ({warning.name}): {warning.message}", rr.TextLogLevel.WARN)
+
+    def _log_choice(self, session: Session, view: View, step: int) -> None:
+        """What the policy values the views at, and where it goes; again if it is asked again."""
+        places, visited = session.sphere.poses[:, :3, 3], [earlier.index for earlier in session.views]
+        values = np.full(len(places), np.nan) if view.values is None else view.values
+        colours = heat(values)
+        colours[visited] = rgb(INK)
+        names = [f"view {k}" for k in range(len(places))]
+        candidates = rr.Points3D(places, colors=colours, radii=0.07, labels=names, show_labels=False)
+        self._stream.log("world/candidates", candidates)
+        considered = np.flatnonzero(np.isfinite(values))
+        self._stream.log("values", rr.BarChart(values[considered], abscissa=considered))
+        best, to = int(view.belief.argmax()), view.next_view
+        chosen = places[[] if to is None else [to]]
+        self._stream.log("world/next", rr.Points3D(chosen, colors=rgb(ACCENT), radii=0.1))
+        onward = "the end" if to is None else f"next view {to}"
+        believed = f"{session.models.classes[best]} {view.belief[best]:.3f}"
+        self._log_text(f"step {step}: view {view.index}, {believed}, {view.travel:.2f} cells of travel, {onward}")
+
+    def _log_text(self, text: str, level: str = rr.TextLogLevel.INFO) -> None:
+        self._stream.log("log", rr.TextLog(text, level=level))
+
+
+def blueprint() -> rrb.Blueprint:
+    """How the viewer arranges a recording at first."""
+    camera, bars = "world/camera", {"belief": "belief_now", "this view alone": "this_view_alone", "values": "values"}
+    beside = rrb.Vertical(
+        rrb.Horizontal(
+            *(rrb.Spatial2DView(origin=camera, contents=[f"{camera}/{k}"], name=k) for k in ("image", "depth"))
+        ),
+        rrb.Horizontal(*(rrb.BarChartView(origin=origin, name=name) for name, origin in bars.items())),
+        rrb.Horizontal(
+            rrb.TimeSeriesView(origin="/", contents=["belief/**", "threshold"], name="belief over the steps"),
+            rrb.TimeSeriesView(origin="travel", name="travel"),
+        ),
+    )
+    scene = rrb.Vertical(
+        rrb.Spatial3DView(origin="world", name="object frame"), rrb.TextLogView(origin="log"), row_shares=[4, 1]
+    )
+    return rrb.Blueprint(rrb.Horizontal(scene, beside), rrb.TimePanel(timeline=TIMELINE), collapse_panels=True)

@@ -1,0 +1,123 @@
+"""A walk in 3D: the object, the candidate views in the colours of their values, the path and the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from nextview.geometry.mesh import Mesh
+from nextview.geometry.viewsphere import great_circle
+from nextview.session.style import ACCENT, INK, heat, rgb
+from nextview.viewers.exploration import Walk
+
+Float = NDArray[np.float64]
+
+BALL = 0.12
+"""Radius of a candidate view, object radii."""
+
+
+def wxyz(pose: Float) -> Float:
+    """The rotation of a pose, (4, 4), as a quaternion, scalar first, (4,)."""
+    return np.asarray(Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))
+
+
+class WalkScene:
+    """Draws a walk below one node of the scene; another walk needs another scene.
+
+    ``look`` is called with the candidate view that is clicked; ``drag`` with the place to which the camera is dragged,
+    (3,), object frame, and whether it was let go.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        name: str,
+        place: tuple[float, float, float],
+        walk: Walk,
+        mesh: Mesh | None,
+        look: Callable[[int], None],
+        drag: Callable[[Float, bool], None],
+    ) -> None:
+        self._scene, self._name, self._drag = server.scene, name, drag
+        self._root = server.scene.add_frame(name, show_axes=False, position=place)
+        self._drawn = 0
+        self._object: viser.MeshHandle | None = None
+        if mesh is not None:
+            vertices = mesh.vertices.astype(np.float32)
+            self._object = server.scene.add_mesh_simple(
+                f"{name}/object", vertices, mesh.faces, color=(180, 187, 194), flat_shading=True, side="double"
+            )
+        plain: dict[str, Any] = {"subdivisions": 2, "cast_shadow": False, "receive_shadow": False}
+        self._balls = [
+            server.scene.add_icosphere(f"{name}/views/{view}", BALL, position=place, **plain)
+            for view, place in enumerate(walk.sphere.poses[:, :3, 3])
+        ]
+        for view, ball in enumerate(self._balls):
+            ball.on_click(lambda event, view=view: look(view))
+        first = walk.sphere.poses[walk.start]
+        self._handle = server.scene.add_transform_controls(
+            f"{name}/handle", 0.7, disable_rotations=True, position=first[:3, 3], depth_test=False
+        )
+        self._handle.on_update(self._dragged)
+
+    def remove(self) -> None:
+        """Take it out of the scene."""
+        self._root.remove()
+
+    def _dragged(self, event: viser.TransformControlsEvent) -> None:
+        if event.phase != "start":
+            self._drag(np.asarray(event.target.position, float), event.phase == "end")
+
+    def draw(self, walk: Walk, hide_unseen: bool) -> None:
+        """Draw the walk as it is now; ``hide_unseen`` hides the object, but for the points that were seen."""
+        if self._object is not None:
+            self._object.visible = not hide_unseen
+        self._colour(walk)
+        points, name = walk.points, self._name
+        self._scene.add_point_cloud(f"{name}/seen", points, rgb(ACCENT), point_size=0.012, visible=len(points) > 0)
+        self._draw_path(walk)
+        if not walk.views:
+            return
+        observation = walk.views[-1].observation
+        pose = observation.pose
+        self._handle.position = tuple(pose[:3, 3])
+        height, width = observation.depth.shape
+        self._scene.add_camera_frustum(
+            f"{name}/camera",
+            fov=2 * float(np.arctan(height / 2 / observation.intrinsics[1, 1])),
+            aspect=width / height,
+            scale=0.5,
+            color=rgb(ACCENT),
+            image=np.repeat(observation.picture[..., None], 3, -1),
+            wxyz=wxyz(pose),
+            position=pose[:3, 3],
+            cast_shadow=False,
+        )
+
+    def _colour(self, walk: Walk) -> None:
+        """Candidates by value; those visited dark and small, the next one in the accent colour and large."""
+        values = np.full(len(walk.sphere), np.nan) if walk.values is None else walk.values.copy()
+        values[walk.visited] = np.nan
+        for view, (ball, colour) in enumerate(zip(self._balls, heat(values), strict=True)):
+            visited, asked = view in walk.visited, view == walk.next_view
+            ball.color = rgb(INK) if visited else rgb(ACCENT) if asked else tuple(int(c) for c in colour)
+            scale = 0.5 if visited else 1.5 if asked else 1.0
+            if ball.scale != scale:
+                ball.scale = scale
+
+    def _draw_path(self, walk: Walk) -> None:
+        """The places where the camera stood, numbered, and great circles between them; those that are new."""
+        distance, places = walk.sphere.distance, [view.direction for view in walk.views]
+        for step in range(self._drawn, len(places)):
+            name = f"{self._name}/path/{step + 1}"
+            self._scene.add_label(f"{name}/number", str(step + 1), position=1.1 * distance * places[step])
+            if step:
+                line = distance * great_circle(places[step - 1], places[step])
+                segments = np.stack([line[:-1], line[1:]], 1)
+                self._scene.add_line_segments(f"{name}/way", segments, rgb(ACCENT), thickness=0.03)
+        self._drawn = len(places)

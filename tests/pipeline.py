@@ -1,0 +1,196 @@
+"""What tests share: tiny furniture, tiny networks, made-up predictions, and small scenes before a camera.
+
+``conftest.py`` makes fixtures of whole pipelines from it.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import onnx
+import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from onnx import TensorProto, helper, numpy_helper
+from scipy.spatial.transform import Rotation
+
+from nextview.data.measured_view import MeasuredView, Surface
+from nextview.data.predictions import Predictions
+from nextview.data.samples import SAMPLES, boxes_mesh
+from nextview.geometry.mesh import Mesh
+from nextview.geometry.observation import pinhole
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.recognition.inference import BINS_OUTPUT
+from nextview.recognition.map_names import measure_of
+from nextview.simulation.simulated import SimulatedCamera
+
+SPHERE = ViewSphere.named("40")
+CLASSES = ["ball", "box", "pillar"]
+"""Of ``some_predictions``."""
+FURNITURE = ["chair", "monitor", "table"]
+"""Of ``write_furniture``."""
+
+
+# Meshes
+
+
+def write_off(path: Path, mesh: Mesh) -> Path:
+    lines = ["OFF", f"{len(mesh.vertices)} {len(mesh.faces)} 0"]
+    lines += [" ".join(map(str, vertex)) for vertex in mesh.vertices]
+    lines += [" ".join(map(str, (3, *face))) for face in mesh.faces]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_furniture(folder: Path, train: int = 4, test: int = 2, seed: int = 0) -> Path:
+    """Chairs, monitors and tables of boxes, each stretched at random, as ``folder/CLASS/SPLIT/CLASS_K.off``."""
+    rng = np.random.default_rng(seed)
+    for label in FURNITURE:
+        for k in range(train + test):
+            scale = rng.uniform(0.8, 1.25, 3)
+            boxes = [tuple(tuple(np.multiply(corner, scale)) for corner in box) for box in SAMPLES[label]()]
+            split = "train" if k < train else "test"
+            write_off(folder / label / split / f"{label}_{k}.off", boxes_mesh(boxes, label))
+    return folder
+
+
+# Networks of a few weights with the interface of the real ones
+
+
+def make_recogniser(folder: Path, classes: list[str], size: int = 16, seed: int = 0, azimuth_bins: int = 0) -> Path:
+    """A recogniser whose answers are random linear maps of each channel's mean over the image."""
+    weights = np.random.default_rng(seed).normal(size=(4, len(classes))).astype(np.float32) / 16
+    weights -= weights.mean(0)
+    nodes = [
+        helper.make_node("Cast", ["input"], ["real"], to=TensorProto.FLOAT),
+        helper.make_node("ReduceMean", ["real", "image"], ["features"], keepdims=0),
+        helper.make_node("MatMul", ["features", "weights"], ["logits"]),
+    ]
+    shape = ["batch", 4, size, size]
+    inputs = [helper.make_tensor_value_info("input", TensorProto.UINT8, shape)]
+    outputs = [helper.make_tensor_value_info("logits", TensorProto.FLOAT, ["batch", len(classes)])]
+    outputs += [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["batch", 4])]
+    constants = {"weights": weights, "image": np.array([2, 3])}
+    card: dict = {"kind": "recogniser", "classes": classes, "input": {"kind": "geometry", "size": size}}
+    if azimuth_bins:
+        nodes += [
+            helper.make_node("MatMul", ["features", "side_weights"], ["flat"]),
+            helper.make_node("Reshape", ["flat", "side_shape"], ["shaped"]),
+            helper.make_node("LogSoftmax", ["shaped"], [BINS_OUTPUT], axis=2),
+        ]
+        shape = ["batch", len(classes), azimuth_bins]
+        outputs += [helper.make_tensor_value_info(BINS_OUTPUT, TensorProto.FLOAT, shape)]
+        side_weights = np.random.default_rng(seed + 1).normal(size=(4, len(classes) * azimuth_bins)).astype(np.float32)
+        constants |= {"side_weights": side_weights / 16, "side_shape": np.array([-1, *shape[1:]])}
+        card["azimuth_bins"] = azimuth_bins
+    return _save(folder / "tiny.json", nodes, inputs, outputs, constants, card)
+
+
+def make_map_network(folder: Path, name: str = "lem", rings: int = 5, valleys: tuple[str, ...] = ()) -> Path:
+    """A map network whose cells are a random linear map of the cloud's middle."""
+    weights = np.random.default_rng(1).normal(size=(3, 3 * rings)).astype(np.float32)
+    nodes = [
+        helper.make_node("ReduceMean", ["cloud", "points"], ["middle"], keepdims=0),
+        helper.make_node("MatMul", ["middle", "weights"], ["flat"]),
+        helper.make_node("Reshape", ["flat", "shape"], ["map"]),
+    ]
+    inputs = [helper.make_tensor_value_info("cloud", TensorProto.FLOAT, ["batch", "points", 3])]
+    outputs = [helper.make_tensor_value_info("map", TensorProto.FLOAT, ["batch", rings, 3])]
+    constants = {"weights": weights, "points": np.array([1]), "shape": np.array([-1, rings, 3])}
+    card = {
+        "kind": name,
+        "measure": measure_of(name),
+        "input": {"kind": "cloud"},
+        "output": "window",
+        "valley_classes": list(valleys),
+    }
+    return _save(folder / f"tiny-{name}.json", nodes, inputs, outputs, constants, card)
+
+
+def _save(path: Path, nodes: list, inputs: list, outputs: list, constants: dict, card: dict) -> Path:
+    initial = [numpy_helper.from_array(np.asarray(values), name) for name, values in constants.items()]
+    graph = helper.make_graph(nodes, "tiny", inputs, outputs, initial)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    weights = path.with_suffix(".onnx")
+    onnx.save(model, weights)
+    path.write_text(
+        json.dumps({"schema": 2, "name": path.stem, "sha256": hashlib.sha256(weights.read_bytes()).hexdigest(), **card})
+    )
+    return path
+
+
+# Predictions
+
+
+def some_predictions(n: int = 6, seed: int = 0) -> Predictions:
+    """Random logits and maps of ``n`` objects of three classes."""
+    rng = np.random.default_rng(seed)
+    return Predictions(
+        rng.normal(size=(n, 40, 3)).astype(np.float32),
+        {"lem": rng.random((n, 40, 5, 3)).astype(np.float32)},
+        rng.random((n, 40)).astype(np.float32),
+        tuple(f"thing_{i}" for i in range(n)),
+        np.arange(n) % 3,
+        tuple(CLASSES),
+        np.array(["test"] * n),
+        np.zeros(n, bool),
+        SPHERE,
+        {"recogniser": ("r", "0" * 64), "lem": ("l", "1" * 64)},
+        {"lem": ("box",)},
+    )
+
+
+# Scenes: meshes in metres, and a pinhole camera that casts rays at them
+
+INTRINSICS = np.array([[520.0, 0, 310.5], [0, 530.0, 246.5], [0, 0, 1]])
+"""First pixel's centre at 0.5."""
+SHAPE = 480, 640
+
+
+def box(size, middle=(0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    return trimesh.creation.box(size).apply_translation(middle)
+
+
+TABLE = box((1.4, 1.4, 0.04), (0, 0, -0.02))
+"""Its top is at z = 0."""
+
+
+def cast(meshes: Sequence[trimesh.Trimesh], pose, intrinsics=INTRINSICS, shape=SHAPE) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W) float32, 0 = nothing, and which mesh is seen, -1 for none."""
+    scene = EmbreeScene()
+    for mesh in meshes:
+        TriangleMesh(scene, mesh.vertices.astype(np.float32), np.ascontiguousarray(mesh.faces, np.int32))
+    row, column = np.mgrid[: shape[0], : shape[1]] + 0.5
+    rays = np.stack([column, row, np.ones_like(row)], -1) @ np.linalg.inv(intrinsics).T
+    directions = (rays.reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
+    origins = np.tile(np.asarray(pose)[:3, 3].astype(np.float32), (len(directions), 1))
+    hits = scene.run(origins, directions, output=1)
+    hit = hits["primID"] >= 0
+    return (
+        np.where(hit, hits["tfar"], 0).reshape(shape).astype(np.float32),
+        np.where(hit, hits["geomID"], -1).reshape(shape),
+    )
+
+
+def pose_at(elevation, azimuth, distance, target=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """A camera (degrees, metres) that looks at a target and is then turned about its own axes, degrees."""
+    pose = look_at_origin(np.radians(elevation), np.radians(azimuth), distance)
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    pose[:3, 3] += target
+    return pose
+
+
+def of_depth(depth, distance=3.0) -> MeasuredView:
+    """What a measure is handed where the depth alone is known, from straight ahead."""
+    depth = np.asarray(depth)
+    return MeasuredView(depth, look_at_origin(0, 0, distance), pinhole(max(depth.shape), distance))
+
+
+def view_of(mesh: Mesh, pose, size=224, distance=3.0) -> MeasuredView:
+    """What a measure is handed of a mesh that is seen from a pose."""
+    camera = SimulatedCamera(mesh, size, distance)
+    seen = camera.observe(pose)
+    return MeasuredView(seen.depth, pose, seen.intrinsics, Surface(mesh.vertices, mesh.faces), camera.face_ids(pose))

@@ -1,0 +1,214 @@
+"""The command line: its table of commands, how they end, and what they show."""
+
+import io
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from pipeline import some_predictions
+from rich.console import Console
+
+from nextview.cli import progress
+from nextview.cli.call import find
+from nextview.cli.commands import COMMANDS
+from nextview.cli.main import main
+from nextview.cli.predict import summed_up
+from nextview.data.store import ViewStore
+
+COMMAND = [sys.executable, "-m", "nextview"]
+
+
+def run(*arguments, **options):
+    return subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=100, **options)
+
+
+def ended(capsys, *arguments):
+    """The status with which a command ends, and what it says on standard error."""
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    return end.value.code, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name, capsys):
+    pytest.importorskip("torch")
+    with pytest.raises(SystemExit) as end:
+        main([*name.split(), "--help"])
+    assert end.value.code == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith(f"usage: nextview {name} ")
+    assert "(required)" in shown or name == "demo" or name == "explore"
+    assert not [line for line in shown.splitlines() if re.search(r"--[\w-]+ \S+\s+\(default", line)], "no help"
+
+
+def test_all_commands_are_listed_without_importing_one():
+    code = (
+        "import sys; from nextview.cli.main import main; main(['--help'])\n"
+        "slow = {'torch', 'pandas', 'matplotlib', 'zarr', 'tyro', 'rich'} & set(sys.modules); assert not slow, slow"
+    )
+    listed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert listed.returncode == 0, listed.stderr
+    for name, command in COMMANDS.items():
+        assert f"  {name} " in listed.stdout
+        assert command.line in listed.stdout
+    assert max(map(len, listed.stdout.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_next_command_is_there(name):
+    named = re.findall(r"nextview (\w+(?: \w+)?)", COMMANDS[name].then)
+    assert all(words in COMMANDS or words.split()[0] in COMMANDS for words in named)
+
+
+@pytest.mark.parametrize(("words", "meant"), [("recognize", "recognise"), ("train recognizer", "train recogniser")])
+def test_a_misspelt_command_is_guessed(words, meant, capsys):
+    assert ended(capsys, *words.split()) == (2, f"nextview: there is no command {words!r}; did you mean {meant!r}?\n")
+
+
+def test_a_group_lists_its_commands(capsys):
+    main(["fit"])
+    assert "fit calibration" in (shown := capsys.readouterr().out)
+    assert "render" not in shown
+
+
+@pytest.mark.parametrize("preset", [None, "thesis"])
+def test_a_preset_sets_defaults_that_options_change(preset, monkeypatch):
+    stage = pytest.importorskip("nextview.learning.recogniser_training")
+    kind, called = stage.RecogniserRecipe, []
+    recipe = find("nextview.learning.recipes:THESIS_RECOGNISER") if preset else kind()
+
+    def train(store: str, out: str, recipe: kind = kind()) -> list[Path]:
+        called.append(recipe)
+        return []
+
+    monkeypatch.setattr(stage, "train_recogniser", train)
+    main(["train", "recogniser", "s", "none", *(["--preset", preset] if preset else []), "--epochs", "1"])
+    assert called == [replace(recipe, epochs=1)]
+
+
+@pytest.fixture
+def meshes(tmp_path):
+    (tmp_path / "meshes/ball").mkdir(parents=True)
+    ball = trimesh.creation.icosphere(4).export(file_type="off")
+    for i in range(12):
+        (tmp_path / f"meshes/ball/ball_{i}.off").write_text(ball)
+    return tmp_path / "meshes"
+
+
+def interrupted(command, ready):
+    """Ctrl-C for a command, once it is ready."""
+    running = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    while not ready() and running.poll() is None:
+        time.sleep(0.01)
+    running.send_signal(signal.SIGINT)
+    _, said = running.communicate(timeout=60)
+    return running.returncode, [line for line in said.splitlines() if line.startswith("nextview: ")][-1]
+
+
+def test_ctrl_c_ends_rendering_in_one_line_and_it_resumes(tmp_path, meshes):
+    store = tmp_path / "v.zarr"
+    command = ["render", str(meshes), str(store), "--size", "32", "--workers", "1"]
+
+    def begun():
+        return len(list(store.glob("image/c/*"))) > 1
+
+    assert interrupted([*COMMAND, *command], begun) == (
+        130,
+        "nextview: stopped; run the same command again; it resumes",
+    )
+    main(command)
+    assert ViewStore.open(store).done.all()
+
+
+def test_ctrl_c_ends_other_commands_in_one_line(monkeypatch, capsys):
+    def stop(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("nextview.cli.listing.bundled_cards", stop)
+    assert ended(capsys, "list", "models") == (130, "nextview: stopped; nothing was written\n")
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch):
+    monkeypatch.setattr("nextview.cli.listing.bundled_cards", lambda: {}["bug"])
+    with pytest.raises(KeyError):
+        main(["list", "models"])
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments", "extra"),
+    [
+        ("torch", ["train", "recogniser", "views.zarr", "run"], "train"),
+        ("pandas", ["benchmark", "p.npz"], "benchmark"),
+    ],
+)
+def test_a_missing_extra_is_named_with_what_brings_it(package, arguments, extra):
+    code = f"import sys; sys.modules[{package!r}] = None; from nextview.cli.main import main; main({arguments!r})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert f"pip install 'nextview[{extra}]'" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("package", "script", "extra"),
+    [("pandas", "benchmarks/views.py", "benchmark"), ("torch", "benchmarks/ablations.py", "train")],
+)
+def test_a_script_names_the_missing_extra_too(package, script, extra):
+    path = str(Path(__file__).parents[1] / script)
+    without = f"import sys, runpy; sys.modules[{package!r}] = None; sys.argv = [{path!r}, '--help']"
+    code = f"{without}; runpy.run_path({path!r}, run_name='__main__')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert f"pip install 'nextview[{extra}]'" in done.stderr
+
+
+def test_names_are_shown_and_mean_nothing(capsys):
+    progress.Terminal().print("[red]a\x1b[31mb :smile:")
+    assert capsys.readouterr().out == "[red]a\\x1b[31mb :smile:\n"
+
+
+def slowly(counts):
+    for n in counts:
+        time.sleep(0.01)
+        yield n
+
+
+def test_a_bar_shows_how_far_it_is_and_the_speed_at_80_columns(monkeypatch):
+    file = io.StringIO()
+    terminal = progress.Terminal(file=file, width=80, force_terminal=True, color_system=None)
+    monkeypatch.setattr(progress, "console", terminal)
+    progress.track(slowly(range(12300, 12312)), 12311, "rendering a_store_with_a_long_name.zarr")
+    last = file.getvalue().rpartition("rendering")[2]
+    assert " 12311/12311 " in last
+    speed = float(re.search(r"([\d.]+)/s", last)[1])
+    assert 1 < speed < 200  # what an earlier run did is not counted
+
+
+def test_where_there_is_no_terminal_a_line_tells_how_far_it_is(monkeypatch):
+    file = io.StringIO()
+    monkeypatch.setattr(progress, "console", Console(file=file, width=80))
+    monkeypatch.setattr(progress, "EVERY", 0.015)
+    progress.track(slowly(range(1, 7)), 6, "rendering v.zarr")
+    lines = file.getvalue().splitlines()
+    assert 1 <= len(lines) <= 4
+    assert all(re.fullmatch(r"rendering v.zarr: \d of 6 after \d+ s", line) for line in lines)
+
+
+def test_predictions_are_summed_up():
+    p = some_predictions(12, seed=0)
+    n, v, c = p.logits.shape
+    truth = np.eye(c, dtype=np.float32)[p.labels]
+    logits = np.repeat(truth[:, None], v, 1)
+    logits[:, : v // 4] = 1.5 * np.roll(truth, 1, axis=1)[:, None]  # a quarter of the views names another class
+    p = replace(p, logits=logits, splits=np.array(["test"] * n), models={"recogniser": ("tiny", "0" * 64)})
+    assert summed_up(p) == [f"{n} test objects: right from one view 0.750, from all {v} 1.000"]

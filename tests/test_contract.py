@@ -1,0 +1,238 @@
+"""What must not break: public names, episodes of the bundled models to the digit, and the benchmark's table.
+
+``python tests/test_contract.py`` writes the golden data beside this file anew, after a wanted change of answers.
+"""
+
+import hashlib
+import importlib
+import json
+import re
+import sys
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nextview
+from nextview.cli.main import main
+from nextview.data.predictions import Predictions
+from nextview.sensing import Frame, ObservedObject
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+GOLDEN = HERE / "contract.json"
+SAMPLES = ROOT / "samples"
+NAMES = {
+    "Camera", "DatasetError", "Directions", "EpisodeState", "Evidence", "Mesh", "MeshError", "ModelError", "Models",
+    "NextviewError", "NoViewLeftError", "Observation", "ObservationError", "Policy", "PolicyError", "PredictionsError",
+    "Recognition", "ResultsError", "Session", "SessionError", "SimulatedCamera", "Stopping", "System", "UsageError",
+    "View", "ViewSphere", "load", "load_mesh", "make_policy", "recognise",
+}  # fmt: skip
+ATTRIBUTES = {
+    nextview.Session: "done failed pose poses reachable result run target travel_cost update view",
+    nextview.Recognition: "answer confidence most_like novelty plot seen travel unknown",
+    nextview.View: "angles",
+    nextview.System: "classes recognise session",
+    ObservedObject: "add object_frame observations",
+    Frame: "camera_to_world",
+    Predictions: "load save",
+}
+FIELDS = {
+    nextview.Recognition: "classes confident sphere stopping stranded views",
+    nextview.View: "alone arc azimuth_bins belief degrees_off direction index maps next_view novelty travel warnings",
+    Frame: "depth image intrinsics mask",
+    nextview.EpisodeState: "azimuth_bins belief current evidence observations reachable step travel visibility visited",
+    nextview.Observation: "depth intrinsics pose",
+}
+POLICIES = (
+    "gain", "spread", "random", "random-all", "furthest", "unidirectional", "lem", "lcm", "lcm-peak", "fixed-sequence",
+    "class-table", "visible-gain",
+)  # fmt: skip
+
+
+def policy_episodes():
+    """The policies on the 40 views, each on two samples."""
+    for k, policy in enumerate(POLICIES):
+        for sample, start in (("chair", (7 * k + 1) % 40), (("table", "monitor")[k % 2], (5 * k + 30) % 40)):
+            options = {"policy": policy, "threshold": 1.0, "max_views": 4}
+            yield f"{sample}, {policy}, from {start}", _recognise, (sample, options, {"start": start, "seed": k})
+
+
+def other_episodes():
+    """The defaults, other viewpoints, sensors, frames on a table, cost and reach, and a cluttered scene."""
+    for sample in ("chair", "monitor", "table"):
+        yield f"{sample}, defaults", _recognise, (sample, {}, {"start": 3})
+    for viewpoints in ("12", "rings:0,30,60x12", "fibonacci:30"):
+        options = {"viewpoints": viewpoints, "threshold": 0.9995, "max_views": 4}
+        yield f"table, {viewpoints}", _recognise, ("table", options, {"seed": 5})
+    yield "table, risk", _recognise, ("table", {"risk": 0.05}, {"start": 33})
+    yield "table, kinect", _recognise, ("table", {}, {"sensor": "kinect", "seed": 1})
+    yield "chair, stereo", _recognise, ("chair", {}, {"sensor": "stereo:0.5", "seed": 2})
+    yield "chair, arm over a table", _arm, ("chair",)
+    yield "monitor, reach and cost", _constrained, ()
+    yield "chair behind a wall", _cluttered, ()
+
+
+def _recognise(sample, options, how):
+    return nextview.load(threads=1, **options).recognise(SAMPLES / f"{sample}.off", **how)
+
+
+def _arm(sample):
+    sys.path.insert(0, str(ROOT / "examples"))
+    try:
+        example = importlib.import_module("arm_over_table")
+    finally:
+        sys.path.remove(str(ROOT / "examples"))
+    return example.recognise(example.Arm(nextview.load_mesh(SAMPLES / f"{sample}.off"), np.random.default_rng(1)))
+
+
+def _constrained():
+    """A session with a mask, a matrix of costs, and two targets that could not be reached."""
+    session = nextview.load(threads=1, threshold=0.9995, max_views=5).session(start=10, seed=3)
+    camera = nextview.SimulatedCamera(nextview.load_mesh(SAMPLES / "monitor.off"))
+    session.reachable = np.arange(40) % 3 > 0
+    session.travel_cost = np.abs(np.subtract.outer(np.arange(40.0), np.arange(40.0)))
+    for k in range(20):
+        if session.done:
+            break
+        if k in (1, 3):
+            session.failed()
+        else:
+            session.update(camera.observe(session.pose))
+    return session.result
+
+
+def _cluttered():
+    """A chair with a wall and a block before it, seen through a sensor."""
+    from nextview.simulation.robot_camera import RobotCamera
+    from nextview.simulation.scene import build_scene
+    from nextview.simulation.scene_layout import Block, Placement, SceneLayout
+
+    sha = {name: hashlib.sha256((SAMPLES / name).read_bytes()).hexdigest() for name in ("chair.off", "table.off")}
+    chair = Placement("chair.off", sha["chair.off"])
+    table = Placement("table.off", sha["table.off"], -0.6, 2.0, 0.7, 1.1)
+    blocks = (Block(1.6, 0.0, 0.3, 0.3, 1.6, 1.8), Block(-3.0, 0.0, 0.0, 0.1, 4.0, 3.0, True))
+    scene = build_scene(SceneLayout("chair@medium-0", "medium", 0, chair, (table,), blocks), SAMPLES)
+    camera = RobotCamera(scene, "wrist", named="box")
+    system = nextview.load(policy="visible-gain", threads=1, threshold=0.999, max_views=4)
+    session = system.session_with(camera, start=0)
+    session.reachable = camera.reachable
+    return session.run(camera)
+
+
+EPISODES = {name: (run, given) for name, run, given in (*policy_episodes(), *other_episodes())}
+
+
+def measured(name):
+    """What an episode comes to, for JSON."""
+    run, given = EPISODES[name]
+    result = run(*given)
+    return {
+        "answer": result.answer,
+        "confident": bool(result.confident),
+        "path": [int(view.index) for view in result.views],
+        "travel": result.travel,
+        "arc": result.views[-1].arc,
+        "belief": [[float(f"{p:.7f}") for p in view.belief] for view in result.views],
+        "novelty": result.novelty,
+    }
+
+
+def synthetic_predictions():
+    """60 objects of three classes, whose views resemble each other within an object."""
+    rng = np.random.default_rng(7)
+    labels, n = np.arange(60) % 3, 60
+    logits = rng.normal(size=(n, 40, 3)) + rng.normal(size=(n, 1, 3)) + 1.5 * np.eye(3)[labels][:, None]
+    maps = {"lem": rng.random((n, 40, 5, 3)).astype(np.float32)}
+    return Predictions(
+        logits.astype(np.float32), maps, rng.random((n, 40)).astype(np.float32), tuple(f"object_{i}" for i in range(n)),
+        labels, ("bed", "desk", "sofa"), np.array(["test"] * n), np.zeros(n, bool), nextview.ViewSphere.named("40"),
+        {}, {"lem": ("desk",)},
+    )  # fmt: skip
+
+
+TABLE_OF = ("random", "random-all", "furthest", "spread", "lem", "lem-peak", "oracle-gain")
+MEASURES = ("accuracy", "n_views", "travel_all", "confident", "calibration_error")
+
+
+def table(folder):
+    """The benchmark's numbers by policy, threshold and measure: value, low, high."""
+    pd = pytest.importorskip("pandas")
+    synthetic_predictions().save(folder / "p.npz")
+    how = ["--thresholds", "0.8", "0.97", "--runs", "3", "--max-views", "4", "--samples", "200", "--seed", "1"]
+    main(["benchmark", str(folder / "p.npz"), str(folder / "out"), "--policies", *TABLE_OF, *how])
+    rows = pd.read_csv(folder / "out" / "summary.csv")
+    rows = rows[rows.measure.isin(MEASURES) & rows.threshold.isin([0.8, 0.97])]
+    return {f"{r.policy} {r.threshold} {r.measure}": [r.value, r.low, r.high] for r in rows.itertuples()}
+
+
+@pytest.fixture(scope="module")
+def golden():
+    return json.loads(GOLDEN.read_text())
+
+
+def test_public_names():
+    assert set(nextview.__all__) >= NAMES
+    assert all(hasattr(nextview, name) for name in nextview.__all__)
+
+
+@pytest.mark.parametrize("kind", ATTRIBUTES, ids=lambda kind: kind.__name__)
+def test_attributes(kind):
+    assert not [name for name in ATTRIBUTES[kind].split() if not hasattr(kind, name)]
+
+
+@pytest.mark.parametrize("kind", FIELDS, ids=lambda kind: kind.__name__)
+def test_fields(kind):
+    found = set(getattr(kind, "__dataclass_fields__", ())) | set(getattr(kind, "__struct_fields__", ()))
+    assert not set(FIELDS[kind].split()) - found
+
+
+PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("examples/*.py"))]
+
+
+def imports(text):
+    """Lines "from nextview... import names", each name of which has to be there."""
+    for module, names in re.findall(r"^(?:>>> )?from (nextview(?:\.[\w.]+)?) import ([\w, ]+)", text, re.M):
+        yield from product([module], names.split(", "))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_pages_import_is_there(page):
+    for module, name in imports(page.read_text()):
+        if not hasattr(importlib.import_module(module), name.strip()):
+            importlib.import_module(f"{module}.{name.strip()}")
+
+
+@pytest.mark.parametrize("name", EPISODES)
+def test_episodes(name, golden):
+    found, wanted = measured(name), golden["episodes"][name]
+    assert (found["path"], found["answer"], found["confident"]) == (
+        wanted["path"], wanted["answer"], wanted["confident"],
+    )  # fmt: skip
+    assert [found["travel"], found["arc"]] == pytest.approx([wanted["travel"], wanted["arc"]], abs=1e-9)
+    np.testing.assert_allclose(found["belief"], wanted["belief"], rtol=0, atol=1e-5)
+    assert found["novelty"] == pytest.approx(wanted["novelty"], abs=1e-4)
+
+
+def test_the_benchmarks_table(tmp_path, golden):
+    found = table(tmp_path)
+    assert found.keys() == golden["table"].keys()
+    for row, numbers in golden["table"].items():
+        assert found[row] == pytest.approx(numbers, abs=1e-6, nan_ok=True), row
+
+
+def test_an_episode_is_drawn(tmp_path):
+    nextview.recognise(SAMPLES / "chair.off", start=3).plot(tmp_path / "episode.png")
+    assert (tmp_path / "episode.png").read_bytes().startswith(b"\x89PNG")
+
+
+if __name__ == "__main__":
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        numbers = table(Path(folder))
+    found = {"episodes": {name: measured(name) for name in EPISODES}, "table": numbers}
+    lines = [f"{json.dumps(name)}: {json.dumps(e)}" for name, e in found["episodes"].items()]
+    rows = [f"{json.dumps(name)}: {json.dumps(row)}" for name, row in found["table"].items()]
+    GOLDEN.write_text('{"episodes": {\n' + ",\n".join(lines) + '\n},\n"table": {\n' + ",\n".join(rows) + "\n}}\n")

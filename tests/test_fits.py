@@ -1,0 +1,405 @@
+"""What is fitted to predictions, against generated evidence whose answer is known."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pipeline import make_recogniser, some_predictions
+from scipy.special import log_softmax
+from scipy.stats import binomtest
+
+from nextview.data.predictions import Predictions
+from nextview.data.rendering import RenderOptions, render
+from nextview.data.samples import sample_mesh
+from nextview.data.splits import divide
+from nextview.errors import DatasetError, ModelError, PredictionsError, ResultsError
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.learning import card_fits as calibration
+from nextview.learning.card_fits import error_bound, fit_calibration, fit_risk, fit_temperature, loss, valley_gains
+from nextview.learning.fitting_set import FittingSet, blind_walks, card_to_fit, fitting_set
+from nextview.learning.policy_tables import fit_class_table, fit_policies, fit_ring, fit_sequence
+from nextview.learning.unknown import FAMILIES, fit_novelty, fit_unknown, synthetic_outlier
+from nextview.policies.baselines import Random
+from nextview.policies.learned_tables import ClassTable, cells_from, cells_to
+from nextview.policies.registry import make_policy
+from nextview.recognition.belief import PLAIN_SUM, Calibration
+from nextview.recognition.inference import Recogniser
+from nextview.recognition.model_card import read_card
+
+SPHERE = ViewSphere.named("40")
+SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
+
+
+def correlated(n: int, correlation: float, temperature: float, seed: int = 0) -> FittingSet:
+    """Two classes at -1 and +1, seen through Gaussian noise that is shared in part by all views of an object."""
+    rng, spread = np.random.default_rng(seed), 1.5
+    labels = (rng.random(n) < 0.8).astype(np.int64)  # a mix that the even weights have to undo
+    shared, own = rng.normal(size=(n, 1)), rng.normal(size=(n, len(SMALL)))
+    seen = 2.0 * labels[:, None] - 1 + spread * (np.sqrt(correlation) * shared + np.sqrt(1 - correlation) * own)
+    logits = np.stack([-((seen - m) ** 2) / (2 * spread**2) for m in (-1, 1)], -1)
+    return FittingSet((temperature * logits).astype(np.float32), labels, SMALL, ("minus", "plus"))
+
+
+@pytest.mark.parametrize(("correlation", "temperature"), [(0.0, 1.0), (0.4, 0.5), (0.8, 2.0)])
+def test_the_correlation_and_temperature_of_generated_looks_are_found(correlation, temperature):
+    data = correlated(4000, correlation, temperature)
+    found = fit_temperature(data, np.random.default_rng(1), walks=1)
+    assert found.temperature == pytest.approx(temperature, rel=0.08)
+    assert found.correlation == pytest.approx(correlation, abs=0.06)
+    losses = [loss(data, c, np.random.default_rng(2), walks=1) for c in (found, Calibration(temperature, correlation))]
+    assert losses[0] == pytest.approx(losses[1], rel=0.01)
+    if correlation:
+        assert losses[0] < loss(data, PLAIN_SUM, np.random.default_rng(2), walks=1)
+
+
+@pytest.mark.parametrize("right", [0.8, 0.5])
+def test_sides_count_as_far_as_looks_are_right_about_them(right):
+    """Both classes look alike; seen as the true one, a view claims to be right about the side 8 times in 10."""
+    rng, n, v, s = np.random.default_rng(0), 2000, len(SMALL), SMALL.azimuths
+    labels, zero = rng.integers(0, 2, n), rng.integers(0, s, n)
+    claimed = rng.integers(0, s, (n, v, 2))  # seen as the other class: anything
+    true = (SMALL.azimuth_index - zero[:, None]) % s
+    wrong = (true + rng.integers(1, s, (n, v))) % s
+    claimed[np.arange(n)[:, None], np.arange(v), labels[:, None]] = np.where(rng.random((n, v)) < right, true, wrong)
+    azimuth_bins = np.log(np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))).astype(np.float32)
+    data = FittingSet(rng.normal(size=(n, v, 2)).astype(np.float32) / 100, labels, SMALL, ("a", "b"), azimuth_bins)
+    found = fit_temperature(data, np.random.default_rng(1), walks=1)
+    if right == 0.8:  # as good as they claim, and each by itself
+        assert found.bin_correlation == pytest.approx(0, abs=0.05)
+    else:
+        assert found.bin_correlation > 0.1
+    blind = Calibration(found.temperature, found.correlation)
+    of_found, of_blind = (loss(data, c, np.random.default_rng(2), walks=1) for c in (found, blind))
+    assert of_found < of_blind
+
+
+def test_the_bound_of_single_episodes_is_that_of_clopper_and_pearson():
+    rng = np.random.default_rng(0)
+    for n, wrong in [(50, 0), (50, 3), (300, 30), (7, 7)]:
+        stopped = np.concatenate([np.ones(n), np.zeros(20)])
+        failed = np.concatenate([np.ones(wrong), np.zeros(n - wrong), np.zeros(20)])
+        order = rng.permutation(n + 20)
+        bound = error_bound(failed[order], stopped[order], np.full(n + 20, 0.7), 0.05)
+        exact = binomtest(wrong, n, alternative="less").proportion_ci(0.95, "exact").high
+        assert bound == pytest.approx(exact, abs=1e-6)
+    assert error_bound(np.zeros(5), np.zeros(5), np.ones(5), 0.1) == 1
+
+
+def test_promises_are_kept_as_often_as_promised():
+    whole = correlated(40_000, 0.5, 1.0, seed=9)
+    even = whole.weights
+    calibration, risk, n_views, delta = Calibration(1.0, 0.5), 0.22, 3, 0.2
+    walks = blind_walks(
+        SMALL, Random(SMALL), np.random.default_rng(0).integers(12, size=len(whole)), n_views, np.random.default_rng(1)
+    )
+    total = np.cumsum(whole.logits[np.arange(len(whole))[:, None], walks], axis=1)
+    sure = np.stack(
+        [np.exp(log_softmax(total[:, k] / calibration.temperature_after(k + 1), 1)).max(1) for k in range(n_views)], 1
+    )
+    wrong = total.argmax(2) != whole.labels[:, None]
+
+    def error_at(threshold: float) -> float:
+        reached = sure >= threshold
+        stopped, first = reached.any(1), reached.argmax(1)
+        return np.average(wrong[np.arange(len(whole)), first][stopped], weights=even[stopped])
+
+    promises, broken = 0, 0
+    for seed in range(60):
+        some = np.random.default_rng([5, seed]).choice(len(whole), 300, replace=False)
+        part = replace(whole, logits=whole.logits[some], labels=whole.labels[some])
+        bounds = fit_risk(part, calibration, np.random.default_rng(seed), delta, n_views, walks=1)
+        if min(bounds.bounds[n_views - 1]) <= risk:  # else it promises nothing, and nothing is broken
+            promises += 1
+            broken += error_at(bounds.threshold(risk, n_views)) > risk
+    assert promises > 30
+    assert broken <= 60 * delta + 3 * np.sqrt(60 * delta * (1 - delta))
+
+
+# What may be fitted to
+
+
+def copied(p: Predictions, often: int) -> Predictions:
+    """With the first object there so many times more, under other names and a little otherwise recognised."""
+    rows = np.array([*range(len(p)), *[0] * often])
+    arrays = {name: getattr(p, name)[rows] for name in ("labels", "splits", "conflicting", "depth_entropy")}
+    logits = p.logits[rows]
+    logits[len(p) :] += 1
+    names = (*p.names, *(f"copy{i}" for i in range(often)))
+    return replace(p, **arrays, logits=logits, maps={k: m[rows] for k, m in p.maps.items()}, names=names)
+
+
+def test_a_shape_that_was_copied_counts_once():
+    p = replace(some_predictions(60), splits=np.array(["train"] * 60))
+    many = copied(p, 9)
+    once = many.deduplicate()
+    assert once.names == p.names
+    np.testing.assert_array_equal(once.logits, p.logits)
+    assert many.deduplicate().deduplicate().names == p.names
+    relabelled = replace(many, labels=np.r_[many.labels[:-1], (many.labels[-1] + 1) % 3])
+    assert relabelled.deduplicate().names == (*p.names, "copy8")  # which of two labels is right is not for us
+    np.testing.assert_array_equal(fitting_set(many, 1.0, 0).logits, p.logits)
+    drawn = [fitting_set(many, 0.1, seed) for seed in range(40)]
+    assert any(p.logits[0] in data.logits for data in drawn)
+    assert all(sum((row == p.logits[0]).all() for row in data.logits) < 2 for data in drawn)
+    assert not any((row == p.logits[0] + 1).all() for data in drawn for row in data.logits)
+
+
+def test_it_is_fitted_to_the_objects_that_validate():
+    p = replace(some_predictions(60), splits=np.array(["train"] * 60))
+    _, validation = divide(p.labels, p.depth_entropy, 0.2, 3)
+    data = fitting_set(p, 0.2, 3)
+    np.testing.assert_array_equal(data.logits, p.logits[validation])
+    assert np.bincount(data.labels).tolist() == [4, 4, 4]
+    assert len(fitting_set(p, 1.0, 3)) == 60
+    for share in (0.0, 1.1, np.nan):
+        with pytest.raises(PredictionsError, match="between 0 and 1"):
+            fitting_set(p, share, 0)
+    with pytest.raises(PredictionsError, match="no object is left"):
+        fitting_set(p, 0.001, 0)
+
+
+# Tables
+
+
+def telling(sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, seed: int = 0) -> FittingSet:
+    """Every view says little of the class, but those on some rings, which depend on the class, say it loudly."""
+    rng = np.random.default_rng(seed)
+    c = len(rings_of_class)
+    labels = np.arange(n) % c
+    logits = rng.normal(size=(n, len(sphere), c)) * 0.1
+    logits[np.arange(n), :, labels] += 0.3
+    for i, label in enumerate(labels):
+        loud = np.isin(sphere.ring, rings_of_class[label])
+        logits[i, loud, label] += 3
+    return FittingSet(logits.astype(np.float32), labels, sphere, tuple("abcdef"[:c]))
+
+
+@pytest.mark.parametrize("scope", ["global", "local"])
+def test_what_tells_most_is_found(scope):
+    data = telling(SMALL, [[2], [2]])
+    assert fit_ring(data, scope, 4, PLAIN_SUM)[0] == 2
+    moves = fit_sequence(data, scope, 3, PLAIN_SUM)
+    assert (SMALL.ring[moves] == 2).all()
+    by_class = fit_class_table(telling(SMALL, [[0], [2]]), 4, 0.0, PLAIN_SUM, np.random.default_rng(0))
+    assert (SMALL.ring[by_class[0].argmax(1)] == 0).all()
+    assert (SMALL.ring[by_class[1].argmax(1)] == 2).all()
+    shared = fit_class_table(telling(SMALL, [[0], [2]]), 4, 1e9, PLAIN_SUM, np.random.default_rng(0))
+    np.testing.assert_allclose(shared[0], shared[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("scope", ["global", "local"])
+def test_each_move_of_a_sequence_is_the_best_there_is(scope):
+    rng, calibration = np.random.default_rng(0), Calibration(0.8, 0.5)
+    labels = np.array([0, 0, 0, 1, 2])
+    data = FittingSet(rng.normal(size=(5, len(SMALL), 3)).astype(np.float32), labels, SMALL, ("a", "b", "c"))
+    travel_weight = 0.05
+    moves = fit_sequence(data, scope, 2, calibration, travel_weight)
+
+    def turned(view: int, steps: int) -> int:
+        ring, azimuth = divmod(view, 4)
+        return ring * 4 + (azimuth + steps) % 4
+
+    def value(path: list[int]) -> float:
+        by_class = {0: [], 1: [], 2: []}
+        for i, label in enumerate(labels):
+            for steps in range(4):
+                total = data.logits[i, [turned(v, steps) for v in path]].astype(float).sum(0)
+                by_class[label].append(log_softmax(total / calibration.temperature_after(len(path)))[label])
+        return np.mean([np.mean(values) for values in by_class.values()])
+
+    for ring in range(3):
+        path = [ring * 4]
+        for move in moves[ring]:
+            reachable = range(12) if scope == "global" else SMALL.windows[path[-1]].ravel()
+            values = {
+                v: value([*path, v]) - travel_weight * SMALL.travel[path[-1], v] for v in reachable if v not in path
+            }
+            path.append(int(cells_from(SMALL)[path[-1], move]))
+            assert values[path[-1]] == pytest.approx(max(values.values()), abs=1e-9)
+
+
+# The stages
+
+
+@pytest.fixture
+def training_predictions(tmp_path):
+    """A recogniser's card, and predictions of the training split that claim to be its own."""
+    card = make_recogniser(tmp_path, ["ball", "box", "pillar"])
+    p = some_predictions(90)
+    logits = p.logits.copy()
+    logits[np.arange(90), :, p.labels] += np.random.default_rng(0).normal(0.6, 0.8, (90, 1))
+    recogniser = ("tiny", json.loads(card.read_text())["sha256"])
+    models = {**p.models, "recogniser": recogniser}
+    path = tmp_path / "training.npz"
+    replace(p, logits=logits.astype(np.float32), splits=np.array(["train"] * 90), models=models).save(path)
+    return card, path
+
+
+def test_a_calibration_goes_into_the_card_and_is_used(training_predictions, monkeypatch):
+    card, path = training_predictions
+    before = json.loads(card.read_text())
+    monkeypatch.setattr("sys.argv", ["/bin/nextview", "fit", "calibration", "a b"])
+    fitted = fit_calibration(path, card, validation=0.5)
+    after = json.loads(card.read_text())
+    assert {name: after[name] for name in before} == before | {"schema": 2}  # written anew
+    assert after["training"]["commands"] == ["nextview fit calibration 'a b'"]
+    assert Recogniser(card).calibration == fitted.calibration
+    assert fitted.after < fitted.before
+    assert "45 objects" in after["fitted_to"]["calibration"]
+    assert [p.name for p in card.parent.iterdir() if p.name.startswith(".")] == []  # no lock, no part is left
+
+
+def test_a_calibration_by_a_bad_sensor_trusts_views_less(training_predictions, tmp_path):
+    card, path = training_predictions
+    p = Predictions.load(path)
+    card.write_text(json.dumps(json.loads(card.read_text()) | {"held_out": list(p.names[:60])}))
+    clean = fit_calibration(path, card).calibration
+    order = np.random.default_rng(1).permutation(90)  # the same objects, in another order
+    noise = np.random.default_rng(2).normal(0, 4, p.logits.shape)
+    sensed = replace(p, logits=(p.logits + noise).astype(np.float32)).of_objects(order)
+    sensed.save(tmp_path / "sensed.npz")
+    fitted = fit_calibration(path, card, sensed=(tmp_path / "sensed.npz",)).calibration
+    assert fitted.temperature > 1.5 * clean.temperature
+    assert json.loads(card.read_text())["fitted_to"]["calibration"].startswith("60 objects")
+    sensed.of_objects(np.arange(50)).save(tmp_path / "few.npz")
+    with pytest.raises(PredictionsError, match="lacks"):
+        fit_calibration(path, card, sensed=(tmp_path / "few.npz",))
+
+
+def test_a_card_that_was_changed_meanwhile_or_does_not_fit_is_left_alone(training_predictions, monkeypatch):
+    card, path = training_predictions
+    whole, p = json.loads(card.read_text()), Predictions.load(path)
+
+    def fit_slowly(*given, **options):
+        with pytest.raises(DatasetError, match="another run is writing it"), card_to_fit(card):
+            pass
+        card.write_text(json.dumps(whole | {"note": "changed"}))
+        return fit_temperature(*given, **options)
+
+    monkeypatch.setattr(calibration, "fit_temperature", fit_slowly)
+    with pytest.raises(ModelError, match="was changed while this ran"):
+        fit_calibration(path, card, validation=0.5)
+    for spoilt, sentence in [
+        (replace(p, splits=np.array(["test"] * 90)), "test split"),
+        (replace(p, models={"recogniser": ("other", "f" * 64)}), "another recogniser"),
+    ]:
+        spoilt.save(path, overwrite=True)
+        with pytest.raises(PredictionsError, match=sentence):
+            fit_calibration(path, card)
+    assert json.loads(card.read_text()) == whole | {"note": "changed"}
+
+
+def test_learned_policies_can_be_run_from_their_cards(training_predictions, tmp_path):
+    _, path = training_predictions
+    made = fit_policies(path, tmp_path / "learned", length=3)
+    assert sorted(c.stem for c in made.cards) == [
+        "class-table", "class-table-local", "class-table-near", "fixed-ring", "fixed-ring-local",
+        "fixed-sequence", "fixed-sequence-local", "fixed-sequence-near",
+    ]  # fmt: skip
+    data = fitting_set(Predictions.load(path), 0.1, 0)
+    fitted = fit_temperature(data, np.random.default_rng([0, 0]), walks=1 + 8000 // 9)
+    values = fit_class_table(data, 5, 20.0, fitted, np.random.default_rng(0))
+    for card in made.cards:
+        policy = make_policy(str(card), SPHERE, classes=("ball", "box", "pillar"))
+        if isinstance(policy, ClassTable):
+            travel_weight = 0.01 if card.stem.endswith("near") else 0.0
+            for ring, azimuth in [(0, 0), (2, 5)]:
+                view = 8 * ring + azimuth
+                paid = values[:, ring, cells_to(SPHERE)[view]] - travel_weight * SPHERE.travel[view]
+                here = policy.values[:, ring, cells_to(SPHERE)[view]]
+                np.testing.assert_allclose(here, paid, atol=1e-5)
+    foreign = tmp_path / "learned/fixed-ring-local.json"
+    for card in made.cards:
+        card.unlink()
+    foreign.write_text("of somebody else")
+    with pytest.raises(ResultsError, match="exists"):
+        fit_policies(path, tmp_path / "learned", length=3)
+    assert [p.name for p in foreign.parent.iterdir()] == [foreign.name]
+    assert foreign.read_text() == "of somebody else"
+
+
+def test_valley_classes_are_those_that_gain_by_the_valley():
+    logits = np.zeros((2, 40, 2))
+    high = SPHERE.ring == 4
+    logits[0, ~high, 0], logits[1, high, 1] = 3, 3  # class 0 is clear from below, class 1 from above
+    maps = np.broadcast_to((SPHERE.ring / 4)[SPHERE.windows], (2, 40, 5, 3))  # the map rises with the ring
+    gains = valley_gains(SPHERE, logits, maps, np.array([0, 1]))
+    assert gains[0] > 0.1
+    assert gains[1] < -0.1
+
+
+# Novelty
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_synthetic_outliers_are_meshes_and_the_same_for_the_same_seed(family):
+    one, other = sample_mesh("chair"), sample_mesh("table")
+    for seed in range(20):
+        made, again = (synthetic_outlier(family, one, other, np.random.default_rng(seed)) for _ in range(2))
+        np.testing.assert_array_equal(made.vertices, again.vertices)
+        assert np.linalg.norm(made.vertices, axis=1).max() == pytest.approx(1)
+    if family == "cut":
+        assert len(one.faces) / 4 - 1 <= len(made.faces) <= 3 * len(one.faces) / 4 + 1
+
+
+def test_what_is_fitted_finds_the_strange_and_keeps_the_rate_that_was_asked_for():
+    rng, centres = np.random.default_rng(4), 6 * np.eye(3, 12)
+
+    def objects(n, middle, views=12):
+        return middle[:, None] + rng.normal(size=(n, 1, 12)) * 0.5 + rng.normal(size=(n, views, 12))
+
+    def known(n):
+        labels = rng.integers(3, size=n)
+        return objects(n, centres[labels]), labels
+
+    learned, labels = known(300)
+    held_out, held_out_labels = known(300)
+    outliers = rng.normal(size=(600, 12)) * 4
+    score = fit_novelty(
+        learned[:, :3].reshape(-1, 12).astype(np.float32),
+        labels.repeat(3),
+        outliers.astype(np.float32),
+        held_out.astype(np.float32),
+        held_out_labels,
+        rng,
+    )
+    fresh, _ = known(2000)
+    strange = objects(500, np.tile(6 * np.eye(12)[7], (500, 1)))  # unlike all outliers
+    for n in (1, 3):
+        p = [
+            score.p_value(score.scores(rows[:, :n].reshape(-1, 12)).reshape(-1, n).mean(1), n)
+            for rows in (fresh, strange)
+        ]
+        assert (p[0] < 0.05).mean() == pytest.approx(0.05, abs=0.03)
+        assert (p[1] < 0.05).mean() > 0.9
+
+
+@pytest.mark.parametrize("sensed", [False, True])
+def test_a_recogniser_learns_to_notice_unknown_objects(sensed, furniture, views, models, tmp_path):
+    card = Path(shutil.copy(models / "tiny.json", tmp_path))
+    shutil.copy(models / "tiny.onnx", tmp_path)
+    before = Recogniser(card)
+    assert before.novelty is None
+    if sensed:
+        sphere = replace(ViewSphere.named("40"), azimuths=3)
+        list(
+            render(
+                furniture,
+                tmp_path / "sensed.zarr",
+                sphere,
+                options=RenderOptions(split="train", sensor="mix"),
+                workers=0,
+            )
+        )
+    stores = (tmp_path / "sensed.zarr", tmp_path / "sensed.zarr") if sensed else None
+    fitted = fit_unknown(views, furniture, card, 10, sensed=stores, workers=0)
+    assert (fitted.objects, fitted.outliers, fitted.held_out) == (6, 10, 6)
+    taught, about = Recogniser(card), read_card(card).fitted_to["novelty"]
+    assert ("clean and through sensors" in about) == sensed
+    inputs = np.random.default_rng(0).integers(0, 256, (3, 4, 32, 32)).astype(np.uint8)
+    evidence = taught.from_inputs(inputs)
+    np.testing.assert_array_equal(evidence.logits, before.from_inputs(inputs).logits)
+    np.testing.assert_array_equal(evidence.novelty, taught.novelty.scores(taught.features(inputs)))

@@ -1,0 +1,153 @@
+"""Models of a card and an ONNX file: what is written is read again, what does not fit is refused in one sentence."""
+
+import json
+
+import numpy as np
+import onnx
+import pytest
+from msgspec.structs import replace
+from onnx import TensorProto, helper, numpy_helper
+from pipeline import make_map_network, make_recogniser
+
+from nextview.errors import ModelError
+from nextview.files import sha256_of
+from nextview.geometry.observation import Observation, pinhole
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.recognition.inference import MapNetwork, Recogniser
+from nextview.recognition.model_card import bundled_cards, find_card, read_card, write_card
+
+CLASSES = [f"class{k}" for k in range(10)]
+
+
+def test_cards_are_read_as_they_were_written(tmp_path):
+    (tmp_path / "card.onnx").touch()
+    for card in bundled_cards().values():
+        write_card(tmp_path / "card.json", card)
+        assert read_card(tmp_path / "card.json") == replace(card, path=tmp_path / "card.onnx")
+
+
+def change(path, **values):
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+def test_a_model_that_is_not_there():
+    with pytest.raises(ModelError, match="no bundled model is called 'resnet'; there are lcm-"):
+        find_card("resnet")
+    with pytest.raises(ModelError, match=r"gone\.json: no such file"):
+        find_card("gone.json")
+
+
+def test_a_card_of_other_classes_or_inputs_than_its_network_is_refused_when_that_is_opened(tmp_path):
+    card = make_recogniser(tmp_path, CLASSES, azimuth_bins=8)
+    for values, sentence in (
+        ({"classes": CLASSES[:9]}, r"has logits \(batch, 10\) .*, not \(batch, 9\)"),
+        ({"azimuth_bins": 4}, r"has sides \(batch, 10, 8\)"),
+        ({"input": {"kind": "geometry", "size": 32}}, r"has input \(batch, 4, 16, 16\)"),
+        ({"input": {"kind": "image", "size": 16}}, r"has input \(batch, 4, 16, 16\)"),
+    ):
+        before = card.read_text()
+        change(card, **values)
+        with pytest.raises(ModelError, match=sentence):
+            Recogniser(card)
+        card.write_text(before)
+    lem = make_map_network(tmp_path)
+    change(lem, good="valley")
+    assert MapNetwork(lem).card.valleys(("a", "b")) == ("a", "b")
+    change(lem, valley_gain={"a": -0.1, "b": 0.1}, valley_classes=["b"])
+    assert MapNetwork(lem).card.valleys(("a", "b")) == ("b",)
+    change(lem, output="sphere")
+    with pytest.raises(ModelError, match="gives no sphere"):
+        MapNetwork(lem)
+
+
+SEEN = Observation(np.pad(np.full((16, 16), 2.5, np.float32), 8), ViewSphere.named("40").poses[3], pinhole(32, 3.5))
+
+
+def constant(model: onnx.ModelProto, name: str) -> onnx.TensorProto:
+    return next(each for each in model.graph.initializer if each.name == name)
+
+
+def weights_elsewhere(where: str):
+    """Weights in another file, as ONNX allows."""
+
+    def change(model: onnx.ModelProto) -> None:
+        weights = constant(model, "weights")
+        weights.ClearField("raw_data")
+        weights.data_location = TensorProto.EXTERNAL
+        weights.external_data.add(key="location", value=where)
+
+    return change
+
+
+def another_input(model: onnx.ModelProto) -> None:
+    model.graph.input[0].name = model.graph.node[0].input[0] = "other"
+
+
+def two_inputs(model: onnx.ModelProto) -> None:
+    model.graph.input.append(helper.make_tensor_value_info("more", TensorProto.UINT8, ["batch", 4, 16, 16]))
+
+
+def one_answer(model: onnx.ModelProto) -> None:
+    """Of the first view alone, however many there are."""
+    model.graph.node[-1].output[0] = "all"
+    model.graph.initializer.extend(numpy_helper.from_array(np.array([k]), f"at{k}") for k in (0, 1))
+    model.graph.node.append(helper.make_node("Slice", ["all", "at0", "at1"], ["logits"]))
+
+
+def any_number_of_answers(model: onnx.ModelProto) -> None:
+    """As many as there are numbers other than zero."""
+    model.graph.node.extend(
+        [
+            helper.make_node("NonZero", ["real"], ["where"]),
+            helper.make_node("Transpose", ["where"], ["rows"], perm=[1, 0]),
+            helper.make_node("Cast", ["rows"], ["numbers"], to=TensorProto.FLOAT),
+            helper.make_node("MatMul", ["numbers", "weights"], ["logits"]),
+        ]
+    )
+    model.graph.node[2].output[0] = "unused"
+
+
+def no_numbers(model: onnx.ModelProto) -> None:
+    constant(model, "weights").CopyFrom(numpy_helper.from_array(np.full((4, 3), np.nan, np.float32), "weights"))
+
+
+def one_view_at_a_time(model: onnx.ModelProto) -> None:
+    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 1
+
+
+def unknown_operator(model: onnx.ModelProto) -> None:
+    model.graph.node.append(helper.make_node("Unknown", ["logits"], ["more"], domain="somewhere"))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (weights_elsewhere("weights.bin"), "not a usable ONNX model"),
+        (weights_elsewhere("../weights.bin"), "not a usable ONNX model"),
+        (weights_elsewhere("/dev/zero"), "not a usable ONNX model"),
+        (another_input, "takes other, not one input called input"),
+        (two_inputs, "takes input, more, not one input called input"),
+        (one_answer, r"gives logits of the shape \(1, 3\) for 2 inputs"),
+        (any_number_of_answers, r"gives logits of the shape \(\d{3,}, 3\) for 2 inputs"),
+        (no_numbers, "gives logits that are not finite numbers"),
+        (one_view_at_a_time, r"has input \(1, 4, 16, 16\)"),
+        (unknown_operator, "not a usable ONNX model"),
+    ],
+)
+def test_a_file_that_is_not_what_its_card_promises(tmp_path, monkeypatch, change, sentence):
+    monkeypatch.chdir(tmp_path)  # ONNX Runtime would find weights here
+    (tmp_path / "models").mkdir()
+    for folder in (tmp_path, tmp_path / "models"):
+        (folder / "weights.bin").write_bytes(np.ones(12, np.float32).tobytes())
+    card = make_recogniser(tmp_path / "models", ["a", "b", "c"])
+    assert Recogniser(card, 1)([SEEN, SEEN]).logits.shape == (2, 3)
+    file = card.with_suffix(".onnx")
+    model = onnx.load(file)
+    change(model)
+    file.write_bytes(model.SerializeToString())
+    with pytest.raises(ModelError, match="the SHA-256 differs"):
+        Recogniser(card, 1)
+    card.write_text(json.dumps(json.loads(card.read_text()) | {"sha256": sha256_of(file)}))
+    with pytest.raises(ModelError, match=f"tiny.onnx: {sentence}") as refused:
+        Recogniser(card, 1)([SEEN, SEEN])
+    assert "\n" not in str(refused.value)

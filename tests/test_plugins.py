@@ -1,0 +1,98 @@
+"""Code of users' own: what it raises is one sentence that says where, and its traceback is to be had."""
+
+import numpy as np
+import pytest
+
+import nextview
+from nextview.data.samples import sample_mesh
+from nextview.errors import PolicyError, UsageError
+
+LONGEST = 300
+
+MINE = """
+import sys
+class Policy:
+    needs = ()
+    def __init__(self, sphere):
+        pass
+    def next_views(self, state, rng):
+        raise self.raises                        # line 8
+class Lines(Policy):
+    raises = ValueError("first\\n\\tsecond \\x1b[31m" + "x" * 10**6)
+class Leaves(Policy):
+    raises = SystemExit("bye")
+class Stops(Policy):
+    raises = KeyboardInterrupt()
+class Values(Policy):
+    def next_views(self, state, rng):
+        return state.free.argmax(1)
+    def view_values(self, state):
+        return self.found
+    found = property(lambda self: 1 / 0)         # line 20
+class Flat(Values):
+    found = 0.0
+"""
+
+
+@pytest.fixture(autouse=True)
+def mine(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "code_of_mine.py").write_text(MINE)
+
+
+def asked(name: str) -> None:
+    system = nextview.load(policy=f"code_of_mine:{name}", threads=1, threshold=1.0)
+    system.recognise(nextview.SimulatedCamera(sample_mesh("chair"), 112))
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("Lines", r"policy Lines raised ValueError: first second \\x1b\[31mx+\.\.\., at code_of_mine.py:8"),
+        ("Leaves", "policy Leaves raised SystemExit: bye, at code_of_mine.py:8"),
+        (
+            "Values",
+            r"policy Values, asked what it values views at, raised ZeroDivisionError: .*, at code_of_mine.py:20",
+        ),
+        ("Flat", r"policy Flat values views by \(B, V\) numbers, here \(1, 40\)"),
+    ],
+)
+def test_a_policy_that_raises_is_one_sentence_that_says_where(name, sentence):
+    with pytest.raises(PolicyError, match=f"^{sentence}$") as refused:
+        asked(name)
+    assert len(str(refused.value)) < LONGEST + 100
+    assert (refused.value.__cause__ is None) == (name == "Flat")
+
+
+def test_the_whole_traceback_is_shown_where_it_is_asked_for(monkeypatch, capsys):
+    with pytest.raises(PolicyError):
+        asked("Leaves")
+    assert capsys.readouterr().err == ""
+    monkeypatch.setenv("NEXTVIEW_TRACEBACK", "1")
+    with pytest.raises(PolicyError):
+        asked("Leaves")
+    assert "raise self.raises  " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("said", [None, "yes", np.zeros(2, bool), np.nan, 1j, [], object()])
+def test_a_callable_that_says_nothing_of_a_pose_is_refused_and_the_session_goes_on(said):
+    camera = nextview.SimulatedCamera(sample_mesh("chair"), 112)
+    session = nextview.load(policy="spread", threads=1, threshold=1.0).session(start=3)
+    for name, what in (("reachable", "whether a view can be reached"), ("travel_cost", "a travel cost")):
+        setattr(session, name, lambda *poses: said)
+        with pytest.raises(UsageError, match=f"^{what} is "):
+            session.update(camera.observe(session.pose))
+        assert session.views == []
+        setattr(session, name, None)
+    session.update(camera.observe(session.pose))
+    assert len(session.views) == 1
+
+
+def test_what_a_callable_of_a_program_raises_is_the_programs():
+    """It is called by whoever handed it in, who may be waiting for that very error."""
+    camera = nextview.SimulatedCamera(sample_mesh("chair"), 112)
+    session = nextview.load(policy="spread", threads=1, threshold=1.0).session(start=3)
+    session.reachable = lambda pose: {}["the arm is off"]
+    with pytest.raises(KeyError, match="the arm is off"):
+        session.update(camera.observe(session.pose))
+    assert session.views == []

@@ -1,0 +1,276 @@
+"""Choosing views among things: what is expected to show, by closed forms; policies by it; scenes in replay and live."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import trimesh
+from pipeline import some_predictions
+from test_scenes import BALL, GRID, layouts, meshes, scene_of, store  # noqa: F401
+
+import nextview
+from nextview.benchmark.entries import default_entries
+from nextview.benchmark.replay import make_specs, replay
+from nextview.data.predictions import Predictions
+from nextview.data.scene_views import SceneSight, scene_intrinsics, scene_views
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, EntryError, PredictionsError
+from nextview.geometry.mesh import make_mesh
+from nextview.geometry.observation import SceneView
+from nextview.policies.base import EpisodeState, Evidence
+from nextview.policies.gain import INPUTS, VISIBILITY, Gain, features, mirrored, mirrored_features
+from nextview.policies.registry import make_policy
+from nextview.recognition.belief import FixedLength
+from nextview.sensing.expected_visibility import SeenScene, expected_visibility
+from nextview.session.session import Session
+from nextview.simulation.robot_camera import RobotCamera
+from nextview.simulation.scene_layout import Block
+from nextview.simulation.simulated import TARGET, OccludedCamera, SceneCamera
+from research.plan import plan
+
+POSITIONS = GRID.poses[:, :3, 3]
+BEFORE = Block(1.6, 0.0, 0.0, 0.2, 2.6, 2.2)
+"""Hides the ball from the front, and nothing from behind."""
+
+
+def looks(scene, *views: int) -> list[SceneView]:
+    """What a camera without errors sees of a scene."""
+    k = scene_intrinsics(GRID.distance, 80)
+    camera, found = SceneCamera(scene, k, (80, 80)), []
+    for view in views:
+        depth, owner = camera.look(GRID.poses[view])
+        found.append(SceneView(depth, owner == TARGET, GRID.poses[view], k, True))
+    return found
+
+
+def state_of(visibility, belief=None, reachable=None) -> EpisodeState:
+    """One episode after view 0."""
+    visited = np.zeros((1, 40), bool)
+    visited[0, 0] = True
+    belief = np.full((1, 10), 0.1) if belief is None else belief
+    bins = np.full((1, 10, 8), 1 / 8)
+    evidence = Evidence(np.log(belief), {"lem-sphere": np.zeros((1, 5, 8))}, bins)
+    return EpisodeState(
+        np.zeros(1, int), visited, belief, evidence, 1, azimuth_bins=bins, reachable=reachable,
+        visibility=np.asarray(visibility, float).reshape(1, 40),
+    )  # fmt: skip
+
+
+# What is expected to show
+
+
+def test_before_anything_is_seen_everything_may_show():
+    found = expected_visibility(SeenScene.unseen(), POSITIONS)
+    assert (found.least <= found.expected).all()
+    assert (found.expected <= found.most).all()
+    np.testing.assert_array_equal(found.most, 1)
+    np.testing.assert_array_equal(found.least, 1)
+
+
+def test_alone_on_its_table_all_of_it_shows_once_the_space_around_was_seen():
+    found = expected_visibility(SeenScene.of(looks(scene_of(), *range(0, 40, 3))), POSITIONS)
+    assert found.least[8:].min() > 0.95  # level with the table its edge is in doubt
+    np.testing.assert_allclose(found.most, 1, atol=0.05)
+
+
+def test_a_box_hides_what_is_behind_it_as_far_as_a_camera_without_errors_says():
+    scene = scene_of(BEFORE)
+    truth = np.array([OccludedCamera(scene, 64).visible_share(pose) for pose in GRID.poses])
+    found = expected_visibility(SeenScene.of(looks(scene, 2, 4, 14, 22, 30)), POSITIONS)
+    assert found.expected[0] < 0.1
+    assert found.expected[4] > 0.85
+    assert np.corrcoef(found.expected, truth)[0, 1] > 0.95
+    assert np.abs(found.expected - truth).mean() < 0.1
+    assert (found.least - 0.1 <= truth).all()
+    assert (truth <= found.most + 0.1).all()
+
+
+def test_the_denser_unseen_space_is_taken_to_be_the_less_shows():
+    seen = SeenScene.of(looks(scene_of(BEFORE), 12))
+    shares = [expected_visibility(seen, POSITIONS, density).expected for density in (0, 0.2, 1, 1000)]
+    for more, less in pairwise(shares):
+        assert (less <= more + 1e-12).all()
+    found = expected_visibility(seen, POSITIONS)
+    np.testing.assert_allclose(shares[0], found.most)
+    np.testing.assert_allclose(shares[-1], found.least, atol=1e-12)
+
+
+# Policies
+
+
+def test_visibility_goes_where_most_shows_and_may_go():
+    share = np.linspace(0, 1, 40)
+    policy, rng = make_policy("visibility", GRID), np.random.default_rng(0)
+    assert policy.next_views(state_of(share), rng)[0] == 39
+    reachable = np.ones((1, 40), bool)
+    reachable[0, 30:] = False
+    assert policy.next_views(state_of(share, reachable=reachable), rng)[0] == 29
+    near = make_policy("visibility@10", GRID).next_views(state_of(share), rng)[0]
+    assert GRID.travel[0, near] == 1
+    assert len({int(policy.next_views(state_of(np.ones(40)), rng)[0]) for _ in range(50)}) > 10  # by chance
+
+
+def test_the_product_goes_where_gain_goes_if_everything_shows():
+    rng, gain, product = np.random.default_rng(0), make_policy("gain", GRID), make_policy("visible-gain", GRID)
+    assert product.travel_weight == gain.travel_weight
+    for _ in range(20):
+        state = state_of(np.ones(40), rng.dirichlet(np.ones(10), 1))
+        np.testing.assert_array_equal(product.next_views(state, rng), gain.next_views(state, rng))
+    assert set(product.needs) == {*gain.needs, "visibility"}
+
+
+def test_the_product_shuns_what_is_hidden():
+    rng, product = np.random.default_rng(0), make_policy("visible-gain@0", GRID)
+    state = state_of(np.ones(40), rng.dirichlet(np.ones(10), 1))
+    best = int(product.next_views(state, rng)[0])
+    share = np.ones((1, 40))
+    share[0, best] = 0.05
+    assert int(product.next_views(replace(state, visibility=share), rng)[0]) != best
+    values = product.view_values(replace(state, visibility=np.zeros((1, 40))))
+    np.testing.assert_allclose(values, 0)
+
+
+# Learned
+
+
+@pytest.mark.parametrize("frame", ["camera", "object"])
+def test_what_shows_is_told_to_networks_cell_by_cell(frame):
+    rng = np.random.default_rng(0)
+    state = replace(state_of(rng.random(40)), current=np.array([11]))
+    whole = features(GRID, state, (*INPUTS[:3], "lem-sphere", "azimuth_bin", VISIBILITY), frame)
+    without = features(GRID, state, (*INPUTS[:3], "lem-sphere", "azimuth_bin"), frame)
+    np.testing.assert_array_equal(whole[:, :-40], without)
+    alone = features(GRID, state, (VISIBILITY,), "camera")[0]
+    assert alone[8] == state.visibility[0, 11]  # straight ahead on its own ring
+    assert alone[9] == state.visibility[0, 12]
+    np.testing.assert_array_equal(np.sort(alone), np.sort(state.visibility[0]))
+    np.testing.assert_array_equal(mirrored_features(GRID, 10, (VISIBILITY,)), mirrored(GRID))
+    policy = Gain(GRID, 10, lambda seen: seen, (VISIBILITY,))
+    assert policy.needs == (VISIBILITY,)
+    np.testing.assert_allclose(policy.gains(state), state.visibility, atol=1e-6)
+
+
+# In scenes
+
+
+OWN = "test_scene_policies:FirstFree"
+
+
+class FirstFree:
+    """A policy that wants to see scenes, and makes nothing of them."""
+
+    needs = ("observations",)
+
+    def __init__(self, sphere):
+        pass
+
+    def next_views(self, state, rng):
+        assert all(seen.scene is not None for views in state.observations for seen in views)
+        return state.free.argmax(1)
+
+
+@pytest.fixture(scope="module")
+def predictions(store) -> Predictions:  # noqa: F811
+    """Random ones of a store of scenes; where nothing of a target shows, all classes are alike."""
+    opened = ViewStore.open(store)
+    made = some_predictions(len(opened))
+    entropy = opened.measure()
+    logits = np.where((opened.measure("visible_share") > 0.05)[..., None], made.logits, 0).astype(np.float32)
+    return replace(
+        made, names=tuple(opened.names), depth_entropy=entropy, logits=logits, store=str(store),
+        splits=np.array(["test"] * len(opened)),
+    )  # fmt: skip
+
+
+def test_what_is_expected_in_a_store_is_what_its_frames_say(store):  # noqa: F811
+    opened = ViewStore.open(store)
+    sight = SceneSight.of(opened, opened.names[1:])
+    visited = np.zeros((3, 40), bool)
+    visited[0, [3, 17]] = visited[1, [3]] = visited[2, [17, 3]] = True
+    found = sight.visibility(np.array([2, 2, 2]), visited)
+    scene = scene_views(opened, 3)
+    expected = expected_visibility(SeenScene.of([scene.scene_view(3), scene.scene_view(17)]), POSITIONS).expected
+    np.testing.assert_allclose(found[0], expected, atol=1e-6)
+    np.testing.assert_array_equal(found[0], found[2])
+    assert not np.allclose(found[0], found[1])
+    np.testing.assert_array_equal(sight.of_scenes(np.array([2, 0])).visibility(np.array([0]), visited[:1]), found[:1])
+    with pytest.raises(DatasetError, match="holds no scene"):
+        SceneSight.of(opened, ["nothing@light-0"])
+
+
+def test_no_policy_goes_where_no_camera_can(predictions, store):  # noqa: F811
+    list(plan(store, [OWN], workers=0))
+    specs = make_specs(predictions, 2, 0)
+    reachable = specs.scenes.reachable
+    assert not reachable.all()
+    entries = "random-all", "random", "visibility", "visibility@0.05"
+    for name in (*entries, OWN, "true-visible_share-all", "oracle-gain-all"):
+        views = replay(name, specs, 4, 0).views
+        assert reachable[specs.objects[:, None], views].all(), name
+    entries = default_entries(specs)
+    assert {"visibility", "true-visible_share-all", "random-all"} <= set(entries)
+    assert not any(name.startswith(("best-", "orbit-")) for name in entries)
+    with pytest.raises(EntryError, match="cannot be reached"):
+        replay("orbit-40", specs, 4, 0)
+
+
+def test_visibility_sees_more_than_random_in_scenes(predictions):
+    specs = make_specs(predictions, 4, 0)
+    share = ViewStore.open(predictions.store).measure("visible_share")
+    seen = {
+        name: share[specs.objects, replay(name, specs, 2, 0).views[:, 1]].mean()
+        for name in ("random-all", "visibility", "true-visible_share-all")
+    }
+    assert seen["random-all"] + 0.1 < seen["visibility"] <= seen["true-visible_share-all"]
+
+
+def test_views_without_the_target_are_no_evidence(predictions):
+    hidden = ~predictions.seen
+    assert hidden.any()
+    scene, view = np.argwhere(hidden)[0]
+    evidence = predictions.evidence(np.array([scene]), np.array([view]))
+    assert not evidence.seen[0]
+    sized = replace(
+        predictions, logits=predictions.logits + 0.3, of_size=np.full((len(predictions), 3), np.float32(0.3))
+    )
+    np.testing.assert_array_equal(sized.seen, predictions.seen)
+
+
+def test_gain_learns_in_scenes_what_to_make_of_what_shows(predictions, tmp_path):
+    from nextview.learning.gain_training import train_gain
+    from nextview.learning.recipes import GainRecipe
+
+    train = np.array(["train"] * len(predictions))
+    replace(predictions, splits=train).save(tmp_path / "p.npz")
+    recipe = GainRecipe(("belief", "place", "visibility"), "camera", epochs=1, walks=1, networks=1)
+    made = train_gain(tmp_path / "p.npz", tmp_path / "in-scenes.json", recipe=recipe, folds=2, travel_weight=0.01)
+    assert made.objects == len(predictions)
+    policy = make_policy(str(made.card), GRID, classes=predictions.classes)
+    assert policy.needs == ("visibility",)
+    specs = make_specs(predictions, 1, 0)
+    views = replay(str(made.card), specs, 4, 0).views
+    assert specs.scenes.reachable[specs.objects[:, None], views].all()
+    replace(some_predictions(), splits=train).save(tmp_path / "alone.npz")
+    with pytest.raises(PredictionsError, match="of no scenes"):
+        train_gain(tmp_path / "alone.npz", tmp_path / "alone.json", recipe=recipe, folds=2)
+
+
+# Live
+
+
+@pytest.mark.parametrize("named", ["box", "mask"])
+def test_a_robot_sees_around_a_box(named):
+    crate = make_mesh(*(lambda m: (m.vertices, m.faces))(trimesh.creation.box([1, 1.2, 0.9])))
+    scene = scene_of(Block(1.9, 0.0, 0.0, 0.3, 1.1, 1.6), target=crate)
+    truth = np.array([OccludedCamera(scene, 64).visible_share(pose) for pose in GRID.poses])
+    assert truth[0] < 0.6 < truth[3]
+    camera = RobotCamera(scene, named=named)
+    system = nextview.load(policy="visibility")
+    session = Session(system.models, system.policy, system.sphere, 0, FixedLength(max_views=3), object=camera.object)
+    session.reachable = camera.reachable
+    while not session.done:
+        session.update(camera.observe(session.pose))
+    first = session.views[0]
+    assert first.observation.scene is not None
+    assert truth[[view.index for view in session.views[1:]]].min() > 0.9

@@ -1,0 +1,259 @@
+"""Scenes: what hides what, by closed forms and another ray caster; nothing overlaps; the same seed, the same scene."""
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pipeline
+import pytest
+import trimesh
+from matplotlib.path import Path as Outline
+
+import nextview
+from nextview.data.checking import check
+from nextview.data.rendering import RenderOptions, render
+from nextview.data.scene_drawing import draw_scenes
+from nextview.data.scene_views import scene_views
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError
+from nextview.geometry.mesh import make_mesh
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.simulation.robot_camera import RobotCamera
+from nextview.simulation.scene import TABLE, Scene, block_item, build_scene, footprint, separation
+from nextview.simulation.scene_drawing import SPREAD, TOLERANCE
+from nextview.simulation.scene_layout import LEVELS, Block, SceneLayout
+from nextview.simulation.simulated import (
+    NOTHING,
+    OTHER,
+    TABLE_TOP,
+    TARGET,
+    OccludedCamera,
+    SceneCamera,
+    SimulatedCamera,
+)
+
+GRID = ViewSphere.named("40")
+BALL = make_mesh(*(lambda m: (m.vertices, m.faces))(trimesh.creation.icosphere(4)))
+FRONT = GRID.poses[0]
+"""From +x, level."""
+
+
+def scene_of(*blocks: Block, target=BALL) -> Scene:
+    floor = float(target.vertices[:, 2].min())
+    return Scene(target, tuple(block_item(block, floor) for block in blocks))
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory) -> Path:
+    """Six simple objects of two classes."""
+    folder, rng = tmp_path_factory.mktemp("things") / "things", np.random.default_rng(0)
+    for i in range(12):
+        kind = ("jar", "crate")[i % 2]
+        mesh = trimesh.creation.cylinder(0.5, 1, sections=24) if i % 2 == 0 else trimesh.creation.box()
+        path = folder / kind / ("train" if i < 8 else "test") / f"{kind}_{i}.off"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mesh.apply_scale(rng.uniform(0.5, 1.5, 3)).export(path)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def layouts(meshes, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("drawn") / "scenes"
+    drawn = list(draw_scenes(meshes, folder, scenes=1, seed=3, workers=0))
+    assert len(drawn) == 6
+    assert not [reason for _, reason in drawn if reason]
+    return folder
+
+
+@pytest.fixture(scope="module")
+def store(layouts, meshes, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("store") / "scenes.zarr"
+    assert [
+        reason for _, reason in render(layouts, path, GRID, 48, workers=0, options=RenderOptions(meshes=meshes))
+    ] == [None] * 6
+    return path
+
+
+# What hides what
+
+
+def test_a_wall_before_one_half_hides_exactly_half():
+    camera = OccludedCamera(scene_of(Block(1.6, 1.5, 0.0, 0.1, 3.0, 3.0)), 112)
+    assert camera.visible_share(FRONT) == pytest.approx(0.5, abs=0.005)
+    assert camera.visible_share(GRID.poses[4]) == 1  # from behind
+    seen = camera.observe(FRONT)  # x to the right in the picture is +y: looking along -x with z up
+    columns = np.flatnonzero(seen.depth.any(0))
+    assert columns.max() < 56 or columns.min() >= 56
+    np.testing.assert_array_equal(seen.depth > 0, seen.picture > 0)
+
+
+def test_a_box_before_the_target_hides_it_and_shows_its_own_face():
+    scene = scene_of(Block(1.5, 0.0, 0.0, 0.2, 2.5, 2.5))
+    assert OccludedCamera(scene).visible_share(FRONT) == 0
+    assert not OccludedCamera(scene).observe(FRONT).seen
+    depth, owner = SceneCamera(scene, np.array([[60.0, 0, 40], [0, 60, 40], [0, 0, 1]]), (80, 80)).look(FRONT)
+    assert owner[40, 40] == OTHER
+    assert depth[40, 40] == pytest.approx(3 - 1.6, abs=1e-5)  # its near face is at x = 1.6
+
+
+def test_every_pixel_has_its_owner():
+    scene = scene_of(Block(0.0, 2.0, 0.3, 0.5, 0.5, 1.0))
+    k, pose = np.array([[40.0, 0, 40], [0, 40, 40], [0, 0, 1]]), GRID.poses[24]
+    depth, owner = SceneCamera(scene, k, (80, 80)).look(pose)
+    row, column = np.mgrid[:80, :80]
+    rays = np.stack([(column + 0.5 - 40) / 40, (row + 0.5 - 40) / 40, np.ones((80, 80))], -1)
+    places = (depth[..., None] * rays) @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(np.linalg.norm(places[owner == TARGET], axis=-1), 1, atol=0.01)
+    np.testing.assert_allclose(places[owner == TABLE_TOP][:, 2], -1, atol=1e-4)
+    assert np.abs(places[owner == TABLE_TOP][:, :2]).max() <= TABLE + 1e-4
+    assert (np.linalg.norm(places[owner == OTHER][:, :2] - (0, 2), axis=1) < 0.36).all()
+    assert {*np.unique(owner)} == {NOTHING, TARGET, OTHER, TABLE_TOP}
+    np.testing.assert_array_equal(depth == 0, owner == NOTHING)
+
+
+def test_shares_are_those_of_another_ray_caster(layouts, meshes):
+    path = sorted(layouts.rglob("*heavy*.json"))[0]
+    layout, k = SceneLayout.load(path), np.array([[60.0, 0, 32], [0, 60.0, 32], [0, 0, 1]])
+    scene = build_scene(layout, meshes)
+    things = [trimesh.Trimesh(item.vertices, item.faces, process=False) for item in (scene.target, *scene.items)]
+    for view in (3, 14, 25, 36):
+        _, alone = pipeline.cast(things[:1], GRID.poses[view], k, (64, 64))
+        _, among = pipeline.cast(things, GRID.poses[view], k, (64, 64))
+        assert layout.visible[view] == pytest.approx((among == 0).sum() / (alone == 0).sum(), abs=0.03)
+
+
+# Where things stand
+
+
+def test_separation_of_squares():
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    assert separation(square, square + np.array([1.5, 0.2])) == pytest.approx(0.5)
+    assert separation(square, square + np.array([0.75, 0.2])) == pytest.approx(-0.25)
+    diamond = np.array([[0.5, -0.5], [1.5, 0.5], [0.5, 1.5], [-0.5, 0.5]])
+    assert separation(square, diamond + np.array([2, 0])) == pytest.approx(0.5)
+    assert separation(square, square + np.array([1.3, 1.4])) == pytest.approx(0.4)  # corner to corner it is 0.5
+    assert separation(np.array([[-1, 0.5], [2, 0.5]]), square) < 0 < separation(np.array([[-1, 2], [2, 2.0]]), square)
+
+
+def test_drawn_scenes_stand_on_their_table_and_never_overlap(layouts, meshes):
+    for path in sorted(layouts.rglob("*.json")):
+        layout = SceneLayout.load(path)
+        scene = build_scene(layout, meshes)
+        assert len(scene.items) >= 3
+        for item in scene.items:
+            assert item.vertices[:, 2].min() == pytest.approx(scene.floor, abs=1e-12)
+            assert np.abs(item.footprint).max() <= TABLE
+        outlines = [footprint(scene.target.vertices), *(item.footprint for item in scene.items)]
+        for a, b in combinations(outlines, 2):
+            assert not Outline(a).intersects_path(Outline(b), filled=True)
+        assert abs(np.mean(layout.visible) - LEVELS[layout.level]) < SPREAD + TOLERANCE + 0.03
+        split = path.parent.name
+        assert all(f"/{split}/" in placed.mesh for placed in (layout.target, *layout.objects))
+        assert layout.target.mesh not in [placed.mesh for placed in layout.objects]
+
+
+def test_cameras_reach_no_place_in_things_behind_walls_or_below_the_table():
+    inside = scene_of(Block(3.0, 0.0, 0.0, 0.6, 0.6, 1.5))
+    there = inside.reachable(GRID.poses[:, :3, 3])
+    assert not there[0]
+    assert there[1:8].all()
+    behind = scene_of(Block(0.0, 1.5, 0.0, 2.0, 0.1, 0.5, wall=True))
+    there = behind.reachable(GRID.poses[:, :3, 3])
+    assert not there[2]
+    assert not there[10]  # above it, but behind it
+    assert there[[0, 4, 6, 14]].all()
+    assert scene_of(Block(0.0, 1.5, 0.0, 2.0, 0.1, 0.5)).reachable(GRID.poses[:, :3, 3]).all()
+    below = look_at_origin(np.radians([-10.0, -30.0]), 0.0)[:, :3, 3]
+    np.testing.assert_array_equal(scene_of().reachable(below), [True, False])  # 0.48 above, 0.5 below
+    np.testing.assert_allclose(inside.clearance(np.array([[3.0, 2.3, 0.0], [3.0, 0.0, 2.0]])), [1.0, 1.5], atol=0.01)
+
+
+# The same again
+
+
+def test_the_same_seed_draws_the_same_bytes(layouts, meshes, tmp_path):
+    files = sorted(path.relative_to(layouts) for path in layouts.rglob("*.json"))
+    list(draw_scenes(meshes, tmp_path / "again", ["light"], 1, 3, workers=0))
+    again = sorted(path.relative_to(tmp_path / "again") for path in tmp_path.rglob("*.json"))
+    assert again == [file for file in files if "@light-" in file.name]
+    for file in again:
+        assert (tmp_path / "again" / file).read_bytes() == (layouts / file).read_bytes()
+    with pytest.raises(DatasetError, match="another seed"):
+        list(draw_scenes(meshes, tmp_path / "again", ["light"], 1, 4, workers=0))
+
+
+def test_a_scene_is_read_as_it_was_written(layouts, tmp_path):
+    path = sorted(layouts.rglob("*.json"))[0]
+    layout = SceneLayout.load(path)
+    layout.save(tmp_path / "copy.json")
+    assert (tmp_path / "copy.json").read_bytes() == path.read_bytes()
+    assert SceneLayout.load(tmp_path / "copy.json") == layout
+
+
+# The store
+
+
+def test_a_store_of_scenes_holds_what_shows_and_the_scene(store, layouts, meshes):
+    opened = ViewStore.open(store)
+    assert sorted(opened.names) == sorted(path.stem for path in layouts.rglob("*.json"))
+    assert sorted(set(opened.splits)) == ["test", "train"]
+    assert not [wrong for _, wrong in check(store, workers=0) if wrong]
+    i = opened.names.index(next(name for name in opened.names if "@heavy-" in name))
+    layout = SceneLayout.load(next(layouts.rglob(f"{opened.names[i]}.json")))
+    views, scene = scene_views(opened, i), build_scene(layout, meshes)
+    assert views.visible_share == pytest.approx(np.array(layout.visible), abs=1e-4)
+    assert np.flatnonzero(~views.reachable).tolist() == list(layout.unreachable)
+    np.testing.assert_allclose(views.clearance, scene.clearance(GRID.poses[:, :3, 3]), rtol=1e-6)
+    alone = [SimulatedCamera(scene.target, 48).observe(pose).visible for pose in GRID.poses]
+    shown = np.count_nonzero(opened.depth(i), axis=(1, 2)) / alone
+    assert shown == pytest.approx(views.visible_share, abs=0.05)
+    # The same object fills the same part of both pictures.
+    wide = np.count_nonzero(views.owner == TARGET, axis=(1, 2)) / views.intrinsics[0, 0] ** 2
+    narrow = np.count_nonzero(opened.depth(i), axis=(1, 2)) / opened.intrinsics[0, 0] ** 2
+    assert wide == pytest.approx(narrow, abs=0.1 * narrow.max())
+
+
+def test_a_store_of_scenes_goes_on_where_it_was_cut_off(store, layouts, meshes, tmp_path):
+    path = tmp_path / "cut.zarr"
+    begun = render(layouts, path, GRID, 48, workers=0, options=RenderOptions(meshes=meshes))
+    next(begun)
+    begun.close()
+    opened = ViewStore.open(path)
+    assert opened.done.sum() == 1
+    opened.forget(int(np.flatnonzero(opened.done)[0]))
+    assert len(list(render(layouts, path, GRID, 48, workers=0, options=RenderOptions(meshes=meshes)))) == 6
+    whole, cut = ViewStore.open(store), ViewStore.open(path)
+    for name in whole.rendered:
+        np.testing.assert_array_equal(whole.array(name)[:], cut.array(name)[:], err_msg=name)
+
+
+# Live
+
+
+@pytest.mark.parametrize("named", ["known", "mask", "box", "point"])
+def test_a_robot_sees_the_target_that_it_was_told_of(named):
+    crate = make_mesh(*(lambda m: (m.vertices, m.faces))(trimesh.creation.box([1, 1.2, 0.9])))
+    scene = scene_of(Block(-1.9, 0.4, 0.2, 0.6, 0.6, 0.9), Block(0.5, 1.6, 0.5, 0.5, 0.4, 0.7), target=crate)
+    camera = RobotCamera(scene, named=named)
+    frame = camera.observe(GRID.poses[16])
+    seen = camera.object.add(frame)
+    frame_of_it = camera.object.object_frame
+    radius = 0.2  # metres: a third of the distance of a sensor without errors
+    assert np.linalg.norm(frame_of_it.centre) < 0.12 * radius
+    assert frame_of_it.radius == pytest.approx(radius, rel=0.12)
+    expected = OccludedCamera(scene).observe(GRID.poses[16])
+    both = (seen.depth > 0) & (expected.depth > 0)
+    either = (seen.depth > 0) | (expected.depth > 0)
+    assert both.sum() > (0.9 if named in ("known", "box") else 0.75) * either.sum()
+    assert (frame.mask is not None) == (named in ("known", "mask"))
+
+
+def test_a_session_runs_live_in_a_scene(layouts, meshes):
+    layout = SceneLayout.load(sorted(layouts.rglob("*medium*.json"))[0])
+    camera = RobotCamera(build_scene(layout, meshes), "stereo", np.random.default_rng(1), "known")
+    session = nextview.load(policy="random", threshold=1.0, max_views=3).session_with(camera, start=1)
+    session.reachable = camera.reachable
+    result = session.run(camera)
+    assert len(result.views) == 3
+    assert result.seen
+    assert all(layout.visible[view.index] > 0 and view.index not in layout.unreachable for view in result.views)
