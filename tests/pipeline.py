@@ -5,23 +5,30 @@
 
 import hashlib
 import json
+import subprocess
+import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import onnx
+import pytest
 import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from onnx import TensorProto, helper, numpy_helper
 from scipy.spatial.transform import Rotation
 
+from nextview.cli.main import main
 from nextview.data.measured_view import MeasuredView, Surface
 from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
+from nextview.data.store import ViewStore
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import BINS_OUTPUT
 from nextview.recognition.map_names import measure_of
 from nextview.simulation.simulated import SimulatedCamera
@@ -31,6 +38,23 @@ CLASSES = ["ball", "box", "pillar"]
 """Of ``some_predictions``."""
 FURNITURE = ["chair", "monitor", "table"]
 """Of ``write_furniture``."""
+SAMPLE_FILES = Path(__file__).parents[1] / "samples"
+
+
+# Commands
+
+
+def refused(capsys, *arguments) -> str:
+    """What a command that ends with status 2 says on standard error, in one line."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    assert end.value.code == 2
+    return " ".join(capsys.readouterr().err.split())
+
+
+def run_python(code: str, **options) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, **options)
 
 
 # Meshes
@@ -143,6 +167,17 @@ def some_predictions(n: int = 6, seed: int = 0) -> Predictions:
     )
 
 
+def scene_predictions(store: Path, classes: Sequence[str]) -> Predictions:
+    """Random logits of a store of cluttered scenes. A view that hardly shows the target says nothing."""
+    opened, rng = ViewStore.open(store), np.random.default_rng(0)
+    shows = opened.measure("visible_share") > 0.3
+    logits = np.where(shows[..., None], 2 * rng.normal(size=(len(opened), 40, len(classes))), 0).astype(np.float32)
+    return replace(
+        some_predictions(len(opened)), logits=logits, classes=tuple(classes), names=tuple(opened.names), maps={},
+        valley_classes={}, depth_entropy=opened.measure(), store=str(store), calibration=Calibration(1.0, 0.3),
+    )  # fmt: skip
+
+
 # Scenes: meshes in metres, and a pinhole camera that casts rays at them
 
 INTRINSICS = np.array([[520.0, 0, 310.5], [0, 530.0, 246.5], [0, 0, 1]])
@@ -158,14 +193,18 @@ TABLE = box((1.4, 1.4, 0.04), (0, 0, -0.02))
 """Its top is at z = 0."""
 
 
+def rays(intrinsics, shape) -> np.ndarray:
+    """Directions with z = 1 through the centres of the pixels, camera frame, (H, W, 3)."""
+    row, column = np.mgrid[: shape[0], : shape[1]] + 0.5
+    return np.stack([column, row, np.ones_like(row)], -1) @ np.linalg.inv(intrinsics).T
+
+
 def cast(meshes: Sequence[trimesh.Trimesh], pose, intrinsics=INTRINSICS, shape=SHAPE) -> tuple[np.ndarray, np.ndarray]:
     """Depth (H, W) float32, 0 = nothing, and which mesh is seen, -1 for none."""
     scene = EmbreeScene()
     for mesh in meshes:
         TriangleMesh(scene, mesh.vertices.astype(np.float32), np.ascontiguousarray(mesh.faces, np.int32))
-    row, column = np.mgrid[: shape[0], : shape[1]] + 0.5
-    rays = np.stack([column, row, np.ones_like(row)], -1) @ np.linalg.inv(intrinsics).T
-    directions = (rays.reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
+    directions = (rays(intrinsics, shape).reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
     origins = np.tile(np.asarray(pose)[:3, 3].astype(np.float32), (len(directions), 1))
     hits = scene.run(origins, directions, output=1)
     hit = hits["primID"] >= 0
