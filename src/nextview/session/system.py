@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,9 +75,8 @@ class System:
                 or a distance the session takes frames, else what it is given first.
         """
         rng = np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1))
-        drawn = int(rng.integers(len(self.sphere)))
-        first, options = drawn if start is None else start, (self.stopping, rng, object, distance, self.unknown)
-        return Session(self.models, self.policy, self.sphere, first, *options)
+        drawn, options = int(rng.integers(len(self.sphere))), (self.stopping, rng, object, distance, self.unknown)
+        return Session(self.models, self.policy, self.sphere, drawn if start is None else start, *options)
 
     def session_with(self, camera: Camera | FrameCamera, start: int | None = None, seed: int = 0) -> Session:
         """A session for a camera: where it gives frames, for its object."""
@@ -111,12 +110,10 @@ class System:
             ObservationError: the object is found in none of the captured views.
         """
         if isinstance(what, str | Path):
-            if Path(what).is_dir():
-                what = _camera_of(Path(what), up)
-            elif up is None or isinstance(up, str):
-                what = load_mesh(what, up, unit)
-            else:
+            folder = Path(what).is_dir()
+            if not folder and not isinstance(up, str | None):
                 raise MeshError(f"{what}: the up axis of a mesh file is y or z, not {up}")
+            what = _camera_of(Path(what), up) if folder else load_mesh(what, up, unit)
         if isinstance(what, Mesh):
             what = simulated(what, sensor, seed)
         elif sensor is not None:
@@ -130,8 +127,8 @@ class System:
         name, views = self.models.recogniser.card.name, len(self.sphere)
         return f"System({name}, policy {self.policy_name}, {views} viewpoints, {self.stopping})"
 
-    def __reduce__(self) -> tuple[Callable[..., System], tuple[dict[str, Any]]]:
-        return _load, (self.loaded,)
+    def __reduce__(self) -> tuple[Callable[[], System], tuple[()]]:
+        return partial(load, **self.loaded), ()
 
 
 def simulated(mesh: Mesh, sensor: str | Sensor | None = None, seed: int = 0) -> Camera:
@@ -180,7 +177,7 @@ def load(
         RiskError: the error rate cannot be promised.
         UsageError: a threshold, a rate or a number of views makes no sense.
     """
-    given = {k: v for k, v in locals().items() if k != "models"} | {"models": str(models)}
+    given = locals() | {"models": str(models)}
     whole(threads, "the number of threads", 0, MOST_THREADS)
     if number(unknown, "the share of known objects called unknown", 0) >= 1:
         raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
@@ -233,10 +230,6 @@ def _default_policy(own: dict[str, Path], sphere: Viewpoints, recogniser: Recogn
     except OtherUseError:
         pass
     return "spread", make_policy_anywhere("spread", sphere)
-
-
-def _load(given: dict[str, Any]) -> System:
-    return load(**given)
 
 
 _bundled = lru_cache(maxsize=1)(load)
