@@ -37,10 +37,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from matplotlib.transforms import Bbox
 
-from nextview.benchmark.entries import EpisodeSpecs, entry_policy, is_oracle
+from nextview.benchmark.entries import EpisodeSpecs, entry_policy, knows_truth
 from nextview.benchmark.figures import COLOURS, OWN
 from nextview.benchmark.replay import Grid, Outcomes, Trajectories, make_specs, run_grid, truncate
-from nextview.benchmark.report import KNOWING
 from nextview.benchmark.statistics import holm, interval, mcnemar, resample
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
@@ -108,7 +107,7 @@ def measured(grid: Grid, n_views: Sequence[int], samples: int, references: Seque
             share = value[name, "to_random"] / gap if gap > 0 else np.nan
             rows.append((name, k, "share_of_gap", share, np.nan, np.nan, np.nan))
     table = pd.DataFrame(rows, columns=["policy", "n_views", "measure", "value", "low", "high", "p"])
-    blind = ~table["policy"].map(knows)
+    blind = ~table["policy"].map(knows_truth)
     table["p_holm"] = holm(np.where(blind, table["p"], np.nan))
     return table
 
@@ -148,11 +147,6 @@ def markdown(table: pd.DataFrame, left_out: Sequence[str], references: Sequence[
     return "\n".join([*lines, *(f"\nLeft out: {sentence}" for sentence in left_out)]) + "\n"
 
 
-def knows(policy: str) -> bool:
-    """Whether a policy or fixed views are chosen by what no robot can know."""
-    return is_oracle(policy) or policy.split("-")[0] in KNOWING
-
-
 def families(names: Sequence[str], specs: EpisodeSpecs) -> dict[str, list[tuple[float, str]]]:
     """The policies that were run at two travel weights or more: travel weight and full name of each, ascending.
 
@@ -174,7 +168,7 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
     """
     found, n_views = by_key(table), table["n_views"].unique().tolist()
     at_prices = {name for members in travel_weights.values() for _, name in members}
-    drawn = [name for name in table["policy"].unique() if not knows(name)]
+    drawn = [name for name in table["policy"].unique() if not knows_truth(name)]
     names = [name for name in drawn if name in at_prices or name.partition("@")[0] not in travel_weights]
     colour = {name: COLOURS.get(name, "#4a5560") for name in names}
     text_of = {name: Path(name).name for name in names}
@@ -208,7 +202,7 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
             above = [
                 f"{name}: {100 * found[name, k, 'accuracy'][0]:.1f} % for {found[name, k, 'travel'][0]:.1f} cells"
                 for name in table["policy"].unique()
-                if knows(name)
+                if knows_truth(name)
             ]
             axes.set_title(f"{k} view{'s' * (k > 1)}", loc="left", fontweight="bold", fontsize=10, y=1.0,
                            pad=8 + 11 * len(above))  # fmt: skip

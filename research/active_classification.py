@@ -49,7 +49,7 @@ class ActiveRecogniseEnv(ap_gym.ActiveClassificationEnv):
         return self._env.reset(options=options)
 
     def _step(self, action: Any, prediction: NDArray[np.floating]) -> tuple[Any, float, bool, bool, dict, Any]:
-        seen = self._env._go(action)
+        seen = self._env.go(action)
         info = info_of(seen)
         ended, target = bool(seen.ended[0]), info["prediction_target"]
         return seen.observation[0], -float(seen.price[0]), ended, False, info, target
@@ -80,6 +80,6 @@ class ActiveRecogniseVectorEnv(ap_gym.ActiveClassificationVectorEnv):
         return self._env.reset(options=options)
 
     def _step(self, action: Any, prediction: NDArray[np.floating]) -> tuple[Any, Any, Any, Any, dict, Any]:
-        seen, info = self._env._go(action)
+        seen, info = self._env.go(action)
         target = info["final_info"]["prediction_target"] if "final_info" in info else info["prediction_target"]
         return seen.observation, -seen.price, seen.ended, np.zeros(self.num_envs, bool), info, target

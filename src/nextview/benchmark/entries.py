@@ -75,6 +75,11 @@ def is_oracle(policy: str) -> bool:
     return policy in ORACLES or policy.startswith(TRUE) or policy.endswith("-oracle-valley")
 
 
+def knows_truth(entry: str) -> bool:
+    """Whether a policy or fixed views are chosen by what a robot cannot know."""
+    return is_oracle(entry) or entry.split("-")[0] in ("best", "worst", "high", "low")
+
+
 def _gain(t: EpisodeSpecs, scope: Scope) -> Policy:
     p, evidence = t.predictions, t.predictions.log_evidence
     return OracleGain(p.sphere, evidence, len(p.classes), p.labels, t.objects, scope, p.calibration)

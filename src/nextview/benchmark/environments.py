@@ -23,12 +23,11 @@ from nextview.data.folders import list_dataset
 from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, sample_mesh
 from nextview.errors import DatasetError, PredictionsError, SessionError, UsageError
-from nextview.geometry.mesh import load_mesh
-from nextview.geometry.observation import Observation
+from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.rollout import OBJECTIVES, value_of
 from nextview.policies.base import EpisodeState
-from nextview.policies.gain import INPUTS, Frame, features, maps_of, mirrored_features, ordered, origin
+from nextview.policies.gain import INPUTS, VISIBILITY, Frame, features, maps_of, mirrored_features, ordered, origin
 from nextview.policies.learned_tables import cells_from
 from nextview.recognition.belief import Calibration, FixedLength, Stopping
 from nextview.recognition.evidence import Evidence
@@ -75,13 +74,11 @@ class Rules:
     travel_price: float = 0.0
 
     def __post_init__(self) -> None:
-        inputs = (self.inputs, (*INPUTS, *self.maps), "an observation")
-        frame = ((self.frame,), get_args(Frame), "the frame")
-        for given, known, what in (inputs, frame, ((self.objective,), OBJECTIVES, "the objective")):
-            unknown = [name for name in given if name not in known] if given else [None]
-            if unknown:
-                raise UsageError(f"{what} is of {', '.join(known)}, not {unknown[0]!r}")
-        whole(self.max_views, "the number of views, the agent's first choice being the second,", 2)
+        if not self.inputs or VISIBILITY in self.inputs:
+            raise UsageError(f"inputs are some of {', '.join(INPUTS)} and maps, not {', '.join(self.inputs)}")
+        for value, known in ((self.frame, get_args(Frame)), (self.objective, OBJECTIVES)):
+            if value not in known:
+                raise UsageError(f"{value!r} is none of {', '.join(known)}")
         number(self.view_price, "the view_price", 0)
         number(self.travel_price, "the travel_price", 0)
         Stopping(0.5 if self.threshold is None else self.threshold)  # says what is wrong with it
@@ -98,15 +95,6 @@ class Rules:
         return AfterAction(self.threshold, self.max_views, calibration.correlation)
 
 
-def rows(values: Any, n: int, below: int, what: str) -> NDArray[np.int64]:
-    """What an agent or a user chose, ``n`` whole numbers from 0 to below ``below``; (n,), or one number for one."""
-    array = np.atleast_1d(np.asarray(values))
-    if array.shape != (n,) or array.dtype.kind not in "iu" or not ((array >= 0) & (array < below)).all():
-        many = "a whole number" if n == 1 else f"{n} whole numbers"
-        raise UsageError(f"{what}: {many} from 0 to {below - 1}, not {one_line(repr(values))}")
-    return array.astype(np.int64)
-
-
 @dataclass(frozen=True)
 class AfterAction(Stopping):
     """As ``Stopping``, but never at the first view: an environment has no episode without an action."""
@@ -116,33 +104,38 @@ class AfterAction(Stopping):
         return np.where(np.asarray(n_views) < 2, np.inf, super().threshold_at(n_views))
 
 
+def rows(values: Any, n: int, below: int, what: str) -> Rows:
+    """What an agent or a user chose, ``n`` whole numbers from 0 to below ``below``; (n,), or one number for one."""
+    array = np.atleast_1d(np.asarray(values))
+    if array.shape != (n,) or array.dtype.kind not in "iu" or not ((array >= 0) & (array < below)).all():
+        many = "a whole number" if n == 1 else f"{n} whole numbers"
+        raise UsageError(f"{what}: {many} from 0 to {below - 1}, not {one_line(repr(values))}")
+    return array.astype(np.int64)
+
+
 @dataclass(frozen=True)
 class Task:
     """N objects, what is seen of them, and the rules."""
 
-    names: tuple[str, ...]
-    labels: NDArray[np.int64]
+    labels: Rows
     classes: tuple[str, ...]
     sphere: ViewSphere
     calibration: Calibration
-    observe: Callable[[NDArray[np.int64], NDArray[np.int64]], Evidence] = field(repr=False)
+    observe: Callable[[Rows, Rows], Evidence] = field(repr=False)
     rules: Rules = Rules()
     balanced: bool = False
 
     def __post_init__(self) -> None:
         whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
 
-    def draw(self, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Objects and first views of ``n`` episodes, each (n,) int64."""
+    def begin(self, n: int, rng: np.random.Generator, options: dict[str, Any] | None = None) -> Cohort:
+        """Begin ``n`` episodes: the options of ``reset`` may name each "object" and "start"; else they are drawn."""
         weight = 1 / np.bincount(self.labels)[self.labels]
         chance = weight / weight.sum() if self.balanced else None
-        return rng.choice(len(self.labels), n, p=chance), rng.integers(len(self.sphere), size=n)
-
-    def begin(self, options: Any, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The same as the options of ``reset`` say, else drawn."""
-        objects, starts = self.draw(n, rng)
+        objects, starts = rng.choice(len(self.labels), n, p=chance), rng.integers(len(self.sphere), size=n)
         given = {"object": objects, "start": starts} | (options or {})
-        return rows(given["object"], n, len(self.labels), "object"), rows(given["start"], n, len(self.sphere), "start")
+        below = {"object": len(self.labels), "start": len(self.sphere)}
+        return Cohort(self, *(rows(given[name], n, most, name) for name, most in below.items()))
 
     @property
     def observation_space(self) -> gymnasium.spaces.Box:
@@ -159,7 +152,7 @@ class Task:
 
 
 def replayed(
-    predictions: str | Path | Predictions, split: Split | None = "train", balanced: bool = False, rules: Rules = Rules()
+    predictions: Source, split: Split | None = "train", balanced: bool = False, rules: Rules = Rules()
 ) -> Task:
     """The task of recognising the objects of one split.
 
@@ -175,14 +168,14 @@ def replayed(
     p = predictions if isinstance(predictions, Predictions) else Predictions.load(Path(predictions))
     p = p if split is None else p.of_split(split)
     p = p.deduplicate() if split == "train" else p
-    lacking = [name for name in rules.maps if name not in p.maps]
-    if lacking:
-        known = ", ".join((*INPUTS, *in_order(p.maps)))
-        raise PredictionsError(f"these predictions hold no map {lacking[0]!r}; inputs are some of {known}")
+    for name in rules.maps:
+        if name not in p.maps:
+            known = ", ".join((*INPUTS, *in_order(p.maps)))
+            raise PredictionsError(f"these predictions hold no map {name!r}; inputs are some of {known}")
     if ("azimuth_bin" in rules.inputs or rules.frame == "object") and p.azimuth_bins is None:
         raise PredictionsError("these predictions hold no azimuth bins, which the inputs or the frame need")
     p = replace(p, maps={name: p.maps[name] for name in rules.maps})
-    return Task(p.names, p.labels, p.classes, p.sphere, p.calibration, p.evidence, rules, balanced)
+    return Task(p.labels, p.classes, p.sphere, p.calibration, p.evidence, rules, balanced)
 
 
 @dataclass
@@ -190,10 +183,10 @@ class Asked:
     """The policy of a cohort: goes where the actions want, or as near to there as a view is free."""
 
     sphere: ViewSphere
-    views: NDArray[np.int64]
+    views: Rows
     needs: tuple[str, ...] = ()
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Rows:
         """See ``Policy.next_views``."""
         return np.where(state.free, self.sphere.travel[self.views[state.episodes]], np.inf).argmin(1)
 
@@ -216,7 +209,7 @@ class Seen:
 class Cohort:
     """B episodes side by side, all at the same view. ``first`` is what is seen before any action."""
 
-    def __init__(self, task: Task, objects: NDArray[np.int64], starts: NDArray[np.int64]) -> None:
+    def __init__(self, task: Task, objects: Rows, starts: Rows) -> None:
         self.task, self.objects = task, objects
         self._asked = Asked(task.sphere, np.array(starts))
         rng, stopping = np.random.default_rng(0), task.rules.stopping(task.calibration)  # nothing is drawn
@@ -225,7 +218,7 @@ class Cohort:
         self._value, self._travel = np.zeros(len(objects)), np.zeros(len(objects))
         self.first = self._look(np.zeros(len(objects)))
 
-    def step(self, actions: NDArray[np.int64]) -> Seen:
+    def step(self, actions: Rows) -> Seen:
         """Go on in each running episode; where a view was taken before, to the nearest one that was not."""
         sphere, running, rules = self.task.sphere, self.episodes.running, self.task.rules
         before = self.episodes.steps[-1].views[~self.episodes.steps[-1].stopped]  # ``current`` is what comes next
@@ -277,19 +270,23 @@ class TaskEnv(gymnasium.Env[Any, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See ``gymnasium.Env.reset``."""
         super().reset(seed=seed)
-        self._cohort = Cohort(self.task, *self.task.begin(options, 1, self.np_random))
-        return self._observed(self._cohort.first)
+        self._cohort = self.task.begin(1, self.np_random, options)
+        return self.observed(self._cohort.first), info_of(self._cohort.first)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See ``gymnasium.Env.step``."""
+        seen = self.go(action)
+        return self.observed(seen), float((seen.change - seen.price)[0]), bool(seen.ended[0]), False, info_of(seen)
+
+    def go(self, action: Any) -> Seen:
+        """What is seen after an action."""
         if self._cohort is None or len(self._cohort.episodes.running) == 0:
             raise SessionError("no episode is under way; call reset")
-        seen = self._cohort.step(rows(action, 1, len(self.task.sphere), "action"))
-        observation, info = self._observed(seen)
-        return observation, float((seen.change - seen.price)[0]), bool(seen.ended[0]), False, info
+        return self._cohort.step(rows(action, 1, len(self.task.sphere), "action"))
 
-    def _observed(self, seen: Seen) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        return seen.observation[0], info_of(seen)
+    def observed(self, seen: Seen) -> Any:
+        """The observation of the one episode."""
+        return seen.observation[0]
 
 
 def info_of(seen: Seen) -> dict[str, Any]:
@@ -330,7 +327,7 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """See ``gymnasium.vector.VectorEnv.reset``."""
         super().reset(seed=seed)
-        cohort = Cohort(self.task, *self.task.begin(options, self.num_envs, self.np_random))
+        cohort = self.task.begin(self.num_envs, self.np_random, options)
         self._cohorts = [(cohort, np.arange(self.num_envs))]
         return cohort.first.observation, cohort.first.info
 
@@ -338,38 +335,34 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         self, actions: Any
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """See ``gymnasium.vector.VectorEnv.step``."""
-        seen, info = self._go(actions)
+        seen, info = self.go(actions)
         return seen.observation, seen.change - seen.price, seen.ended, np.zeros(self.num_envs, bool), info
 
-    def _go(self, actions: Any) -> tuple[Seen, dict[str, Any]]:
+    def go(self, actions: Any) -> tuple[Seen, dict[str, Any]]:
         """What is seen in each episode; where one ended, the observation and the info are those of the next."""
         if not self._cohorts:
             raise SessionError("no episode is under way; call reset")
         actions = rows(actions, self.num_envs, len(self.task.sphere), "actions")
         wheres = [members[cohort.episodes.running] for cohort, members in self._cohorts]
         parts = [cohort.step(actions[where]) for (cohort, _), where in zip(self._cohorts, wheres, strict=True)]
-        seen = _merged(parts, np.argsort(np.concatenate(wheres)))
+        order = np.argsort(np.concatenate(wheres))
+        joined = {
+            name: np.concatenate([getattr(part, name) for part in parts])[order]
+            for name in ("observation", "change", "price", "ended")
+        }
+        info = {name: np.concatenate([part.info[name] for part in parts])[order] for name in parts[0].info}
+        seen = Seen(**joined, info=info)
         self._cohorts = [(cohort, members) for cohort, members in self._cohorts if len(cohort.episodes.running)]
         over = np.flatnonzero(seen.ended)
         if len(over) == 0:
-            return seen, seen.info
-        last, info = seen.observation.copy(), {name: values.copy() for name, values in seen.info.items()}
-        fresh = Cohort(self.task, *self.task.draw(len(over), self.np_random))
+            return seen, info
+        last, now = seen.observation.copy(), {name: values.copy() for name, values in info.items()}
+        fresh = self.task.begin(len(over), self.np_random)
         self._cohorts.append((fresh, over))
         seen.observation[over] = fresh.first.observation
         for name, values in fresh.first.info.items():
-            info[name][over] = values
-        ended = {"final_obs": last, "_final_obs": seen.ended, "final_info": seen.info, "_final_info": seen.ended}
-        return seen, info | ended
-
-
-def _merged(seen: list[Seen], order: Rows) -> Seen:
-    def joined(values: Any) -> Any:
-        return np.concatenate(list(values))[order]
-
-    info = {name: joined(part.info[name] for part in seen) for name in seen[0].info}
-    names = ("observation", "change", "price", "ended")
-    return Seen(**{name: joined(getattr(part, name) for part in seen) for name in names}, info=info)
+            now[name][over] = values
+        return seen, now | {"final_obs": last, "_final_obs": seen.ended, "final_info": info, "_final_info": seen.ended}
 
 
 class RecogniseVectorEnv(TaskVectorEnv):
@@ -412,47 +405,37 @@ class RecogniseMeshEnv(TaskEnv):
     ) -> None:
         whole(size, "the side of an image", 1)
         given, found, sphere = Rules(**rules), find_models(models), ViewSphere.named(viewpoints)
-        networks = Models(Recogniser(found.recogniser), open_maps(found.maps, given.maps))
-        objects = _samples() if meshes is None else _of_folder(Path(meshes), split)
-        unknown = [label for _, label, _ in objects if label not in networks.classes]
-        if unknown:
-            raise DatasetError(f"the recogniser knows no class {unknown[0]!r}; it knows {', '.join(networks.classes)}")
-        labels = np.array([networks.classes.index(label) for _, label, _ in objects])
-        self._looking = _Rendered([load for *_, load in objects], networks, sphere, size)
-        calibration = networks.recogniser.calibration
-        names = tuple(name for name, *_ in objects)
-        super().__init__(Task(names, labels, networks.classes, sphere, calibration, self._looking, given, balanced))
+        self._models = Models(Recogniser(found.recogniser), open_maps(found.maps, given.maps))
+        classes, calibration = self._models.classes, self._models.recogniser.calibration
+        objects = _meshes(meshes, split)
+        for label, _ in objects:
+            if label not in classes:
+                raise DatasetError(f"the recogniser knows no class {label!r}; it knows {', '.join(classes)}")
+        labels = np.array([classes.index(label) for label, _ in objects])
+        self._camera = lru_cache(CAMERAS)(lambda k: SimulatedCamera(objects[k][1](), size, sphere.distance))
+        super().__init__(Task(labels, classes, sphere, calibration, self._rendered, given, balanced))
         self._depth = depth
         if depth:
             image = gymnasium.spaces.Box(0, np.float32(sphere.distance + 1), (size, size))
             self.observation_space = gymnasium.spaces.Dict({"state": self.task.observation_space, "depth": image})
 
-    def _observed(self, seen: Seen) -> tuple[Any, dict[str, Any]]:
-        state = seen.observation[0]
-        return {"state": state, "depth": self._looking.last.depth} if self._depth else state, info_of(seen)
-
-
-class _Rendered:
-    """Evidence by rendering: ``Task.observe``. ``last`` is the observation that it came from."""
-
-    last: Observation
-
-    def __init__(self, loads: list[Any], models: Models, sphere: ViewSphere, size: int) -> None:
-        self._models, self._sphere = models, sphere
-        self._camera = lru_cache(CAMERAS)(lambda k: SimulatedCamera(loads[k](), size, sphere.distance))
-
-    def __call__(self, objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
-        seen = [self._camera(int(k)).observe(self._sphere.poses[v]) for k, v in zip(objects, views, strict=True)]
-        self.last = seen[-1]
+    def _rendered(self, objects: Rows, views: Rows) -> Evidence:
+        poses = self.task.sphere.poses
+        seen = [self._camera(int(k)).observe(poses[v]) for k, v in zip(objects, views, strict=True)]
+        self._last = seen[-1]
         return self._models.evidence(seen)
 
+    def observed(self, seen: Seen) -> Any:
+        """The state, and the depth image if it is wanted."""
+        state = super().observed(seen)
+        return {"state": state, "depth": self._last.depth} if self._depth else state
 
-def _samples() -> list[tuple[str, str, Any]]:
-    return [(name, name, partial(sample_mesh, name)) for name in SAMPLES]
 
-
-def _of_folder(folder: Path, split: str | None) -> list[tuple[str, str, Any]]:
-    entries = [e for e in list_dataset(folder) if split in (None, e.split)]
+def _meshes(folder: str | Path | None, split: str | None) -> list[tuple[str, Callable[[], Mesh]]]:
+    """The class of each mesh of a folder, or of the samples, and what reads it."""
+    if folder is None:
+        return [(name, partial(sample_mesh, name)) for name in SAMPLES]
+    entries = [e for e in list_dataset(Path(folder)) if split in (None, e.split)]
     if not entries:
         raise DatasetError(f"{folder}: holds no meshes of the split {split!r}; split=None takes all that there are")
-    return [(e.name, e.label, partial(load_mesh, e.path)) for e in entries]
+    return [(e.label, partial(load_mesh, e.path)) for e in entries]
