@@ -214,6 +214,14 @@ def cast(meshes: Sequence[trimesh.Trimesh], pose, intrinsics=INTRINSICS, shape=S
     )
 
 
+def ball_depth(pose, intrinsics, size, radius=1.0, centre=(0, 0, 0)) -> np.ndarray:
+    """Depth image of a ball, (size, size): the smaller root of a quadratic equation, 0 where there is none."""
+    d, o = rays(intrinsics, (size, size)) @ pose[:3, :3].T, pose[:3, 3] - np.array(centre)
+    a, b, c = (d * d).sum(-1), d @ o, o @ o - radius**2
+    inside = b * b - a * c
+    return np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0))) / a, 0)
+
+
 def pose_at(elevation, azimuth, distance, target=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)) -> np.ndarray:
     """A camera (degrees, metres) that looks at a target and is then turned about its own axes, degrees."""
     pose = look_at_origin(np.radians(elevation), np.radians(azimuth), distance)

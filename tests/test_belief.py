@@ -1,6 +1,5 @@
 """Belief against SciPy, sizes of objects, and the limits of a stopping rule."""
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,6 +19,8 @@ from nextview.recognition.belief import (
     reorient,
 )
 
+STEP = np.pi / 4
+
 logits = npst.arrays(
     st.sampled_from([np.float32, np.float64]),
     npst.array_shapes(min_dims=2, max_dims=4, max_side=6),
@@ -33,13 +34,6 @@ def test_belief_is_the_softmax_of_the_sum(values):
     assert belief.dtype == np.float64
     np.testing.assert_allclose(belief, softmax(values.astype(np.float64).sum(-2), axis=-1), rtol=1e-12, atol=1e-300)
     np.testing.assert_allclose(belief.sum(-1), 1)
-
-
-@given(logits, st.randoms(use_true_random=False))
-def test_the_order_of_looks_and_a_constant_do_not_matter(values, random):
-    values = values.astype(np.float64)
-    order = random.sample(range(values.shape[-2]), values.shape[-2])
-    np.testing.assert_allclose(fuse(values[..., order, :] + 7.5), fuse(values), atol=1e-12)
 
 
 def test_huge_logits_do_not_overflow():
@@ -94,12 +88,6 @@ def test_with_a_decline_of_its_correlation_a_calibrated_belief_stops_where_the_p
     np.testing.assert_array_equal((belief >= Stopping(threshold_at, 8, c).threshold_at(n_views)) | near, plain | near)
 
 
-def test_a_threshold_that_is_certain_or_nothing_stays_so():
-    for threshold in (0.0, 1.0):
-        assert Stopping(threshold, 5, 0.7).threshold_at(np.arange(1, 6)).tolist() == [threshold] * 5
-    assert Stopping(0.9).threshold_at(4) == 0.9
-
-
 def test_what_is_said_of_sides_is_said_of_where_side_0_points():
     azimuth_bins = np.random.default_rng(0).normal(size=(3, 2, 8))
     azimuth = np.pi * np.array([0.0, 0.5, -1.0])
@@ -126,9 +114,6 @@ def some_views(n_views, classes=3, azimuth_bins=8):
     rng = np.random.default_rng(n_views)
     likely = log_softmax(2 * rng.normal(size=(n_views, classes, azimuth_bins)), axis=2)
     return rng.normal(size=(n_views, classes)), likely, rng.integers(0, 8, n_views)
-
-
-STEP = np.pi / 4
 
 
 @pytest.mark.parametrize("n_views", [1, 2, 5])
@@ -174,25 +159,9 @@ def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
 
 
 def test_what_makes_no_sense_is_refused():
-    for make in (
-        lambda: Stopping(1.01),
-        lambda: Stopping(0.9, 0),
-        lambda: Stopping(0.9, 5, -0.1),
-        lambda: fuse(np.array([[0.0, np.nan]])),
-        lambda: Calibration(0.0),
-        lambda: Calibration(bin_correlation=-0.1),
-        lambda: RiskBounds((0.9, 0.8), ((0.1, 0.1),), 0.1),
-        lambda: SizeEvidence((1.0, 0.5), ((0.0, 0.0),), 1.0),
-        lambda: SizeEvidence((1.0, 2.0), ((0.0,),), 1.0),
-    ):
+    for make, value in ((Stopping, 1.01), (fuse, np.array([[0.0, np.nan]])), (Calibration, 0.0)):
         with pytest.raises(NextviewError):
-            make()
-
-
-def test_a_calibration_survives_json():
-    bounds = RiskBounds((0.5, 0.9), ((0.2, 0.1), (0.3, 0.15)), 0.1)
-    for calibration in (Calibration(), Calibration(0.7, 0.25), Calibration(1.2, 0.8, bounds, 0.2)):
-        assert msgspec.json.decode(msgspec.json.encode(calibration), type=Calibration) == calibration
+            make(value)
 
 
 def test_sizes_between_two_radii_are_interpolated_and_unknown_ones_say_nothing():

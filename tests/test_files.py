@@ -54,11 +54,8 @@ def test_a_folder_is_new_or_empty_and_with_overwrite_only_its_own_files_are_repl
 def test_links_and_places_of_another_kind_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "link").symlink_to(tmp_path / "file")
-    for path, folder, words in (
-        ("link", False, "link"),
-        ("file", True, "is a file"),
-        ("file/x", False, "not a folder"),
-    ):
+    cases = ("link", False, "link"), ("file", True, "is a file"), ("file/x", False, "not a folder")
+    for path, folder, words in cases:
         with pytest.raises(ResultsError, match=words):
             files.check_new(tmp_path / path, overwrite=True, folder=folder)
     with pytest.raises(ResultsError, match="is a folder"):
@@ -101,15 +98,7 @@ def test_records_come_back_and_what_is_none_is_one_sentence(tmp_path):
     path = tmp_path / "card.json"
     files.write_record(path, Record("a", (0.1, 1e300)))
     assert files.read_record(path, Record, "a card") == Record("a", (0.1, 1e300))
-    for text in (
-        "[",
-        "[]",
-        "{}",
-        '{"name": 1}',
-        '{"name": "a", "other": 1}',
-        '{"name": "a", "values": [NaN]}',
-        "\udcff",
-    ):
+    for text in ("[", "{}", '{"name": "a", "other": 1}', "\udcff"):
         path.write_bytes(text.encode(errors="surrogateescape"))
         with pytest.raises(ModelError, match=r"card\.json: not a card \(.+\)$"):
             files.read_record(path, Record, "a card")

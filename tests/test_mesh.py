@@ -77,28 +77,28 @@ def vertices_edited(replacement: str) -> str:
     return re.sub(r"(?m)^(\d) (\d) (\d)$", replacement, PYRAMID.replace("5 6 9", "counts")).replace("counts", "5 6 9")
 
 
-def ply(faces: int, body: str, more: str = "", vertices: int = 3) -> str:
+def ply(faces: int, body: str) -> str:
     return (
-        f"ply\nformat ascii 1.0\nelement vertex {vertices}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {faces}\nproperty list uchar int vertex_indices\n{more}end_header\n{body}"
+        f"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {faces}\nproperty list uchar int vertex_indices\nend_header\n{body}"
     )
 
 
-def glb(gltf: dict | bytes, binary: bytes = b"") -> bytes:
-    text = gltf if isinstance(gltf, bytes) else json.dumps(gltf).encode()
+def glb(gltf: dict, binary: bytes = b"") -> bytes:
+    text = json.dumps(gltf).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-def one_triangle(positions=None, view=None, part=None, **changes) -> dict:
+def one_triangle(positions=None, view=None, **changes) -> dict:
     """The JSON of a GLB of one triangle, some of whose parts are replaced; its binary part is TRIANGLE."""
     accessor = {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"} | (positions or {})
     return {
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1} | (part or {})]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
         "accessors": [
             {key: value for key, value in accessor.items() if value is not None},
             {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"},
@@ -238,25 +238,18 @@ def test_a_mesh_is_the_same_with_copies_of_its_triangles():
 # Refusing
 
 
-EDGE = "element edge 1\nproperty int vertex1\nproperty int vertex2\n"
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 MANY_TIMES = one_triangle(scenes=[{"nodes": list(range(101))}], nodes=101 * [{"mesh": 0}])
 BROKEN = {
     "no faces": ("a.off", "OFF\n3 0 0\n" + GOOD, "no faces"),
-    "edges only": ("a.off", off(GOOD, "2 0 1"), "no faces"),
     "index too high": ("a.off", off(GOOD, "3 0 1 3"), "outside of the 3"),
-    "index absurd": ("a.off", off(GOOD, "3 0 1 " + "9" * 30), "outside of the 3"),
     "index below zero": ("a.off", off(GOOD, "3 0 1 -1"), "vertex -1"),
-    "index with a fraction": ("a.off", off(GOOD, "3 0 1 1.5"), "1.5"),
     "too few corners": ("a.off", off(GOOD, "3 0 1"), "face 0 has 2 of 3 corners"),
     "too few coordinates": ("a.off", off("0 0 0\n1 0\n0 1 0", "3 0 1 2"), "vertex 1 has 2 of 3 coordinates"),
     "NaN": ("a.off", off("0 0 nan\n1 0 0\n0 1 0", "3 0 1 2"), "1 vertices are NaN or infinite"),
-    "overflow": ("a.off", off("0 0 1e999\n1 0 0\n0 1 0", "3 0 1 2"), "1 vertices are NaN or infinite"),
     "too large": ("a.off", off("-1.7e308 -1.7e308 0\n1.7e308 0 0\n0 1.7e308 0", "3 0 1 2"), "too large"),
     "one place": ("a.off", off("5 5 5\n5 5 5\n5 5 5", "3 0 1 2"), "no extent"),
     "a slanted line": ("a.off", off("0.1 0.1 0.1\n0.2 0.3 0.4\n0.3 0.5 0.7", "3 0 1 2"), "no area"),
-    "rounding apart": ("a.off", off("1e6 1 0\n1e6 1.0000001 0\n1000000.0000001 1 0", "3 0 1 2"), "no extent"),
-    "binary OFF": ("a.off", b"OFF BINARY\n\0\0\0\3\0\0\0\1", "counts"),
     "another format": ("a.off", "solid x\nendsolid x\n", "does not begin with OFF"),
     "unknown suffix": ("a.xyz", "0 0 0\n", "not a mesh format"),
     "cut in its faces": ("a.off", PYRAMID[: PYRAMID.index("3 3 0")], "cut short.*6 faces.*5 found"),
@@ -264,43 +257,24 @@ BROKEN = {
         "a.off", "COFF\n3 3 0\n3 0 0 1 0 0 0\n1 0 3 0 1 2 3\n0 1 2 3 0 1 2\n", "3 faces announced, 3 and 0 found",
     ),
     "huge counts": ("a.off", "OFF\n1 999999999999 0\n1 2 3\n", "cut short"),
-    "absurd count": ("a.off", "OFF\n" + "9" * 5000 + " 1 0\n", "not a readable OFF mesh"),
-    "huge face": ("a.off", off(GOOD, "999999999999 0 1 2"), "3 of 999999999999 corners"),
     "too many bytes": ("a.off", "OFF\n" + " " * 100 * BYTES_PER_FACE, "has more than 6,000 bytes; --max-faces"),
     "too many faces": ("a.off", off(GOOD, "3 0 1 2\n" * 101), "101 triangles, more than 100; --max-faces"),
     "OBJ index too high": ("a.obj", OBJ + "f 1 2 4\n", "vertex 4, but there are only 3"),
-    "OBJ index absurd": ("a.obj", OBJ + "f 1 2 " + "9" * 30, "the first is 1"),
     "OBJ index of no vertex yet": ("a.obj", f"f -1 1 2\n{OBJ}", "0 come before it"),
-    "OBJ index zero": ("a.obj", OBJ + "f 0 1 2\n", "the first is 1"),
     "OBJ cut in a face": ("a.obj", OBJ + "f 1 2 3\nf 1 2", "cut short"),
-    "OBJ not a number": ("a.obj", OBJ.replace("v 1 0", "v one 0") + "f 1 2 3\n", "one"),
     "PLY index too high": ("a.ply", ply(1, GOOD + "\n3 0 1 3\n"), "vertex 3"),
     "PLY points": ("a.ply", trimesh.PointCloud(np.eye(3)).export(file_type="ply"), "no vertices"),
     "PLY of more rows than lines": ("a.ply", ply(BIG, GOOD + "\n3 0 1 2\n"), "cut short"),
-    "PLY of more vertices than lines": ("a.ply", ply(1, GOOD + "\n3 0 1 2\n", "", BIG), "cut short"),
     "PLY of a list longer than the file": ("a.ply", ply(1, GOOD + f"\n{BIG} 0 1 2\n"), ""),
-    "PLY of a list of less than nothing": ("a.ply", ply(1, GOOD + "\n-1 0 1 2\n"), ""),
-    "PLY of half a corner": ("a.ply", ply(1, GOOD + "\n3 0 1 1.5\n"), ""),
-    "PLY of words": ("a.ply", ply(1, GOOD + "\n3 0 one 2\n"), ""),
-    "PLY of spaces": ("a.ply", "ply\nformat ascii 1.0\nelement face 0 property list" + " " * 5000, "no header"),
     "STL cut": ("a.stl", exported(wedge(), "stl")[:400], "cut short or damaged, 12 faces"),
-    "STL named solid, cut": ("a.stl", b"solid" + exported(wedge(), "stl")[5:400], "cut short"),
     "STL cut in its second solid": ("a.stl", 2 * exported(wedge(), "stl_ascii")[:-30] + b"\n", "cut short"),
-    "STL of two corners": ("a.stl", f"solid x\n{FACET.replace('vertex 1 0 0', '')}endsolid", ""),
-    "STL of words": ("a.stl", f"solid x\n{FACET.replace('vertex 1 0', 'vertex one 0')}endsolid", ""),
     "GLB without data": ("a.glb", glb(one_triangle({"bufferView": None, "count": BIG}), TRIANGLE), "than its bytes"),
-    "GLB without little data": ("a.glb", glb(one_triangle({"bufferView": None}), TRIANGLE), "without data"),
     "GLB of more positions than bytes": ("a.glb", glb(one_triangle({"count": BIG}), TRIANGLE), ""),
-    "GLB positions that stand still": ("a.glb", glb(one_triangle(view={"byteStride": 0}), TRIANGLE), ""),
     "GLB view beyond the buffer": ("a.glb", glb(one_triangle(view={"byteOffset": 1 << 40}), TRIANGLE), ""),
     "GLB sparse": ("a.glb", glb(one_triangle({"sparse": {}}), TRIANGLE), "sparse"),
     "GLB quantised": ("a.glb", glb(one_triangle({"normalized": True}), TRIANGLE), "fractions"),
-    "GLB fans": ("a.glb", glb(one_triangle(part={"mode": 6}), TRIANGLE), "fans"),
     "GLB elsewhere": ("a.glb", glb(one_triangle(buffers=[{"uri": "x.bin"}])), "outside of its binary part"),
     "GLB node in itself": ("a.glb", glb(one_triangle(nodes=[{"children": [0]}]), TRIANGLE), "twice"),
-    "GLB list for a scene": ("a.glb", glb(one_triangle(nodes={"0": 1})), "not a readable GLB"),
-    "GLB deep JSON": ("a.glb", glb(b"[" * 5000), "RecursionError"),
-    "GLB without a mesh": ("a.glb", glb({"asset": {"version": "2.0"}, "scenes": [{"nodes": []}]}), ""),
     "GLB mesh too often": ("a.glb", glb(MANY_TIMES, TRIANGLE), "101 triangles, more than 100; --max-faces"),
 }  # fmt: skip
 for suffix in FORMATS:
@@ -324,11 +298,9 @@ def test_a_broken_file_gets_one_sentence_in_little_memory(tmp_path, case, capfd)
 
 
 HARMLESS = {
-    "an edge between distant vertices": ("a.ply", ply(1, GOOD + "\n3 0 1 2\n0 100000000\n", EDGE)),
     "a texture that is none": (
         "a.glb", glb(one_triangle(images=[{"uri": "x.png"}], textures=[{"source": 0}], materials=[{}]), TRIANGLE),
     ),
-    "blank lines": ("a.stl", "solid x\n" + FACET + "endsolid x" + "\n" * 300_000),
     "a Latin-1 name": ("a.stl", f"solid T\xfcr\n{FACET}endsolid T\xfcr\n".encode("latin-1")),
     "copies": ("a.off", "OFF\n3 200000 0\n" + GOOD + "\n" + "3 0 1 2\n3 2 1 0\n" * 100_000),
     "a binary STL that begins with solid": (

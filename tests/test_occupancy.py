@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pipeline import ball_depth, rays
 from scipy.spatial.transform import Rotation
 
 from nextview.geometry.observation import pinhole
@@ -19,23 +20,9 @@ EYE = np.array([3.0, 0, 0])
 SPHERE = ViewSphere.named("40")
 
 
-def rays(pose, size=224, intrinsics=K):
-    """Directions in the world of which the depth is 1, (size, size, 3)."""
-    row, column = np.mgrid[:size, :size] + 0.5
-    return np.stack([column, row, np.ones_like(row)], -1) @ np.linalg.inv(intrinsics).T @ pose[:3, :3].T
-
-
-def ball_depth(pose, radius, centre=(0, 0, 0), size=224, intrinsics=K):
-    """Depth image of a ball: the smaller root of a quadratic equation."""
-    d, o = rays(pose, size, intrinsics), pose[:3, 3] - np.array(centre)
-    a, b, c = (d * d).sum(-1), d @ o, o @ o - radius**2
-    inside = b * b - a * c
-    return np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0))) / a, 0)
-
-
 def wall_depth(pose, x, half):
     """Depth image of a square wall in the plane of a given x, -half to half in y and z."""
-    d, o = rays(pose), pose[:3, 3]
+    d, o = rays(K, (224, 224)) @ pose[:3, :3].T, pose[:3, 3]
     t = (x - o[0]) / d[..., 0]
     at = o + t[..., None] * d
     return np.where((t > 0) & (np.abs(at[..., 1:]) < half).all(-1), t, 0)
@@ -58,7 +45,7 @@ def hidden_by_ball(points, eye, radius):
 def after(*poses, radius=0.6, grid=GRID):
     found = Occupancy.unseen(grid)
     for pose in poses:
-        found = found.seen(ball_depth(pose, radius), pose, K)
+        found = found.seen(ball_depth(pose, K, 224, radius), pose, K)
     return found
 
 
@@ -94,7 +81,7 @@ def test_occupied_are_the_voxels_that_the_visible_cap_passes_through():
 
 def test_object_and_occluder_are_kept_apart():
     pose = look_at_origin(0, 0)
-    ball, wall = ball_depth(pose, 0.4), wall_depth(pose, 0.8, 0.2)
+    ball, wall = ball_depth(pose, K, 224, 0.4), wall_depth(pose, 0.8, 0.2)
     depth = np.where(wall > 0, wall, ball)
     cells = Occupancy.unseen(GRID).seen(depth, pose, K, object_mask=(wall == 0) & (ball > 0)).cells
     x = GRID.middles[0].reshape(cells.shape)
@@ -110,12 +97,13 @@ def test_object_and_occluder_are_kept_apart():
 @settings(deadline=None, max_examples=25)
 @given(st.lists(st.integers(0, 39), min_size=2, max_size=4), st.permutations(range(4)))
 def test_more_views_never_make_seen_space_unseen_and_their_order_counts_for_nothing(views, order):
-    frames = [(ball_depth(SPHERE.poses[v], 0.5, (0.2, 0, 0.1), 32, pinhole(32, 3.0)), SPHERE.poses[v]) for v in views]
+    small = pinhole(32, 3.0)
+    frames = [(ball_depth(SPHERE.poses[v], small, 32, 0.5, (0.2, 0, 0.1)), SPHERE.poses[v]) for v in views]
 
     def seen(frames):
         found = [Occupancy.unseen(SMALL)]
         for depth, pose in frames:
-            found.append(found[-1].seen(depth, pose, pinhole(32, 3.0)))
+            found.append(found[-1].seen(depth, pose, small))
         return found
 
     steps = seen(frames)
@@ -133,7 +121,7 @@ def test_more_views_never_make_seen_space_unseen_and_their_order_counts_for_noth
 def test_nothing_changes_if_all_moves_or_is_measured_in_another_unit(view, quarters, shift, unit):
     """The scene, the cameras and the grid turned by quarters about z, moved, and in another unit."""
     pose, centre = SPHERE.poses[view], np.array([0.15, -0.2, 0.1])
-    depth = ball_depth(pose, 0.5, centre)
+    depth = ball_depth(pose, K, 224, 0.5, centre)
     here = Occupancy.unseen(SMALL).seen(depth, pose, K)
     turn = Rotation.from_euler("z", 90 * quarters, degrees=True).as_matrix()
 

@@ -15,7 +15,7 @@ from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.baselines import Furthest, Random, RandomAll, Spread, Unidirectional, Visibility
-from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence, cells_from
+from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence
 from nextview.policies.maps import MapPeak, SpherePeak, local_peaks
 from nextview.policies.oracle import OracleGain, OracleValley
 from nextview.policies.policy_card import bundled_policies, read_policy_card, write_policy_card
@@ -107,18 +107,7 @@ def test_no_row_depends_on_another(sphere, seed):
             continue  # they draw, or may
         together = policy.next_views(state, rng)
         for row in range(0, 50, 7):
-            alone = EpisodeState(
-                state.current[[row]],
-                state.visited[[row]],
-                state.belief[[row]],
-                Evidence(np.zeros((1, 2)), {k: m[[row]] for k, m in state.evidence.maps.items()}),
-                state.step,
-                state.episodes[[row]],
-            )
-            assert policy.next_views(alone, rng)[0] == together[row]
-
-
-# The best in the window
+            assert policy.next_views(state.select([row]), rng)[0] == together[row]
 
 
 # Baselines
@@ -181,27 +170,6 @@ def test_spread_is_the_free_view_farthest_from_all_visited(sphere, scope, seed):
 # Tables
 
 
-@settings(deadline=None, max_examples=20)
-@given(st.integers(0, 2**32), st.sampled_from(["global", "local"]))
-def test_a_fixed_sequence_makes_the_moves_of_the_ring_it_began_on(seed, scope):
-    rng = np.random.default_rng(seed)
-    moves = np.array([rng.permutation(40)[:4] for _ in range(5)])
-    policy = FixedSequence(SPHERE, moves, scope)
-    starts = np.arange(40)
-    state = state_of(SPHERE, starts)
-    lost = np.zeros(40, bool)  # a random sequence may come back to where it was; what follows then is another matter
-    expected = starts
-    for k in range(4):
-        expected = cells_from(SPHERE)[expected, moves[SPHERE.ring[starts], k]]
-        lost |= state.visited[np.arange(40), expected]
-        chosen = policy.next_views(replace(state, step=k + 1), rng)
-        sets = {(frozenset(np.flatnonzero(v)), c) for v, c in zip(state.visited, state.current, strict=True)}
-        if len(sets) == 40:  # else two starts led to the same place and cannot be told apart
-            np.testing.assert_array_equal(chosen[~lost], expected[~lost])
-        state = replace(state, current=np.where(lost, chosen, expected), visited=state.visited.copy())
-        state.visited[np.arange(40), state.current] = True
-
-
 def test_a_fixed_ring_is_entered_where_the_camera_is_and_walked_in_its_steps():
     policy, state, walked = FixedRing(SPHERE, 3, 3), state_of(SPHERE, 6), []
     for _ in range(9):
@@ -236,18 +204,6 @@ HILLS = [[0.1, 0.9, 0.1], [0.2, 0.3, 0.2], [0.4, 0.2, 0.1], [0.5, 0.3, 0.2], [0.
 """Around view 11: peaks at the top left (0.8), the bottom middle (0.9) and the top right (0.7)."""
 
 
-def test_map_peak_goes_from_peak_to_peak_then_to_the_highest_rest():
-    policy, state = MapPeak(SPHERE, "lem"), state_of(SPHERE, 11, lem=[HILLS])
-    taken = []
-    for _ in range(4):
-        chosen = policy.next_views(state, np.random.default_rng(0))
-        state.visited[0, chosen] = True
-        taken.append(int(chosen[0]))
-    # 3 is below, 34 and 36 are at the azimuth bins of the top ring; no peak left, the highest rest is 35 between them
-    # (0.6).
-    assert taken == [3, 34, 36, 35]
-
-
 @settings(deadline=None)
 @given(st.integers(0, 2**32))
 def test_map_peak_is_the_highest_free_peak_of_scikit_image(seed):
@@ -278,25 +234,15 @@ def test_a_valley_is_chosen_by_the_believed_class():
 # By name
 
 
-def test_policies_by_name():
-    for name in POLICIES:
-        assert hasattr(make_policy(name, SPHERE), "next_views")
-    assert make_policy("lem", SPHERE, [1, 3]) == MapPeak(SPHERE, "lem", (1, 3))
-    assert make_policy("lem-peak", SPHERE, [1, 3]) == MapPeak(SPHERE, "lem")
-    with pytest.raises(ValueError, match=r"no policy is called 'best'.*random"):
-        make_policy("best", SPHERE)
-
-
-@pytest.mark.parametrize(("name", "maps"), [("lem", ()), ("lcm", ()), ("view_area", ["view_area"]), ("a:b", ["a:b"])])
+@pytest.mark.parametrize(("name", "maps"), [("lem", ()), ("view_area", ["view_area"]), ("a:b", ["a:b"])])
 def test_every_map_has_policies_by_one_rule(name, maps):
     assert make_policy(name, SPHERE, [1], maps=maps) == MapPeak(SPHERE, name, (1,))
     assert make_policy(f"{name}-peak", SPHERE, [1], maps=maps) == MapPeak(SPHERE, name)
     assert make_policy(f"{name}-sphere-peak", SPHERE, [1], maps=maps) == SpherePeak(SPHERE, f"{name}-sphere")
-    with pytest.raises(PolicyError, match=f"there are random, .*lem, .*{name}-sphere-peak, .*gain"):
+    with pytest.raises(PolicyError, match=f"is called 'best'; there are random, .*{name}-sphere-peak, .*gain"):
         make_policy("best", SPHERE, maps=maps)
-    for wrong in (f"{name}-sphere", f"{name}-sphere-sphere-peak", f"{name}-peak-peak"):
-        with pytest.raises(PolicyError, match=rf"no policy is called|policy {wrong} cannot be made"):
-            make_policy(wrong, SPHERE, maps=maps)
+    with pytest.raises(PolicyError, match=rf"no policy is called|policy {name}-peak-peak cannot be made"):
+        make_policy(f"{name}-peak-peak", SPHERE, maps=maps)
 
 
 def test_a_card_is_written_as_it_was_read_and_a_broken_one_is_named(tmp_path):
@@ -304,7 +250,7 @@ def test_a_card_is_written_as_it_was_read_and_a_broken_one_is_named(tmp_path):
         write_policy_card(tmp_path / f"{name}.json", read_policy_card(path))
         assert read_policy_card(tmp_path / f"{name}.json") == read_policy_card(path)
     good = json.loads((tmp_path / "fixed-ring.json").read_text())
-    wrong = ({"kind": "agent"}, {"azimuths": 0}, {"table": {"ring": 9, "steps": 1}}, {"more": 1}, {"schema": 2})
+    wrong = ({"kind": "agent"}, {"table": {"ring": 9, "steps": 1}}, {"more": 1}, {"schema": 2})
     for k, change in enumerate(wrong):
         (tmp_path / f"{k}.json").write_text(json.dumps(good | change))
         with pytest.raises(PolicyError, match=rf"^\S+{k}\.json: not a policy card"):

@@ -1,6 +1,8 @@
+"""Predictions: what the networks say of a store, kept whole, resumed, and refused where the file is damaged."""
+
 import io
-import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,15 +13,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-import trimesh
-from pipeline import CLASSES, make_map_network, make_recogniser, some_predictions
+from pipeline import SPHERE, some_predictions
 
-from nextview.cli.main import main
 from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import render
 from nextview.data.store import ViewStore
-from nextview.errors import NextviewError, PredictionsError
+from nextview.errors import PredictionsError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration, RiskBounds
@@ -27,35 +27,12 @@ from nextview.recognition.inference import MapNetwork, Recogniser
 from nextview.recognition.model_card import read_card
 
 
-@pytest.fixture(scope="module")
-def shop(tmp_path_factory):
-    """Rendered meshes, one of them under two labels, and tiny networks."""
-    folder = tmp_path_factory.mktemp("shop")
-    rng = np.random.default_rng(0)
-    for label, split in [("ball", "train"), ("ball", "test"), ("box", "test"), ("pillar", "train"), ("pillar", "test")]:
-        mesh = trimesh.creation.icosphere(2) if label == "ball" else trimesh.creation.box()
-        mesh.apply_scale(rng.uniform(0.5, 2, 3) * ([1, 1, 4] if label == "pillar" else 1))
-        path = folder / "meshes" / label / split / f"{label}_{split}.off"
-        path.parent.mkdir(parents=True)
-        mesh.export(path)
-    same = folder / "meshes/box/train/box_train.off"
-    same.parent.mkdir()
-    same.write_bytes((folder / "meshes/pillar/test/pillar_test.off").read_bytes())
-    list(render(folder / "meshes", folder / "views.zarr", ViewSphere.named("40"), 32, workers=1))
-    make_recogniser(folder, CLASSES, azimuth_bins=8)
-    make_map_network(folder, valleys=("box",))
-    return folder
-
-
-def cards(shop: Path) -> tuple:
-    return read_card(shop / "tiny.json"), {"lem": read_card(shop / "tiny-lem.json")}
-
-
 def test_what_is_saved_is_what_is_loaded(tmp_path):
-    saved = replace(some_predictions(), calibration=Calibration(0.8, 0.3, RiskBounds((0.9,), ((0.1,),), 0.1)))
+    calibration = Calibration(0.8, 0.3, RiskBounds((0.9,), ((0.1,),), 0.1))
+    saved = replace(some_predictions(), calibration=calibration, of_size=np.arange(18, dtype=np.float32).reshape(6, 3))
     saved.save(tmp_path / "p.npz")
     loaded = Predictions.load(tmp_path / "p.npz")
-    for name in ("logits", "depth_entropy", "labels", "splits", "conflicting"):
+    for name in ("logits", "of_size", "depth_entropy", "labels", "splits", "conflicting"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(saved, name))
         assert getattr(loaded, name).dtype == getattr(saved, name).dtype
     np.testing.assert_array_equal(loaded.maps["lem"], saved.maps["lem"])
@@ -67,8 +44,6 @@ def test_what_is_saved_is_what_is_loaded(tmp_path):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"names": ()}, "hold no objects"),
-        ({"classes": ()}, "name no classes"),
         ({"classes": ("ball", "box")}, r"logits .* has the shape \(6, 40, 3\), not \(6, 40, 2\)"),
         ({"labels": np.full(6, 3)}, "not one of the 3 classes"),
         ({"names": ("a",) * 6}, "the same name"),
@@ -132,33 +107,35 @@ def test_nothing_is_unpickled(tmp_path):
         Predictions.load(tmp_path / "p.npz")
 
 
-def test_predictions_are_what_the_networks_say_of_each_look(shop):
-    recogniser, maps = cards(shop)
-    *_, last = predict(shop / "views.zarr", shop / "all.npz", [recogniser], maps, workers=2)
-    assert last == (6, 6)
-    found, store = Predictions.load(shop / "all.npz"), ViewStore.open(shop / "views.zarr")
+def cards(models: Path) -> tuple:
+    return [read_card(models / "tiny.json")], {"lem": read_card(models / "tiny-lem.json")}
+
+
+def test_predictions_are_what_the_networks_say_of_each_look(views, models, predictions):
+    found, store = Predictions.load(predictions), ViewStore.open(views)
     assert found.names == tuple(store.names)
-    assert found.store == str((shop / "views.zarr").resolve())
-    assert found.models["lem"] == ("tiny-lem", maps["lem"].sha256)
-    assert found.valley_classes == {"lem": ("box",)}
+    assert found.store == str(views.resolve())
+    assert found.models["lem"] == ("tiny-lem", cards(models)[1]["lem"].sha256)
+    assert found.valley_classes == {"lem": ("table",)}
     i, v = 3, 17
     observation = Observation(store.depth(i)[v], store.sphere.poses[v], store.intrinsics)
-    evidence = Recogniser(shop / "tiny.json")([observation])
+    evidence = Recogniser(models / "tiny.json")([observation])
     np.testing.assert_allclose(found.logits[i, v], evidence.logits[0], atol=1e-5)
     np.testing.assert_allclose(found.azimuth_bins[i, v], evidence.azimuth_bins[0], atol=1e-5)
     # Here the points come from the stored depth, which is rounded; those in the store are from the depth as rendered.
-    np.testing.assert_allclose(
-        found.maps["lem"][i, v], MapNetwork(shop / "tiny-lem.json")([observation])["lem"][0], atol=2e-4
-    )
+    lem = MapNetwork(models / "tiny-lem.json")([observation])["lem"][0]
+    np.testing.assert_allclose(found.maps["lem"][i, v], lem, atol=5e-4)
 
 
-def test_the_same_mesh_under_two_labels_is_marked_across_splits(shop):
-    recogniser, maps = cards(shop)
-    list(predict(shop / "views.zarr", shop / "test.npz", [recogniser], maps, "test", workers=1))
-    found = Predictions.load(shop / "test.npz")
-    assert dict(zip(found.names, found.conflicting, strict=True)) == {
-        "ball_test": False, "box_test": False, "pillar_test": True,
-    }  # fmt: skip
+def test_the_same_mesh_under_two_labels_is_marked_across_splits(furniture, models, tmp_path):
+    for place in ("chair/test/chair_4", "table/train/twin", "monitor/test/monitor_4"):
+        path = tmp_path / f"meshes/{place}.off"
+        path.parent.mkdir(parents=True)
+        shutil.copy(furniture / f"{place.replace('table/train/twin', 'chair/test/chair_4')}.off", path)
+    list(render(tmp_path / "meshes", tmp_path / "views.zarr", SPHERE, 32, workers=0))
+    list(predict(tmp_path / "views.zarr", tmp_path / "p.npz", cards(models)[0], {}, "test", workers=0))
+    found = Predictions.load(tmp_path / "p.npz")
+    assert dict(zip(found.names, found.conflicting, strict=True)) == {"chair_4": True, "monitor_4": False}
 
 
 KILLED = """
@@ -168,46 +145,28 @@ from nextview.data.predicting import predict
 from nextview.recognition.model_card import read_card
 
 if __name__ == "__main__":
-    shop, out = map(Path, sys.argv[1:])
-    maps = {"lem": read_card(shop / "tiny-lem.json")}
-    for done, _ in predict(shop / "views.zarr", out, [read_card(shop / "tiny.json")], maps, workers=1):
+    views, models, out = map(Path, sys.argv[1:])
+    maps = {"lem": read_card(models / "tiny-lem.json")}
+    for done, _ in predict(views, out, [read_card(models / "tiny.json")], maps, workers=1):
         if done == 2:
             os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def test_a_killed_run_goes_on_where_it_was(shop):
-    recogniser, maps = cards(shop)
-    out = shop / "again.npz"
-    (shop / "killed.py").write_text(KILLED)
-    killed = subprocess.run([sys.executable, shop / "killed.py", shop, out], check=False)
+def test_a_killed_run_goes_on_where_it_was_and_a_later_calibration_needs_no_other(views, models, predictions, tmp_path):
+    out, (recognisers, maps) = tmp_path / "again.npz", cards(models)
+    (tmp_path / "killed.py").write_text(KILLED)
+    killed = subprocess.run([sys.executable, tmp_path / "killed.py", views, models, out], check=False)
     assert killed.returncode == -signal.SIGKILL
     assert not out.exists()
-    steps = predict(shop / "views.zarr", out, [recogniser], maps, workers=1)
-    assert next(steps) == (2, 6)
-    list(steps)
+    steps = list(predict(views, out, recognisers, maps, workers=1))
+    assert steps[0] == (2, 18)
     assert not out.with_name("again.npz.part").exists()
-    list(predict(shop / "views.zarr", shop / "whole.npz", [recogniser], maps, workers=1))
-    np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(shop / "whole.npz").logits)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="mounts a small disk")
-def test_a_full_disk_is_one_sentence_and_loses_nothing(shop, tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=56k", "tmpfs", disk]).returncode:
-        pytest.skip("only root can mount a small disk")
-    recogniser, maps = cards(shop)
-    try:
-        with pytest.raises(NextviewError, match=r"p\.npz: cannot be written \(No space left on device\)"):
-            list(predict(shop / "views.zarr", disk / "p.npz", [recogniser], maps, workers=0))
-        subprocess.run(["mount", "-o", "remount,size=100m", disk], check=True)
-        steps = list(predict(shop / "views.zarr", disk / "p.npz", [recogniser], maps, workers=0))
-        assert steps[0][0] > 0
-        assert len(Predictions.load(disk / "p.npz")) == 6
-        assert [file.name for file in disk.iterdir()] == ["p.npz"]
-    finally:
-        subprocess.run(["umount", disk], check=True)
+    np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(predictions).logits)
+    later = msgspec.structs.replace(recognisers[0], calibration=Calibration(0.5, 0.25))
+    assert list(predict(views, out, [later], maps, workers=1)) == [(18, 18)]
+    assert Predictions.load(out).calibration == Calibration(0.5, 0.25)
+    np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(predictions).logits)
 
 
 def test_an_array_that_announces_more_than_the_file_holds_is_refused_before_it_takes_memory(tmp_path):
@@ -225,34 +184,3 @@ def test_an_array_that_announces_more_than_the_file_holds_is_refused_before_it_t
         with pytest.raises(PredictionsError, match="announces more than"):
             Predictions.load(tmp_path / f"{name}.npz")
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + 50_000
-
-
-def test_a_card_that_was_calibrated_since_brings_predictions_up_to_date(shop):
-    (recogniser, maps), out = cards(shop), shop / "calibrated.npz"
-    list(predict(shop / "views.zarr", out, [recogniser], maps, workers=1))
-    before = Predictions.load(out)
-    later = msgspec.structs.replace(recogniser, calibration=Calibration(0.5, 0.25))
-    assert list(predict(shop / "views.zarr", out, [later], maps, workers=1)) == [(6, 6)]
-    after = Predictions.load(out)
-    assert (before.calibration, after.calibration) == (Calibration(), Calibration(0.5, 0.25))
-    np.testing.assert_array_equal(after.logits, before.logits)
-
-
-def test_all_maps_that_the_models_predict_are_predicted_by_default(shop, tmp_path, monkeypatch):
-    """Whatever their measure: those of the folder, and of the bundled ones that it lacks."""
-    make_recogniser(tmp_path, CLASSES)
-    make_map_network(tmp_path)
-    make_map_network(tmp_path, "mine:clutter")
-    asked = []
-
-    def listen(*arguments, **options):
-        asked.append(arguments[3])
-        return predict(*arguments[:3], {}, *arguments[4:], **options)
-
-    monkeypatch.setattr("nextview.data.predicting.predict", listen)
-    command = ["predict", str(shop / "views.zarr"), str(tmp_path / "p.npz"), "--models", str(tmp_path)]
-    for given in ([], ["--maps"], ["--maps", "mine:clutter"]):
-        main([*command, *given, "--workers", "1"])
-    names = [[card.name for card in maps.values()] for maps in asked]
-    assert names == [["tiny-lem", "lcm-modelnet10", "tiny-mine:clutter"], [], ["tiny-mine:clutter"]]
-    assert [list(maps) for maps in asked[::2]] == [["lem", "lcm", "mine:clutter"], ["mine:clutter"]]

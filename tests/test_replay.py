@@ -1,20 +1,16 @@
-import json
+"""Replay against episodes one by one, against a live camera, and what entries and oracles promise."""
+
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
-import trimesh
-from pipeline import make_map_network, make_recogniser, some_predictions
+from pipeline import some_predictions
 from scipy.special import log_softmax, softmax
 
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.replay import Grid, make_specs, replay, run_grid, truncate
-from nextview.benchmark.true_maps import true_map
-from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
-from nextview.data.rendering import render
 from nextview.errors import EntryError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.viewsphere import ViewSphere
@@ -22,7 +18,6 @@ from nextview.policies.base import Evidence
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import Calibration, Stopping
 from nextview.recognition.inference import MapNetwork, Models, Recogniser
-from nextview.recognition.model_card import read_card
 from nextview.session.episode import run_episodes
 from nextview.session.session import Session
 from nextview.simulation.simulated import SimulatedCamera
@@ -46,17 +41,11 @@ def evidence_of(predictions: Predictions, objects: np.ndarray):
 @pytest.mark.parametrize("name", ["lem", "lem-peak", "unidirectional"])
 def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(specs, name, threshold, threshold_decay):
     p = specs.predictions
-    policy = make_policy(name, p.sphere, specs.valley_classes("lem"))
-    episodes = run_episodes(
-        evidence_of(p, specs.objects),
-        p.sphere,
-        policy,
-        specs.starts,
-        Stopping(threshold, 5, threshold_decay),
-        np.random.default_rng(0),
-    ).outcome
+    policy, stopping = make_policy(name, p.sphere, specs.valley_classes("lem")), Stopping(threshold, 5, threshold_decay)
+    observe, rng = evidence_of(p, specs.objects), np.random.default_rng(0)
+    episodes = run_episodes(observe, p.sphere, policy, specs.starts, stopping, rng).outcome
     paths = replay(name, specs, max_views=5, seed=0)
-    ends = truncate(paths, Stopping(threshold, 5, threshold_decay))
+    ends = truncate(paths, stopping)
     for field in ("answer", "confidence", "n_views", "confident", "travel", "arc"):
         np.testing.assert_allclose(getattr(ends, field), getattr(episodes, field), atol=1e-12, err_msg=field)
     taken = np.arange(5) < ends.n_views[:, None]
@@ -94,30 +83,16 @@ def test_each_map_has_the_valley_classes_of_its_own_card():
     assert {*np.flatnonzero(peak != valley)} == {*np.flatnonzero(specs.labels == 1)}
 
 
-def test_true_maps_are_the_truth_around_each_view():
-    p = some_predictions(4)
-    true_lem, true_lcm = true_map(p, "lem"), true_map(p, "lcm")
-    i, v = 2, 9
-    for ring in range(5):
-        for column in range(3):
-            seen = p.sphere.windows[v, ring, column]
-            low, high = p.depth_entropy[i].min(), p.depth_entropy[i].max()
-            assert true_lem[i, v, ring, column] == pytest.approx((p.depth_entropy[i, seen] - low) / (high - low))
-            belief = softmax(p.logits[i, seen].astype(float))
-            right = belief.argmax() == p.labels[i]
-            assert true_lcm[i, v, ring, column] == pytest.approx(belief.max() if right else 0)
-
-
 def test_fixed_views_are_the_ones_their_name_says(specs):
     p = specs.predictions
     sure = softmax(p.logits.astype(float), axis=2)[np.arange(len(p)), :, p.labels][specs.objects]
     entropy = p.depth_entropy[specs.objects]
-    for name, values in [
+    for name, values in (
         ("best-5", sure),
         ("worst-5", -sure),
         ("high-entropy-5", entropy),
         ("low-entropy-5", -entropy),
-    ]:
+    ):
         paths = replay(name, specs, max_views=3, seed=0)
         taken = np.take_along_axis(values, paths.views, 1)
         np.testing.assert_allclose(np.sort(taken), np.sort(values)[:, -5:], err_msg=name)
@@ -186,22 +161,6 @@ def test_the_contestants_are_those_that_the_predictions_allow(specs):
         replay(name, with_lcm, 2, 0)
 
 
-def sample_meshes(folder: Path) -> None:
-    rng = np.random.default_rng(0)
-    makers = {
-        "ball": lambda: trimesh.creation.icosphere(2),
-        "box": trimesh.creation.box,
-        "pillar": lambda: trimesh.creation.capsule(count=[12, 12]),
-    }
-    for label, make in makers.items():
-        for n in range(2):
-            mesh = make()
-            mesh.apply_scale(rng.uniform(0.5, 2, 3))
-            path = folder / label / "test" / f"{label}_{n}.off"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            mesh.export(path)
-
-
 class ToItsBack:
     """Goes round the ring to where the side opposite to that which the recogniser calls 0 is likely to be seen."""
 
@@ -218,33 +177,22 @@ class ToItsBack:
         return views[rows, np.where(state.visited[rows[:, None], views], -1.0, seen).argmax(1)]
 
 
-def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(tmp_path):
-    sample_meshes(tmp_path / "meshes")
-    sphere = ViewSphere.named("40")
-    list(render(tmp_path / "meshes", tmp_path / "views.zarr", sphere, 64, workers=1))
-    classes = sorted(path.name for path in (tmp_path / "meshes").iterdir())
-    recogniser = make_recogniser(tmp_path, classes, size=32, azimuth_bins=8)
-    calibrated = json.loads(recogniser.read_text()) | {"calibration": msgspec.to_builtins(Calibration(0.6, 0.7))}
-    recogniser.write_text(json.dumps(calibrated))
-    lem = make_map_network(tmp_path, valleys=(classes[0],))
-    cards = [read_card(recogniser)], {"lem": read_card(lem)}
-    list(predict(tmp_path / "views.zarr", tmp_path / "p.npz", *cards, workers=1))
-    p = Predictions.load(tmp_path / "p.npz")
+def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(furniture, models, predictions):
+    p = Predictions.load(predictions).of_split("test")
     specs = make_specs(p, runs=2, seed=0)
-    models = Models(Recogniser(recogniser, 1), {"lem": MapNetwork(lem, 1)})
+    networks = Models(Recogniser(models / "tiny.json", 1), {"lem": MapNetwork(models / "tiny-lem.json", 1)})
     # A threshold that some reach: the middle of all confidences after two views.
     threshold = float(np.median(replay("lem", specs, 2, 0).confidences[:, 1]))
     for name in ("lem", "lem-peak", "unidirectional", "test_replay:ToItsBack"):
-        policy = make_policy(name, sphere, specs.valley_classes("lem"))
-        paths = replay(name, specs, 5, 0)
-        ends = truncate(paths, Stopping(threshold))
+        policy, paths = make_policy(name, p.sphere, specs.valley_classes("lem")), replay(name, specs, 5, 0)
+        stopping = Stopping.of(p.calibration, threshold, max_views=5)
+        ends = truncate(paths, stopping)
         for e, (i, start) in enumerate(zip(specs.objects, specs.starts, strict=True)):
-            label = classes[p.labels[i]]
-            mesh = load_mesh(tmp_path / "meshes" / label / "test" / f"{p.names[i]}.off")
-            camera = SimulatedCamera(mesh, 64, sphere.distance)
-            live = Session(models, policy, sphere, int(start), Stopping(threshold)).run(camera)
+            mesh = load_mesh(furniture / p.classes[p.labels[i]] / "test" / f"{p.names[i]}.off")
+            camera = SimulatedCamera(mesh, 32, p.sphere.distance)
+            live = Session(networks, policy, p.sphere, int(start), stopping).run(camera)
             assert [view.index for view in live.views] == paths.views[e, : ends.n_views[e]].tolist()
-            assert live.answer == classes[ends.answer[e]]
+            assert live.answer == p.classes[ends.answer[e]]
             assert live.confident == ends.confident[e]
             assert live.confidence == pytest.approx(ends.confidence[e], abs=0.01)  # the store rounds
             assert live.travel == pytest.approx(ends.travel[e])

@@ -59,38 +59,17 @@ def test_colour_becomes_grey():
     assert Frame(DEPTH, INTRINSICS, image=colour).image[0, :3].tolist() == [255, 150, 0]
 
 
-def scaled(matrix, scale):
-    changed = matrix.copy()
-    changed[:3, :3] = changed[:3, :3] * scale
-    return changed
-
-
-def with_focal(x, y=500.0):
-    return np.array([[x, 0, 320], [0, y, 240], [0, 0, 1.0]])
-
-
-LEFT_HANDED = POSE @ np.diag([1, -1, 1, 1.0])
 WRONG = {
     "millimetres?": {"depth": DEPTH * 1000},
     "scaled to 0 .. 1": {"depth": DEPTH / 1000},
     "nothing is seen": {"depth": np.full(SHAPE, np.nan)},
-    "nothing is seen: no pixel": {"depth": np.zeros(SHAPE, np.uint16)},
-    "(H, W), not": {"depth": DEPTH[..., None]},
-    "not int64": {"depth": (DEPTH * 1000).astype(np.int64)},
-    "a (3, 3) matrix": {"intrinsics": np.eye(4)},
     "transposed, or with a skew": {"intrinsics": INTRINSICS.T},
-    "have to be positive": {"intrinsics": with_focal(-500.0)},
-    "in pixels, not in millimetres": {"intrinsics": with_focal(3.6, 3.6)},
-    "a focal length of 1e-30 is too short": {"intrinsics": with_focal(500.0, 1e-30)},
+    "in pixels, not in millimetres": {"intrinsics": np.diag([3.6, 3.6, 1])},
     "another resolution": {"intrinsics": np.array([[520, 0, 1500], [0, 520, 900], [0, 0, 1.0]])},
-    "a (4, 4) matrix": {"pose": POSE[:3]},
-    "finite numbers": {"pose": np.full((4, 4), np.nan)},
     "transposed?": {"pose": POSE.T},
-    "scaled by 2": {"pose": scaled(POSE, 2)},
-    "no rotation matrix": {"pose": POSE @ np.diag([1, 0.5, 1, 1.0])},
-    "left-handed": {"pose": LEFT_HANDED},
+    "scaled by 2": {"pose": POSE @ np.diag([2, 2, 2, 1.0])},
+    "left-handed": {"pose": POSE @ np.diag([1, -1, 1, 1.0])},
     "not 'unity'": {"pose": POSE, "axes": "unity"},
-    "a mask is (H, W) bool": {"mask": DEPTH},
     "no pixel of the mask": {"mask": np.zeros(SHAPE, bool)},
     "registered to the depth": {"image": np.zeros((10, 10, 3), np.uint8)},
 }

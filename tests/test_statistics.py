@@ -6,17 +6,6 @@ from nextview.benchmark import statistics as st
 from nextview.data import metrics
 
 
-def test_intervals_agree_with_scipy():
-    values = np.random.default_rng(0).exponential(size=300)
-    weights = st.resample(300, 4000, np.random.default_rng(1))
-    low, high = st.interval(metrics.ratio(values[:, None], np.ones((300, 1)), weights))
-    theirs = stats.bootstrap(
-        (values,), np.mean, n_resamples=4000, method="percentile", rng=np.random.default_rng(2)
-    ).confidence_interval
-    assert low[0] == pytest.approx(theirs.low, abs=0.01)
-    assert high[0] == pytest.approx(theirs.high, abs=0.01)
-
-
 def test_ratios_and_class_means_agree_with_plain_loops():
     rng = np.random.default_rng(0)
     top, bottom, labels = rng.random((12, 2)), rng.integers(0, 3, (12, 2)).astype(float), rng.integers(0, 3, 12)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nextview.geometry.viewsphere import ViewSphere, great_circle, level_pose, look_at_origin
@@ -75,17 +75,6 @@ def test_arcs_are_the_haversine_formula(sphere):
     np.testing.assert_allclose(sphere.arc, expected, atol=5e-8)
 
 
-@settings(deadline=None)
-@given(spheres)
-def test_travel_and_arc_are_distances(sphere):
-    for distance in (sphere.travel, sphere.arc):
-        np.testing.assert_allclose(np.diag(distance), 0, atol=1e-12)
-        np.testing.assert_array_equal(distance, distance.T)
-        through = (distance[:, :, None] + distance[None, :, :]).min(1)
-        assert (distance <= through + 1e-9).all()
-    assert sphere.arc.max() <= np.pi
-
-
 @given(st.floats(-np.pi / 2, np.pi / 2), st.floats(-10, 10), st.floats(0.1, 100))
 def test_poses_look_at_the_origin_with_a_level_horizon(elevation, azimuth, distance):
     pose = look_at_origin(elevation, azimuth, distance)
@@ -98,16 +87,6 @@ def test_poses_look_at_the_origin_with_a_level_horizon(elevation, azimuth, dista
     assert rotation[2, 0] == 0  # x has no vertical part: the horizon is level
     assert rotation[2, 1] <= 1e-12  # y is down
     np.testing.assert_allclose(np.cross(rotation[:, 0], rotation[:, 1]), rotation[:, 2], atol=1e-12)
-
-
-@given(st.floats(-1.5, 1.5), st.floats(-np.pi, np.pi))
-def test_poses_against_the_usual_look_at_matrix(elevation, azimuth):
-    assume(abs(np.cos(elevation)) > 1e-3)
-    pose = look_at_origin(elevation, azimuth)
-    forward = -pose[:3, 3] / np.linalg.norm(pose[:3, 3])
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    np.testing.assert_allclose(pose[:3, :3], np.stack([right, np.cross(forward, right), forward], 1), atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))
