@@ -247,6 +247,11 @@ def _read_seven_scenes(folder: Path, intrinsics: Float | None, _: int | None) ->
     return frames, notes
 
 
+def is_capture(folder: Path) -> bool:
+    """Whether a folder holds the files of one of the layouts."""
+    return any(next(folder.glob(files), None) for files, _ in LAYOUTS.values())
+
+
 LAYOUTS = {  # a file that tells each, and what reads its views
     "BOP": ("scene_camera.json", _read_bop),
     "TUM RGB-D": ("depth.txt", _read_tum),

@@ -17,6 +17,7 @@ from nextview.geometry.mesh import Mesh
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.simulation.captured import NOTHING, Float, pinhole_of
+from nextview.simulation.scene import square
 
 PINHOLE = pinhole_of(525.0, 525.0, 319.5, 239.5)  # a Kinect's as ROS has it by default; first pixel's centre at 0
 SHAPE = 480, 640
@@ -53,8 +54,7 @@ def write_capture(
     vertices = setting.radius * mesh.vertices + np.array([0, 0, height])
     things = [(vertices, mesh.faces)]
     if setting.table:
-        square = TABLE * setting.radius * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-        things.append((square, np.array([[0, 1, 2], [0, 2, 3]], np.int32)))
+        things.append(square(TABLE * setting.radius, 0.0))
     caster, rays = RayCaster(things), pixel_rays(pinhole_of(525.0, 525.0, 320.0, 240.0), SHAPE).reshape(-1, 3)
     # The box has an inside, even that of a flat mesh.
     low, high = vertices.min(0) - 1e-6 * setting.radius, vertices.max(0) + 1e-6 * setting.radius

@@ -63,9 +63,7 @@ class Scene:
     @cached_property
     def table(self) -> Mesh:
         """Its top, a square."""
-        square = np.array([[-TABLE, -TABLE], [TABLE, -TABLE], [TABLE, TABLE], [-TABLE, TABLE]])
-        square = np.column_stack([square, np.full(4, self.floor)])
-        return Mesh(square, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(3), 1.0, "table")
+        return Mesh(*square(TABLE, self.floor), np.zeros(3), 1.0, "table")
 
     def clearance(self, positions: Float) -> Float:
         """Distance of cameras, (V, 3), from the nearest item, as a prism on its footprint, or the table, object radii.
@@ -148,6 +146,12 @@ def boxes_around(vertices: Float, count: int, rng: np.random.Generator) -> Mesh:
     away = reach + np.hypot(size[:, 0], size[:, 1]) / 2 + rng.uniform(*GAP, count)
     at = away[:, None] * np.stack([np.cos(towards), np.sin(towards)], 1)
     return upright_boxes(size, azimuth, at, float(floor))
+
+
+def square(half: float, height: float) -> tuple[Float, NDArray[np.int32]]:
+    """Vertices and faces of a level square, half its side and its height given."""
+    corners = np.array([[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]])
+    return corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
 
 def upright_boxes(size: Float, azimuth: Float, at: Float, floor: float) -> Mesh:

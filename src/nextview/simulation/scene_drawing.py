@@ -75,10 +75,9 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
         placed = _layout(mesh, others, meshes.folder, hiding, level, goal, rng)
         if placed is not None:
             scene = Scene(mesh, tuple(item for _, item in placed))
-            visible = visible_shares(scene, GRID.poses, SIZE, GRID.distance)
             objects = tuple(thing for thing, _ in placed if isinstance(thing, Placement))
             blocks = tuple(thing for thing, _ in placed if isinstance(thing, Block))
-            shares = tuple(round(float(share), 4) for share in visible)
+            shares = tuple(_rounded(*visible_shares(scene, GRID.poses, SIZE, GRID.distance)))
             unreachable = tuple(np.flatnonzero(~scene.reachable(GRID.poses[:, :3, 3])).tolist())
             middle = Placement(target, mesh_hash(meshes.folder / target))
             return SceneLayout(name, level, seed, middle, objects, blocks, shares, unreachable)
@@ -149,13 +148,12 @@ def _layout(
 
 def _thing(others: Sequence[str], folder: Path, level: str, short: bool, rng: np.random.Generator) -> Placement | Block:
     """An object or a box, anywhere around; an object where there are too few."""
-    away, towards, azimuth = rng.uniform(*AWAY[level]), rng.uniform(0, 2 * np.pi), _round(rng.uniform(0, 2 * np.pi))
-    x, y = _round(away * np.cos(towards)), _round(away * np.sin(towards))
+    away, towards, azimuth = rng.uniform(*AWAY[level]), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)
+    there = away * np.cos(towards), away * np.sin(towards), azimuth
     if short or (others and rng.random() < OBJECTS[level]):
         file = others[int(rng.integers(len(others)))]
-        return Placement(file, mesh_hash(folder / file), x, y, azimuth, _round(rng.uniform(*OBJECT_RADIUS)))
-    width, depth = rng.uniform(*FOOTPRINT, 2)
-    return Block(x, y, azimuth, _round(width), _round(depth), _round(rng.uniform(*BOX_HEIGHT[level])))
+        return Placement(file, mesh_hash(folder / file), *_rounded(*there, rng.uniform(*OBJECT_RADIUS)))
+    return Block(*_rounded(*there, *rng.uniform(*FOOTPRINT, 2), rng.uniform(*BOX_HEIGHT[level])))
 
 
 def _wall(rng: np.random.Generator) -> Block:
@@ -163,7 +161,7 @@ def _wall(rng: np.random.Generator) -> Block:
     away, towards, lean = rng.uniform(*WALL_AWAY), rng.uniform(0, 2 * np.pi), rng.uniform(-0.3, 0.3)
     x, y, azimuth = away * np.cos(towards), away * np.sin(towards), towards + np.pi / 2 + lean
     width, height = rng.uniform(*WALL_WIDTH), rng.uniform(*WALL_HEIGHT)
-    return Block(_round(x), _round(y), _round(azimuth), _round(width), WALL_DEPTH, _round(height), True)
+    return Block(*_rounded(x, y, azimuth, width, WALL_DEPTH, height), wall=True)
 
 
 def _stood(thing: Placement | Block, folder: Path, floor: float) -> Item | None:
@@ -176,6 +174,6 @@ def _stood(thing: Placement | Block, folder: Path, floor: float) -> Item | None:
         return None
 
 
-def _round(value: float) -> float:
+def _rounded(*values: float) -> list[float]:
     """Few digits are enough, and JSON holds them exactly."""
-    return round(float(value), 4)
+    return [round(float(value), 4) for value in values]

@@ -55,17 +55,14 @@ class SensedCamera:
     ) -> None:
         known = sensor_named(sensor)
         self.sensor = known.draw(rng.spawn(1)[0]) if isinstance(known, SensorMix) else known
-        self.denoise, self._rng = denoise, rng
-        self._camera = self._looking_at(mesh)
-        self._floor = float(mesh.vertices[:, 2].min())
-        self._metres = mesh.metres
+        self.denoise, self._rng, self._reach, self._metres = denoise, rng, table, mesh.metres
+        self._camera, self._floor = self._looking_at(mesh), float(mesh.vertices[:, 2].min())
         self._truth = ObjectFrame(np.zeros(3), self.sensor.radius, np.eye(3))
         setup, draws = self.sensor, rng.spawn(1)[0]
         centre = draws.normal(0, setup.centre * setup.radius, 3)
         radius = setup.radius * np.exp(draws.normal(0, setup.size))
         lean = Rotation.from_rotvec([*draws.normal(0, setup.tilt, 2), 0], degrees=True).as_matrix()
         self.object_frame = ObjectFrame(centre, float(radius), lean)  # where the robot takes the object to be
-        self._reach = table
         if around is None and self.sensor.boxes:
             draws = rng.spawn(1)[0]
             if count := int(draws.poisson(self.sensor.boxes)):
@@ -124,35 +121,26 @@ class SensedCamera:
         inside = self._truth.pose_in_object(pose)
         depth = self._camera.observe(inside).depth
         whose = np.full(depth.shape, OBJECT, np.uint8)
-        table, part = self._table(inside)
-        shown = np.isfinite(table) & (depth[part] == 0)
-        depth[part][shown], whose[part][shown] = table[shown], TABLE_TOP
+        table = self._table(inside)
+        shown = np.isfinite(table) & (depth == 0)
+        depth[shown], whose[shown] = table[shown], TABLE_TOP
         if self._around is not None:
             boxes = self._around.observe(inside).depth
             nearer = (boxes > 0) & ((depth == 0) | (boxes < depth))
             depth, whose = np.where(nearer, boxes, depth), np.where(nearer, np.uint8(BOX), whose)
         return depth * np.float32(self.sensor.radius), whose
 
-    def _table(self, pose: Float) -> tuple[Float, tuple[slice, slice]]:
-        """Depth of the table, object radii, infinite beside it; and the part of the picture that holds it."""
-        height = pose[2, 3] - self._floor
-        x = (np.arange(self.sensor.width) + 0.5 - self.sensor.width / 2) / self.sensor.focal
-        y = (np.arange(self.sensor.height) + 0.5 - self.sensor.height / 2) / self.sensor.focal
-        if height <= 0:
-            return np.zeros((0, 0)), (slice(0), slice(0))
-        ends = (-self._reach, self._reach)
-        corners = np.array([[a, b, self._floor] for a in ends for b in ends])
-        right, down, forward = ((corners - pose[:3, 3]) @ pose[:3, :3]).T
-        rows, columns = slice(None), slice(None)
-        if forward.min() > 0:  # else its border is beside the camera, and it may be anywhere in the picture
-            rows = slice(*np.searchsorted(y, [(down / forward).min(), (down / forward).max()]))
-            columns = slice(*np.searchsorted(x, [(right / forward).min(), (right / forward).max()]))
-        x, y = x[columns], y[rows, None]
+    def _table(self, pose: Float) -> Float:
+        """Depth of the table, object radii, infinite beside it and from below."""
+        height, setup = pose[2, 3] - self._floor, self.sensor
+        x = (np.arange(setup.width) + 0.5 - setup.width / 2) / setup.focal
+        y = ((np.arange(setup.height) + 0.5 - setup.height / 2) / setup.focal)[:, None]
         falls = x * pose[2, 0] + y * pose[2, 1] + pose[2, 2]
-        along = np.where(falls < 0, -height / np.where(falls < 0, falls, -1), np.inf)
+        down = (falls < 0) & (height > 0)
+        along = np.where(down, -height / np.where(down, falls, -1), np.inf)
         with np.errstate(invalid="ignore"):
             across = [pose[i, 3] + along * (x * pose[i, 0] + y * pose[i, 1] + pose[i, 2]) for i in (0, 1)]
-            return np.where(across[0] ** 2 + across[1] ** 2 < self._reach**2, along, np.inf), (rows, columns)
+            return np.where(across[0] ** 2 + across[1] ** 2 < self._reach**2, along, np.inf)
 
     def _cropped(
         self, depth: NDArray[np.float32], mask: NDArray[np.bool_], rng: np.random.Generator

@@ -21,7 +21,6 @@ EDGE = 0.02  # two surfaces differ so much from pixel to pixel, as a part of q, 
 STEEPEST = np.radians(80.0)  # the laws of noise are held here: they grow without bound towards 90 degrees
 NO_GRAIN, NARROWEST = 0.1, 1.0  # pixels: a window that holds one pixel; the narrowest shadow
 WIDEST = 8  # projector columns that two neighbouring pixels of one surface may lie apart
-MOST_COLUMNS = 2**26  # projector columns in all rows together
 LARGEST, SIDE, GRAIN, STRONGEST = 10_000, 4096, 100, 100  # limits of numbers, sides of pictures, grain and strength
 MARGIN = 16  # how far beside what there is a pixel may show it, pixels
 
@@ -107,13 +106,9 @@ class Sensor:
     def measure(
         self, depth: NDArray[np.float32], rng: np.random.Generator
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """What the sensor makes of a true depth image. Errors of strength 0 change nothing, to the bit.
+        """What the sensor makes of a true depth image, (height, width) float32, metres, 0 where there is nothing.
 
-        Each error draws from a generator of its own, so that changing one strength changes no other error.
-
-        Args:
-            depth: (height, width) float32, metres, 0 where there is nothing.
-            rng: for all that is random.
+        Errors of strength 0 change nothing, to the bit. Each error draws from a generator of its own.
 
         Returns:
             Depth, (height, width) float32, 0 where none was measured. And whose surface each pixel shows, its own or
@@ -148,12 +143,7 @@ class Sensor:
             changed, near = shifted(changed, slope, right, down)
             source, lost = source[near], lost[near]
         if self.axial or self.noise or self.disparity:
-            z = np.where(changed > 0, 1 / np.where(changed > 0, changed, 1), 1.0)
-            along = (self.axial * kinect_axial(z, angle)) ** 2 + self.noise**2
-            # The published laws were measured on what came out, in steps already: theirs is taken off.
-            steps = (self.disparity**2 - self.step**2 / 12) / (self.focal * self.baseline) ** 2
-            sigma = np.sqrt(np.maximum(along / z**4 + steps, 0))
-            changed = np.where(changed > 0, changed + sigma * normal_field(axial, q.shape, self.grain), 0)
+            changed = self._noisy(changed, angle, axial)
         if self.step:
             unit = self.step / (self.focal * self.baseline)
             changed = np.rint(changed / unit) * unit
@@ -167,6 +157,15 @@ class Sensor:
             made = np.where(found, 1 / np.where(found, changed, 1), 0)
             measured[part] = np.where(lost | (made < self.nearest), 0, made)
         return measured, sources
+
+    def _noisy(self, q: Image, angle: Image, rng: np.random.Generator) -> Image:
+        """Inverse depth with the noise of depth and of disparity."""
+        z = np.where(q > 0, 1 / np.where(q > 0, q, 1), 1.0)
+        along = (self.axial * kinect_axial(z, angle)) ** 2 + self.noise**2
+        # The published laws were measured on what came out, in steps already: theirs is taken off.
+        steps = (self.disparity**2 - self.step**2 / 12) / (self.focal * self.baseline) ** 2
+        sigma = np.sqrt(np.maximum(along / z**4 + steps, 0))
+        return np.where(q > 0, q + sigma * normal_field(rng, q.shape, self.grain), 0)
 
 
 ERRORS = tuple(field.name for field in fields(Sensor))[10:]  # the strengths, from axial on
@@ -275,8 +274,7 @@ def shifted(
     at = np.clip(row + down, 0, len(q) - 1), np.clip(column + right, 0, q.shape[1] - 1)
     there = q[at]
     moved = there - slope[0][at] * (at[1] - column) - slope[1][at] * (at[0] - row)
-    # The slope of a surface seen edge-on leads anywhere.
-    moved = np.where(np.abs(moved - there) < 0.1 * there, moved, there)
+    moved = np.where(np.abs(moved - there) < 0.1 * there, moved, there)  # a slope seen edge-on leads anywhere
     return np.where(there > 0, moved, 0), at
 
 
@@ -312,14 +310,10 @@ def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
     disparity = focal * baseline * q
     column = np.arange(width) - disparity
     offset = int(np.ceil(abs(disparity).max(initial=0.0))) + 1
-    if height * 2 * offset > MOST_COLUMNS:
-        raise UsageError(f"a shadow of {baseline} m reaches {offset:,} pixels here, more than can be drawn")
     lit = np.zeros((height, width + 2 * offset + 2))  # the largest disparity in each column of the projector
-    row = np.broadcast_to(np.arange(height)[:, None], q.shape)
-    seen = q > 0
+    row, seen = np.broadcast_to(np.arange(height)[:, None], q.shape), q > 0
     # A surface covers all projector columns from one of its pixels to the next.
-    along, _ = slopes(q)
-    joined = np.zeros(q.shape, bool)
+    along, joined = _slope(q), np.zeros(q.shape, bool)
     bend = np.abs(q[:, 1:] - q[:, :-1] - along[:, :-1])
     joined[:, :-1] = seen[:, :-1] & seen[:, 1:] & (bend <= EDGE * q[:, :-1])
     last = np.where(joined, np.roll(column, -1, 1), column)
@@ -360,5 +354,5 @@ def normal_field(rng: np.random.Generator, shape: tuple[int, int], grain: float)
 
 
 def uniform_field(rng: np.random.Generator, shape: tuple[int, int], grain: float) -> Image:
-    """Numbers between 0 and 1, each as likely, of which neighbours are alike as in ``normal_field``."""
+    """Numbers between 0 and 1, each as likely; neighbours are alike as in ``normal_field``."""
     return rng.random(shape) if grain == 0 else np.asarray(ndtr(normal_field(rng, shape, grain)))
