@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.data.measured_view import MeasuredView
+from research.seen_area import seen_area
 
 
 def bits(shares: NDArray[np.floating]) -> float:
@@ -34,7 +35,7 @@ def visible_area_ratio(view: MeasuredView) -> float:
     Returns:
         Between 0 and 1: of a sphere from distance d, (1 - 1/d) / 2.
     """
-    return min(float(view.seen_area.sum() / view.surface.area), 1.0)
+    return min(float(seen_area(view).sum() / view.surface.areas.sum()), 1.0)
 
 
 def surface_visibility(view: MeasuredView) -> float:
@@ -46,7 +47,7 @@ def surface_visibility(view: MeasuredView) -> float:
     Returns:
         Between 0 and 1: 1/2 of a cube of which three sides are seen.
     """
-    return float(view.surface.areas[view.pixels[0]].sum() / view.surface.area)
+    return float(view.surface.areas[view.pixels[0]].sum() / view.surface.areas.sum())
 
 
 def viewpoint_entropy(view: MeasuredView) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 from nextview.data.measured_view import MeasuredView
 from research.area import bits
 from research.bending import bent
+from research.seen_area import seen_area, seen_share
 
 LEVELS = 32
 """Steps of the arc tangent of a curvature from 0 to infinity, half as wide at both ends: a flat surface, whose deficits
@@ -28,7 +29,7 @@ def curvature_entropy(view: MeasuredView) -> float:
     surface, (faces, _) = bent(view.surface), view.pixels
     curvature = surface.gaussian[surface.corners[faces]]
     level = np.rint(np.arctan(curvature) * (2 * LEVELS / np.pi)).astype(np.int64) + LEVELS
-    weight = np.bincount(level.ravel(), np.repeat(view.seen_area, 3))
+    weight = np.bincount(level.ravel(), np.repeat(seen_area(view), 3))
     return bits(weight / weight.sum()) if weight.sum() > 0 else 0.0
 
 
@@ -41,7 +42,7 @@ def mean_curvature(view: MeasuredView) -> float:
     Returns:
         Object radii: of a sphere of radius 1 from distance d, 2 pi (1 - 1/d).
     """
-    return float((bent(view.surface).mean_of_faces[view.pixels[0]] * view.seen_share).sum())
+    return float((bent(view.surface).mean_of_faces[view.pixels[0]] * seen_share(view)).sum())
 
 
 def gaussian_curvature(view: MeasuredView) -> float:
@@ -52,4 +53,4 @@ def gaussian_curvature(view: MeasuredView) -> float:
     Returns:
         Radians squared: of a sphere from distance d, 2 pi (1 - 1/d).
     """
-    return float((bent(view.surface).gaussian_of_faces[view.pixels[0]] * view.seen_share).sum())
+    return float((bent(view.surface).gaussian_of_faces[view.pixels[0]] * seen_share(view)).sum())

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from nextview.data.measured_view import MeasuredView
 from research.bending import BentSurface, bent
+from research.seen_area import seen_area
 
 UNIT = 0.006
 """Of the scales, object radii: Lee's 0.003 diagonals of a bounding box whose corners the object's sphere goes through,
@@ -31,7 +32,7 @@ def mesh_saliency(view: MeasuredView) -> float:
     Returns:
         Object radii; 0 on a sphere, or where nothing is seen.
     """
-    return float((saliency_of(bent(view.surface))[view.pixels[0]] * view.seen_area).sum())
+    return float((saliency_of(bent(view.surface))[view.pixels[0]] * seen_area(view)).sum())
 
 
 def saliency_of(surface: BentSurface) -> NDArray[np.float64]:

@@ -43,8 +43,9 @@ def base_avoidance(view: MeasuredView) -> float:
         return 0.0
     normals = surface.normals[faces]
     # A face's own normal may point either way; what counts is the side that the camera is on.
-    towards = ((view.pose[:3, 3] - surface.centres[faces]) * normals).sum(1)
+    towards = ((view.pose[:3, 3] - surface.vertices[surface.faces[faces]].mean(1)) * normals).sum(1)
     down = -normals[:, 2] * np.sign(towards)
-    low, high = surface.heights
-    base = (down > DOWN) & (surface.tops[faces] < low + BASE * (high - low))
+    heights = surface.vertices[:, 2]
+    low, high = heights.min(), heights.max()
+    base = (down > DOWN) & (heights[surface.faces[faces]].max(1) < low + BASE * (high - low))
     return float(1 - pixels[base].sum() / pixels.sum())

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from nextview.data.pool import each
-from nextview.data.store import DEPTH_UNIT, POINT_UNIT, ViewStore, writing
+from nextview.data.store import DEPTH_UNIT, POINT_UNIT, ViewStore, opened, writing
 from nextview.errors import DatasetError
 from nextview.geometry.depth import visible_points
 
@@ -32,7 +32,7 @@ def check(
     for name in store.rendered:
         store.array(name)  # says what is wrong
     with writing(path) if repair else nullcontext():
-        items = [int(i) for i in np.flatnonzero(store.done)]
+        items = np.flatnonzero(store.done).tolist()
         for i, problem in each(partial(_check_object, Path(path).absolute()), items, workers, scheduler):
             if problem is not None and repair:
                 store.forget(i)
@@ -42,12 +42,13 @@ def check(
 def incomplete(path: Path) -> dict[str, int]:
     """The arrays that were added to a store and lack some of the rendered objects, and how many objects they hold."""
     store = ViewStore.open(path)
-    held = {name: int((store.held(name) & store.done).sum()) for name in store.added}
-    return {name: n for name, n in held.items() if n < store.done.sum()}
+    done = store.done
+    held = {name: int((store.held(name) & done).sum()) for name in store.added}
+    return {name: n for name, n in held.items() if n < done.sum()}
 
 
 def _check_object(path: Path, i: int) -> str | None:
-    store = ViewStore.open(path)
+    store = opened(path)
     names = [*store.rendered, *(name for name in store.added if store.has(name, i))]
     try:
         arrays = {name: store.read(name, i) for name in names}

@@ -42,8 +42,8 @@ ARCHIVES = {
 def download(archive: Archive, destination: Path, timeout: float = 60, bar: Any = False) -> Path:
     """Fetch an archive and unpack it as ``destination / archive.folder``; nothing to do if that is there.
 
-    ``timeout`` is of a connection without a sign of life, seconds; ``bar`` shows the progress. DatasetError if it
-    cannot be fetched, is not the published file, or cannot be unpacked.
+    ``timeout`` is of a silent connection, seconds; ``bar`` shows the progress. DatasetError if it cannot be fetched, is
+    not the published file, or cannot be unpacked.
     """
     import pooch
     import requests

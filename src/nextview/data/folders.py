@@ -13,6 +13,7 @@ from pathlib import Path
 
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import FORMATS
+from nextview.recognition.model_card import read_card
 
 SPLITS = ("train", "test", "val")
 FEW = 3
@@ -39,13 +40,9 @@ class Listing:
 
     def summary(self) -> str:
         """How many objects lie in which layout, and what was left out, for people to read."""
+        layouts = Counter(entry.layout for entry in self.entries)
         total = len(self.entries) + len(self.left_out)
-        layouts = Counter(
-            entry.layout.replace("SPLIT", entry.split) if entry.split else entry.layout for entry in self.entries
-        )
         text = f"{len(self.entries)} of {total} objects: " + ", ".join(f"{n} in {at}" for at, n in layouts.items())
-        if not self.left_out:
-            return text
         reasons: dict[str, list[str]] = {}
         for path, reason in self.left_out:
             reasons.setdefault(reason, []).append(str(path))
@@ -53,7 +50,7 @@ class Listing:
             f"{len(paths)} ({reason}): {', '.join(paths[:FEW])}" + (", ..." if len(paths) > FEW else "")
             for reason, paths in reasons.items()
         ]
-        return f"{text}; left out: {'; '.join(parts)}"
+        return f"{text}; left out: {'; '.join(parts)}" if parts else text
 
 
 def list_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> list[Entry]:
@@ -62,19 +59,19 @@ def list_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> list[
 
 
 def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> Listing:
-    """All meshes of a dataset folder, or other files in its layout, and those that were left out."""
+    """All meshes of a dataset folder, or other files in its layout, and those that were left out.
+
+    Raises:
+        DatasetError: there is no such folder, it holds none, or two of them would have one name.
+    """
     root = Path(root)
     if not root.is_dir():
         raise DatasetError(f"{root}: there is no such folder")
     files, left_out = _walk(root, suffixes)
-    split_first = {parts[0] for parts in files if len(parts) > 1} <= set(SPLITS)
-    entries = []
-    for parts, path in files.items():
-        entry = _entry(parts, path, split_first)
-        if entry is None:
-            left_out.append((Path(*parts), "not in a class folder"))
-        else:
-            entries.append(entry)
+    split_first = {place.parts[0] for place in files if len(place.parts) > 1} <= set(SPLITS)
+    found = {place: _entry(place, path, split_first) for place, path in files.items()}
+    left_out += [(place, "not in a class folder") for place, entry in found.items() if entry is None]
+    entries = [entry for entry in found.values() if entry is not None]
     if not entries:
         what = "meshes" if suffixes == FORMATS else "scenes"
         raise DatasetError(f"{root}: no {what} in CLASS/NAME, CLASS/SPLIT/NAME or SPLIT/CLASS/NAME below it")
@@ -84,45 +81,58 @@ def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> Listi
     return Listing(sorted(_named(entries, root), key=lambda e: (e.label, e.split != "train", e.name)), left_out)
 
 
-def _walk(root: Path, suffixes: tuple[str, ...]) -> tuple[dict[tuple[str, ...], Path], list[tuple[Path, str]]]:
-    """All files with one of the suffixes by the parts of their relative paths; each folder once."""
-    files: dict[tuple[str, ...], Path] = {}
+def select(entries: list[Entry], dataset: Path, split: str | None, held_out: Path | None) -> list[Entry]:
+    """Those of one split, and those that the model of a card calls held out of its training, by mesh or scene."""
+    entries = [entry for entry in entries if split in (None, entry.split)]
+    if not entries:
+        raise DatasetError(f"{dataset}: nothing in CLASS/{split}/NAME below it")
+    if held_out is not None:
+        kept = set(read_card(held_out).held_out)
+        entries = [entry for entry in entries if entry.name.partition("@")[0] in kept]
+        if not entries:
+            raise DatasetError(f"{dataset}: holds no object that {held_out} calls held out")
+    return entries
+
+
+def _walk(root: Path, suffixes: tuple[str, ...]) -> tuple[dict[Path, Path], list[tuple[Path, str]]]:
+    """All files with one of the suffixes by their relative paths, each folder once; and those that are left out."""
+    files: dict[Path, Path] = {}
     left_out: list[tuple[Path, str]] = []
-    seen: set[Path] = set()
-    top = root.resolve()
+    seen, top = set[Path](), root.resolve()
 
     def unreadable(error: OSError) -> None:
         left_out.append((Path(error.filename).relative_to(root), f"{error.strerror}"))
 
     for folder, below, names in os.walk(root, onerror=unreadable, followlinks=True):
-        place = Path(folder).relative_to(root)
-        below.sort()
-        for name in sorted(name for name in names if Path(name).suffix.lower() in suffixes):
-            path = Path(folder, name)
-            if any(part.startswith(".") for part in (place / name).parts):
-                left_out.append((place / name, "hidden"))
+        for path in sorted(Path(folder, name) for name in names):
+            place = path.relative_to(root)
+            if path.suffix.lower() not in suffixes:
+                continue
+            if any(part.startswith(".") for part in place.parts):
+                left_out.append((place, "hidden"))
             elif not path.is_file():
-                left_out.append((place / name, "no file"))
+                left_out.append((place, "no file"))
             else:
-                files[(place / name).parts] = path
-        for name in list(below):
+                files[place] = path
+        for name in sorted(below):
             real = Path(folder, name).resolve()
             if real in seen or top.is_relative_to(real):
-                left_out.append((place / name, "a folder that is listed already"))
+                left_out.append((Path(folder, name).relative_to(root), "a folder that is listed already"))
                 below.remove(name)
             seen.add(real)
+        below.sort()
     return files, left_out
 
 
-def _entry(parts: tuple[str, ...], path: Path, split_first: bool) -> Entry | None:
-    """What the parts of a file's path say of it; None if they name no class."""
-    *folders, _ = parts
+def _entry(place: Path, path: Path, split_first: bool) -> Entry | None:
+    """What a file's relative path says of it; None if it names no class."""
+    *folders, _ = place.parts
     if split_first and len(folders) > 1:
-        (split, label), rest, layout = folders[:2], folders[2:], "SPLIT/CLASS"
+        (split, label), rest, layout = folders[:2], folders[2:], f"{folders[0]}/CLASS"
     elif not folders or split_first:
         return None
     elif len(folders) > 1 and folders[1] in SPLITS:
-        (label, split), rest, layout = folders[:2], folders[2:], "CLASS/SPLIT"
+        (label, split), rest, layout = folders[:2], folders[2:], f"CLASS/{folders[1]}"
     else:
         label, split, rest, layout = folders[0], "", folders[1:], "CLASS"
     return Entry(path, path.stem, label, split, layout + ("/.../MESH" if rest else "/MESH"))
@@ -131,15 +141,15 @@ def _entry(parts: tuple[str, ...], path: Path, split_first: bool) -> Entry | Non
 def _named(entries: list[Entry], root: Path) -> list[Entry]:
     """The entries with unique names: their file's, or as much of their path before it as it takes."""
 
-    def folder(entry: Entry) -> str:  # CLASS/ID/models/MESH: the ID
-        between = entry.path.relative_to(root).parts[1 + bool(entry.split) : -1]
-        return between[0] if between else entry.path.stem
+    def below(entry: Entry) -> tuple[str, ...]:  # CLASS/ID/models/MESH: ID, models, MESH
+        return entry.path.relative_to(root).with_suffix("").parts[1 + bool(entry.split) :]
 
-    def whole(entry: Entry) -> str:
-        parts = entry.path.relative_to(root).with_suffix("").parts
-        return "_".join([entry.label, *filter(None, [entry.split]), *parts[1 + bool(entry.split) :]])
-
-    rules = [lambda e: e.path.stem, folder, lambda e: f"{e.label}_{e.path.stem}", whole]
+    rules = [
+        lambda e: e.path.stem,
+        lambda e: below(e)[0],
+        lambda e: f"{e.label}_{e.path.stem}",
+        lambda e: "_".join([e.label, *filter(None, [e.split]), *below(e)]),
+    ]
     for rule in rules:
         named = [replace(entry, name=rule(entry)) for entry in entries]
         if len({entry.name for entry in named}) == len(named):

@@ -12,10 +12,6 @@ from nextview.errors import MeasureError
 from nextview.geometry.depth import object_depth
 from nextview.geometry.observation import depth_image
 
-GRAZING = 0.05
-"""Where a surface turns farther from the camera than this cosine, it counts as turned so far: one row of pixels more or
-less on a plane that is seen from its edge would else decide over as much area as all the rest."""
-
 
 @dataclass(frozen=True)
 class Surface:
@@ -44,26 +40,6 @@ class Surface:
         """Unit normals of the faces, (F, 3) float64; 0 of a face without area."""
         length = 2 * self.areas[:, None]
         return np.divide(self._cross, length, out=np.zeros_like(self._cross), where=length > 0)
-
-    @cached_property
-    def area(self) -> float:
-        """Of all faces, square object radii."""
-        return float(self.areas.sum())
-
-    @cached_property
-    def heights(self) -> tuple[float, float]:
-        """Of the lowest and the highest vertex, object radii."""
-        return float(self.vertices[:, 2].min()), float(self.vertices[:, 2].max())
-
-    @cached_property
-    def centres(self) -> NDArray[np.float64]:
-        """Of the faces, (F, 3) float64, object radii."""
-        return self.vertices[self.faces].mean(1)
-
-    @cached_property
-    def tops(self) -> NDArray[np.float64]:
-        """Of the faces' highest corners, the height, (F,) float64, object radii."""
-        return self.vertices[:, 2][self.faces].max(1)
 
 
 @dataclass(frozen=True)
@@ -129,48 +105,15 @@ class MeasuredView:
         return self.mesh
 
     @cached_property
-    def pixels(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Faces that are seen, (k,), ascending, and in how many pixels, (k,)."""
-        counts = np.bincount(self._ids)
-        faces = np.flatnonzero(counts)
-        return faces, counts[faces]
-
-    @cached_property
-    def seen_area(self) -> NDArray[np.float64]:
-        """How much of each of these faces is seen, (k,), square object radii.
-
-        A pixel shows z^2 / (fx fy |n . r|) of a face: z is its depth, n the face's unit normal, r the pixel's ray whose
-        z is 1. z |n . r| is how far the camera is from the face's plane. Pixels are samples: of a face smaller than
-        one, more may be counted than there is, and of others none; over many it evens out.
-        """
-        faces, _ = self.pixels
-        corners = self.surface.vertices[self.surface.faces[faces, 0]]
-        apart = np.zeros(int(faces[-1]) + 1 if len(faces) else 0)
-        apart[faces] = np.abs(((corners - self.pose[:3, 3]) * self.surface.normals[faces]).sum(1))
-        z = self.depths[self._hits]
-        focal = self.intrinsics[0, 0] * self.intrinsics[1, 1]
-        patches = z**2 / (focal * np.maximum(apart[self._ids] / z, GRAZING))
-        return np.asarray(np.bincount(self._ids, patches)[faces], np.float64)
-
-    @cached_property
-    def seen_share(self) -> NDArray[np.float64]:
-        """Which share of each of these faces is seen, (k,), about 0 .. 1; 0 of a face without area."""
-        areas = self.surface.areas[self.pixels[0]]
-        return np.divide(self.seen_area, areas, out=np.zeros(len(areas)), where=areas > 0)
-
-    @cached_property
-    def _faces(self) -> NDArray[np.int32]:
-        """The face that each of the pixels shows which show the object, -1 for none."""
+    def faces(self) -> NDArray[np.int32]:
+        """The face that each of the pixels shows that show the object, (n,), row by row; -1 for none."""
+        self.surface  # noqa: B018  # says if there is none
         assert self.face_ids is not None
         return self.face_ids[self.box][self.seen]
 
     @cached_property
-    def _hits(self) -> NDArray[np.bool_]:
-        """Which of these pixels show a face."""
-        return self._faces >= 0
-
-    @cached_property
-    def _ids(self) -> NDArray[np.int32]:
-        """The face of each pixel that shows one."""
-        self.surface  # noqa: B018  # says if there is none
-        return self._faces[self._hits]
+    def pixels(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Faces that are seen, (k,), ascending, and in how many pixels, (k,)."""
+        counts = np.bincount(self.faces[self.faces >= 0])
+        seen = np.flatnonzero(counts)
+        return seen, counts[seen]

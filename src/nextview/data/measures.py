@@ -22,13 +22,10 @@ QUANTUM = 1e-3
 
 @dataclass(frozen=True)
 class Measure:
-    """A view measure, and what is to be known of it.
+    """A view measure: a function from a view to a finite number, and what is to be known of it.
 
-    Attributes:
-        function: from a view to a finite number.
-        needs: "depth", or "mesh": the mesh and which face of it each pixel shows.
-        source: where it comes from.
-        good: which values are those of good views, by its source.
+    It needs the depth alone, or the mesh and which face each pixel shows. Good views have high or low values of it, by
+    its source.
     """
 
     function: Callable[[MeasuredView], float]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,9 @@ from nextview.checks import plugin_errors
 from nextview.data.folders import list_dataset
 from nextview.data.measured_view import MeasuredView, Surface
 from nextview.data.measures import MEASURES, find_measure, names_of
-from nextview.data.pool import WorkerDied, each
+from nextview.data.pool import counted
 from nextview.data.rendering import deformed
-from nextview.data.store import DEPTH_UNIT, ViewStore, writing
+from nextview.data.store import DEPTH_UNIT, ViewStore, opened, writing
 from nextview.errors import DatasetError, MeasureError
 from nextview.files import sha256_of
 from nextview.geometry.mesh import MAX_FACES, load_mesh
@@ -36,15 +36,13 @@ def measure(
     objects: NDArray[np.int64] | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """Put view measures into a store, as ``measures/NAME`` (N, V) float32.
+    """Put view measures into a store, as ``measures/NAME`` (N, V) float32; see ``nextview measure``.
 
     Args:
         path: the store.
         names: of the measures, "all", or "MODULE:FUNCTION", see ``find_measure``; by default all that can be had.
-        workers: processes; one for each core by default; 0 to work in this one.
-        scheduler: address of a dask.distributed scheduler, to use instead.
-        meshes: the dataset folder that the store was rendered from, for measures that need the mesh.
-        max_faces: of a mesh, as it was rendered.
+        workers, scheduler: see ``pool.each``.
+        meshes, max_faces: the dataset folder, as the store was rendered from it, for measures that need the mesh.
         objects: indices of those to measure; all that are rendered by default.
         overwrite: measure anew what is there.
 
@@ -54,36 +52,23 @@ def measure(
     names = names_of(names, meshes is not None)
     store = ViewStore.open(path)
     store.array("depth")  # says if it is missing, before anything is begun
-    if all(find_measure(name).needs == "depth" for name in names):
-        meshes = None
-    if meshes is not None:
-        meshes = Path(meshes).absolute()
-        _check_meshes(store, meshes)
-    function = partial(_measure, names, meshes, max_faces)
+    files = None
+    if meshes is not None and any(find_measure(name).needs == "mesh" for name in names):
+        files = {entry.name: entry.path.absolute() for entry in list_dataset(meshes)}
+        if store.attributes.sensor is not None:
+            raise DatasetError(f"{path}: was rendered through a sensor, whose depth does not tell which face is seen")
+        lacking = [store.names[i] for i in np.flatnonzero(store.done) if store.names[i] not in files]
+        if lacking:
+            raise DatasetError(f"{meshes}: holds no mesh called {lacking[0]}, of which {path} has views")
+    function = partial(_measure, names, files, max_faces)
     yield from keep(path, [f"measures/{name}" for name in names], function, workers, scheduler, objects, overwrite)
 
 
-def _check_meshes(store: ViewStore, meshes: Path) -> None:
-    """Look for the mesh file of each rendered object."""
-    if store.attributes.sensor is not None:
-        raise DatasetError(f"{store.path}: was rendered through a sensor, whose depth does not tell which face is seen")
-    names, found = store.names, {entry.name for entry in list_dataset(meshes)}
-    lacking = [names[i] for i in np.flatnonzero(store.done) if names[i] not in found]
-    if lacking:
-        raise DatasetError(f"{meshes}: holds no mesh called {lacking[0]}, of which {store.path} has views")
-
-
-@lru_cache(maxsize=1)  # once for each process
-def _files(meshes: Path, store: Path) -> dict[str, Path]:
-    """The mesh files of a dataset by name. The store only makes the key: for each one it is looked anew."""
-    return {entry.name: entry.path for entry in list_dataset(meshes)}
-
-
-def _measure(names: tuple[str, ...], meshes: Path | None, max_faces: int, store: ViewStore, i: int) -> Made:
+def _measure(names: tuple[str, ...], files: dict[str, Path] | None, max_faces: int, store: ViewStore, i: int) -> Made:
     depths, object_name = store.read("depth", i), store.names[i]
     surface = camera = None
-    if meshes is not None:
-        hashes, file = store.attributes.sha256, _files(meshes, store.path)[object_name]
+    if files is not None:
+        hashes, file = store.attributes.sha256, files[object_name]
         if hashes and sha256_of(file) != hashes[i]:
             raise DatasetError(f"{file}: is not the mesh that {store.path} was rendered from")
         mesh = deformed(store, load_mesh(file, max_faces=max_faces), object_name)
@@ -96,17 +81,14 @@ def _measure(names: tuple[str, ...], meshes: Path | None, max_faces: int, store:
         faces = None if camera is None else camera.face_ids(pose, depth)
         view = MeasuredView(depth, pose, store.intrinsics, surface, faces)
         for name, function in functions.items():
-            guard = nullcontext() if name in MEASURES else plugin_errors(partial(_failed, name, object_name))
+            about = f"measure {name} of {object_name}: "
+            guard = nullcontext() if name in MEASURES else plugin_errors(lambda said, at=about: MeasureError(at + said))
             with guard, np.errstate(over="ignore"):  # what is too large for float32 is told below
                 values[name][k] = function(view)
     for name, found in values.items():
         if not np.isfinite(found).all():
             raise MeasureError(f"measure {name} of {object_name}, view {np.isfinite(found).argmin()}, is not finite")
     return {f"measures/{name}": found for name, found in values.items()}
-
-
-def _failed(name: str, of: str, said: str) -> MeasureError:
-    return MeasureError(f"measure {name} of {of}: {said}")
 
 
 def keep(
@@ -121,23 +103,16 @@ def keep(
     """Call ``function(store, i)`` for the objects that lack values in the arrays, and keep what it returns."""
     with writing(path):
         store = ViewStore.open(Path(path).absolute())
-        wanted = store.done
-        if objects is not None:
-            wanted &= np.isin(np.arange(len(store)), objects)
+        wanted = store.done & (True if objects is None else np.isin(np.arange(len(store)), objects))
         for name in names:
             if overwrite:
                 store.remove(name)
             store.add(name)
         held = np.all([store.held(name) for name in names], axis=0)
         items, total = np.flatnonzero(wanted & ~held).tolist(), int(wanted.sum())
-        finished = total - len(items)
-        yield finished, total
+        work = partial(_keep_object, store.path, function)
         try:
-            for i, died in each(partial(_keep_object, store.path, function), items, workers, scheduler):
-                if isinstance(died, WorkerDied):
-                    raise DatasetError(f"{path}: object {store.names[i]} cannot be computed ({died})")
-                finished += 1
-                yield finished, total
+            yield from counted(work, items, total, lambda i: f"{path}: {store.names[i]}", workers, scheduler)
         finally:  # nothing is left of what failed at once
             for name in names:
                 if not store.held(name).any():
@@ -145,5 +120,5 @@ def keep(
 
 
 def _keep_object(path: Path, function: Callable[[ViewStore, int], Made], i: int) -> None:
-    store = ViewStore.open(path)
+    store = opened(path)
     store.write(i, function(store, i))

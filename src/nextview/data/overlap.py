@@ -8,12 +8,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.data.measures import normalise_per_object
 from nextview.data.measuring import keep
 from nextview.data.store import OVERLAP, ViewStore
 
 TOLERANCE = 0.003
 """How far behind the visible surface a point may lie and still count as seen, object radii. Against rays cast from the
 camera to each point, this one and a pixel's four neighbours differ least; much more sees through table tops."""
+
+overlap_maps = normalise_per_object
+"""The thesis's maps: each view's row of (..., V, V) scaled so that the least is 0 and the most, itself, is 1."""
 
 
 def overlap(
@@ -34,10 +38,7 @@ def _overlap(store: ViewStore, i: int) -> dict[str, NDArray[np.float32]]:
 
 
 def shared_points(
-    points: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    poses: NDArray[np.float64],
-    intrinsics: NDArray[np.float64],
+    points: NDArray[np.float32], depth: NDArray[np.float32], poses: NDArray[np.float64], intrinsics: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """Share of the points visible from each view that each view sees.
 
@@ -54,22 +55,10 @@ def shared_points(
     cloud = points.reshape(-1, 3)
     share = np.zeros((v, v), np.float32)
     for other in range(v):
-        reach = _deepest_neighbour(depth[other])
+        p = np.pad(depth[other], 1)  # the largest depth of each pixel and the four beside it
+        reach = np.maximum.reduce([depth[other], p[:-2, 1:-1], p[2:, 1:-1], p[1:-1, :-2], p[1:-1, 2:]])
         x, y, z = ((cloud - poses[other, :3, 3]) @ poses[other, :3, :3]).T
         column = np.floor(x / z * intrinsics[0, 0] + intrinsics[0, 2]).astype(np.int64).clip(0, width - 1)
         row = np.floor(y / z * intrinsics[1, 1] + intrinsics[1, 2]).astype(np.int64).clip(0, height - 1)
         share[:, other] = (z < reach[row, column] + TOLERANCE).reshape(v, count).mean(1)
     return share * np.any(depth, axis=(1, 2))[:, None]
-
-
-def _deepest_neighbour(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Largest depth of each pixel and the four beside it."""
-    padded = np.pad(depth, 1)
-    beside = (padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:])
-    return np.maximum.reduce([depth, *beside])
-
-
-def overlap_maps(share: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The thesis's maps: each view's row of (..., V, V) scaled so that the least is 0 and the most, itself, is 1."""
-    low, high = share.min(-1, keepdims=True), share.max(-1, keepdims=True)
-    return np.where(high > low, (share - low) / np.where(high > low, high - low, 1), 0).astype(np.float32)

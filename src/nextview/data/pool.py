@@ -35,10 +35,7 @@ def count(workers: int | None) -> int:
 
 
 def each(
-    function: Callable[[Item], Result],
-    items: Sequence[Item],
-    workers: int | None = None,
-    scheduler: str | None = None,
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int | None = None, scheduler: str | None = None
 ) -> Iterator[tuple[Item, Result | WorkerDied]]:
     """Call ``function(item)`` for every item, side by side; yields (item, result) as they come, in any order.
 
@@ -73,24 +70,40 @@ def each(
                     yield item, WorkerDied("the process that worked on it died, twice")
 
 
+def counted(
+    function: Callable[[Item], None],
+    items: Sequence[Item],
+    total: int,
+    name: Callable[[Item], str],
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Iterator[tuple[int, int]]:
+    """Call a function for the items that are left of ``total``, see ``each``; yields how many are done, and the total.
+
+    Raises:
+        DatasetError: the process of an item died; it begins with the item's ``name``.
+    """
+    before = total - len(items)
+    yield before, total
+    for finished, (item, result) in enumerate(each(function, items, workers, scheduler), before + 1):
+        if isinstance(result, WorkerDied):
+            raise DatasetError(f"{name(item)} cannot be computed: {result}")
+        yield finished, total
+
+
 def _in_pool(function: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[tuple[Item, Result]]:
-    others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(min(workers, len(items)), multiprocessing.get_context("spawn"), _begin_worker)
     try:
         jobs = {pool.submit(function, item): item for item in items}
         for job in as_completed(jobs):
             yield jobs[job], job.result()
-    except KeyboardInterrupt:  # what is being worked on counts as not done: wait for none of it
-        for worker in set(multiprocessing.active_children()) - others:
-            worker.terminate()
-        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
 
 def _begin_worker() -> None:
-    """Use one core, leave Ctrl-C to the parent, and end with it: without it a worker would wait for ever."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Use one core, end at once and silently with Ctrl-C, and end with the parent: a worker would wait for ever."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     threadpool_limits(1, "blas")
     parent = multiprocessing.parent_process()
     assert parent is not None

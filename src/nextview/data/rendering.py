@@ -6,27 +6,25 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
-from uuid import uuid4
+from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 from nextview.checks import number, whole
-from nextview.data.folders import Entry, Listing, scan_dataset
+from nextview.data.folders import Entry, Listing, scan_dataset, select
 from nextview.data.measures import depth_entropy
 from nextview.data.pool import count, each
 from nextview.data.scene_views import SIDE, render_scene
-from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, Attributes, ViewStore, describe, writing
+from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, Attributes, ViewStore, describe, opened, writing
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.files import command, sha256_of
 from nextview.geometry.depth import POINTS
-from nextview.geometry.mesh import FORMATS, MAX_FACES, Mesh, load_mesh, make_mesh
+from nextview.geometry.mesh import FORMATS, MAX_FACES, UNITS, Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Camera
 from nextview.geometry.viewsphere import DISTANCE, ViewSphere
-from nextview.recognition.model_card import read_card
 from nextview.sensing.observed_object import SIZE
 from nextview.simulation.robot_camera import sensed_camera
 from nextview.simulation.scene import build_scene
@@ -127,13 +125,11 @@ def render(
     The run may end at any moment, even by a kill or a full disk; the next one goes on with what is missing.
 
     Args:
-        dataset: folder of meshes, or of scenes.
-        path: the store.
+        dataset, path: folder of meshes, or of scenes, and the store.
         sphere: the viewpoints.
         size: side of the images, pixels.
         options: see there.
-        workers: processes; one for each core by default; 0 to work in this one.
-        scheduler: address of a dask.distributed scheduler whose workers see the same files, to use instead.
+        workers, scheduler: see ``pool.each``; a scheduler's workers see the same files.
         overwrite: replace a store of other objects or settings.
 
     Yields:
@@ -148,50 +144,38 @@ def render(
     count(workers)
     entries = listing(dataset, options).entries
     with writing(path):
-        with ThreadPoolExecutor() as pool:
-            hashes = list(pool.map(_hash, [e.path for e in entries]))
-        recipe = {
-            "seed": options.seed,
-            "stretch": options.deform.stretch,
-            "rotated": options.deform.rotated,
-            "sha256": hashes,
-            "sensor": None if sensor is None else sensor.to_dict(),
-            "scene": None if options.meshes is None else SIDE,
-            "unit": options.unit,
-            "dataset": dataset.name,
-        }
-        store = _begin(path, describe(entries, sphere, size, recipe), overwrite)
+        wanted = describe(entries, sphere, size, _recipe(dataset, entries, options, sensor))
+        store = _begin(path, wanted, overwrite)
         if (made_by := command()) not in store.commands:
             store.note(commands=[*store.commands, made_by])
-        todo = [int(i) for i in np.flatnonzero(~store.done)]
         # Largest files first, so that no worker is left with a long one at the end.
+        todo = np.flatnonzero(~store.done).tolist()
         todo.sort(key=lambda i: -entries[i].path.stat().st_size)
-        job = _Job(path, uuid4().hex, sphere, size, options, sensor)
-        for (i, entry), reason in each(
-            partial(_render_entry, job), [(i, entries[i]) for i in todo], workers, scheduler
-        ):
+        items = [(i, entries[i]) for i in todo]
+        for (i, entry), problem in each(partial(_render_entry, path, options, sensor), items, workers, scheduler):
+            reason = None if problem is None else f"{problem}"
+            others = {name: said for name, said in store.failures.items() if name != entry.name}
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is done.
-                store.note(failures=store.failures | {entry.name: f"{reason}"})
+                store.note(failures=others | {entry.name: reason})
                 store.write(i, {"status": np.array(FAILED, np.uint8)})
-            elif entry.name in store.failures:
-                store.note(failures={n: r for n, r in store.failures.items() if n != entry.name})
-            yield entry.name, None if reason is None else f"{reason}"
+            elif len(others) < len(store.failures):
+                store.note(failures=others)
+            yield entry.name, reason
 
 
 def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) -> Sensor | SensorMix | None:
     """Refuse settings that make no views; the sensor, if there is one."""
-    most = int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere)))
-    whole(size, f"the size of {len(sphere)} views in pixels", 1, most)
+    whole(size, f"the size of {len(sphere)} views in pixels", 1, int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere))))
     whole(options.seed, "the seed", 0, 2**63 - 1)
     number(options.deform.stretch, "a stretch", 0)
+    if options.unit not in (None, *UNITS):
+        raise UsageError(f"the unit is one of {', '.join(UNITS)}, not {options.unit}")
     if options.meshes is not None and options.deform != Deform():
         raise UsageError("scenes are rendered as they are: objects in them are neither stretched nor rotated")
     if sphere.distance + 1 > FARTHEST:
-        raise DatasetError(
-            f"{path}: depth is stored up to {FARTHEST:.2f} object radii, so the distance can be "
-            f"{FARTHEST - 1:.2f} at most, not {sphere.distance:g}"
-        )
+        most = f"{FARTHEST:.2f} object radii, so the distance can be {FARTHEST - 1:.2f} at most"
+        raise DatasetError(f"{path}: depth is stored up to {most}, not {sphere.distance:g}")
     if options.sensor is None:
         return None
     if (size, sphere.distance) != (SIZE, DISTANCE):
@@ -207,27 +191,45 @@ def listing(dataset: Path, options: RenderOptions) -> Listing:
         if options.meshes is None and any(dataset.glob(f"*/**/*@*{SUFFIX}")):
             raise DatasetError(f"{dataset}: holds scenes; say with --meshes where the meshes are in them") from None
         raise
-    entries = [e for e in found.entries if options.split in (None, e.split)]
-    if not entries:
-        raise DatasetError(f"{dataset}: nothing in CLASS/{options.split}/NAME below it")
-    if options.held_out is not None:
-        kept = set(read_card(Path(options.held_out)).held_out)
-        entries = [e for e in entries if e.name.partition("@")[0] in kept]
-        if not entries:
-            raise DatasetError(f"{dataset}: holds no object that {options.held_out} calls held out")
-    return replace(found, entries=entries)
+    return replace(found, entries=select(found.entries, dataset, options.split, options.held_out))
+
+
+def _deform(store: ViewStore) -> Deform:
+    return Deform(store.attributes.stretch, store.attributes.rotated)
 
 
 def rotations(store: ViewStore) -> NDArray[np.float64]:
     """By how much each object of a store was rotated about z when it was rendered, radians, (N,)."""
-    deform = Deform(store.attributes.stretch, store.attributes.rotated)
-    return np.array([deform.draw(store.attributes.seed, name)[1] for name in store.names])
+    return np.array([_deform(store).draw(store.attributes.seed, name)[1] for name in store.names])
 
 
 def deformed(store: ViewStore, mesh: Mesh, name: str) -> Mesh:
-    """A mesh as it was deformed when a store's object of that name was rendered."""
-    deform = Deform(store.attributes.stretch, store.attributes.rotated)
-    return mesh if deform == Deform() else deform(mesh, store.attributes.seed, name)
+    """A mesh as it is deformed when a store's object of that name is rendered."""
+    return mesh if _deform(store) == Deform() else _deform(store)(mesh, store.attributes.seed, name)
+
+
+def _recipe(
+    dataset: Path, entries: list[Entry], options: RenderOptions, sensor: Sensor | SensorMix | None
+) -> dict[str, Any]:
+    """What the attributes of the store say of its making."""
+    with ThreadPoolExecutor() as pool:
+        hashes = list(pool.map(_hash, [e.path for e in entries]))
+    return {
+        "seed": options.seed,
+        "stretch": options.deform.stretch,
+        "rotated": options.deform.rotated,
+        "sha256": hashes,
+        "sensor": None if sensor is None else sensor.to_dict(),
+        "scene": None if options.meshes is None else SIDE,
+        "unit": options.unit,
+        "dataset": dataset.name,
+    }
+
+
+def _hash(path: Path) -> str:
+    with suppress(OSError):
+        return sha256_of(path)
+    return f"unreadable {path.name}"  # its rendering will say why
 
 
 def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
@@ -237,17 +239,18 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
     if not (path / "zarr.json").exists():
         raise DatasetError(f"{path}: is there, and is no view store; give another name")
     store = ViewStore.open(path)
+    there = store.attributes
     for key in wanted.__struct_fields__:
-        if key in ("unit", "dataset", "failures", "commands") or (key == "sha256" and store.attributes.sha256 is None):
+        if key in ("unit", "dataset", "failures", "commands") or (key == "sha256" and there.sha256 is None):
             continue
-        if getattr(store.attributes, key) != getattr(wanted, key):
+        if getattr(there, key) != getattr(wanted, key):
             if overwrite:
                 return ViewStore.create(path, wanted, overwrite)
             raise DatasetError(f"{path}: was begun with other {key}; give another store, or --overwrite to replace it")
-    if wanted.unit not in (None, store.attributes.unit):
-        if store.attributes.unit is not None:
-            raise DatasetError(f"{path}: its meshes are measured in {store.attributes.unit}, not {wanted.unit}")
+    if wanted.unit is not None and there.unit is None:
         store.note(unit=wanted.unit)
+    if wanted.unit not in (None, there.unit):
+        raise DatasetError(f"{path}: its meshes are measured in {there.unit}, not {wanted.unit}")
     for name in store.rendered:
         store.array(name)  # says what is missing
     for leftover in path.rglob("*.partial"):  # what was being written when a run was killed
@@ -255,66 +258,32 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
     return store
 
 
-def _hash(path: Path) -> str:
-    with suppress(OSError):
-        return sha256_of(path)
-    return f"unreadable {path.name}"  # its rendering will say why
-
-
-@dataclass(frozen=True)
-class _Job:
-    """What is the same for all objects of a run."""
-
-    path: Path
-    run: str
-    sphere: ViewSphere
-    size: int
-    options: RenderOptions
-    sensor: Sensor | SensorMix | None
-
-
-@lru_cache(maxsize=1)
-def _arrays(path: Path, run: str) -> dict[str, zarr.Array]:
-    """The store's arrays, opened once for each process and run."""
-    # Finding out whether a chunk is worth writing costs more than writing it.
-    with zarr.config.set({"array.write_empty_chunks": True}):
-        store = ViewStore.open(path)
-        return {name: store.array(name) for name in store.rendered}
-
-
-def _render_entry(job: _Job, item: tuple[int, Entry]) -> str | None:
+def _render_entry(
+    path: Path, options: RenderOptions, sensor: Sensor | SensorMix | None, item: tuple[int, Entry]
+) -> str | None:
     """Render one object, or the target of one scene, into the store; the reason if its mesh cannot be used."""
-    i, entry = item
-    arrays = _arrays(job.path, job.run)
+    (i, entry), store = item, opened(path)
     try:
-        rendered = _rendered(job, entry)
+        rendered = _rendered(store, options, sensor, entry)
     except (MeshError, DatasetError) as error:
         return str(error)
     except MemoryError:
         return f"{entry.path}: too large for this machine's memory"
-    for name, values in rendered.items():
-        arrays[name][i] = values
-    arrays["status"][i] = DONE  # last, so that an object counts only when it is whole
+    store.write(i, rendered | {"status": np.array(DONE, np.uint8)})  # last: an object counts only when it is whole
     return None
 
 
-def _rendered(job: _Job, entry: Entry) -> dict[str, NDArray]:
-    options, sphere = job.options, job.sphere
+def _rendered(
+    store: ViewStore, options: RenderOptions, sensor: Sensor | SensorMix | None, entry: Entry
+) -> dict[str, NDArray]:
+    sphere, size = store.sphere, store.attributes.size
     rng = np.random.default_rng([options.seed, SENSING, *entry.name.encode()])
     camera: Camera
     if options.meshes is None:
-        mesh = load_mesh(entry.path, max_faces=options.max_faces)
-        if options.deform != Deform():
-            mesh = options.deform(mesh, options.seed, entry.name)
-        if job.sensor is None:
-            camera = SimulatedCamera(mesh, job.size, sphere.distance)
-        else:
-            camera = SensedCamera(mesh, job.sensor, rng)
-        return render_object(camera, sphere, job.size) | {"radius": np.array(mesh.radius)}
+        mesh = deformed(store, load_mesh(entry.path, max_faces=options.max_faces), entry.name)
+        camera = SimulatedCamera(mesh, size, sphere.distance) if sensor is None else SensedCamera(mesh, sensor, rng)
+        return render_object(camera, sphere, size) | {"radius": np.array(mesh.radius)}
     scene = build_scene(SceneLayout.load(entry.path), Path(options.meshes).absolute(), options.max_faces)
-    if job.sensor is None:
-        camera = OccludedCamera(scene, job.size, sphere.distance)
-    else:
-        camera = sensed_camera(scene, job.sensor, rng)
-    shown = render_object(camera, sphere, job.size) | render_scene(scene, sphere)
+    camera = OccludedCamera(scene, size, sphere.distance) if sensor is None else sensed_camera(scene, sensor, rng)
+    shown = render_object(camera, sphere, size) | render_scene(scene, sphere)
     return shown | {"radius": np.array(scene.target.radius)}

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from nextview.checks import whole
-from nextview.data.folders import Entry, list_dataset
+from nextview.data.folders import Entry, list_dataset, select
 from nextview.data.pool import each
 from nextview.data.store import writing
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.files import check_new
-from nextview.recognition.model_card import read_card
 from nextview.simulation.scene_drawing import Meshes, draw_scene
 from nextview.simulation.scene_layout import LEVELS, SUFFIX, SceneLayout
 
@@ -52,14 +51,12 @@ def draw_scenes(
     CLASS/NAME@LEVEL-NUMBER.json where the dataset has no splits.
 
     Args:
-        dataset: folder of meshes.
-        out: folder of scenes.
+        dataset, out: folder of meshes, and of scenes.
         levels: of LEVELS.
         scenes: how many at each level, of each split; each object once by default.
         seed: decides everything.
         split: only this one.
-        workers: processes; one for each core by default; 0 to work in this one.
-        scheduler: address of a dask.distributed scheduler whose workers see the same files, to use instead.
+        workers, scheduler: see ``pool.each``; a scheduler's workers see the same files.
         held_out: draw scenes only around objects that the model of this card calls held out of its training.
 
     Yields:
@@ -101,14 +98,7 @@ def tasks(
         whole(scenes, "the number of scenes at each level", 1, MOST)
     whole(seed, "a seed", 0, 2**31 - 1)
     found: list[Task] = []
-    entries = [entry for entry in list_dataset(dataset) if split in (None, entry.split)]
-    if not entries:
-        raise DatasetError(f"{dataset}: no meshes in CLASS/{split}/MESH below it")
-    if held_out is not None:
-        kept = set(read_card(held_out).held_out)
-        entries = [entry for entry in entries if entry.name in kept]
-        if not entries:
-            raise DatasetError(f"{dataset}: holds no object that {held_out} calls held out")
+    entries = select(list_dataset(dataset), dataset, split, held_out)
     for one in dict.fromkeys(entry.split for entry in entries):
         mine = [entry for entry in entries if entry.split == one]
         order = np.random.default_rng([seed, *one.encode()]).permutation(len(mine))

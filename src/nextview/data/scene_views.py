@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,20 +55,19 @@ def render_scene(scene: Scene, sphere: ViewSphere) -> dict[str, NDArray]:
 
 @dataclass(frozen=True)
 class SceneViews:
-    """One scene of a store, as it is from all V views.
-
-    ``depth`` (V, S, S) float32, object radii, 0 = nothing, with ``intrinsics``; ``owner`` of each pixel: NOTHING,
-    TARGET, OTHER or TABLE_TOP; ``poses`` (V, 4, 4); ``reachable`` (V,); ``visible_share`` of the target (V,), the
-    truth; ``clearance`` (V,), object radii.
-    """
+    """One scene of a store, as it is from all V views."""
 
     depth: NDArray[np.float32]
+    """(V, S, S), object radii, 0 = nothing."""
     owner: NDArray[np.uint8]
+    """Of each pixel: NOTHING, TARGET, OTHER or TABLE_TOP, (V, S, S)."""
     intrinsics: NDArray[np.float64]
     poses: NDArray[np.float64]
     reachable: NDArray[np.bool_]
     visible_share: NDArray[np.float32]
+    """Of the target, the truth, (V,)."""
     clearance: NDArray[np.float32]
+    """(V,), object radii."""
 
     def scene_view(self, view: int) -> SceneView:
         """What a camera sees from there: things and table alike are no target."""
@@ -123,8 +123,8 @@ class SceneSight:
     store: ViewStore
     rows: NDArray[np.int64]
     reachable: NDArray[np.bool_]
-    _found: dict[tuple[int, bytes], NDArray[np.float32]] = field(default_factory=dict, repr=False, compare=False)
-    _frames: dict[tuple[int, int], tuple[bytes, float]] = field(default_factory=dict, repr=False, compare=False)
+    _found: dict[tuple[int, bytes], NDArray[np.float32]] = field(default_factory=dict, repr=False)
+    _frames: dict[tuple[int, int], tuple[bytes, float]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, store: ViewStore, names: Sequence[str]) -> SceneSight | None:
@@ -146,22 +146,18 @@ class SceneSight:
         """Share of the target that is expected to show from each view."""
         keys = [(int(self.rows[scene]), np.packbits(row).tobytes()) for scene, row in zip(scenes, visited, strict=True)]
         new = {key: row for key, row in zip(keys, visited, strict=True) if key not in self._found}
-        views: tuple[int, SceneViews] | None = None
+        read = lru_cache(maxsize=1)(partial(scene_views, self.store))
         for key in sorted(new):  # scene by scene, each read once
-            scene = SeenScene.unseen()
-            for view in np.flatnonzero(new[key]):
-                if (key[0], int(view)) not in self._frames and (views is None or views[0] != key[0]):
-                    views = key[0], scene_views(self.store, key[0])
-                scene = scene.and_also(self._frame(key[0], int(view), views))
+            frames = (self._frame(key[0], int(view), read) for view in np.flatnonzero(new[key]))
+            scene = reduce(SeenScene.and_also, frames, SeenScene.unseen())
             self._found[key] = expected_visibility(scene, self.store.sphere.poses[:, :3, 3]).expected.astype(np.float32)
         return np.stack([self._found[key] for key in keys]).astype(np.float64)
 
-    def _frame(self, row: int, view: int, views: tuple[int, SceneViews] | None) -> SeenScene:
+    def _frame(self, row: int, view: int, read: Callable[[int], SceneViews]) -> SeenScene:
         """What the frame from one view says alone of what lies on a line of sight; kept packed, a hundredth or so."""
         if (row, view) not in self._frames:
-            assert views is not None
             asked = sight_lines(GRID, self.store.sphere.poses[:, :3, 3].tobytes()).asked
-            seen = SeenScene(Occupancy.unseen(GRID, asked)).seen(views[1].scene_view(view))
+            seen = SeenScene(Occupancy.unseen(GRID, asked)).seen(read(row).scene_view(view))
             self._frames[row, view] = zlib.compress(seen.occupancy.cells.tobytes(), 1), seen.floor
         packed, floor = self._frames[row, view]
         cells = np.frombuffer(zlib.decompress(packed), np.uint8).reshape((GRID.n,) * 3)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -35,21 +36,15 @@ PLANNED = 5
 OVERLAP = "overlap"
 """The array of ``data.overlap``."""
 RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
-"""The arrays that rendering makes; others are added later."""
-SCENE = (
-    "scene/depth", "scene/owner", "scene/reachable", "measures/visible_share", "measures/clearance",
-)  # fmt: skip
-"""The arrays that rendering makes of cluttered scenes beside these, see ``data.scene_views``."""
+"""The arrays that rendering makes; others are added later. Those of cluttered scenes, see ``data.scene_views``:"""
+SCENE = ("scene/depth", "scene/owner", "scene/reachable", "measures/visible_share", "measures/clearance")
 Name = Annotated[str, Meta(min_length=1)]
 Split = Literal["train", "test", "val", ""]
 Pixels = Annotated[int, Meta(ge=1, le=100_000)]
 
 
 class Attributes(msgspec.Struct, omit_defaults=True):
-    """What a store says of itself: its objects, its views, and how it was rendered.
-
-    ``sensor`` and ``scene`` (pixels) are there if it was rendered through a sensor, or of scenes; ``commands`` made it.
-    """
+    """The objects of a store, its views, and how it was rendered: through a ``sensor``, of a ``scene`` (pixels)."""
 
     format: Literal[2]
     names: Annotated[list[Name], Meta(min_length=1)]
@@ -65,19 +60,10 @@ class Attributes(msgspec.Struct, omit_defaults=True):
     sensor: dict[str, Any] | None = None
     scene: Pixels | None = None
     sha256: list[str] | None = None
-    unit: str | None = None
+    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None
     dataset: str = ""
     failures: dict[str, str] = {}
     commands: list[str] = []
-
-    def __post_init__(self) -> None:
-        n = len(self.names)
-        if len(set(self.names)) < n:
-            raise ValueError("two objects have the same name")
-        if not n == len(self.labels) == len(self.splits) == len(self.names if self.sha256 is None else self.sha256):
-            raise ValueError(f"names, labels, splits and sha256 are not of {n} objects each")
-        if self.unit is not None and self.unit not in UNITS:
-            raise ValueError(f"the unit is one of {', '.join(UNITS)}")
 
 
 def describe(entries: Sequence[Entry], sphere: ViewSphere, size: int, recipe: Mapping[str, Any]) -> Attributes:
@@ -99,11 +85,11 @@ def describe(entries: Sequence[Entry], sphere: ViewSphere, size: int, recipe: Ma
 class ViewStore:
     """Views of N objects from the V views of a sphere.
 
-    Arrays of the group, sharded by object (axis 0): ``image`` (N, V, S, S) uint8; ``depth`` (N, V, S, S) uint16 in
-    DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object frame; ``measures/NAME`` (N, V)
-    float32; ``plans/NAME`` (N, V, PLANNED) float32, the views that a policy takes from each first view; ``radius`` (N,)
-    float64, of the object in the unit of its mesh file; ``status`` (N,) uint8. All else are attributes. Every chunk has
-    a checksum. A chunk that is gone is noticed too: zarr would read its fill value, so every read looks for its file.
+    Arrays of the group, one chunk an object: ``image`` (N, V, S, S) uint8; ``depth`` (N, V, S, S) uint16 in DEPTH_UNIT,
+    0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object frame; ``measures/NAME`` (N, V) float32;
+    ``plans/NAME`` (N, V, PLANNED) float32, the views that a policy takes from each first view; ``radius`` (N,) float64,
+    in the unit of its mesh file; ``status`` (N,) uint8. Every chunk has a checksum. Of a chunk that is gone zarr would
+    read the fill value, so every read looks for its file.
     """
 
     path: Path
@@ -134,9 +120,9 @@ class ViewStore:
             group = zarr.open_group(path, mode="r+")
         except Exception as error:  # zarr and JSON raise whatever a damaged file makes them raise
             raise DatasetError(f"{path}: zarr.json is damaged ({error}); copy it back or render again") from None
-        if group.attrs.get("format") != FORMAT:
-            raise DatasetError(f"{path}: not a view store of format {FORMAT}; render it again")
         content = group.attrs.asdict()
+        if content.get("format") != FORMAT:
+            raise DatasetError(f"{path}: not a view store of format {FORMAT}; render it again")
         content.setdefault("rotated", content.get("turn", False))  # its name before
         attributes = decode_record(content, Attributes, f"{path}: zarr.json is damaged", DatasetError)
         return cls(path, group, attributes)
@@ -149,8 +135,8 @@ class ViewStore:
     @property
     def added(self) -> list[str]:
         """Names of the arrays that were added later."""
-        names = [file.parent.relative_to(self.path).as_posix() for file in self.path.glob("[!.]*/*/zarr.json")]
-        return sorted({*names, *([OVERLAP] if self.holds(OVERLAP) else [])} - {*self.rendered})
+        files = [*self.path.glob("[!.]*/*/zarr.json"), *self.path.glob(f"{OVERLAP}/zarr.json")]
+        return sorted({file.parent.relative_to(self.path).as_posix() for file in files} - {*self.rendered})
 
     def note(self, **changes: Any) -> None:
         """Change attributes, and write them."""
@@ -163,17 +149,12 @@ class ViewStore:
         if self.holds(name):
             return
         shape, dtype, fill = self._layout(name)
-        self.group.create_array(
-            name,
-            shape=(len(self), *shape),
-            chunks=(1, *shape),
-            dtype=dtype,
-            fill_value=fill,
-            compressors=(BloscCodec(cname="zstd", clevel=2, shuffle="shuffle"), Crc32cCodec()),
-        )
+        packed = BloscCodec(cname="zstd", clevel=2, shuffle="shuffle"), Crc32cCodec()
+        layout = {"shape": (len(self), *shape), "chunks": (1, *shape), "dtype": dtype, "fill_value": fill}
+        self.group.create_array(name, **layout, compressors=packed)
 
     def remove(self, name: str) -> None:
-        """Remove an array."""
+        """Remove an array, if there is one of that name."""
         if self.holds(name):
             del self.group[name]
 
@@ -192,9 +173,8 @@ class ViewStore:
             "scene/owner": ((v, scene, scene), "uint8", 0),
             "scene/reachable": ((v,), "bool", False),
         }
-        if name.startswith("plans/"):
-            return (v, min(PLANNED, v)), "float32", np.nan
-        return layouts.get(name, ((v,), "float32", np.nan))  # another measure
+        added = ((v, min(PLANNED, v)) if name.startswith("plans/") else (v,), "float32", np.nan)  # a plan or measure
+        return layouts.get(name, added)
 
     def array(self, name: str) -> zarr.Array:
         """One of the store's arrays."""
@@ -211,9 +191,10 @@ class ViewStore:
         return array
 
     def _remedy(self, name: str) -> str:
-        kind, _, rest = name.partition("/")
+        """What makes an array that is missing or damaged."""
         if name in self.rendered:
             return f"nextview check {self.path} --repair, and nextview render makes it anew"
+        kind, _, rest = name.partition("/")
         makers = {"measures": f"nextview measure {self.path} --measures {rest}", OVERLAP: "nextview overlap"}
         return f"{makers.get(kind, 'the command that made it')} makes it"
 
@@ -247,16 +228,14 @@ class ViewStore:
 
     def rows(self, name: str) -> NDArray:
         """One of the arrays, as it is stored, (N, ...). Rows of objects that are not rendered may hold anything."""
-        done, array = np.flatnonzero(self.done), self.array(name)
-        try:
+        done, array = self.done, self.array(name)
+        with suppress(Exception):  # a damaged chunk, of which it matters whose it is
             values = array[:]
-        except Exception:  # find out which chunk is damaged
-            values = np.full(array.shape, array.fill_value, array.dtype)
-            for i in done:
-                values[i] = self.read(name, int(i))
-        for i in done:
-            if not self._chunk(array, int(i)).exists():
-                self.read(name, int(i))  # says so
+            if self.held(name)[done].all():
+                return values
+        values = np.full(array.shape, array.fill_value, array.dtype)
+        for i in np.flatnonzero(done):
+            values[i] = self.read(name, int(i))
         return values
 
     def write(self, i: int, arrays: Mapping[str, NDArray]) -> None:
@@ -320,15 +299,13 @@ class ViewStore:
     @property
     def done(self) -> NDArray[np.bool_]:
         """Objects that are rendered, (N,). One whose status cannot be read counts as not rendered."""
-        array = self.array("status")
-        try:
+        array, done = self.array("status"), np.zeros(len(self), bool)
+        with suppress(Exception):  # a damaged chunk raises whatever its codec makes of it
             return array[:] == DONE
-        except Exception:  # find out which chunk is damaged: it raises whatever its codec makes of it
-            done = np.zeros(len(self), bool)
-            for i in range(len(self)):
-                with suppress(Exception):
-                    done[i] = array[i] == DONE
-            return done
+        for i in range(len(self)):
+            with suppress(Exception):
+                done[i] = array[i] == DONE
+        return done
 
     @property
     def failures(self) -> dict[str, str]:
@@ -361,10 +338,6 @@ class ViewStore:
         """Clouds of all views of object i, (V, 1024, 3) float32, object frame."""
         return self.read("points", i).astype(np.float32) * np.float32(POINT_UNIT)
 
-    def all_points(self) -> NDArray[np.int16]:
-        """Clouds of all views of all objects as stored, (N, V, 1024, 3) int16: 240 kB an object."""
-        return self.rows("points")
-
     @property
     def measures(self) -> list[str]:
         """Names of the view measures it holds, sorted."""
@@ -375,6 +348,17 @@ class ViewStore:
         return self.rows(f"measures/{name}")
 
 
+def opened(path: Path) -> ViewStore:
+    """A store to work on object by object: opened once for each process, and anew when its attributes change."""
+    about = (path / "zarr.json").stat()
+    return _opened(path, about.st_ino, about.st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _opened(path: Path, *_: int) -> ViewStore:
+    return ViewStore.open(path)
+
+
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """One writer at a time; what the disk refuses becomes a sentence."""
@@ -382,7 +366,5 @@ def writing(path: Path) -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            reason = f"{error.strerror or error}"
-            raise DatasetError(
-                f"{path}: cannot be written ({reason}); what is done is kept, run again to go on"
-            ) from None
+            reason = f"cannot be written ({error.strerror or error}); what is done is kept, run again to go on"
+            raise DatasetError(f"{path}: {reason}") from None
