@@ -21,7 +21,6 @@ from torch import nn
 
 from nextview.benchmark.published import published_recognisers, read_rows
 from nextview.cli.ending import orderly_end
-from nextview.cli.printing import trained
 from nextview.cli.progress import track as progress
 from nextview.data.progress import Track, silently
 from nextview.data.splits import test_objects
@@ -34,6 +33,7 @@ from nextview.learning.loop import is_first
 from nextview.learning.recipes import THESIS_RECOGNISER, Hardware, RecogniserRecipe
 from nextview.learning.recogniser_training import train_recogniser
 from nextview.session.style import ACCENT, BLUE, legend, new_figure, percent_axis, to_png
+from nextview.viewers.training_curves import draw_curves
 
 TABLE, FIGURE = "grid.csv", "grid.png"
 
@@ -230,7 +230,7 @@ def main(
         hardware: on what.
     """
     table = train_grid(store, out, recipe, depths=depths, batches=batches, hardware=hardware, track=progress)
-    trained(sorted(out.glob("resnet*-batch*")))
+    draw_curves(sorted(out.glob("resnet*-batch*")))
     if is_first():
         with new_file(out / FIGURE, True) as part:
             to_png(grid_figure(read_grid(table)), part)

@@ -1,10 +1,10 @@
-"""Call a function with the arguments of a command line: tyro reads its parameters and its docstring."""
+"""Call a function with the arguments of a command line: tyro reads its parameters, their comments and its docstring."""
 
 from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass
 from importlib import import_module
 from types import NoneType, UnionType
@@ -14,8 +14,14 @@ import tyro
 
 from nextview.cli.commands import Command
 
-CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff, tyro.conf.PositionalMetavarFromFieldName)
+CONFIG = (
+    tyro.conf.OmitArgPrefixes,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.PositionalMetavarFromFieldName,
+    tyro.conf.PositionalRequiredArgs,
+)
 PRESET = "which recipe the options of the recipe begin as"
+PARAMETER = re.compile(r" +(?:# (?P<above>.+)|(?P<name>\w+): .*?(?:  # (?P<beside>.+))?)")
 
 
 def find(path: str) -> Any:
@@ -24,31 +30,32 @@ def find(path: str) -> Any:
     return getattr(import_module(module), name)
 
 
-def call(name: str, command: Command, arguments: Sequence[str], given: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
-    """What the function of a command returns, and its arguments; ``given`` fills parameters that are no options.
+def call(name: str, command: Command, arguments: Sequence[str], track: Callable[..., None]) -> tuple[Any, dict]:
+    """What the function of a command returns, and its arguments. A parameter ``track`` is given, all others are asked.
 
     Parameters without a default, and those that are positional only, are arguments; all others are options.
     """
     function = find(command.function)
-    hints, parameters = get_type_hints(function, include_extras=True), []
-    for parameter in inspect.signature(function).parameters.values():
-        if parameter.name in given:
-            continue
+    signature, hints = inspect.signature(function), get_type_hints(function, include_extras=True)
+    parameters = []
+    for parameter in signature.parameters.values():
         kind = _none_first(hints[parameter.name])
-        if parameter.default is parameter.empty or parameter.kind is parameter.POSITIONAL_ONLY:
-            kind = tyro.conf.Positional[kind]  # type: ignore[misc, valid-type]
-        parameters.append(parameter.replace(annotation=kind, kind=parameter.KEYWORD_ONLY))
-    if command.presets:
-        parameters = _with_preset(parameters, command.presets, arguments)
+        if text := _comments(function).get(parameter.name):
+            kind = Annotated[kind, tyro.conf.arg(help=text)]
+        if parameter.name != "track":
+            parameters.append(parameter.replace(annotation=kind))
+    if command.thesis:
+        if re.search(r"(^| )--preset[ =]thesis( |$)", " ".join(arguments)):
+            parameters = [p.replace(default=find(command.thesis)) if p.name == "recipe" else p for p in parameters]
+        kind = Annotated[Literal["default", "thesis"], tyro.conf.arg(help=PRESET)]
+        parameters.append(
+            inspect.Parameter("preset", inspect.Parameter.KEYWORD_ONLY, default="default", annotation=kind)
+        )
     called: dict[str, Any] = {}
 
-    def run(**options: Any) -> Any:
-        called.update(options)
-        options.pop("preset", None)
-        options |= {key: value for key, value in given.items() if key in hints}
-        own = inspect.signature(function).parameters.values()
-        positional = [options.pop(p.name) for p in own if p.kind is p.POSITIONAL_ONLY]
-        return function(*positional, **options)
+    def run(*positional: Any, preset: str = "default", **options: Any) -> Any:
+        called.update(signature.bind_partial(*positional, **options).arguments)
+        return function(*positional, **options, **({"track": track} if "track" in hints else {}))
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -67,14 +74,13 @@ def _none_first(kind: Any) -> Any:
     return kind
 
 
-def _with_preset(
-    parameters: list[inspect.Parameter], presets: Mapping[str, str], arguments: Sequence[str]
-) -> list[inspect.Parameter]:
-    """Let --preset choose the defaults of the recipe, so that any option of it can still be changed."""
-    named = re.search(r"(?:^| )--preset[ =](\S+)", " ".join(arguments))
-    kind = Annotated[Literal[("default", *presets)], tyro.conf.arg(help=PRESET)]  # type: ignore[valid-type]
-    preset = inspect.Parameter("preset", inspect.Parameter.KEYWORD_ONLY, default="default", annotation=kind)
-    if named and named[1] in presets:
-        recipe = find(presets[named[1]])
-        parameters = [p.replace(default=recipe) if p.name == "recipe" else p for p in parameters]
-    return [*parameters, preset]
+def _comments(function: Callable[..., Any]) -> dict[str, str]:
+    """Help of parameters: the comment beside each, or the lines above it, as tyro reads it of the fields of a class."""
+    found, above = {}, []
+    for line in inspect.getsource(function).partition('"""')[0].splitlines()[1:]:
+        if match := PARAMETER.fullmatch(line):
+            if match["above"]:
+                above.append(match["above"])
+            else:
+                found[match["name"]], above = match["beside"] or " ".join(above), []
+    return found

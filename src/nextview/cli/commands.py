@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -13,38 +12,39 @@ class Command:
     function: str
     line: str  # in the list of all commands
     then: str = ""  # printed at the end; names in braces are arguments, ``found`` is what the function returns
-    show: str = ""  # function of printing.py that shows what the function returns
-    presets: Mapping[str, str] = field(default_factory=dict)  # what --preset may name, for a function with a recipe
+    show: str = ""  # the function that shows what it returns
+    thesis: str = ""  # the recipe that --preset thesis names
 
 
-CLI, LEARNING, THESIS = "nextview.cli", "nextview.learning", "nextview.learning.recipes:THESIS"
+CLI, LEARNING = "nextview.cli", "nextview.learning"
+CURVES, THESIS = "nextview.viewers.training_curves:draw_curves", f"{LEARNING}.recipes:THESIS"
 EXPORTED = "{found.card}: largest difference between torch and ONNX on real views {found.difference:.2g}"
 COMMANDS = {
     "recognise": Command(f"{CLI}.recognise:recognise", "say what an object is: a mesh file, or captured views"),
     "demo": Command(f"{CLI}.recognise:demo", "recognise a sample object, and draw the episode"),
     "explore": Command(f"{CLI}.explore:explore", "choose views in the browser, and see what is believed"),
-    "capture": Command(f"{CLI}.capture:capture", "write depth images of a mesh, as a camera would take them"),
+    "capture": Command(f"{CLI}.recognise:capture", "write depth images of a mesh, as a camera would take them"),
     "list": Command(f"{CLI}.listing:show", "list the bundled models, or the view measures"),
-    "download": Command(f"{CLI}.download:download", "download ModelNet10 or ModelNet40"),
-    "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes, a target half hidden in each"),
+    "download": Command(f"{CLI}.listing:download", "download ModelNet10 or ModelNet40"),
+    "scenes": Command(f"{CLI}.stores:scenes", "draw cluttered scenes, a target half hidden in each"),
     "render": Command(f"{CLI}.stores:render", "render every view of a dataset into a view store"),
     "check": Command(f"{CLI}.stores:check", "check that a view store is sound"),
-    "measure": Command(f"{CLI}.scenes:measure", "compute view measures, into the store"),
+    "measure": Command(f"{CLI}.stores:measure", "compute view measures, into the store"),
     "overlap": Command(f"{CLI}.pictures:overlap", "compute which part of a view each other view shows"),
     "inspect": Command(f"{CLI}.pictures:inspect", "draw what a view store holds, or one object of it"),
     "train recogniser": Command(
         f"{LEARNING}.recogniser_training:train_recogniser",
         "train a recogniser",
         "next: nextview export recogniser {out} {store} MODELS",
-        "trained",
-        {"thesis": f"{THESIS}_RECOGNISER"},
+        CURVES,
+        f"{THESIS}_RECOGNISER",
     ),
     "train map": Command(
         f"{LEARNING}.map_training:train_map",
         "train a network that predicts a measure of views",
         "next: nextview export map {out} {store} MODELS",
-        "trained",
-        {"thesis": f"{THESIS}_MAP"},
+        CURVES,
+        f"{THESIS}_MAP",
     ),
     "train gain": Command(
         f"{LEARNING}.gain_training:train_gain",
@@ -92,10 +92,13 @@ COMMANDS = {
         "nextview.benchmark.evaluation_page:write_evaluation",
         "judge a recogniser and its maps on every view",
         "numbers, figures and evaluate.html are in {out}",
-        "print_evaluation",
+        f"{CLI}.leaderboard_table:print_evaluation",
     ),
     "benchmark": Command(
-        "nextview.benchmark.run:run_benchmark", "compare policies", "next: nextview report {out}", "print_results"
+        "nextview.benchmark.run:run_benchmark",
+        "compare policies",
+        "next: nextview report {out}",
+        f"{CLI}.leaderboard_table:print_results",
     ),
     "report": Command("nextview.benchmark.report:report", "write one HTML page of a benchmark's results", "{found}"),
 }

@@ -12,35 +12,25 @@ from nextview.cli.sources import Looking
 
 
 def explore(
+    # a mesh file; a folder of meshes, or of class folders of them; a view store. The sample objects if not given
     path: Path | None = None,
     /,
-    looking: Looking = Looking(),
-    compare: str | None = None,
+    looking: Looking = Looking(),  # who looks; exploring goes on where an episode would end
+    compare: str | None = None,  # another policy, to walk beside it
+    # look through a sensor with all its errors: kinect, stereo, setup, wrist or none, or NAME:STRENGTH
     sensor: str | None = None,
-    start: int | None = None,
-    up: Literal["y", "z"] | None = None,
-    seed: int = 0,
+    start: int | None = None,  # where policies look first; drawn by the seed if not given
+    up: Literal["y", "z"] | None = None,  # the up axis of mesh files; z if not given, but y for GLB
+    seed: int = 0,  # decides the first view, whatever a policy draws and the errors of a sensor
+    # address to serve the page at; 0.0.0.0 lets every machine that reaches this one see and drive the page
     host: str = "127.0.0.1",
-    port: int = 8080,
-    browser: bool = True,
+    port: int = 8080,  # of the page; the next free one if it is taken
+    browser: bool = True,  # open the page in this machine's browser, where it has a screen
 ) -> None:
     """Look at objects in the browser: click where to look from, or let a policy walk, and see what it believes.
 
     Candidate views are coloured by what the policy values them at. Images, local maps and belief follow at once. Two
     policies walk side by side, with clean renders or through a sensor with its errors.
-
-    Args:
-        path: a mesh file; a folder of meshes, or of class folders of them; a view store. The sample objects if not
-            given.
-        looking: who looks; exploring goes on where an episode would end.
-        compare: another policy, to walk beside it.
-        sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist or none, or NAME:STRENGTH.
-        start: where policies look first; drawn by the seed if not given.
-        up: the up axis of mesh files; z if not given, but y for GLB.
-        seed: decides the first view, whatever a policy draws and the errors of a sensor.
-        host: address to serve the page at; 0.0.0.0 lets every machine that reaches this one see and drive the page.
-        port: of the page; the next free one if it is taken.
-        browser: open the page in this machine's browser, where it has a screen.
     """
     import viser  # noqa: F401  # a missing extra is named before models are opened
 

@@ -1,13 +1,16 @@
-"""The results of a benchmark as a table in the terminal."""
+"""The results of a benchmark and of an evaluation as tables in the terminal."""
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Any
 
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
 from nextview.benchmark.entries import is_oracle
+from nextview.benchmark.evaluation import Evaluation
 from nextview.benchmark.leaderboard import (
     SIGNIFICANT,
     headline_threshold,
@@ -17,8 +20,17 @@ from nextview.benchmark.leaderboard import (
     promised_risks,
     too_few,
 )
+from nextview.benchmark.page import Number, numbers
 from nextview.benchmark.run import Results
 from nextview.cli.progress import Terminal
+from nextview.errors import EntryError
+
+
+def print_results(found: Results) -> None:
+    """Print the leaderboard; then what failed is an error."""
+    print_leaderboard(found)
+    if found.settings["failures"]:
+        raise EntryError("\n".join(found.settings["failures"].values()))
 
 
 def print_leaderboard(results: Results) -> None:
@@ -90,3 +102,61 @@ def _risks(risks: list[Any]) -> Table:
         early = f"{100 * r.confident:.1f} %" + (" broken" if r.broken else "")
         table.add_row(r.policy, f"{100 * r.risk:g} %", f"{r.threshold:.4g}", measured, early)
     return table
+
+
+def print_evaluation(found: Evaluation) -> None:
+    """Print the scores of the recogniser and of each map."""
+    console = Terminal()
+    console.print(_recogniser_table(found))
+    for name in found.maps["map"].unique():
+        console.print(_map_table(found, name))
+    for name, why in found.left_out.items():
+        console.print(f"{name}: {why}")
+
+
+def _recogniser_table(found: Evaluation) -> Table:
+    """Accuracy of each class and of all, from one view and from all views fused."""
+    views = int(found.accuracy["n_views"].max())
+    shown = Table("share of right answers", "objects", "one view", f"all {views} views")
+    right = numbers(found.accuracy, "n_views", "label", "measure")
+    objects = found.accuracy.groupby(["label", "measure"])["objects"].first()
+    labels = [label for label in found.accuracy["label"].unique() if label]
+    lines = [(label.replace("_", " "), label, "accuracy") for label in labels]
+    lines += [("mean of classes", "", "class_accuracy"), ("mean of objects", "", "accuracy")]
+    lines += [("  without duplicates", "", "clean_accuracy")]
+    if "shape_accuracy" in set(found.accuracy["measure"]):
+        lines += [("  size not known", "", "shape_accuracy")]
+    for heading, label, measure in lines:
+        cells = (_cell(right[n_views, label, measure], 3) for n_views in (1, views))
+        shown.add_row(heading, str(objects[label, measure]), *cells, end_section=label == labels[-1])
+    published = right[1, "", "accuracy"].published
+    if isfinite(published):
+        shown.add_row("  published", "", f"{published:.3f}")
+    return shown
+
+
+def _map_table(found: Evaluation, name: str) -> Table:
+    """Scores of a map over objects and classes, beside the published ones and the baselines."""
+    measures = {"mse": "MSE", "d0": "d = 0", "d_le_1": "d <= 1", "d_lt_2": "d < 2", "regret": "regret"}
+    scores = numbers(found.maps[(found.maps["map"] == name) & (found.maps["label"] == "")], "by", "measure")
+    baselines = [by for by in found.maps["by"].unique() if by != "network"]
+    printed = any(isfinite(score.published) for score in scores.values())
+    caption = "published: squared error over objects, peaks over classes (table 4)" if printed else None
+    shown = Table(name.upper(), "mean of objects", "of classes", "published", *baselines, caption=caption)
+    shown.columns[1].no_wrap = True
+    for measure, heading in measures.items():
+        digits = 4 if measure == "mse" else 3
+        over_objects, over_classes = scores["network", measure], scores["network", f"class_{measure}"]
+        published = over_objects.published if measure == "mse" else over_classes.published
+        rest = [over_classes.value, published, *(scores[by, measure].value for by in baselines)]
+        cells = (f"{value:.{digits}f}" if isfinite(value) else "-" for value in rest)
+        shown.add_row(heading, _cell(over_objects, digits), *cells)
+    return shown
+
+
+def _cell(number: Number, digits: int) -> Text:
+    """A number and its interval."""
+    if not isfinite(number.value):
+        return Text("-")
+    interval = f" {number.low:.{digits}f}-{number.high:.{digits}f}" if number.high > number.low else ""
+    return Text.assemble(f"{number.value:.{digits}f}", (interval, "dim"))

@@ -1,25 +1,28 @@
-"""``nextview list``: what ships with the package."""
+"""``nextview list`` and ``nextview download``: what ships with the package, and published datasets."""
 
 from __future__ import annotations
 
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Literal
 
 from rich.table import Table
 
-from nextview.cli.progress import Terminal
+from nextview.cli.progress import Terminal, console
 from nextview.files import sha256_of
 from nextview.recognition.model_card import bundled_cards, find_card
 
 
-def show(what: Literal["models", "measures"], name: str | None = None, /) -> None:
+def show(
+    what: Literal["models", "measures"],  # models or measures
+    name: str | None = None,  # of a model: print its whole card
+    /,
+) -> None:
     """List the bundled models, or the view measures: what makes a view good.
 
     A measure that needs the depth is computed from a view store alone. One that needs the mesh also takes the folder of
     meshes that the store was rendered from. MODULE:FUNCTION is a measure of your own (docs/add_a_measure.md).
-
-    Args:
-        what: models or measures.
-        name: of a model: print its whole card.
     """
     if what == "measures":
         from nextview.data.measures import all_measures
@@ -29,8 +32,7 @@ def show(what: Literal["models", "measures"], name: str | None = None, /) -> Non
             table.add_row(key, measure.needs, "high" if measure.good == "peak" else "low", measure.source)
         return Terminal().print(table)
     if name:
-        print(find_card(name).path.with_suffix(".json").read_text())
-        return None
+        return print(find_card(name).path.with_suffix(".json").read_text())
     table = Table("model", "kind", "MB", "scores on test", "file")
     table.columns[0].no_wrap = True
     for card in bundled_cards().values():
@@ -46,3 +48,23 @@ def show(what: Literal["models", "measures"], name: str | None = None, /) -> Non
 
 def _score(value: float | dict[str, float]) -> str:
     return f"{value['instance']}\n    class mean {value['class']}" if isinstance(value, dict) else f"{value}"
+
+
+def download(
+    dataset: Literal["modelnet10", "modelnet40"],  # which one
+    destination: Path,  # folder to put it into, as DESTINATION/ModelNet10
+    /,
+) -> None:
+    """Download ModelNet10 (473 MB) or ModelNet40 (2 GB), verify and unpack it."""
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+
+    from nextview.data.downloading import ARCHIVES
+    from nextview.data.downloading import download as fetch
+
+    archive = ARCHIVES[dataset]
+    columns = BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()
+    with Progress(TextColumn("{task.description}"), *columns, console=console) as progress:
+        move = partial(progress.update, progress.add_task(f"downloading {archive.folder}", total=None))
+        bar = SimpleNamespace(total=0, reset=partial(move, completed=0), close=lambda: None)  # as pooch wants it
+        bar.update = lambda advance: move(advance=advance, total=bar.total)
+        console.print(f"{fetch(archive, destination, bar=bar)}")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from collections.abc import Mapping
 from difflib import get_close_matches
+from itertools import takewhile
 
 from nextview import __version__
 from nextview.cli.commands import COMMANDS, RESUMES
@@ -27,46 +27,35 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _run(arguments: list[str]) -> None:
     if arguments == ["--version"]:
-        print(f"nextview {__version__}")
-        return
-    words = 0
-    while words < len(arguments) and not arguments[words].startswith("-") and words < 2:
-        words += 1
-    for count in range(words, 0, -1):
-        name = " ".join(arguments[:count])
-        if name in COMMANDS:
+        return print(f"nextview {__version__}")
+    words = list(takewhile(lambda word: not word.startswith("-"), arguments[:2]))
+    for count in range(len(words), 0, -1):
+        if (name := " ".join(words[:count])) in COMMANDS:
             return _call(name, arguments[count:])
-    group = arguments[0] if words else ""
+    group = words[0] if words else ""
     listed = {name: command.line for name, command in COMMANDS.items() if f"{name} ".startswith(f"{group} ".lstrip())}
-    if words == 2 or not listed:
-        name = " ".join(arguments[:words]) if listed else group
+    if len(words) == 2 or not listed:
+        name = " ".join(words) if listed else group
         near = get_close_matches(name, [*COMMANDS, *(name.split()[0] for name in COMMANDS)], 1, 0.6)
         hint = f"did you mean {near[0]!r}?" if near else "nextview --help lists all"
         raise UsageError(f"there is no command {name!r}; {hint}")
-    print_commands(group, listed)
+    usage = f"nextview {group} COMMAND".replace("  ", " ")
+    print(f"usage: {usage} [ARGUMENTS]\n\n{ABOUT}\n")
+    for name, line in listed.items():
+        print(f"  {name:18}  {line}")
+    print(f"\n{usage} --help explains one; nextview --version tells the version.")
 
 
 def _call(name: str, arguments: list[str]) -> None:
-    from nextview.cli.call import call
+    from nextview.cli.call import call, find
     from nextview.cli.progress import console, track
 
     command = COMMANDS[name]
-    result, given = call(name, command, arguments, {"track": track})
+    result, given = call(name, command, arguments, track)
     if command.show:
-        from nextview.cli import printing
-
-        getattr(printing, command.show)(result)
+        find(command.show)(result)
     if command.then:
         console.print(command.then.format(found=result, **given), soft_wrap=True)
-
-
-def print_commands(group: str, lines: Mapping[str, str]) -> None:
-    """Print the commands, or those of a group, one line each."""
-    usage = f"nextview {group} COMMAND" if group else "nextview COMMAND"
-    print(f"usage: {usage} [ARGUMENTS]\n\n{ABOUT}\n")
-    for name, line in lines.items():
-        print(f"  {name:18}  {line}")
-    print(f"\n{usage} --help explains one; nextview --version tells the version.")
 
 
 if __name__ == "__main__":

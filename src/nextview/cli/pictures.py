@@ -8,29 +8,26 @@ from pathlib import Path
 import numpy as np
 
 from nextview.cli.progress import console, follow
-from nextview.cli.sources import PICTURES
+from nextview.cli.sources import check_file
 from nextview.data.overlap import overlap as overlap_store
 from nextview.data.overlap import overlap_maps
 from nextview.data.store import OVERLAP, ViewStore
-from nextview.errors import DatasetError, UsageError
+from nextview.errors import DatasetError
 from nextview.files import check_new, new_file
 from nextview.viewers.store_figures import object_figure, overlap_figure, store_figure, summary
 
 
-def inspect(store: Path, out: Path | None = None, /, object: str | None = None, overwrite: bool = False) -> None:
-    """Draw what a view store holds: classes, counts, failures; or one object from all sides.
-
-    Args:
-        store: view store made by nextview render.
-        out: picture to make (PNG, PDF or SVG); STORE.png or OBJECT.png here if not given.
-        object: name of the object to draw instead of the whole store.
-        overwrite: replace the picture if it exists.
-    """
+def inspect(
+    store: Path,  # view store made by nextview render
+    out: Path | None = None,  # picture to make (PNG, PDF or SVG); STORE.png or OBJECT.png here if not given
+    /,
+    object: str | None = None,  # name of the object to draw instead of the whole store
+    overwrite: bool = False,  # replace the picture if it exists
+) -> None:
+    """Draw what a view store holds: classes, counts, failures; or one object from all sides."""
     views = ViewStore.open(store)
     out = out or Path(f"{object or store.resolve().stem}.png")
-    check_new(out, overwrite)
-    if out.suffix.lower() not in PICTURES:
-        raise UsageError(f"{out}: the name ends in {' or '.join(PICTURES)}")
+    check_file(out, overwrite)
     if object is not None:
         if object not in views.names:
             near = get_close_matches(object, views.names, 3, 0) or views.names[:3]
@@ -51,26 +48,18 @@ def inspect(store: Path, out: Path | None = None, /, object: str | None = None, 
 
 
 def overlap(
-    store: Path,
-    out: Path = Path("overlap"),
+    store: Path,  # view store made by nextview render
+    out: Path = Path("overlap"),  # name of the two files, without a suffix
     /,
-    label: str | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    overwrite: bool = False,
+    label: str | None = None,  # average over this class only
+    workers: int | None = None,  # processes; one for each core by default
+    scheduler: str | None = None,  # address of a dask.distributed scheduler to use instead
+    overwrite: bool = False,  # replace the two files if they exist
 ) -> None:
     """How much of what one view shows is seen from each other view, averaged over the objects. Resumes where it was.
 
     Every object's share (V, V) is kept in the store; OUT.npz gets the mean ``share`` and the mean ``maps``, each row of
     an object scaled to [0, 1] first, and OUT.png the picture.
-
-    Args:
-        store: view store made by nextview render.
-        out: name of the two files, without a suffix.
-        label: average over this class only.
-        workers: processes; one for each core by default.
-        scheduler: address of a dask.distributed scheduler to use instead.
-        overwrite: replace the two files if they exist.
     """
     views, arrays, picture = ViewStore.open(store), Path(f"{out}.npz"), Path(f"{out}.png")
     for path in (arrays, picture):

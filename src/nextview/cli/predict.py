@@ -15,34 +15,24 @@ from nextview.recognition.model_card import find_card, find_models
 
 
 def predict(
-    store: Path,
-    out: Path,
+    store: Path,  # view store made by nextview render
+    out: Path,  # predictions to make (.npz), from which nextview benchmark replays policies
     /,
-    split: Split | None = None,
-    models: str = "modelnet10",
-    recogniser: tuple[str, ...] = (),
+    split: Split | None = None,  # only this split
+    models: str = "modelnet10",  # bundled models by name, or a folder with models of your own
+    recogniser: tuple[str, ...] = (),  # instead, name of a bundled model or path of a card. Several with --held-out
+    # let each object be judged by a recogniser from whose training it was held out (nextview train recogniser --folds
+    # makes such), and leave out those that all were trained on
     held_out: bool = False,
+    # maps to predict with those models, or NAME=CARD for others; all that those models predict by default
     maps: tuple[str, ...] | None = None,
+    # recognise by shape alone. By default the size of the objects counts too, where the store knows it (nextview render
+    # --unit) and the card of the recogniser says what sizes mean (nextview fit size)
     by_shape: bool = False,
     workers: Workers = Workers(),
-    overwrite: bool = False,
+    overwrite: bool = False,  # replace predictions of other objects or models
 ) -> None:
-    """Run the recogniser and the map networks over every view of a store, once. Resumes where it was.
-
-    Args:
-        store: view store made by nextview render.
-        out: predictions to make (.npz), from which nextview benchmark replays policies.
-        split: only this split.
-        models: bundled models by name, or a folder with models of your own.
-        recogniser: instead, name of a bundled model or path of a card. Several with --held-out.
-        held_out: let each object be judged by a recogniser from whose training it was held out (nextview train
-            recogniser --folds makes such), and leave out those that all were trained on.
-        maps: maps to predict with those models, or NAME=CARD for others; all that those models predict by default.
-        by_shape: recognise by shape alone. By default the size of the objects counts too, where the store knows it
-            (nextview render --unit) and the card of the recogniser says what sizes mean (nextview fit size).
-        workers: who does the work.
-        overwrite: replace predictions of other objects or models.
-    """
+    """Run the recogniser and the map networks over every view of a store, once. Resumes where it was."""
     if len(recogniser) > 1 and not held_out:
         raise UsageError("several recognisers can only share the work with --held-out")
     if out.suffix != ".npz":
@@ -54,9 +44,8 @@ def predict(
             raise ModelError(f"no network of {models} predicts the map {name!r}; there are {', '.join(found.maps)}")
         cards[name] = find_card(card or found.maps[name])
     judges = [find_card(r) for r in recogniser or (found.recogniser,)]
-    shape = not by_shape
-    steps = predicting.predict(store, out, judges, cards, split, held_out, shape, **vars(workers), overwrite=overwrite)
-    follow(steps, f"predicting {store.name}")
+    what = judges, cards, split, held_out, not by_shape
+    follow(predicting.predict(store, out, *what, **vars(workers), overwrite=overwrite), f"predicting {store.name}")
     for line in summed_up(Predictions.load(out)):
         console.print(line)
     console.print(f"predictions in {out}; compare policies with: nextview benchmark {out} RESULTS", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""``nextview recognise`` and ``nextview demo``: look at one object until it is clear what it is."""
+"""``nextview recognise`` and ``demo``: look at one object until it is clear what it is; ``capture`` for the former."""
 
 from __future__ import annotations
 
@@ -7,87 +7,62 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from nextview.cli.episode_table import episode_as_json, print_episode
-from nextview.cli.progress import console
-from nextview.cli.sources import PICTURES, Looking, Source
+from nextview.cli.progress import console, track
+from nextview.cli.sources import Looking, Source, Unit, check_file
 from nextview.errors import ObservationError, UsageError
 from nextview.files import check_new, new_file
-from nextview.session.system import System, load
+from nextview.geometry.mesh import MAX_FACES, load_mesh
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.session.system import System, load, simulated
 
 
 @dataclass(frozen=True)
 class Output:
-    """What is made of it.
+    """What is made of it."""
 
-    Attributes:
-        figure: write a picture of the episode to this file (PNG, PDF or SVG).
-        record: write the episode to this file (.rrd), for the Rerun viewer.
-        json: print JSON instead of a table.
-        overwrite: replace these files if they exist.
-    """
-
-    figure: Path | None = None
-    record: Path | None = None
-    json: bool = False
-    overwrite: bool = False
-
-    def check(self) -> None:
-        """Refuse files that cannot be written, before any work."""
-        for file, kinds in ((self.figure, PICTURES), (self.record, (".rrd",))):
-            if file is not None:
-                check_new(file, self.overwrite)
-                if file.suffix.lower() not in kinds:
-                    raise UsageError(f"{file}: the name ends in {' or '.join(kinds)}")
+    figure: Path | None = None  # write a picture of the episode to this file (PNG, PDF or SVG)
+    record: Path | None = None  # write the episode to this file (.rrd), for the Rerun viewer
+    json: bool = False  # print JSON instead of a table
+    overwrite: bool = False  # replace these files if they exist
 
 
 def recognise(
-    path: Path,
+    path: Path,  # OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder of captured views
     /,
     source: Source = Source(),
     looking: Looking = Looking(),
     output: Output = Output(),
+    # first view; of the 40, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given
     start: int | None = None,
-    seed: int = 0,
+    seed: int = 0,  # decides the first view, whatever the policy draws and the errors of a sensor
 ) -> None:
     """Recognise an object by next best views, and show where it looked and why.
 
     The object is in a mesh file, or in a folder of captured depth images with poses in the layout of BOP, TUM RGB-D or
     7-Scenes. Of these the view nearest to the one asked for answers. The object is what the masks show; else what lies
     in the box; else the thing on the support plane that is nearest to the point, or the largest.
-
-    Args:
-        path: OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder of captured views.
-        source: what is looked at.
-        looking: who looks, and when it ends.
-        output: what is made of it.
-        start: first view; of the 40, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given.
-        seed: decides the first view, whatever the policy draws and the errors of a sensor.
     """
-    output.check()
+    check_file(output.figure, output.overwrite)
+    check_file(output.record, output.overwrite, (".rrd",))
     name = path.name if source.sensor is None else f"{path.name} through {source.sensor}"
     show(source.camera(path, seed), name, load(**vars(looking)), output, start, seed)
 
 
 def demo(
-    shape: Literal["table", "chair", "monitor"] = "table",
-    start: int = 33,
-    figure: Path = Path("nextview_demo.png"),
-    overwrite: bool = False,
+    shape: Literal["table", "chair", "monitor"] = "table",  # which one
+    start: int = 33,  # first view, 0 to 39
+    figure: Path = Path("nextview_demo.png"),  # where to write the picture
+    overwrite: bool = False,  # replace the picture if it exists
 ) -> None:
-    """Recognise a sample object that ships with nextview, and draw the episode.
-
-    Args:
-        shape: which one.
-        start: first view, 0 to 39.
-        figure: where to write the picture.
-        overwrite: replace the picture if it exists.
-    """
+    """Recognise a sample object that ships with nextview, and draw the episode."""
     from nextview.data.samples import sample_mesh
-    from nextview.simulation.simulated import SimulatedCamera
 
-    output = Output(figure, overwrite=overwrite)
-    output.check()
-    show(SimulatedCamera(sample_mesh(shape)), f"the sample {shape}", load(), output, start)
+    check_file(figure, overwrite)
+    camera = simulated(sample_mesh(shape))
+    show(camera, f"the sample {shape}", load(), Output(figure, overwrite=overwrite), start)
 
 
 def show(camera: Any, name: str, system: System, output: Output, start: int | None, seed: int = 0) -> None:
@@ -115,3 +90,41 @@ def show(camera: Any, name: str, system: System, output: Output, start: int | No
     if output.figure is not None:
         with new_file(output.figure, output.overwrite) as part:
             result.plot(part, name)
+
+
+@dataclass(frozen=True)
+class Captured:
+    """How it is captured."""
+
+    table: bool = False  # the object stands on a table, which is seen too
+    masks: bool = False  # write masks of the object also with --table. Without a table they are always written
+    radius: float | None = None  # object radius, metres, if the file's unit does not tell
+    distance: float = 3.0  # of the camera from the object's centre, object radii
+    jitter: float = 0.0  # standard deviation of the camera's direction from the viewpoint's, degrees
+
+
+def capture(
+    mesh: Path,  # OFF, OBJ, PLY, STL or GLB file of one object that stands upright
+    folder: Path,  # to write, in the layout of the BOP challenge; whole or not there at all
+    /,
+    viewpoints: Literal["40", "12"] = "40",  # from where it is captured, as in nextview recognise
+    captured: Captured = Captured(),
+    up: Literal["y", "z"] | None = None,  # the file's up axis; z if not given, but y for GLB
+    unit: Unit | None = None,  # the file's unit of length
+    max_faces: int = MAX_FACES,  # refuse a mesh of more triangles, or a file of more than 60 bytes for each of these
+    seed: int = 0,  # decides the jitter
+    overwrite: bool = False,  # replace the files of an earlier capture
+) -> None:
+    """Write captured views of a mesh: depth images, poses, intrinsics, as ``nextview recognise FOLDER`` reads them."""
+    from nextview.simulation.capturing import Setting, write_capture
+
+    check_new(folder, overwrite, folder=True)
+    loaded = load_mesh(mesh, up, unit, max_faces)
+    metres = loaded.metres if captured.radius is None else captured.radius
+    if metres is None:
+        raise UsageError(f"{mesh}: how large is it? Give the file's --unit or the object's --radius in metres")
+    table, sphere = captured.table, ViewSphere.named(viewpoints)
+    setting = Setting(metres, captured.distance, table, captured.masks or not table, captured.jitter)
+    frames = write_capture(loaded, folder, sphere, setting, np.random.default_rng(seed), overwrite)
+    track(frames, len(sphere), f"capturing {mesh.name}")
+    console.print(f"{folder}: {len(sphere)} views; look at them with: nextview recognise {folder}")

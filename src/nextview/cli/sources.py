@@ -1,19 +1,20 @@
-"""Options of several commands: who looks, and what is looked at."""
+"""Options of several commands: who looks, what is looked at, and files of pictures."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
+
+import numpy as np
 
 from nextview.cli.progress import console
 from nextview.errors import UsageError
-from nextview.geometry.mesh import MAX_FACES
-
-if TYPE_CHECKING:
-    from nextview.geometry.observation import Camera
-    from nextview.session.session import FrameCamera
-    from nextview.simulation.captured_camera import CapturedCamera
+from nextview.files import check_new
+from nextview.geometry.mesh import MAX_FACES, load_mesh
+from nextview.geometry.observation import Camera
+from nextview.session.session import FrameCamera
+from nextview.session.system import simulated
 
 Unit = Literal["mm", "cm", "inch", "foot", "m"]
 Three = tuple[float, float, float]
@@ -22,61 +23,46 @@ PICTURES = (".png", ".pdf", ".svg")
 
 @dataclass(frozen=True)
 class Looking:
-    """Who looks, and when it ends.
+    """Who looks, and when it ends."""
 
-    Attributes:
-        models: bundled models by name, or a folder with models of your own.
-        policy: chooses the next view: gain (the predicted gain of a view less its weighted travel; the default), MAP,
-            MAP-peak or MAP-sphere-peak for a map of the models (lem, lcm), random, random-all, furthest,
-            unidirectional, spread, spread-local, the card of a learned one (.json), or MODULE:CLASS for your own.
-        threshold: stop when the belief in one class reaches this after one view, less after several.
-        risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
-        max_views: stop after so many views.
-        viewpoints: where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in degrees by views on
-            each ring), or fibonacci:60 (spread evenly over the upper half).
-        unknown: say "unknown" of an object that is as novel as at most this share of the objects of known classes
-            (0.05: one in 20 of these is called unknown); 0 always names a class.
-    """
-
-    models: str = "modelnet10"
+    models: str = "modelnet10"  # bundled models by name, or a folder with models of your own
+    # chooses the next view: gain (the predicted gain of a view less its weighted travel; the default), MAP, MAP-peak or
+    # MAP-sphere-peak for a map of the models (lem, lcm), random, random-all, furthest, unidirectional, spread,
+    # spread-local, the card of a learned one (.json), or MODULE:CLASS for your own
     policy: str | None = None
-    threshold: float = 0.97
+    threshold: float = 0.97  # stop when the belief in one class reaches this after one view, less after several
+    # instead, stop at the lowest threshold at which at most this share of those who stop early is wrong
     risk: float | None = None
-    max_views: int = 5
+    max_views: int = 5  # stop after so many views
+    # where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in degrees by views on each ring), or
+    # fibonacci:60 (spread evenly over the upper half)
     viewpoints: str = "40"
+    # say "unknown" of an object that is as novel as at most this share of the objects of known classes (0.05: one in 20
+    # of these is called unknown); 0 always names a class
     unknown: float = 0.0
 
 
 @dataclass(frozen=True)
 class Source:
-    """What is looked at.
+    """What is looked at."""
 
-    Attributes:
-        up: a mesh file's up axis; z if not given, but y for GLB. Of a folder, also a direction in its world; z if not
-            given, but the normal of the support plane for 7-Scenes.
-        unit: a mesh file's unit of length: the size of an object says something of its class.
-        sensor: look at a mesh through a sensor with all its errors: kinect, stereo, setup, wrist or none, or
-            NAME:STRENGTH (docs/your_camera.md); clean renders if not given.
-        max_faces: refuse a mesh of more triangles, or a file of more than 60 bytes for each of these.
-        point: of a folder: near the object that is meant, metres, in the capture's world.
-        box: of a folder: the upright box into which the object just fits, its low and its high corner, metres (heights
-            along --up), or a JSON file with low, high and axes.
-        object_id: of a BOP folder with several objects: the one that is meant.
-        intrinsics: of a folder: FX FY CX CY, pixels, or a file with the pinhole matrix.
-        raw: of a folder: take the depth as it is, without denoising.
-        any_size: of a folder: the object's size says nothing of its class, as with toys.
-    """
-
+    # a mesh file's up axis; z if not given, but y for GLB. Of a folder, also a direction in its world; z if not given,
+    # but the normal of the support plane for 7-Scenes
     up: Literal["y", "z"] | Three | None = None
-    unit: Unit | None = None
+    unit: Unit | None = None  # a mesh file's unit of length: the size of an object says something of its class
+    # look at a mesh through a sensor with all its errors: kinect, stereo, setup, wrist or none, or
+    # NAME:STRENGTH (docs/your_camera.md); clean renders if not given
     sensor: str | None = None
-    max_faces: int = MAX_FACES
-    point: Three | None = None
+    max_faces: int = MAX_FACES  # refuse a mesh of more triangles, or a file of more than 60 bytes for each of these
+    point: Three | None = None  # of a folder: near the object that is meant, metres, in the capture's world
+    # of a folder: the upright box into which the object just fits, its low and its high corner, metres (heights
+    # along --up), or a JSON file with low, high and axes
     box: tuple[float, float, float, float, float, float] | Path | None = None
-    object_id: int | None = None
+    object_id: int | None = None  # of a BOP folder with several objects: the one that is meant
+    # of a folder: FX FY CX CY, pixels, or a file with the pinhole matrix
     intrinsics: tuple[float, float, float, float] | Path | None = None
-    raw: bool = False
-    any_size: bool = False
+    raw: bool = False  # of a folder: take the depth as it is, without denoising
+    any_size: bool = False  # of a folder: the object's size says nothing of its class, as with toys
 
     def camera(self, path: Path, seed: int) -> Camera | FrameCamera:
         """A camera before the object of a mesh file or of a folder."""
@@ -89,14 +75,9 @@ class Source:
             return self._captured(path)
         if isinstance(self.up, tuple):
             raise UsageError(f"{path}: the up axis of a mesh file is y or z, not {self.up}")
-        from nextview.geometry.mesh import load_mesh
-        from nextview.session.system import simulated
-
         return simulated(load_mesh(path, self.up, self.unit, self.max_faces), self.sensor, seed)
 
-    def _captured(self, folder: Path) -> CapturedCamera:
-        import numpy as np
-
+    def _captured(self, folder: Path) -> FrameCamera:
         from nextview.sensing.object_frame import Box, upright_axes
         from nextview.simulation.captured import read_box, read_capture
         from nextview.simulation.captured_camera import UP, CapturedCamera
@@ -111,3 +92,11 @@ class Source:
                 raise UsageError(f"{folder}: a box is upright, and in this layout nothing tells where up is: give --up")
             box = Box(np.array(self.box[:3]), np.array(self.box[3:]), upright_axes(upwards))
         return CapturedCamera(capture, up, self.point, box, not self.raw, not self.any_size)
+
+
+def check_file(path: Path | None, overwrite: bool, kinds: tuple[str, ...] = PICTURES) -> None:
+    """Refuse, before any work, a file that cannot be written, or whose name ends otherwise."""
+    if path is not None:
+        check_new(path, overwrite)
+        if path.suffix.lower() not in kinds:
+            raise UsageError(f"{path}: the name ends in {' or '.join(kinds)}")

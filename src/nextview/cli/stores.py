@@ -1,4 +1,4 @@
-"""``nextview render`` and ``nextview check``: view stores."""
+"""``nextview scenes``, ``render``, ``check`` and ``measure``: view stores, and the scenes that they may be made of."""
 
 from __future__ import annotations
 
@@ -7,52 +7,68 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from nextview.cli.progress import console, track
-from nextview.data import checking, rendering
+from nextview.cli.progress import console, follow, track
+from nextview.data import checking, measuring, rendering, scene_drawing
+from nextview.data.splits import some_objects
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
+from nextview.geometry.mesh import MAX_FACES
 from nextview.geometry.viewsphere import ViewSphere
 
 Split = Literal["train", "test", "val"]
+Level = Literal["light", "medium", "heavy"]
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the work.
+    """Who does the work."""
 
-    Attributes:
-        workers: processes; one for each core by default.
-        scheduler: address of a dask.distributed scheduler to use instead, as tcp://HOST:8786.
+    workers: int | None = None  # processes; one for each core by default
+    scheduler: str | None = None  # address of a dask.distributed scheduler to use instead, as tcp://HOST:8786
+
+
+def scenes(
+    meshes: Path,  # dataset folder, CLASS/train|test/MESH or CLASS/MESH
+    out: Path,  # folder for the scenes; those that are there are kept
+    /,
+    # how much of the target shows, on the average over the 40 views: light 85 %, medium 65 %, heavy 45 %
+    level: tuple[Level, ...] = ("light", "medium", "heavy"),
+    scenes: int | None = None,  # how many at each level, of each split; by default one around each object
+    split: Split | None = None,  # only this one
+    # only around objects that the model of this card (NAME.json) calls held out of its training: scenes for learning
+    # policies
+    held_out: Path | None = None,
+    seed: int = 0,  # decides which objects are targets, and all that stands around them
+    workers: Workers = Workers(),
+) -> None:
+    """Draw cluttered scenes: a target on a table among other objects, boxes and walls that hide parts of it.
+
+    Each scene is a small JSON file that names meshes and says where they stand; the same seed draws the same files.
+    Resumes where it was. Objects of one split stand only among objects of that split. Render them with nextview render
+    OUT STORE --meshes MESHES, and go on as with any other store.
     """
-
-    workers: int | None = None
-    scheduler: str | None = None
+    total = len(scene_drawing.tasks(meshes, out, level, scenes, seed, split, held_out))
+    drawn = scene_drawing.draw_scenes(meshes, out, level, scenes, seed, split, **vars(workers), held_out=held_out)
+    failed = track_all(drawn, total, f"drawing {out.name}")
+    if len(failed) == total:
+        raise DatasetError(f"{out}: none of the {total} scenes can be drawn; see the reasons above")
+    console.print(f"{out}: {total - len(failed)} scenes; next: nextview render {out} STORE --meshes {meshes}")
 
 
 def render(
-    dataset: Path,
-    store: Path,
+    dataset: Path,  # folder of meshes, or of scenes
+    store: Path,  # the store to make or to complete
     /,
-    viewpoints: Literal["40", "12"] = "40",
-    azimuths: int | None = None,
-    size: int = 224,
+    viewpoints: Literal["40", "12"] = "40",  # from where it is seen
+    azimuths: int | None = None,  # views on each ring, if not 8 of the 40 and 12 of the 12
+    size: int = 224,  # side of the images, pixels
     how: rendering.RenderOptions = rendering.RenderOptions(),
     workers: Workers = Workers(),
-    overwrite: bool = False,
+    overwrite: bool = False,  # replace a store of other objects or settings
 ) -> None:
     """Render a dataset folder (CLASS/SPLIT/MESH, SPLIT/CLASS/MESH or CLASS/MESH) into a view store; resumes.
 
     A folder of scenes (nextview scenes) makes a store too: of what shows of each target, and of the scene around it.
-
-    Args:
-        dataset: folder of meshes, or of scenes.
-        store: the store to make or to complete.
-        viewpoints: from where it is seen.
-        azimuths: views on each ring, if not 8 of the 40 and 12 of the 12.
-        size: side of the images, pixels.
-        how: what is rendered, and how.
-        workers: who does the work.
-        overwrite: replace a store of other objects or settings.
     """
     sphere = ViewSphere.named(viewpoints)
     sphere = sphere if azimuths is None else replace(sphere, azimuths=azimuths)
@@ -77,14 +93,13 @@ def render(
     console.print(f"{store}: {done} of {len(made)} objects, {len(sphere)} views each", soft_wrap=True)
 
 
-def check(store: Path, /, repair: bool = False, workers: Workers = Workers()) -> None:
-    """Read every object of a view store and hold its arrays against each other. Ends with status 2 if one is damaged.
-
-    Args:
-        store: view store made by nextview render.
-        repair: take damaged objects out, so that the next nextview render makes them anew.
-        workers: who does the work.
-    """
+def check(
+    store: Path,  # view store made by nextview render
+    /,
+    repair: bool = False,  # take damaged objects out, so that the next nextview render makes them anew
+    workers: Workers = Workers(),
+) -> None:
+    """Read every object of a view store, hold its arrays against each other. Ends with status 2 if one is damaged."""
     views = ViewStore.open(store)
     done = int(views.done.sum())
     damaged = track_all(checking.check(store, repair, **vars(workers)), done, f"checking {store.name}")
@@ -97,6 +112,28 @@ def check(store: Path, /, repair: bool = False, workers: Workers = Workers()) ->
     if damaged:
         what = ("" if repair else "with --repair, ") + "nextview render makes them anew"
         raise DatasetError(f"{store}: {len(damaged)} of {done} objects are damaged; {what}")
+
+
+def measure(
+    store: Path,  # view store made by nextview render
+    # the dataset folder that it was rendered from: measures that need the mesh find there which face each pixel shows
+    meshes: Path | None = None,
+    /,
+    # names (see nextview list measures), all, or MODULE:FUNCTION for one of your own; by default all that need the
+    # depth alone, or with MESHES all
+    measures: tuple[str, ...] = (),
+    max_faces: int = MAX_FACES,  # of a mesh, as for nextview render
+    split: Split | None = None,  # only this split
+    # only the objects that this model, bundled or a card (NAME.json), calls held out of its training
+    held_out: str | None = None,
+    objects: int | None = None,  # only so many of these, spread evenly; twice as many later hold the same
+    workers: Workers = Workers(),
+    overwrite: bool = False,  # measure anew what is there
+) -> None:
+    """Compute view measures of every rendered object and keep them in the store. Resumes where it was."""
+    select = some_objects(ViewStore.open(store), split, held_out, objects)
+    on = workers.workers, workers.scheduler
+    follow(measuring.measure(store, measures, *on, meshes, max_faces, select, overwrite), f"measuring {store.name}")
 
 
 def track_all(done: Iterable[tuple[str, str | None]], total: int, what: str, before: int = 0) -> list[str]:

@@ -9,7 +9,8 @@ import matplotlib
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from nextview.session.style import ACCENT, INK, LIGHT_BLUE, STYLE, PlainFigure
+from nextview.files import new_file
+from nextview.session.style import ACCENT, INK, LIGHT_BLUE, STYLE, PlainFigure, to_png
 
 SELECTED = {"class_accuracy": max, "validation_mse": min}
 """By which score, and which way, the kept epoch was chosen: the first that a log has."""
@@ -50,3 +51,12 @@ def training_curves(log: dict[str, list[float]]) -> Figure:
         axes.set_xlabel("epoch")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
+
+
+def draw_curves(runs: list[Path]) -> None:
+    """Draw the log of each run that was trained as its curves.png."""
+    from nextview.learning.loop import is_first
+
+    for run in runs if is_first() else ():  # of the processes of a training on several devices, one draws
+        with new_file(run / "curves.png", overwrite=True) as part:
+            to_png(training_curves(read_log(run)), part)
