@@ -68,26 +68,6 @@ def views(shared, furniture) -> Path:
 
 
 @pytest.fixture(scope="session")
-def noisy_views(shared, furniture) -> Path:
-    """A store of the test half of ``furniture`` as a Kinect sees it: 6 objects, 12 views, 224 pixels."""
-    from nextview.data.rendering import RenderOptions, render
-    from nextview.geometry.viewsphere import ViewSphere
-
-    def make(folder: Path) -> None:
-        list(
-            render(
-                furniture,
-                folder / "views.zarr",
-                ViewSphere.named("12"),
-                workers=0,
-                options=RenderOptions(split="test", sensor="kinect"),
-            )
-        )
-
-    return shared("noisy_views", make) / "views.zarr"
-
-
-@pytest.fixture(scope="session")
 def models(shared) -> Path:
     """A folder of tiny networks for FURNITURE: tiny.json (recogniser, 8 azimuth bins, calibrated), tiny-lem.json."""
 

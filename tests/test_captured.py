@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from pipeline import refused
 
 import nextview
 from nextview.cli.main import main
@@ -45,7 +46,7 @@ def depth_image(value=4000):
     return depth
 
 
-def write_bop(folder, cameras=None, gt=None):
+def write_bop(folder):
     world_to_camera = np.linalg.inv(DOWN)
     camera = {
         "cam_K": np.ravel(K).tolist(),
@@ -54,9 +55,7 @@ def write_bop(folder, cameras=None, gt=None):
         "cam_t_w2c": (1000 * world_to_camera[:3, 3]).tolist(),
     }
     write_png(folder / "depth/000007.png", depth_image())
-    (folder / "scene_camera.json").write_text(json.dumps({"7": camera} if cameras is None else cameras(camera)))
-    if gt is not None:
-        (folder / "scene_gt.json").write_text(json.dumps(gt))
+    (folder / "scene_camera.json").write_text(json.dumps({"7": camera}))
     return folder
 
 
@@ -188,14 +187,6 @@ def test_the_section_of_the_guide_runs(tmp_path, monkeypatch, capsys):
 # What is wrong is said in one sentence
 
 
-def sentence(capsys, *arguments):
-    with pytest.raises(SystemExit) as end:
-        main([str(argument) for argument in arguments])
-    assert end.value.code == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if " layout, " not in line]
-    return " ".join(lines)
-
-
 def edited(change):
     def edit(path):
         values = json.loads(path.read_text())
@@ -214,35 +205,23 @@ def fifo(path):
     os.mkfifo(path)
 
 
-CAMERAS, POSE, TRAJECTORY = "scene_camera.json", "frame-000003.pose.txt", "groundtruth.txt"
+CAMERAS, TRAJECTORY = "scene_camera.json", "groundtruth.txt"
+POSE, DEPTH = "frame-000003.pose.txt", "frame-000003.depth.png"
 DAMAGE = {
     "a missing image": ("bop", "depth/000007.png", Path.unlink, "no such file"),
-    "a truncated image": (
-        "7scenes",
-        "frame-000003.depth.png",
-        lambda p: p.write_bytes(p.read_bytes()[:-40]),
-        "damaged",
-    ),
-    "a pipe for an image": ("7scenes", "frame-000003.depth.png", fifo, "is no file"),
-    "a pipe for a list": ("tum", TRAJECTORY, fifo, "is no file"),
+    "a truncated image": ("7scenes", DEPTH, lambda p: p.write_bytes(p.read_bytes()[:-40]), "damaged"),
+    "a pipe for an image": ("7scenes", DEPTH, fifo, "is no file"),
     "8 bits": ("tum", "depth/a.png", lambda p: write_png(p, depth_image(90), np.uint8), "16 bits"),
     "no JSON": ("bop", CAMERAS, put("{"), "not the cameras"),
-    "no K": ("bop", CAMERAS, edited(lambda v: v.pop("cam_K")), "cam_K"),
     "no scale": ("bop", CAMERAS, edited(lambda v: v.update(depth_scale=0)), "depth_scale"),
     "no translation": ("bop", CAMERAS, edited(lambda v: v.pop("cam_t_w2c")), "cam_t"),
     "no rotation": ("bop", CAMERAS, edited(lambda v: v.update(cam_R_w2c=[2, 0, 0, 0, 2, 0, 0, 0, 2])), "scaled by 2"),
     "a lost camera": ("7scenes", POSE, put(4 * "nan nan nan nan\n"), "NaN"),
-    "half a pose": ("7scenes", POSE, put("1 0 0 0\n"), "4 x 4"),
-    "bytes": ("7scenes", POSE, lambda p: p.write_bytes(b"\xff\xfe\x00"), "as text"),
     "an empty trajectory": ("tum", TRAJECTORY, put("# t\n"), "lists nothing"),
-    "a short line": ("tum", TRAJECTORY, put("1 2 3\n"), "line 1"),
-    "a word in a trajectory": ("tum", TRAJECTORY, put("10 x 0 0 0 0 0 1\n"), "number"),
     "no quaternion": ("tum", TRAJECTORY, put("10 0 0 0 0 0 0 0\n"), "quaternion"),
     "another clock": ("tum", TRAJECTORY, put("99 0 0 0 0 0 0 1\n"), "one clock"),
     "an image elsewhere": ("tum", "depth.txt", put("10 /etc/passwd\n"), "no file of this folder"),
-    "an image above": ("tum", "depth.txt", put("10 ../a.png\n"), "no file of this folder"),
     "no intrinsics": ("tum", "camera-intrinsics.txt", Path.unlink, "--intrinsics"),
-    "odd intrinsics": ("tum", "camera-intrinsics.txt", put("1 2 3\n"), "3 x 3"),
 }
 
 
@@ -251,10 +230,9 @@ def test_what_is_damaged_is_named(what, tmp_path, capsys):
     layout, name, damage, said = DAMAGE[what]
     WRITERS[layout](tmp_path)
     damage(tmp_path / name)
-    message = sentence(capsys, "recognise", tmp_path)
-    joined = message.replace(" ", "")
-    assert said.replace(" ", "") in joined
-    assert (name if "intrinsics" not in what or what == "odd intrinsics" else tmp_path.name) in joined
+    sentence = refused(capsys, "recognise", tmp_path).replace(" ", "")  # it may be broken in two lines anywhere
+    assert said.replace(" ", "") in sentence
+    assert (tmp_path.name if what == "no intrinsics" else name) in sentence
 
 
 # nextview capture
@@ -266,9 +244,6 @@ def test_capture_writes_what_recognise_reads(tmp_path, capsys):
     capsys.readouterr()
     main(["recognise", str(tmp_path / "new"), "--json"])
     assert json.loads(capsys.readouterr().out)["answer"] == "monitor"
-    before = {path: path.read_bytes() for path in (tmp_path / "new").rglob("*.*") if path.is_file()}
-    assert "exists" in sentence(capsys, "capture", *arguments)
-    assert {path: path.read_bytes() for path in (tmp_path / "new").rglob("*.*") if path.is_file()} == before
 
 
 # A real Kinect

@@ -7,12 +7,10 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
-from pipeline import some_predictions
+from pipeline import run_python, some_predictions
 from rich.console import Console
 
 from nextview.cli import progress
@@ -23,10 +21,6 @@ from nextview.cli.predict import summed_up
 from nextview.data.store import ViewStore
 
 COMMAND = [sys.executable, "-m", "nextview"]
-
-
-def run(*arguments, **options):
-    return subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=100, **options)
 
 
 def ended(capsys, *arguments):
@@ -53,7 +47,7 @@ def test_all_commands_are_listed_without_importing_one():
         "import sys; from nextview.cli.main import main; main(['--help'])\n"
         "slow = {'torch', 'pandas', 'matplotlib', 'zarr', 'tyro', 'rich'} & set(sys.modules); assert not slow, slow"
     )
-    listed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    listed = run_python(code)
     assert listed.returncode == 0, listed.stderr
     for name, command in COMMANDS.items():
         assert f"  {name} " in listed.stdout
@@ -72,34 +66,19 @@ def test_a_misspelt_command_is_guessed(words, meant, capsys):
     assert ended(capsys, *words.split()) == (2, f"nextview: there is no command {words!r}; did you mean {meant!r}?\n")
 
 
-def test_a_group_lists_its_commands(capsys):
-    main(["fit"])
-    assert "fit calibration" in (shown := capsys.readouterr().out)
-    assert "render" not in shown
-
-
 @pytest.mark.parametrize("preset", [None, "thesis"])
 def test_a_preset_sets_defaults_that_options_change(preset, monkeypatch):
     stage = pytest.importorskip("nextview.learning.recogniser_training")
     kind, called = stage.RecogniserRecipe, []
     recipe = find("nextview.learning.recipes:THESIS_RECOGNISER") if preset else kind()
 
-    def train(store: str, out: str, recipe: kind = kind()) -> list[Path]:
+    def train(store: str, out: str, recipe: kind = kind()) -> list[str]:
         called.append(recipe)
         return []
 
     monkeypatch.setattr(stage, "train_recogniser", train)
     main(["train", "recogniser", "s", "none", *(["--preset", preset] if preset else []), "--epochs", "1"])
     assert called == [replace(recipe, epochs=1)]
-
-
-@pytest.fixture
-def meshes(tmp_path):
-    (tmp_path / "meshes/ball").mkdir(parents=True)
-    ball = trimesh.creation.icosphere(4).export(file_type="off")
-    for i in range(12):
-        (tmp_path / f"meshes/ball/ball_{i}.off").write_text(ball)
-    return tmp_path / "meshes"
 
 
 def interrupted(command, ready):
@@ -115,17 +94,15 @@ def interrupted(command, ready):
     return running.returncode, [line for line in said.splitlines() if line.startswith("nextview: ")][-1]
 
 
-def test_ctrl_c_ends_rendering_in_one_line_and_it_resumes(tmp_path, meshes):
+def test_ctrl_c_ends_rendering_in_one_line_and_it_resumes(tmp_path, furniture):
     store = tmp_path / "v.zarr"
-    command = ["render", str(meshes), str(store), "--size", "32", "--workers", "1"]
+    command = ["render", str(furniture), str(store), "--size", "32", "--workers", "1"]
 
     def begun():
         return len(list(store.glob("image/c/*"))) > 1
 
-    assert interrupted([*COMMAND, *command], begun) == (
-        130,
-        "nextview: stopped; run the same command again; it resumes",
-    )
+    again = "nextview: stopped; run the same command again; it resumes"
+    assert interrupted([*COMMAND, *command], begun) == (130, again)
     main(command)
     assert ViewStore.open(store).done.all()
 
@@ -146,61 +123,23 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
 
 @pytest.mark.parametrize(
     ("package", "arguments", "extra"),
-    [
-        ("torch", ["train", "recogniser", "views.zarr", "run"], "train"),
-        ("pandas", ["benchmark", "p.npz"], "benchmark"),
-    ],
+    [("torch", ["train", "recogniser", "s", "run"], "train"), ("pandas", ["benchmark", "p.npz"], "benchmark")],
 )
 def test_a_missing_extra_is_named_with_what_brings_it(package, arguments, extra):
     code = f"import sys; sys.modules[{package!r}] = None; from nextview.cli.main import main; main({arguments!r})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    done = run_python(code)
     assert done.returncode == 2
     assert f"pip install 'nextview[{extra}]'" in done.stderr
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("package", "script", "extra"),
-    [("pandas", "benchmarks/views.py", "benchmark"), ("torch", "benchmarks/ablations.py", "train")],
-)
-def test_a_script_names_the_missing_extra_too(package, script, extra):
-    path = str(Path(__file__).parents[1] / script)
-    without = f"import sys, runpy; sys.modules[{package!r}] = None; sys.argv = [{path!r}, '--help']"
-    code = f"{without}; runpy.run_path({path!r}, run_name='__main__')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 2
-    assert f"pip install 'nextview[{extra}]'" in done.stderr
-
-
-def test_names_are_shown_and_mean_nothing(capsys):
-    progress.Terminal().print("[red]a\x1b[31mb :smile:")
-    assert capsys.readouterr().out == "[red]a\\x1b[31mb :smile:\n"
-
-
-def slowly(counts):
-    for n in counts:
-        time.sleep(0.01)
-        yield n
-
-
-def test_a_bar_shows_how_far_it_is_and_the_speed_at_80_columns(monkeypatch):
-    file = io.StringIO()
-    terminal = progress.Terminal(file=file, width=80, force_terminal=True, color_system=None)
-    monkeypatch.setattr(progress, "console", terminal)
-    progress.track(slowly(range(12300, 12312)), 12311, "rendering a_store_with_a_long_name.zarr")
-    last = file.getvalue().rpartition("rendering")[2]
-    assert " 12311/12311 " in last
-    speed = float(re.search(r"([\d.]+)/s", last)[1])
-    assert 1 < speed < 200  # what an earlier run did is not counted
-
-
 def test_where_there_is_no_terminal_a_line_tells_how_far_it_is(monkeypatch):
     file = io.StringIO()
     monkeypatch.setattr(progress, "console", Console(file=file, width=80))
-    monkeypatch.setattr(progress, "EVERY", 0.015)
-    progress.track(slowly(range(1, 7)), 6, "rendering v.zarr")
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    progress.track(range(1, 7), 6, "rendering v.zarr")
     lines = file.getvalue().splitlines()
-    assert 1 <= len(lines) <= 4
+    assert lines
     assert all(re.fullmatch(r"rendering v.zarr: \d of 6 after \d+ s", line) for line in lines)
 
 

@@ -9,9 +9,9 @@ from nextview.cli.pictures import inspect
 from nextview.data.measuring import measure
 from nextview.data.rendering import render
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, ResultsError, UsageError
+from nextview.errors import DatasetError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.viewers.store_figures import median_radii, object_figure, store_figure, summary
+from nextview.viewers.store_figures import median_radii, object_figure, summary
 
 SPHERE = ViewSphere.named("40")
 
@@ -48,12 +48,6 @@ def test_sizes_are_told_where_the_unit_is_known(views, tmp_path, capsys):
     store.note(unit=None)
 
 
-def test_bars_are_as_long_as_the_classes(views):
-    bars = store_figure(ViewStore.open(views)).subfigs[0].axes[0].containers
-    counts = {threshold_at.get_label(): [patch.get_width() for patch in threshold_at] for threshold_at in bars}
-    assert counts == {"train": [1, 1], "test": [1, 2], "not rendered": [0, 1]}  # ball, box
-
-
 def test_an_object_is_drawn_with_the_horizon_lowest(views):
     list(measure(views, workers=0))
     store = ViewStore.open(views)
@@ -72,8 +66,6 @@ def test_the_command_draws_or_says_why_not(views, tmp_path):
     assert (tmp_path / "store.png").read_bytes().startswith(b"\x89PNG")
     assert b"<svg" in (tmp_path / "thing.svg").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["store.png", "thing.svg"]
-    with pytest.raises(ResultsError, match="exists"):
-        inspect(views, tmp_path / "store.png")
     with pytest.raises(DatasetError, match="has no object 'thin'; there are thing_"):
         inspect(views, tmp_path / "x.png", object="thin")
     with pytest.raises(DatasetError, match="broken is not rendered"):

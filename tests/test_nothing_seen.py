@@ -1,25 +1,21 @@
 """Views in which nothing is seen: no evidence, no confidence, no answer."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as npst
-from pipeline import make_recogniser
+from pipeline import make_recogniser, refused
 from scipy.special import softmax
 
 import nextview
 from nextview import SimulatedCamera, Stopping, ViewSphere, make_policy
-from nextview.cli.main import main
 from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import render
 from nextview.data.samples import sample_mesh
 from nextview.data.store import ViewStore
-from nextview.errors import ObservationError
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import Observation, pinhole
 from nextview.policies.base import Evidence
@@ -57,13 +53,9 @@ def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibr
     sure = Stopping(1.0, k)
     together = Episodes(SPHERE, Unidirectional(SPHERE), np.arange(b), sure, np.random.default_rng(0), calibration)
     for observation in range(k):
-        step = together.update(
-            features(
-                np.where(empty[:, observation, None], np.nan, logits[:, observation]),
-                ~empty[:, observation],
-                None if azimuth_bins is None else azimuth_bins[:, observation],
-            )
-        )  # the log-evidence of an empty view is not even read
+        unread = np.where(empty[:, observation, None], np.nan, logits[:, observation])
+        bins = None if azimuth_bins is None else azimuth_bins[:, observation]
+        step = together.update(features(unread, ~empty[:, observation], bins))
         np.testing.assert_array_equal(step.seen, (~empty[:, : observation + 1]).sum(1))
     assert (together.outcome.n_views == k).all()
     views = together.outcome.views
@@ -73,11 +65,8 @@ def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibr
         total = log_evidence.sum(0) / calibration.temperature_after(max(len(kept), 1))
         if azimuth_bins is not None:
             zero = np.zeros((3, 8))  # by the azimuth of the object's azimuth bin 0
-            for observation in kept:
-                for side in range(8):
-                    zero[:, (SPHERE.azimuth_index[views[e, observation]] - side) % 8] += azimuth_bins[
-                        e, observation, :, side
-                    ]
+            for k, side in product(kept, range(8)):
+                zero[:, (SPHERE.azimuth_index[views[e, k]] - side) % 8] += azimuth_bins[e, k, :, side]
             total = total + np.log(np.exp(zero / (1 + 2.0 * (max(len(kept), 1) - 1))).sum(1))
         np.testing.assert_allclose(together.steps[-1].belief[e], softmax(total), atol=1e-12)
     np.testing.assert_array_equal(together.steps[-1].belief[0], np.full(3, 1 / 3))
@@ -85,9 +74,8 @@ def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibr
 
 @pytest.mark.parametrize("threshold", [0.0, 1 / 3, 0.9])
 def test_an_empty_view_is_taken_but_never_confident(threshold):
-    episodes = Episodes(
-        SPHERE, Unidirectional(SPHERE), np.array([0, 0]), Stopping(threshold, 3), np.random.default_rng(0)
-    )
+    rule, rng = Stopping(threshold, 3), np.random.default_rng(0)
+    episodes = Episodes(SPHERE, Unidirectional(SPHERE), np.array([0, 0]), rule, rng)
     episodes.update(features([[9, 0, 0], [9, 0, 0]], [False, True]))
     assert episodes.running.tolist() == [0]
     episodes.update(features([[9, 0, 0]], [False]))
@@ -108,7 +96,7 @@ def test_a_threshold_that_comes_down_does_not_come_down_by_empty_views():
     assert episodes.update(features(logits, [True])).stopped[0]
 
 
-@pytest.mark.parametrize("name", ["gain", "lem", "lem-peak", "lcm", "random", "furthest", "spread", "spread-local"])
+@pytest.mark.parametrize("name", ["gain", "lem", "spread-local"])
 def test_every_kind_of_policy_goes_on_past_an_empty_view(name):
     policy = make_policy(name, SPHERE)
     models = load_models(policy.needs)
@@ -149,37 +137,10 @@ def test_nothing_seen_is_no_answer(tiny):
     assert "nothing is seen" in result.plot(title="air").get_suptitle()
 
 
-@settings(deadline=None)
-@given(
-    npst.arrays(
-        np.float32,
-        (32, 32),
-        elements=st.one_of(st.floats(0, 60, width=32), st.floats(width=32, allow_nan=False, allow_infinity=False)),
-    )
-)
-def test_any_finite_depth_is_refused_or_believed_in_no_more_than_all(tiny, depth):
-    session = Session(tiny, make_policy("lem", SPHERE), SPHERE, 20, Stopping(0.99, 2))
-    try:
-        view = session.update(view_of(depth, session.pose))
-    except ObservationError:
-        assert not session.views
-        return
-    assert view.belief.sum() == pytest.approx(1)
-    assert np.isfinite(view.belief).all()
-    if not view.observation.seen:
-        np.testing.assert_array_equal(view.belief, np.full(3, 1 / 3))
-        assert not session.done
-
-
 # Meshes and the command line
 
 
-def far_apart() -> trimesh.Trimesh:
-    speck = trimesh.creation.box((1e-4, 1e-4, 1e-4))
-    return trimesh.util.concatenate([speck.copy().apply_translation((x, x, x)) for x in (-1, 1)])
-
-
-@pytest.mark.parametrize("gap", [20, 30, 60, 300])
+@pytest.mark.parametrize("gap", [20, 300])
 def test_two_boxes_far_apart_are_nothing(gap):
     """Most of their bounding sphere is empty; the networks would name what they see of it a table, confidently."""
     boxes = [trimesh.creation.box((1, 1, 1)).apply_translation((x, 0, 0)) for x in (0, gap + 1)]
@@ -196,9 +157,8 @@ def test_predictions_and_cameras_have_one_idea_of_nothing(tmp_path):
     trimesh.util.concatenate(balls).export(file)
     list(render(tmp_path / "meshes", tmp_path / "store.zarr", SPHERE, 112, workers=0))
     store = ViewStore.open(tmp_path / "store.zarr")
-    looks = [
-        Observation(depth, pose, store.intrinsics) for depth, pose in zip(store.depth(0), SPHERE.poses, strict=True)
-    ]
+    both = zip(store.depth(0), SPHERE.poses, strict=True)
+    looks = [Observation(depth, pose, store.intrinsics) for depth, pose in both]
     assert min(look.visible for look in looks) > 0.006 * 112**2
     card = make_recogniser(tmp_path, ["ball"])
     list(predict(tmp_path / "store.zarr", tmp_path / "said.npz", [read_card(card)], {}, workers=0))
@@ -210,12 +170,8 @@ def test_predictions_and_cameras_have_one_idea_of_nothing(tmp_path):
 @pytest.mark.parametrize("json_too", [[], ["--json"]])
 def test_the_command_has_no_answer_about_next_to_nothing(tmp_path, capsys, json_too):
     path = tmp_path / "specks.off"
-    far_apart().export(path)
-    with pytest.raises(SystemExit) as end:
-        main(["recognise", str(path), "--threshold", "0", *json_too])
-    assert end.value.code == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert "specks.off: there is no answer" in printed.err
-    assert "any of 5 views" in printed.err
-    assert printed.err.count("\n") == 1
+    specks = [trimesh.creation.box((1e-4, 1e-4, 1e-4)).apply_translation((x, x, x)) for x in (-1, 1)]
+    trimesh.util.concatenate(specks).export(path)
+    said = refused(capsys, "recognise", path, "--threshold", "0", *json_too)
+    assert "specks.off: there is no answer" in said
+    assert "any of 5 views" in said

@@ -1,17 +1,22 @@
 """Choosing views among things: what is expected to show, by closed forms; policies by it; scenes in replay and live."""
 
+import runpy
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from pipeline import some_predictions
+from pipeline import scene_predictions, some_predictions
 from test_scenes import GRID, scene_of
 
 import nextview
+from nextview.benchmark import statistics
 from nextview.benchmark.entries import default_entries
+from nextview.benchmark.published import ACCURACY, comparable_classes, read_table
 from nextview.benchmark.replay import make_specs, replay
+from nextview.benchmark.summary import target_weights
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import SceneSight, scene_intrinsics, scene_views
 from nextview.data.store import ViewStore
@@ -29,6 +34,8 @@ from nextview.simulation.scene_layout import Block
 from nextview.simulation.simulated import TARGET, OccludedCamera, SceneCamera
 from research.plan import plan
 
+TEN = tuple(read_table(ACCURACY[10]))
+SCRIPT = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "scenes.py"))
 POSITIONS = GRID.poses[:, :3, 3]
 BEFORE = Block(1.6, 0.0, 0.0, 0.2, 2.6, 2.2)
 """Hides the ball from the front, and nothing from behind."""
@@ -58,12 +65,6 @@ def state_of(visibility, belief=None, reachable=None) -> EpisodeState:
 
 
 # What is expected to show
-
-
-def test_alone_on_its_table_all_of_it_shows_once_the_space_around_was_seen():
-    found = expected_visibility(SeenScene.of(looks(scene_of(), *range(0, 40, 3))), POSITIONS)
-    assert found.least[8:].min() > 0.95  # level with the table its edge is in doubt
-    np.testing.assert_allclose(found.most, 1, atol=0.05)
 
 
 def test_a_box_hides_what_is_behind_it_as_far_as_a_camera_without_errors_says():
@@ -164,15 +165,7 @@ class FirstFree:
 
 @pytest.fixture(scope="module")
 def predictions(cluttered_views) -> Predictions:
-    """Random ones of a store of scenes; where nothing of a target shows, all classes are alike."""
-    opened = ViewStore.open(cluttered_views)
-    made = some_predictions(len(opened))
-    entropy = opened.measure()
-    logits = np.where((opened.measure("visible_share") > 0.05)[..., None], made.logits, 0).astype(np.float32)
-    return replace(
-        made, names=tuple(opened.names), depth_entropy=entropy, logits=logits, store=str(cluttered_views),
-        splits=np.array(["test"] * len(opened)),
-    )  # fmt: skip
+    return scene_predictions(cluttered_views, TEN)
 
 
 def test_what_is_expected_in_a_store_is_what_its_frames_say(cluttered_views):
@@ -210,11 +203,9 @@ def test_no_policy_goes_where_no_camera_can(predictions, cluttered_views):
 def test_visibility_sees_more_than_random_in_scenes(predictions):
     specs = make_specs(predictions, 4, 0)
     share = ViewStore.open(predictions.store).measure("visible_share")
-    seen = {
-        name: share[specs.objects, replay(name, specs, 2, 0).views[:, 1]].mean()
-        for name in ("random-all", "visibility", "true-visible_share-all")
-    }
-    assert seen["random-all"] + 0.1 < seen["visibility"] <= seen["true-visible_share-all"]
+    names = ("random-all", "visibility", "true-visible_share-all")
+    random, visibility, best = (share[specs.objects, replay(n, specs, 2, 0).views[:, 1]].mean() for n in names)
+    assert random + 0.1 < visibility <= best
 
 
 def test_views_without_the_target_are_no_evidence(predictions):
@@ -224,7 +215,7 @@ def test_views_without_the_target_are_no_evidence(predictions):
     evidence = predictions.evidence(np.array([scene]), np.array([view]))
     assert not evidence.seen[0]
     sized = replace(
-        predictions, logits=predictions.logits + 0.3, of_size=np.full((len(predictions), 3), np.float32(0.3))
+        predictions, logits=predictions.logits + 0.3, of_size=np.full((len(predictions), 10), np.float32(0.3))
     )
     np.testing.assert_array_equal(sized.seen, predictions.seen)
 
@@ -246,6 +237,47 @@ def test_gain_learns_in_scenes_what_to_make_of_what_shows(predictions, tmp_path)
     replace(some_predictions(), splits=train).save(tmp_path / "alone.npz")
     with pytest.raises(PredictionsError, match="of no scenes"):
         train_gain(tmp_path / "alone.npz", tmp_path / "alone.json", recipe=recipe, folds=2)
+
+
+# Replay
+
+
+def test_scenes_without_their_store_are_not_taken_for_single_objects(predictions, tmp_path):
+    lost = replace(predictions, store=str(tmp_path / "lost.zarr"))
+    with pytest.raises(DatasetError, match=r"of scenes, and there is no view store at .*lost.zarr any more"):
+        make_specs(lost, 1, 0)
+    with pytest.raises(DatasetError, match="are of scenes, and name no view store; predict again"):
+        make_specs(replace(predictions, store=""), 1, 0)
+    alone = replace(lost, names=tuple(f"thing_{i}" for i in range(len(lost))))
+    assert make_specs(alone, 1, 0).scenes is None
+
+
+def test_nothing_published_stands_beside_scenes(predictions):
+    assert comparable_classes(predictions) == ()
+    alone = replace(predictions, names=tuple(f"thing_{i}" for i in range(len(predictions))))
+    assert comparable_classes(alone) == TEN
+
+
+def test_scenes_around_one_target_are_drawn_together():
+    names = ("a@light-0", "b@light-0", "a@heavy-0", "c@heavy-0", "a@heavy-1")
+    weights = target_weights(names, 200, np.random.default_rng(0))
+    for same in (2, 4):
+        np.testing.assert_array_equal(weights[:, 0], weights[:, same])
+    np.testing.assert_array_equal(weights[:, [0, 1, 3]].sum(1), 3)  # as many targets as there are
+    plain = statistics.resample(5, 200, np.random.default_rng(0))
+    np.testing.assert_array_equal(target_weights(tuple("abcde"), 200, np.random.default_rng(0)), plain)
+
+
+def test_what_the_script_judges_is_what_replay_believes(predictions):
+    specs = make_specs(predictions, 4, 0)
+    path = replay("random-all", specs, 4, 0)
+    assert (path.views >= 0).all()
+    found = SCRIPT["Believed"].of(predictions, specs.objects, path.views)
+    np.testing.assert_allclose(found.confidence, path.confidences, rtol=1e-6)
+    sure = found.confidence > 0.11  # else all classes are alike
+    np.testing.assert_array_equal(found.right[sure], (path.answers == specs.labels[:, None])[sure])
+    np.testing.assert_allclose(found.loss[found.right], -np.log(found.confidence[found.right]), rtol=1e-6)
+    assert (found.loss[~found.right] >= np.log(2)).all()
 
 
 # Live
