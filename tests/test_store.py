@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import SPHERE
+from pipeline import SPHERE, refused
 
-from nextview.cli.main import main
 from nextview.data.checking import check, incomplete
 from nextview.data.measuring import measure
 from nextview.data.rendering import RenderOptions, render
@@ -77,13 +76,6 @@ def test_wrong_values_with_a_right_checksum_are_found(store):
     assert problems.keys() == {"chair_0", "chair_2"}
     assert "points" in problems["chair_0"]
     assert "silhouette" in problems["chair_2"]
-
-
-def refused(capsys, *arguments) -> str:
-    with pytest.raises(SystemExit) as end:
-        main([str(a) for a in arguments])
-    assert end.value.code == 2
-    return capsys.readouterr().err.strip().splitlines()[-1]
 
 
 def test_a_damaged_object_ends_every_command_that_reads_it(store, models, tmp_path, capsys):
