@@ -105,12 +105,7 @@ class Episodes:
         self._last: Taken | None = None
         self._scenes: dict[int, tuple[list[SceneView], SeenScene]] = {}
 
-    def update(
-        self,
-        evidence: Evidence,
-        directions: Float | None = None,
-        constrain: Constrain = unconstrained,
-    ) -> Step:
+    def update(self, evidence: Evidence, directions: Float | None = None, constrain: Constrain = unconstrained) -> Step:
         """Take in the evidence of one view in every running episode; stop or choose its next view.
 
         A view in which nothing was seen is taken, but changes no belief and ends no episode as a confident one. Where
@@ -128,10 +123,7 @@ class Episodes:
         return taken.step
 
     def next_step(
-        self,
-        evidence: Evidence,
-        directions: Float | None = None,
-        constrain: Constrain = unconstrained,
+        self, evidence: Evidence, directions: Float | None = None, constrain: Constrain = unconstrained
     ) -> Taken:
         """What ``update`` would take in. Nothing is changed; ``keep`` takes it in."""
         taken = self._taken(evidence, directions)
@@ -164,12 +156,10 @@ class Episodes:
         """
         if not self.steps or self.steps[-1].state is None or len(self.running) == 0:
             raise SessionError("there is nothing to choose: no view was taken yet, or the episodes have ended")
-        step, running = self.steps[-1], np.isin(self.steps[-1].episodes, self.running)
-        state, chosen = self._move(
-            self.steps[-1].state.select(np.isin(self.steps[-1].state.episodes, self.running)), constrain
-        )
+        step, before = self.steps[-1], self.steps[-1].state
+        state, chosen = self._move(before.select(np.isin(before.episodes, self.running)), constrain)
         next_views = np.full(len(step.episodes), -1)
-        next_views[running] = chosen
+        next_views[np.isin(step.episodes, self.running)] = chosen
         return replace(step, next_views=next_views, stopped=next_views < 0, state=state)
 
     def keep_choice(self, step: Step) -> None:
@@ -309,8 +299,7 @@ class Episodes:
             chosen = np.asarray(self.policy.next_views(state, self.rng))
         if chosen.shape != state.current.shape or not np.issubdtype(chosen.dtype, np.integer):
             raise PolicyError(f"policy {name} has to return {len(state.current)} integers, one for each episode")
-        off = (chosen < 0) | (chosen >= len(self.sphere))
-        if off.any():
+        if (off := (chosen < 0) | (chosen >= len(self.sphere))).any():
             where = int(state.episodes[off][0])
             raise PolicyError(f"policy {name} chose view {chosen[off][0]}, which is not on the sphere", where)
         return chosen
@@ -336,9 +325,8 @@ class Episodes:
         if len(self.running):
             raise SessionError("the episodes are still running")
         b = len(self.current)
-        views = np.full((b, len(self.steps)), -1)
+        views, confident = np.full((b, len(self.steps)), -1), np.zeros(b, bool)
         answer, n_views, confidence = np.zeros(b, np.int64), np.zeros(b, np.int64), np.zeros(b)
-        confident = np.zeros(b, bool)
         for k, step in enumerate(self.steps):
             views[step.episodes, k] = step.views
             answer[step.episodes] = step.belief.argmax(1)
@@ -346,17 +334,9 @@ class Episodes:
             n_views[step.episodes] = k + 1
             reached = self.stopping.reached(step.belief, np.maximum(step.seen, 1))
             confident[step.episodes] = reached & (step.seen > 0)
-        moved = views[:, 1:] >= 0
-        legs = (views[:, :-1], views[:, 1:])
-        return Outcome(
-            answer,
-            confidence,
-            n_views,
-            confident,
-            (self.sphere.travel[legs] * moved).sum(1),
-            (self.sphere.arc[legs] * moved).sum(1),
-            views,
-        )
+        moved, legs = views[:, 1:] >= 0, (views[:, :-1], views[:, 1:])
+        travel, arc = ((ways[legs] * moved).sum(1) for ways in (self.sphere.travel, self.sphere.arc))
+        return Outcome(answer, confidence, n_views, confident, travel, arc, views)
 
 
 def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
@@ -368,11 +348,10 @@ def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
     def kept(values: NDArray[np.floating]) -> NDArray[np.floating]:
         return np.where(seen.reshape(-1, *[1] * (values.ndim - 1)), values, 0)
 
-    azimuth_bins = None if evidence.azimuth_bins is None else kept(evidence.azimuth_bins)
     maps = {name: kept(values) for name, values in evidence.maps.items()}
-    novelty = None if evidence.novelty is None else kept(evidence.novelty)
-    logits = kept(evidence.logits)
-    return replace(evidence, logits=logits, maps=maps, azimuth_bins=azimuth_bins, novelty=novelty), seen
+    others = {name: getattr(evidence, name) for name in ("logits", "azimuth_bins", "novelty")}
+    others = {name: values if values is None else kept(values) for name, values in others.items()}
+    return replace(evidence, maps=maps, **others), seen
 
 
 def run_episodes(

@@ -49,8 +49,7 @@ class Reach:
         views = views[self.can_reach(views, poses)]
         if self.cost is not None:
             if callable(self.cost):
-                at = poses()
-                cost = np.array([_cost(self.cost(here, at[view])) for view in views], np.float64)
+                cost = np.array([_cost(self.cost(here, pose)) for pose in poses()[views]], np.float64)
             else:
                 cost = self.cost[state.current[0], views]
             views, cost = views[cost < np.inf], cost[cost < np.inf]

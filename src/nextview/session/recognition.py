@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.recognition.belief import Stopping
-from nextview.recognition.novelty import Novelty
+from nextview.recognition.novelty import Quantiles
 from nextview.session.view import View
 
 if TYPE_CHECKING:
@@ -17,27 +17,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Recognition:
-    """The end of an episode.
+    """The end of an episode."""
 
-    Attributes:
-        views: in order.
-        classes: their names.
-        confident: whether the threshold was reached (else the views ran out); never if nothing was seen.
-        sphere: the candidate viewpoints.
-        stopping: the rule that ended it.
-        stranded: whether it ended because no view that was left could be reached; then it is not confident.
-        score: gives the novelty of views; None if the recogniser has none.
-        unknown_rate: share of objects of known classes that may be called unknown; 0: none.
-    """
-
-    views: tuple[View, ...]
-    classes: tuple[str, ...]
-    confident: bool
-    sphere: Viewpoints
-    stopping: Stopping
-    stranded: bool = False
-    score: Novelty | None = None
-    unknown_rate: float = 0.0
+    views: tuple[View, ...]  # in order
+    classes: tuple[str, ...]  # their names
+    confident: bool  # whether the threshold was reached (else the views ran out); never if nothing was seen
+    sphere: Viewpoints  # the candidates
+    stopping: Stopping  # the rule that ended it
+    stranded: bool = False  # whether it ended because no view that was left could be reached; then it is not confident
+    score: Quantiles | None = None  # gives the novelty of views; None if the recogniser has none
+    unknown_rate: float = 0.0  # share of objects of known classes that may be called unknown; 0: none
 
     @property
     def seen(self) -> bool:
@@ -95,17 +84,11 @@ class Recognition:
     def plot(self, path: str | Path | None = None, title: str = "") -> Figure:
         """Draw the episode: images, what the policy valued the views at, beliefs and the path on the sphere.
 
-        Args:
-            path: write it to this file too (PNG, PDF or SVG).
-            title: of the picture.
-
-        Raises:
-            UsageError: the file cannot be written, or its suffix is not a picture's.
+        With a path it is written to that file too, PNG, PDF or SVG; UsageError if it cannot be.
         """
         from nextview.session.episode_figure import draw_episode, save_figure
 
-        heading = f"{title}: {self!r}" if title else repr(self)
-        figure = draw_episode(self.views, self.classes, self.sphere, self.stopping, heading)
+        figure = draw_episode(self, f"{title}: {self!r}" if title else repr(self))
         if path is not None:
             save_figure(figure, Path(path))
         return figure

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
@@ -17,7 +18,7 @@ from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.viewsphere import Viewpoints, angle_between, azimuth_of, direction_of
 from nextview.policies.base import EpisodeState, Policy, ValuesViews
 from nextview.policies.off_grid import anywhere
-from nextview.recognition.belief import Stopping, fuse
+from nextview.recognition.belief import Stopping, log_evidence_of
 from nextview.recognition.inference import Models
 from nextview.recognition.map_names import maps_among
 from nextview.sensing.frame import Frame
@@ -211,20 +212,18 @@ class Session:
             view = replace(self.views[-1], next_view=_next_of(step), values=self._values(step))
             self._episodes.keep_choice(step)
             self._reach, self.views[-1] = reach, view
-            self._tell_observers()
+            for observer in self.observers:
+                observer(self)
         else:  # with frames it begins where the camera is
             episodes = self._begin_nearest(reach) if self.object is None else self._episodes
             self._reach, self._episodes = reach, episodes
 
     def _begin_nearest(self, reach: Reach) -> Episodes:
         """Before the first view: begin at the nearest view that can be reached. A callable is not asked yet."""
-        order = np.argsort(self.sphere.arc[self.view], kind="stable")
-        there = ~reach.failed[order]
-        if isinstance(reach.reachable, np.ndarray):
-            there &= reach.reachable[order]
+        there = ~reach.failed & (reach.reachable if isinstance(reach.reachable, np.ndarray) else True)
         if not there.any():
             raise SessionError("none of the candidate views can be reached")
-        return self._begin(int(order[there.argmax()]))
+        return self._begin(int(np.where(there, self.sphere.arc[self.view], np.inf).argmin()))
 
     def _constrained(
         self, state: EpisodeState, reach: Reach, object: ObservedObject | None, here: Float | None = None
@@ -256,12 +255,9 @@ class Session:
             raise SessionError("this session has ended; begin another one")
         with _blas().limit(limits=1):
             view = self._add_frame(seen) if isinstance(seen, Frame) else self._add_observation(seen)
-        self._tell_observers()
-        return view
-
-    def _tell_observers(self) -> None:
         for observer in self.observers:
             observer(self)
+        return view
 
     def _add_observation(self, seen: Observation) -> View:
         if not isinstance(seen, Observation):
@@ -300,7 +296,10 @@ class Session:
         changed = [k for k, seen in enumerate(observations) if k == last or seen is not self.views[k].observation]
         found = self.models.evidence([observations[k] for k in changed])
         evidence = {k: found.select([row]) for row, k in enumerate(changed)}
-        directions = [self._snapped(direction_of(observation.pose)) for observation in observations]
+        at = [
+            (direction, *self.sphere.nearest(direction)) for direction in (direction_of(o.pose) for o in observations)
+        ]
+        directions = [self.sphere.directions[view] if there else direction for direction, view, there in at]
         episodes = self._episodes
         if changed != [last]:
             episodes = self._begin(self.view)
@@ -317,11 +316,10 @@ class Session:
             views[k] = replace(
                 seen, next_view=was.next_view, values=was.values, warnings=was.warnings, degrees_off=was.degrees_off
             )
-        view = self._view(taken.step, observations[last], directions[last], travel[last])
         off = angle_between(self.sphere.directions[self.view], directions[last])
         asked = bool(self.views) or object is None or object.known is not None
         view = replace(
-            view,
+            self._view(taken.step, observations[last], directions[last], travel[last]),
             next_view=_next_of(taken.step),
             values=self._values(taken.step),
             warnings=tuple(warnings),
@@ -335,12 +333,14 @@ class Session:
         """What a step says of its view, but for what was chosen after it."""
         calibration, (nearest, there) = self._episodes.calibration, self.sphere.nearest(direction)
         azimuth = self.sphere.azimuth[[nearest]] if there else azimuth_of(direction[None])
-        bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), len(self.models.classes), azimuth)
-        novelty = step.evidence.novelty
+        classes, evidence = len(self.models.classes), step.evidence
+        bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), classes, azimuth)
+        alone = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth)
+        novelty = evidence.novelty
         return View(
             int(step.views[0]),
             observation,
-            alone=fuse(step.evidence.logits[:, None], calibration.temperature_after(1))[0],
+            alone=calibration.belief(alone, 1, classes)[0],
             belief=step.belief[0],
             maps={name: values[0] for name, values in step.evidence.maps.items()},
             next_view=None,
@@ -351,20 +351,15 @@ class Session:
             novelty=float(novelty[0]) if novelty is not None and observation.seen else None,
         )
 
-    def _snapped(self, direction: Float) -> Float:
-        view, there = self.sphere.nearest(direction)
-        return self.sphere.directions[view] if there else direction
-
     def _travelled(self, views: Sequence[int], directions: Sequence[Float]) -> list[tuple[float, float]]:
         """Cells and radians on the way to each view, from the places where the camera stood."""
         sphere, found = self.sphere, [(0.0, 0.0)]
         at = [np.array_equal(d, sphere.directions[view]) for view, d in zip(views, directions, strict=True)]
-        for k in range(1, len(views)):
-            if at[k - 1] and at[k]:
-                leg = sphere.travel[views[k - 1], views[k]], sphere.arc[views[k - 1], views[k]]
+        for a, b in pairwise(range(len(views))):
+            if at[a] and at[b]:
+                leg = sphere.travel[views[a], views[b]], sphere.arc[views[a], views[b]]
             else:
-                before, now = directions[k - 1], directions[k]
-                leg = sphere.travel_between(before, now), angle_between(before, now)
+                leg = sphere.travel_between(directions[a], directions[b]), angle_between(directions[a], directions[b])
             found.append((found[-1][0] + float(leg[0]), found[-1][1] + float(leg[1])))
         return found
 
@@ -404,16 +399,9 @@ class Session:
         """How it ended."""
         confident = bool(self._episodes.outcome.confident[0])
         all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
-        return Recognition(
-            tuple(self.views),
-            self.models.classes,
-            confident,
-            self.sphere,
-            self.stopping,
-            stranded=not confident and not all_taken,
-            score=self.models.recogniser.novelty,
-            unknown_rate=self.unknown,
-        )
+        ended = tuple(self.views), self.models.classes, confident, self.sphere, self.stopping
+        stranded = not confident and not all_taken
+        return Recognition(*ended, stranded, score=self.models.recogniser.novelty, unknown_rate=self.unknown)
 
 
 def _next_of(step: Step) -> int | None:

@@ -14,41 +14,26 @@ from nextview.sensing.plausibility import ViewWarning
 
 @dataclass(frozen=True)
 class View:
-    """One view and what followed from it.
+    """One view and what followed from it."""
 
-    Attributes:
-        index: candidate viewpoint that it was taken from, or the nearest one to where the camera stood.
-        observation: what was seen.
-        alone: belief by this view alone, (classes,) float64; even if nothing is seen in it.
-        belief: fused over all views so far, (classes,) float64.
-        maps: predicted local maps by name, each (rings, 3).
-        next_view: where to look next; None where the episode ends.
-        travel: so far, grid cells.
-        arc: so far, radians.
-        direction: unit vector from the object to where the camera stood, (3,) float64.
-        azimuth_bins: belief, over all views, in the azimuth from which the object is seen here, for each class,
-            (classes, azimuth bins), in even steps; None if the recogniser does not tell.
-        values: what the policy valued each candidate view at, (V,) float64, NaN if not considered; None at the end, and
-            for policies that value nothing.
-        novelty: score of this view; None if nothing is seen in it, or the recogniser has none.
-        warnings: what is likely to be wrong with the view; usually nothing.
-        degrees_off: angle between the view that was asked for and where the camera stood; 0 for a first frame.
-    """
-
-    index: int
+    index: int  # candidate viewpoint that it was taken from, or the nearest one to where the camera stood
     observation: Observation
-    alone: NDArray[np.float64]
-    belief: NDArray[np.float64]
-    maps: dict[str, NDArray[np.floating]]
-    next_view: int | None
-    travel: float
-    arc: float
-    direction: NDArray[np.float64]
+    alone: NDArray[np.float64]  # belief by this view alone, (classes,); even if nothing is seen in it
+    belief: NDArray[np.float64]  # fused over all views so far, (classes,)
+    maps: dict[str, NDArray[np.floating]]  # predicted local maps by name, each (rings, 3)
+    next_view: int | None  # where to look next; None where the episode ends
+    travel: float  # so far, grid cells
+    arc: float  # so far, radians
+    direction: NDArray[np.float64]  # unit vector from the object to where the camera stood, (3,)
+    # Belief, over all views, in the azimuth from which the object is seen here, for each class, in even steps,
+    # (classes, azimuth bins); None if the recogniser does not tell.
     azimuth_bins: NDArray[np.float64] | None = None
+    # What the policy valued each candidate view at, (V,), NaN if not considered; None at the end, and for policies that
+    # value nothing.
     values: NDArray[np.float64] | None = None
-    novelty: float | None = None
-    warnings: tuple[ViewWarning, ...] = ()
-    degrees_off: float = 0.0
+    novelty: float | None = None  # score of this view; None if nothing is seen in it, or the recogniser has none
+    warnings: tuple[ViewWarning, ...] = ()  # what is likely to be wrong with the view; usually nothing
+    degrees_off: float = 0.0  # between the view that was asked for and where the camera stood; 0 for a first frame
 
     @property
     def angles(self) -> tuple[float, float]:
