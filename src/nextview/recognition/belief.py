@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -32,9 +33,9 @@ def _softmax(logs: Floating) -> Float:
     return values / values.sum(-1, keepdims=True)
 
 
-def _pointing(total: Floating, classes: int) -> Floating:
-    """Sums of log-evidence of the azimuths to which azimuth bin 0 points, (..., azimuth bins, classes)."""
-    return total[..., classes:].reshape(*total.shape[:-1], -1, classes)
+def _pointing(total: Floating, classes: int, hypotheses: int) -> Floating:
+    """Sums of log-evidence of the azimuths to which azimuth bin 0 points, (..., azimuth bins, hypotheses)."""
+    return total[..., classes:].reshape(*total.shape[:-1], -1, hypotheses)
 
 
 def reorient(azimuth_bins: Floating, azimuth: Floating) -> Floating:
@@ -65,9 +66,10 @@ def reorient(azimuth_bins: Floating, azimuth: Floating) -> Floating:
 def log_evidence_of(logits: Floating, azimuth_bins: Floating | None, azimuth: Floating) -> Floating:
     """Log-evidence of views in a form that can be summed over views: see ``Calibration.belief``.
 
-    From logits (..., classes), log-likelihoods of the azimuth bins seen, (..., classes, azimuth bins), or None,
+    From logits (..., classes), log-likelihoods of the azimuth bins seen, (..., hypotheses, azimuth bins), or None,
     and azimuths, radians, (...): the logits, then for each azimuth the log-evidence that azimuth bin 0 points there,
-    given each class, (..., (1 + azimuth bins) * classes). The logits alone without azimuth bins.
+    given each hypothesis, (..., classes + azimuth bins * hypotheses). The hypotheses are the classes, or see
+    ``Calibration.hypotheses``. The logits alone without azimuth bins.
     """
     if azimuth_bins is None:
         return logits
@@ -128,15 +130,18 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         correlation: of the evidence of two views, 0 .. 1.
         risk: for stopping with a promise; None if not known.
         bin_correlation: of the azimuth bins of two views, 0 .. 1; None where these shall not count for the class.
+        hypotheses: what the azimuth bins are given, by the class of each, ascending: things, each in every resting pose
+            that it was taught in. () where they are given the classes.
 
     Raises:
-        ModelError: a temperature that is not positive, or a negative number.
+        ModelError: a temperature that is not positive, a negative number, or hypotheses that are not of every class.
     """
 
     temperature: float = 1.0
     correlation: float = 0.0
     risk: RiskBounds | None = None
     bin_correlation: float | None = None
+    hypotheses: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         numbers = (self.correlation, self.bin_correlation or 0.0)
@@ -145,9 +150,16 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
                 f"no calibration: temperature {self.temperature}, correlation {self.correlation}, of azimuth bins "
                 f"{self.bin_correlation}"
             )
+        if self.hypotheses and not (set(np.diff((-1, *self.hypotheses)).tolist()) <= {0, 1}):
+            raise ModelError("no calibration: the hypotheses are not of every class in order")
 
-    def temperature_after(self, n_views: int) -> float:
-        """What the sum of the logits of so many views is divided by."""
+    @property
+    def threshold_decay(self) -> float:
+        """How fast the threshold for stopping comes down with the views, see ``Stopping``: not at all for things."""
+        return 0.0 if self.hypotheses else self.correlation
+
+    def temperature_after(self, n_views: NDArray | int) -> Any:
+        """What the sum of the logits of so many views is divided by, same shape."""
         return self.temperature * (1 + self.correlation * (n_views - 1))
 
     def log_belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
@@ -162,26 +174,45 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         logs = total[..., :classes] / (self.temperature * (1 + self.correlation * more))
         if self.bin_correlation is None or total.shape[-1] == classes:
             return logs
-        pointing = _pointing(total, classes) / (1 + self.bin_correlation * more)[..., None]
+        pointing = self._pointing(total, n_views, classes)
         top = pointing.max(-2)
         pointing -= top[..., None, :]
-        return logs + top + np.log(np.exp(pointing, out=pointing).sum(-2))
+        agreement = top + np.log(np.exp(pointing, out=pointing).sum(-2))
+        if self.hypotheses:  # a class is the sum of its things
+            first, top = np.unique(self.hypotheses, return_index=True)[1], agreement.max(-1, keepdims=True)
+            # What underflows is far below the best, but still ordered.
+            shares = np.add.reduceat(np.exp(agreement - top), first, -1)
+            agreement = np.maximum(np.log(shares + 1e-300), np.maximum.reduceat(agreement, first, -1) - top) + top
+        return logs + agreement
+
+    def _pointing(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
+        correlation = self.correlation if self.bin_correlation is None else self.bin_correlation
+        pointing = _pointing(np.asarray(total, np.float64), classes, len(self.hypotheses) or classes)
+        return pointing / (1 + correlation * (np.asarray(n_views)[..., None, None] - 1))
+
+    def joint(self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating) -> Float:
+        """Belief in each hypothesis seen from each azimuth bin, jointly, (..., hypotheses, azimuth bins), sums to 1.
+
+        From an azimuth, radians, (...); other arguments as for ``log_belief``.
+        """
+        total = np.asarray(total, np.float64)
+        logs = reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth)
+        of_class = total[..., :classes] / self.temperature_after(np.asarray(n_views)[..., None])
+        logs = logs + (of_class[..., list(self.hypotheses)] if self.hypotheses else of_class)[..., None]
+        return _softmax(logs.reshape(*logs.shape[:-2], -1)).reshape(logs.shape)
 
     def belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
         """Belief in each class, (..., classes) float64, sums to 1; arguments as for ``log_belief``."""
         return _softmax(self.log_belief(total, n_views, classes))
 
     def azimuth_bins(self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating) -> Float | None:
-        """Belief in the azimuth bin seen from an azimuth, radians, given each class: (..., classes, azimuth bins).
+        """Belief in the azimuth bin seen from an azimuth, radians, given each hypothesis, (..., hypotheses, bins).
 
         None without azimuth bins; ``total`` as for ``log_belief``.
         """
         if total.shape[-1] == classes:
             return None
-        correlation = self.correlation if self.bin_correlation is None else self.bin_correlation
-        more = np.asarray(n_views)[..., None, None] - 1
-        pointing = _pointing(np.asarray(total, np.float64), classes) / (1 + correlation * more)
-        return _softmax(reorient(pointing.swapaxes(-1, -2), azimuth))
+        return _softmax(reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth))
 
     def threshold(self, risk: float, max_views: int) -> float:
         """The lowest threshold of the belief that promises an error rate; RiskError if none does."""
@@ -261,7 +292,7 @@ class Stopping:
         """
         if risk is not None:
             return cls(calibration.threshold(risk, max_views), max_views)
-        return cls(threshold, max_views, calibration.correlation)
+        return cls(threshold, max_views, calibration.threshold_decay)
 
     def reached(self, belief: Floating, n_views: NDArray | int) -> NDArray[np.bool_]:
         """Whether beliefs, (..., classes), after so many views, (...), are sure enough to stop, (...)."""

@@ -17,13 +17,14 @@ from nextview.files import checked_bytes
 from nextview.geometry.observation import Observation
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.map_names import SPHERE, maps_among
-from nextview.recognition.model_card import MAPS, RECOGNISER, ModelCard, find_card
+from nextview.recognition.model_card import FEATURES, MAPS, RECOGNISER, ModelCard, find_card
 from nextview.recognition.network_input import from_observations
-from nextview.recognition.novelty import novelty_path, read_novelty
+from nextview.recognition.novelty import Novelty, Quantiles, novelty_path, read_novelty
 
 INPUT = "input"
 BINS_OUTPUT = "sides"
 FEATURES_OUTPUT = "features"
+EMBEDDING_OUTPUT = "embedding"
 """Ends of a recogniser's ONNX file: the last is what its last layers make the logits of, (B, F)."""
 LONGEST = 300
 """Letters of what the runtime says."""
@@ -123,7 +124,7 @@ class Recogniser:
         self.calibration = self.card.calibration
         self._session = open_weights(self.card, threads)
         sha256 = self.card.novelty_sha256
-        self.novelty = read_novelty(novelty_path(self.card.path), sha256) if sha256 else None
+        self.novelty: Quantiles | None = read_novelty(novelty_path(self.card.path), sha256) if sha256 else None
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
         """Evidence of B views from one camera; views in which nothing is seen are marked, see ``Evidence.seen``."""
@@ -134,11 +135,14 @@ class Recogniser:
         radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
         return replace(evidence, logits=evidence.logits + self.card.size.logits(radii))
 
-    def from_inputs(self, inputs: NDArray[Any]) -> Evidence:
-        """Evidence by shape alone, from what the network takes, see ``network_input``."""
+    def from_inputs(self, inputs: NDArray[Any], elevations: NDArray[np.floating] | None = None) -> Evidence:
+        """Evidence by shape alone, from what the network takes, see ``network_input``.
+
+        ``elevations`` of the cameras, radians, (B,), are for memories of things.
+        """
         names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins) + [FEATURES_OUTPUT] * (self.novelty is not None)
         outputs = dict(zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True))
-        novelty = None if self.novelty is None else self.novelty.scores(outputs[FEATURES_OUTPUT])
+        novelty = self.novelty.scores(outputs[FEATURES_OUTPUT]) if isinstance(self.novelty, Novelty) else None
         return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT), novelty=novelty)
 
     def features(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
@@ -146,6 +150,18 @@ class Recogniser:
         if FEATURES_OUTPUT not in [end.name for end in self._session.get_outputs()]:
             raise ModelError(f"{self.card.path}: gives no {FEATURES_OUTPUT}; export the recogniser again")
         return run_onnx(self.card.path, self._session, [FEATURES_OUTPUT], inputs)[0]
+
+
+class Features:
+    """The bundled network that knows no classes: views to embeddings, unit vectors that alike views share."""
+
+    def __init__(self, threads: int = 0) -> None:
+        self.card = find_card(FEATURES)
+        self._session = open_onnx(self.card.path, self.card.sha256, threads)
+
+    def __call__(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
+        """Embeddings, (B, F) float32, from what the network takes, see ``network_input``."""
+        return run_onnx(self.card.path, self._session, [EMBEDDING_OUTPUT], inputs)[0]
 
 
 class MapNetwork:

@@ -18,6 +18,11 @@ from nextview.recognition.network_input import InputSpec
 
 BUNDLED = Path(__file__).parent / "bundled"
 RECOGNISER = "recogniser-modelnet10"
+FEATURES = "features"
+"""The bundled network that knows no classes: what taught things are remembered by."""
+MEMORY_SUFFIX = ".safetensors"
+COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}
+"""Recognisers that are bundled, by the name of the models they belong to."""
 MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}
 """The map networks that are bundled, by the name of the map."""
 NOWHERE = Path()
@@ -31,14 +36,33 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     commands: tuple[str, ...] = ()
 
 
+class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One taught thing: its name, the file or folder that it was taught from, and in how many resting poses."""
+
+    name: str
+    source: str
+    poses: int
+
+
+class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a memory of things is of: the things in order, the features it is made of, and the weight of a cosine."""
+
+    things: tuple[Thing, ...]
+    features_sha256: Sha256
+    weight: float
+    attribution: str = ""
+
+
 class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="schema", tag=2):
-    """One model; as a file, a JSON object of these fields beside the ONNX file of the same name.
+    """One model; as a file, a JSON object of these fields beside the file of the same name with its weights.
+
+    That is an ONNX file; of a memory of taught things, which is a recogniser too, a safetensors file.
 
     Attributes:
         name: what users call it.
         kind: "recogniser" or the name of the map that it predicts ("lem").
         input: what it takes of a view.
-        sha256: of its ONNX file.
+        sha256: of that file.
         path: of that file; it does not stand in the card.
         network: which architecture, in words.
         classes: of a recogniser, unique, in the order of its logits.
@@ -57,6 +81,7 @@ class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
         note: what else is to be said.
         held_out: objects of the training split that it was not trained on; () if it does not say.
         fitted_to: what calibration, size, novelty and valleys were fitted to, in words, by their names.
+        memory: of a recogniser that was taught things; None for a network.
 
     Raises:
         ModelError: a recogniser without classes, sizes of other classes than these, or a network of no input.
@@ -84,6 +109,7 @@ class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
     note: str = ""
     held_out: tuple[str, ...] = ()
     fitted_to: dict[str, str] = {}
+    memory: Taught | None = None
 
     def __post_init__(self) -> None:
         if not self.name or not self.kind:
@@ -118,7 +144,8 @@ class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
 def read_card(path: Path) -> ModelCard:
     """Read a card; the weights are the file beside it with the same name. ModelError if one is missing."""
     path = Path(path)
-    card = replace(read_record(path, ModelCard, "a model card"), path=path.with_suffix(".onnx"))
+    card = read_record(path, ModelCard, "a model card")
+    card = replace(card, path=path.with_suffix(MEMORY_SUFFIX if card.memory else ".onnx"))
     if not card.path.exists():
         raise ModelError(f"{card.path}: the weights of model {card.name} are missing")
     return card
@@ -154,22 +181,24 @@ class Collection:
 
 
 def find_models(models: str | Path) -> Collection:
-    """The bundled models by name ("modelnet10"), or those in a folder.
+    """The bundled models by name, one of COLLECTIONS, or those in a folder.
 
     A folder holds the card of one recogniser. Maps that it lacks are the bundled ones: they know no classes.
     """
     bundled = {name: BUNDLED / f"{card}.json" for name, card in MAPS.items()}
-    name, folder = RECOGNISER.removeprefix("recogniser-"), Path(models)
-    if str(models) == name:
-        return Collection(BUNDLED / f"{RECOGNISER}.json", bundled, {})
+    folder = Path(models)
+    if str(models) in COLLECTIONS:
+        return Collection(BUNDLED / f"{COLLECTIONS[str(models)]}.json", bundled, {})
     if not folder.is_dir():
-        raise ModelError(f"{folder}: is neither a folder with models nor the name of bundled ones ({name})")
+        known = ", ".join(COLLECTIONS)
+        raise ModelError(f"{folder}: is neither a folder with models nor the name of bundled ones ({known})")
     networks: dict[str, list[Path]] = {}
     policies: dict[str, Path] = {}
     for path in sorted(folder.glob("*.json")):
         regular_file(path, "a card", ModelError)
         # A policy's card names the viewpoints that it was learned for.
-        if path.with_suffix(".onnx").exists() and b'"elevations"' not in path.read_bytes():
+        weights = path.with_suffix(".onnx").exists() or path.with_suffix(MEMORY_SUFFIX).exists()
+        if weights and b'"elevations"' not in path.read_bytes():
             networks.setdefault(read_card(path).kind, []).append(path)
         else:
             policies[path.stem] = path
@@ -177,6 +206,6 @@ def find_models(models: str | Path) -> Collection:
         if len(paths) > 1:
             raise ModelError(f"{folder}: holds several models of the kind {kind}: {paths[0].name}, {paths[1].name}")
     if "recogniser" not in networks:
-        raise ModelError(f"{folder}: holds no card of a recogniser; nextview export recogniser makes one")
+        raise ModelError(f"{folder}: holds no card of a recogniser; nextview learn makes one")
     own = {kind: paths[0] for kind, paths in networks.items()}
     return Collection(own.pop("recogniser"), bundled | own, policies)

@@ -23,65 +23,21 @@ NEIGHBOUR = 10
 
 
 @dataclass(frozen=True)
-class Novelty:
-    """A novelty score of views by the recogniser's features, and its distribution over objects of known classes.
-
-    The score is the sum of two parts, each standardised over known views that the recogniser was not trained on: the
-    distance to the tenth nearest of known views, of unit vectors (Sun et al., ICML 2022), and a perceptron that was
-    trained to discriminate known objects and synthetic outliers (outlier exposure, Hendrycks et al., ICLR 2019). The
-    score of an object is the mean over its views.
+class Quantiles:
+    """The distribution of a novelty score over objects of known classes: the mean over the views of an object.
 
     Attributes:
-        middle: of the features, (F,) float32.
-        directions: on which the distances are measured, (F, D) float32.
-        neighbours: known views on them, unit vectors, (R, D) float32.
-        hidden, hidden_bias: first layer of the perceptron, (F, H) and (H,) float32.
-        output, output_bias: its second, (H,) and (1,) float32.
-        standard: mean and deviation of the distance, then of the perceptron's, over known views, (2, 2) float32.
         quantiles: scores of known objects after 1, 2, ... views, ascending, at even steps of probability from 0 to 1,
             (views, Q) float32.
         objects: how many known objects they are of, (1,) int64.
-
-    Raises:
-        ModelError: shapes that do not fit, or numbers that are not finite.
     """
 
-    middle: Float
-    directions: Float
-    neighbours: Float
-    hidden: Float
-    hidden_bias: Float
-    output: Float
-    output_bias: Float
-    standard: Float
     quantiles: Float
     objects: NDArray[np.int64]
 
     def __post_init__(self) -> None:
-        f, d, h = len(self.middle), self.directions.shape[-1], self.hidden.shape[-1]
-        shapes = {"middle": (f,), "directions": (f, d), "neighbours": (len(self.neighbours), d), "hidden": (f, h)}
-        shapes |= {"hidden_bias": (h,), "output": (h,), "output_bias": (1,), "standard": (2, 2), "objects": (1,)}
-        shapes |= {"quantiles": (len(self.quantiles), self.quantiles.shape[-1])}
-        for name, shape in shapes.items():
-            values = getattr(self, name)
-            if values.shape != shape or 0 in shape or not np.isfinite(values).all():
-                raise ModelError(f"no novelty score: {name} has the shape {values.shape}, or is not finite")
-        if len(self.neighbours) < NEIGHBOUR or (self.standard[:, 1] <= 0).any() or self.objects[0] < 1:
-            raise ModelError("no novelty score: too few known views, or a deviation that is not positive")
-        if self.quantiles.shape[1] < 2 or (np.diff(self.quantiles) < 0).any():
+        if self.quantiles.ndim != 2 or self.quantiles.shape[1] < 2 or not (np.diff(self.quantiles) >= 0).all():
             raise ModelError("no novelty score: quantiles that do not ascend")
-
-    def scores(self, features: Float) -> NDArray[np.float64]:
-        """The novelty score of each view, (B,) float64, from features (B, F): the higher, the more novel."""
-        return ((self.parts(features) - self.standard[:, 0]) / self.standard[:, 1]).sum(1)
-
-    def parts(self, features: Float) -> NDArray[np.float64]:
-        """Distance and perceptron of each view before they are standardised, (B, 2) float64."""
-        centred = np.asarray(features, np.float32) - self.middle
-        nearness = unit(centred @ self.directions) @ self.neighbours.T
-        distance = -np.partition(nearness, -NEIGHBOUR, axis=1)[:, -NEIGHBOUR]
-        perceptron = np.tanh(centred @ self.hidden + self.hidden_bias) @ self.output + self.output_bias
-        return np.stack([distance, perceptron], 1).astype(np.float64)
 
     def p_value(self, score: Float | float, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
         """The share of known objects that are at least as novel after so many views, by the mean score over them.
@@ -101,6 +57,62 @@ class Novelty:
     def of_views(self, scores: Sequence[float]) -> float:
         """The p-value of one object by the scores of its views so far; 1 if there is none."""
         return float(self.p_value(float(np.mean(scores)), len(scores))) if scores else 1.0
+
+
+@dataclass(frozen=True)
+class Novelty(Quantiles):
+    """A novelty score of views by the recogniser's features, and its distribution over objects of known classes.
+
+    The score is the sum of two parts, each standardised over known views that the recogniser was not trained on: the
+    distance to the tenth nearest of known views, of unit vectors (Sun et al., ICML 2022), and a perceptron that was
+    trained to discriminate known objects and synthetic outliers (outlier exposure, Hendrycks et al., ICLR 2019). The
+    score of an object is the mean over its views.
+
+    Attributes:
+        middle: of the features, (F,) float32.
+        directions: on which the distances are measured, (F, D) float32.
+        neighbours: known views on them, unit vectors, (R, D) float32.
+        hidden, hidden_bias: first layer of the perceptron, (F, H) and (H,) float32.
+        output, output_bias: its second, (H,) and (1,) float32.
+        standard: mean and deviation of the distance, then of the perceptron's, over known views, (2, 2) float32.
+
+    Raises:
+        ModelError: shapes that do not fit, or numbers that are not finite.
+    """
+
+    middle: Float
+    directions: Float
+    neighbours: Float
+    hidden: Float
+    hidden_bias: Float
+    output: Float
+    output_bias: Float
+    standard: Float
+
+    def __post_init__(self) -> None:
+        f, d, h = len(self.middle), self.directions.shape[-1], self.hidden.shape[-1]
+        shapes = {"middle": (f,), "directions": (f, d), "neighbours": (len(self.neighbours), d), "hidden": (f, h)}
+        shapes |= {"hidden_bias": (h,), "output": (h,), "output_bias": (1,), "standard": (2, 2), "objects": (1,)}
+        shapes |= {"quantiles": (len(self.quantiles), self.quantiles.shape[-1])}
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values.shape != shape or 0 in shape or not np.isfinite(values).all():
+                raise ModelError(f"no novelty score: {name} has the shape {values.shape}, or is not finite")
+        if len(self.neighbours) < NEIGHBOUR or (self.standard[:, 1] <= 0).any() or self.objects[0] < 1:
+            raise ModelError("no novelty score: too few known views, or a deviation that is not positive")
+        super().__post_init__()
+
+    def scores(self, features: Float) -> NDArray[np.float64]:
+        """The novelty score of each view, (B,) float64, from features (B, F): the higher, the more novel."""
+        return ((self.parts(features) - self.standard[:, 0]) / self.standard[:, 1]).sum(1)
+
+    def parts(self, features: Float) -> NDArray[np.float64]:
+        """Distance and perceptron of each view before they are standardised, (B, 2) float64."""
+        centred = np.asarray(features, np.float32) - self.middle
+        nearness = unit(centred @ self.directions) @ self.neighbours.T
+        distance = -np.partition(nearness, -NEIGHBOUR, axis=1)[:, -NEIGHBOUR]
+        perceptron = np.tanh(centred @ self.hidden + self.hidden_bias) @ self.output + self.output_bias
+        return np.stack([distance, perceptron], 1).astype(np.float64)
 
     def save(self, path: Path, overwrite: bool = False) -> str:
         """Write a .safetensors file, the large tables in half precision if that holds them; returns its SHA-256."""

@@ -1,0 +1,301 @@
+"""Teach things: from a folder of meshes or captured frames to a memory that recognises them, without PyTorch."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from msgspec.structs import replace as replace_record
+from safetensors.numpy import load_file, save_file
+
+from nextview.data.pool import WorkerDied, each
+from nextview.data.progress import Track, silently
+from nextview.errors import DatasetError, NextviewError, UsageError
+from nextview.files import command, new_file, new_folder, only_one
+from nextview.learning.learned_picture import draw_learned
+from nextview.learning.memory_fit import VIEWS, fit_memory, size_evidence
+from nextview.learning.teaching import Arrays, teach
+from nextview.learning.things import Source, find_things
+from nextview.recognition.belief import Calibration
+from nextview.recognition.memory import AZIMUTHS, Memory, read_memory
+from nextview.recognition.model_card import (
+    FEATURES,
+    ModelCard,
+    Taught,
+    Thing,
+    Training,
+    find_card,
+    read_card,
+    write_card,
+)
+
+NAME = "memory"
+"""Of the card in a folder of taught things, and of the file beside it."""
+Pair = tuple[Source, Arrays]
+"""A thing, and what is remembered of it."""
+ODD_SIZE = 300
+"""A thing so many times larger or smaller than the median of the others is asked about."""
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What was learned.
+
+    Attributes:
+        out: the folder.
+        things: how many, of so many ``classes``.
+        accuracy: share of the cases in which held-out views are named right after 1, 2, 3 and 5 of them, by shape
+            alone; things of a class of several by the others of that class.
+        confused: pairs of things that are most often taken for each other, with the share of the cases.
+        notes: what there is to know, a sentence each.
+        left_out: what could not be learned and why, a phrase each.
+    """
+
+    out: Path
+    things: int
+    classes: int
+    accuracy: tuple[float, ...]
+    confused: tuple[tuple[str, str, float], ...]
+    notes: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class How:
+    """How things are looked at.
+
+    Attributes:
+        unit: of the mesh files; then size counts as evidence.
+        up: the up axis of the mesh files; z by default, but y for GLB.
+        upright: the things only ever stand as their files have them; by default they may also lie.
+        sensor: the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help.
+        any_size: take things of very different sizes as they are.
+        seed: of all random draws.
+    """
+
+    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None
+    up: Literal["y", "z"] | None = None
+    upright: bool = False
+    sensor: str = "wrist"
+    any_size: bool = False
+    seed: int = 0
+
+
+def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
+    """Teach the things in a folder; options are those of ``How`` and of ``learn_things``, which says all."""
+    how = {name: options.pop(name) for name in How.__dataclass_fields__ if name in options}
+    return learn_things(Path(folder), Path(out), How(**how), **options)
+
+
+def learn_things(
+    folder: Path,
+    out: Path,
+    how: How = How(),
+    add: bool = False,
+    remove: tuple[str, ...] = (),
+    workers: int | None = None,
+    scheduler: str | None = None,
+    overwrite: bool = False,
+    track: Track = silently,
+) -> Learned:
+    """Teach the things in a folder, and write a folder of models that recognises them.
+
+    Each mesh in the folder is a thing of its own name, as is each folder of captured depth frames with poses (BOP, TUM
+    RGB-D or 7-Scenes); any other folder is a class, and the meshes in it are its things. A run that was stopped goes on
+    where it was. Use what it writes with --models OUT, or ``nextview.load(models=OUT)``.
+
+    Args:
+        folder: what is to be taught.
+        out: folder to write.
+        how: how things are looked at.
+        add: put the things beside those that ``out`` knows; the old ones are not looked at again.
+        remove: forget the things of these names in ``out``; with --add only, and ``folder`` may be ``out`` then.
+        workers: processes; one for each core by default; 0 to work in this one.
+        scheduler: address of a dask.distributed scheduler whose workers see the same files, to use instead.
+        overwrite: replace what ``out`` knows.
+        track: follows the things.
+
+    Raises:
+        DatasetError: nothing can be taught; what is wrong, in one sentence.
+        ResultsError: ``out`` is there, and neither ``add`` nor ``overwrite``.
+    """
+    folder, out = Path(folder), Path(out)
+    if remove and not add:
+        raise UsageError("--remove goes with --add: it changes what is known")
+    card_path, old, known = out / f"{NAME}.json", None, list[Pair]()
+    if add:
+        old = read_card(card_path)
+        known = _known(old, read_memory(old.path, old.sha256), remove)
+    elif card_path.exists() and not overwrite:
+        check = f"{out}: knows things already; --add puts others beside them, --overwrite replaces them"
+        raise UsageError(check)
+    found = find_things(folder) if not (remove and folder.resolve() == out.resolve()) else None
+    sources = [] if found is None else _new(found.things, known)
+    left_out = [] if found is None else list(found.left_out)
+    part = out.with_name(f".{out.name}.part")
+    with only_one(out):
+        taught = known
+        track(_teach(sources, how, part, taught, left_out, workers, scheduler), len(sources), "things")
+        if not taught:
+            raise DatasetError(f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})")
+        taught.sort(key=lambda pair: (pair[0].label, pair[0].name))
+        if not how.any_size:
+            _check_sizes(taught)
+        learned = _write(out, taught, left_out, old)
+        shutil.rmtree(part, ignore_errors=True)
+    return learned
+
+
+def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]:
+    """The things of a memory, without some."""
+    assert card.memory is not None
+    names = [thing.name for thing in card.memory.things]
+    if missing := sorted(set(remove) - set(names)):
+        raise UsageError(f"{card.path}: knows nothing called {missing[0]!r}")
+    kept = []
+    for index, thing in enumerate(card.memory.things):
+        own = memory.thing == index
+        label = card.classes[card.calibration.hypotheses[int(np.flatnonzero(own)[0])]]
+        arrays = {name: getattr(memory, name)[own] for name in ("views", "rotations")}
+        arrays |= {name: getattr(memory, name)[index] for name in PER_THING}
+        arrays["radii"] = arrays["radii"].reshape(1)
+        if thing.name not in remove:
+            kept.append((Source(thing.name, label, Path(thing.source)), arrays))
+    return kept
+
+
+PER_THING = ("held_out", "held_out_views", "radii", "pictures")
+
+
+def _new(things: Sequence[Source], known: Sequence[Pair]) -> list[Source]:
+    names = {source.name for source, _ in known}
+    for thing in things:
+        if thing.name in names:
+            raise UsageError(f"{thing.path}: something called {thing.name} is known already; --remove it, or rename it")
+    return list(things)
+
+
+def _teach(
+    sources: Sequence[Source],
+    how: How,
+    part: Path,
+    taught: list[Pair],
+    left_out: list[str],
+    workers: int | None,
+    scheduler: str | None,
+) -> Iterator[int]:
+    """Teach things side by side, each into a file of its own; what is there from a run that was stopped is taken."""
+    part.mkdir(parents=True, exist_ok=True)
+    waiting = []
+    for source in sources:
+        file = part / f"{source.name}.safetensors"
+        # A file that was changed since, or other options, make it anew.
+        stamp = repr((str(source.path.resolve()), source.path.stat().st_mtime_ns, how))
+        if (arrays := _finished(file, stamp)) is not None:
+            taught.append((source, arrays))
+        else:
+            waiting.append((source, stamp))
+    yield len(sources) - len(waiting)
+    for count, ((source, _), result) in enumerate(
+        each(partial(_teach_one, how, part), waiting, workers, scheduler), len(sources) - len(waiting) + 1
+    ):
+        if isinstance(result, WorkerDied | str):
+            left_out.append(f"{source.name}: {result}")
+        else:
+            taught.append((source, result))
+        yield count
+
+
+def _finished(file: Path, stamp: str) -> Arrays | None:
+    try:
+        arrays = load_file(file)
+    except Exception:  # missing, or cut off by a kill: it is made again
+        return None
+    return arrays if bytes(arrays.pop("stamp").tobytes()).decode() == stamp else None
+
+
+def _teach_one(how: How, part: Path, item: tuple[Source, str]) -> Arrays | str:
+    """What is to be remembered of one thing; a sentence where it cannot be taught."""
+    source, stamp = item
+    try:
+        arrays = teach(source.path, source.name, how.unit, how.up, how.upright, how.sensor, how.seed)
+    except NextviewError as error:
+        return str(error)
+    arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+    with new_file(part / f"{source.name}.safetensors", overwrite=True) as file:
+        save_file(arrays | {"stamp": np.frombuffer(stamp.encode(), np.uint8)}, file)
+    return arrays
+
+
+def _check_sizes(taught: Sequence[Pair]) -> None:
+    """Ask about a thing a thousand times larger than the others: its file is in another unit."""
+    radii = np.concatenate([arrays["radii"] for _, arrays in taught])
+    if np.isfinite(radii).sum() < 2:
+        return
+    ratio = radii / np.nanmedian(radii)
+    for (source, _), times in zip(taught, ratio, strict=True):
+        if times > ODD_SIZE or times < 1 / ODD_SIZE:
+            how = f"{times:,.0f} times larger" if times > 1 else f"{1 / times:,.0f} times smaller"
+            raise DatasetError(
+                f"{source.path}: is {how} than most others; is it in another unit? --any-size takes it as it is"
+            )
+
+
+def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: ModelCard | None) -> Learned:
+    """Fit what is fitted to all things together, and write memory and card."""
+    classes = tuple(dict.fromkeys(source.label for source, _ in taught))
+    label = np.array([classes.index(source.label) for source, _ in taught])
+    poses = [len(arrays["views"]) for _, arrays in taught]
+    thing = np.repeat(np.arange(len(taught)), poses)
+    stacked = {name: np.stack([arrays[name] for _, arrays in taught]) for name in PER_THING}
+    stacked["radii"] = stacked["radii"][:, 0]
+    joint = {name: np.concatenate([arrays[name] for _, arrays in taught]) for name in ("views", "rotations")}
+    fit = fit_memory(joint["views"], thing, label, stacked["held_out"], stacked["held_out_views"])
+    memory = Memory(thing=thing, head=fit.head, head_bias=fit.head_bias, quantiles=fit.quantiles, **joint, **stacked)
+    things = tuple(Thing(source.name, str(source.path), n) for (source, _), n in zip(taught, poses, strict=True))
+    features = find_card(FEATURES)
+    calibration = Calibration(1.0, 1.0, None, fit.correlation, tuple(label[thing].tolist()))
+    card = ModelCard(
+        NAME,
+        "recogniser",
+        features.input,
+        "0" * 64,
+        network="memory of views",
+        classes=classes,
+        azimuth_bins=AZIMUTHS,
+        calibration=calibration,
+        size=size_evidence(stacked["radii"], label),
+        training=Training(f"{len(taught)} things", commands=() if old is None else old.training.commands),
+        scores={"held-out views": {str(k): round(a, 4) for k, a in zip(VIEWS, fit.accuracy, strict=True)}},
+        memory=Taught(things, features.sha256, fit.weight),
+    ).made_by(command())
+    with new_folder(out, overwrite=True) as part:
+        sha256 = memory.save(part / f"{NAME}.safetensors")
+        write_card(part / f"{NAME}.json", replace_record(card, sha256=sha256))
+        pictures = {source.name: arrays["pictures"] for source, arrays in taught}
+        draw_learned(part / "learned.png", pictures, fit)
+    names = [source.name for source, _ in taught]
+    confused = tuple((names[a], names[b], share) for a, b, share in fit.confused)
+    return Learned(out, len(taught), len(classes), fit.accuracy, confused, _notes(taught), tuple(left_out))
+
+
+def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:
+    """What there is to know of what was learned, a sentence each."""
+    names, notes = [source.name for source, _ in taught], []
+    if len(taught) == 1:
+        notes.append(f"{names[0]} is all it knows, so everything is that; teach what it may be mistaken for, too")
+    first: dict[bytes, str] = {}
+    for source, arrays in taught:
+        # The picture is a render without errors: only the same mesh gives the very same one.
+        look = arrays["pictures"].tobytes() + np.round(np.log(arrays["radii"]), 3).tobytes()
+        if (twin := first.setdefault(look, source.name)) != source.name:
+            notes.append(f"{twin} and {source.name} look the same: one thing under two names?")
+    unknown = [source.name for source, arrays in taught if not np.isfinite(arrays["radii"])]
+    if unknown and len(taught) > 1:
+        notes.append(f"the size of {len(unknown)} of {len(taught)} things is not known; --unit makes it count")
+    return tuple(notes)

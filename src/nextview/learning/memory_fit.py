@@ -1,0 +1,192 @@
+"""What is fitted to a memory as a whole: how much a likeness weighs, a head for classes, sizes, and novelty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.recognition.belief import Calibration, SizeEvidence, log_evidence_of, of_true_class
+from nextview.recognition.memory import AZIMUTHS, by_ring, similarities
+
+Float = NDArray[np.floating]
+WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)
+"""Of a cosine, as a log-likelihood."""
+CORRELATIONS = (0.1, 0.3, 0.6)
+"""Of two views, see ``Calibration.bin_correlation``."""
+HEADS = (0.0, 5.0, 15.0)
+"""Weights of the head beside the nearest views."""
+RIDGE = 1.0
+MOST_THINGS = 150
+"""Things whose held-out views are judged: a drawn part of more."""
+DRAWS, VIEWS, FOLDS = 4, (1, 2, 3, 5), 5
+LEVELS = 101
+SIZE_ERROR = 0.07
+"""Deviation of the logarithm of a radius that a sensor measures."""
+FAR = -1e3
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What was fitted; ``accuracy`` after as many held-out views as VIEWS says; ``confused`` (thing, thing, share)."""
+
+    weight: float
+    correlation: float
+    head: Float
+    head_bias: Float
+    quantiles: Float
+    accuracy: tuple[float, ...]
+    confused: tuple[tuple[int, int, float], ...]
+
+
+def fit_memory(
+    views: Float, thing: NDArray[np.int64], label: NDArray[np.int64], held_out: Float, held_out_views: Float
+) -> Fit:
+    """Fit by the held-out views of the things, most likely after 1, 2, 3 and 5 of them.
+
+    A thing that has others of its class is judged by these alone, in folds over things: whoever teaches a class will
+    meet other things of it. A thing that is a class of its own is judged by what is remembered of itself.
+
+    Args:
+        views: (H, rings, azimuths, F), remembered, unit vectors.
+        thing: of each resting pose, (H,).
+        label: class of each thing, ascending, (T,).
+        held_out: embeddings of views that are not remembered, (T, K, F).
+        held_out_views: their elevations and azimuths, radians, (T, K, 2).
+    """
+    views, held_out = np.asarray(views, np.float32), np.asarray(held_out, np.float32)
+    rng = np.random.default_rng(0)
+    several = np.bincount(label)[label] > 1
+    judged = np.sort(rng.permutation(len(label))[:MOST_THINGS])
+    fold = rng.permutation(len(label)) % FOLDS
+    alike = _judged(views, thing, held_out[judged], held_out_views[judged])
+    for row, t in enumerate(judged):
+        if several[t]:
+            alike[row][:, (fold[thing] == fold[t]) & several[thing]] = FAR
+    heads, whole = _heads(views, thing, label, several, fold, held_out, judged)
+    drawn = np.stack([np.stack([rng.permutation(held_out.shape[1]) for _ in range(DRAWS)]) for _ in judged])
+    grid = [(w, c, h) for h in (HEADS if several.any() else (0.0,)) for w in WEIGHTS for c in CORRELATIONS]
+    scored = [
+        (_belief(alike, heads, held_out_views[judged], drawn, label[thing], len(whole[1]), each), each) for each in grid
+    ]
+    truth = label[judged]
+    loss = [-np.mean([of_true_class(logs, truth).mean() for logs in beliefs]) for beliefs, _ in scored]
+    beliefs, (weight, correlation, head) = scored[int(np.argmin(loss))]
+    accuracy = tuple(float((logs.argmax(-1) == truth[:, None]).mean()) for logs in beliefs)
+    scores = -np.stack([alike_of.max((1, 2)) for alike_of in np.where(alike > FAR, alike, -1.0)])
+    kept = [np.take_along_axis(scores[:, None], drawn, 2)[..., :k].mean(-1).ravel() for k in range(1, 6)]
+    quantiles = np.stack([np.quantile(values, np.linspace(0, 1, LEVELS)) for values in kept]).astype(np.float32)
+    return Fit(
+        weight,
+        correlation,
+        head * whole[0],
+        head * whole[1],
+        quantiles,
+        accuracy,
+        _confused(beliefs[1], truth, judged, label),
+    )
+
+
+def _judged(views: Float, thing: NDArray[np.int64], held_out: Float, where: Float) -> NDArray[np.float32]:
+    """How alike each held-out view is to each resting pose and azimuth, (T, K, H, azimuths)."""
+    flat = similarities(by_ring(views), held_out.reshape(-1, held_out.shape[-1]), where[..., 0].ravel())
+    return flat.reshape(*held_out.shape[:2], len(thing), AZIMUTHS)
+
+
+def _heads(
+    views: Float,
+    thing: NDArray[np.int64],
+    label: NDArray[np.int64],
+    several: NDArray[np.bool_],
+    fold: NDArray[np.int64],
+    held_out: Float,
+    judged: NDArray[np.int64],
+) -> tuple[NDArray[np.float32], tuple[Float, Float]]:
+    """What heads that have not seen a thing say of its held-out views, (T, K, C); and the head of all things."""
+    classes, f = int(label.max()) + 1, views.shape[-1]
+    if not several.any():
+        return np.zeros((len(judged), held_out.shape[1], classes), np.float32), (
+            np.zeros((f, classes), np.float32),
+            np.zeros(classes, np.float32),
+        )
+    x, y = views[:, :, ::4].reshape(len(thing), -1, f), label[thing]
+    found = np.zeros((len(judged), held_out.shape[1], classes), np.float32)
+    for k in range(FOLDS):
+        weights, bias = _ridge(
+            x[(fold[thing] != k) | ~several[thing]], y[(fold[thing] != k) | ~several[thing]], classes
+        )
+        own = fold[judged] == k
+        found[own] = held_out[judged][own] @ weights + bias
+    return found, _ridge(x, y, classes)
+
+
+def _ridge(x: Float, y: NDArray[np.int64], classes: int) -> tuple[Float, Float]:
+    """Ridge regression from views, (H, n, F), of classes (H,), to one-hot classes, each class weighted evenly."""
+    h, n, f = x.shape
+    rows, target = x.reshape(h * n, f), np.repeat(np.eye(classes, dtype=np.float32)[y], n, 0)
+    weight = np.repeat(1 / np.maximum(np.bincount(y, minlength=classes), 1)[y] / n, n).astype(np.float32)[:, None]
+    middle = (weight * rows).sum(0) / weight.sum()
+    centred = rows - middle
+    gram = centred.T @ (weight * centred) + RIDGE * 0.01 * np.eye(f, dtype=np.float32)
+    found = np.linalg.solve(gram, centred.T @ (weight * (target - 1 / classes)))
+    return found.astype(np.float32), (-middle @ found).astype(np.float32)
+
+
+def _belief(
+    alike: Float,
+    heads: Float,
+    where: Float,
+    drawn: NDArray[np.int64],
+    hypotheses: NDArray[np.int64],
+    classes: int,
+    settings: tuple[float, float, float],
+) -> list[NDArray[np.float64]]:
+    """Log-belief after so many drawn views as VIEWS says, (T, draws, classes) each."""
+    weight, correlation, head = settings
+    calibration = Calibration(1.0, 1.0, None, correlation, tuple(hypotheses.tolist()))
+    found = []
+    total = np.stack(
+        [log_evidence_of(head * h, weight * a, z) for h, a, z in zip(heads, alike, where[..., 1], strict=True)]
+    )
+    for k in VIEWS:
+        sums = np.stack([t[d[:, :k]].sum(1) for t, d in zip(total, drawn, strict=True)])
+        found.append(calibration.log_belief(sums, k, classes))
+    return found
+
+
+def _confused(
+    logs: Float, truth: NDArray[np.int64], judged: NDArray[np.int64], label: NDArray[np.int64]
+) -> tuple[tuple[int, int, float], ...]:
+    """Pairs of things by the share of the cases in which one is named as the class of the other, the worst first."""
+    answers, pairs = logs.argmax(-1), dict[tuple[int, int], float]()
+    first = {int(c): int(np.flatnonzero(label == c)[0]) for c in np.unique(label)}
+    for row, t in enumerate(judged):
+        for answer in answers[row][answers[row] != truth[row]]:
+            other = first[int(answer)]
+            pair = min(int(t), other), max(int(t), other)
+            pairs[pair] = pairs.get(pair, 0) + 0.5 / answers.shape[1]
+    return tuple((a, b, share) for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1]))
+
+
+def size_evidence(radii: Float, label: NDArray[np.int64]) -> SizeEvidence | None:
+    """How likely each size is for the things of each class; None where no size is known.
+
+    Each thing of a class adds a Student distribution (3 degrees of freedom) of the logarithm of its radius; half hidden
+    things look smaller. A class of which no size is known has none.
+    """
+    known = np.isfinite(radii)
+    if not known.any():
+        return None
+    low, high = np.log(radii[known].min()) - 0.7, np.log(radii[known].max()) + 0.7
+    grid = np.linspace(low, high, int((high - low) / 0.03) + 2)
+    density = np.zeros((int(label.max()) + 1, len(grid)))
+    for c in range(len(density)):
+        own = np.log(radii[known & (label == c)])
+        # Things of a class differ in size, and the fewer are known the wider their sizes may lie.
+        wide = SIZE_ERROR if (label == c).sum() == 1 else max(SIZE_ERROR, 0.5 * own.std() if len(own) > 1 else 0.3)
+        if len(own):
+            student = (1 + ((grid[:, None] - own) / wide) ** 2 / 3) ** -2
+            density[c] = np.log(student.mean(1) / wide)
+    density[~np.isin(np.arange(len(density)), label[known])] = density.max()
+    return SizeEvidence.from_arrays(np.exp(grid), density, 1.0)

@@ -1,0 +1,142 @@
+"""Look at one thing from everywhere, without and with a sensor's errors, and note what its views are like."""
+
+from __future__ import annotations
+
+import zlib
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import NoViewLeftError, ObservationError
+from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.geometry.observation import Observation
+from nextview.geometry.resting import resting_poses, rotated
+from nextview.geometry.viewsphere import ViewSphere, angle_between, direction_of, look_at_origin
+from nextview.recognition.inference import Features
+from nextview.recognition.memory import AZIMUTHS, RINGS, joined
+from nextview.recognition.network_input import from_observations
+from nextview.recognition.novelty import unit
+from nextview.simulation.captured import is_capture, read_capture
+from nextview.simulation.captured_camera import CapturedCamera
+from nextview.simulation.sensed_camera import SensedCamera
+from nextview.simulation.simulated import SimulatedCamera
+
+Arrays = dict[str, NDArray]
+HELD_OUT = 8
+"""Views of each thing that are not remembered."""
+SETUP = 8
+"""Views that share the errors of one setup: a wrong centre, a wrong size."""
+BATCH = 20
+NEAR = np.radians(30)
+"""A captured view teaches what the thing looks like from no farther than this."""
+GRID = ViewSphere(RINGS, AZIMUTHS)
+
+
+def teach(path: Path, name: str, unit: str | None, up: str | None, upright: bool, sensor: str, seed: int) -> Arrays:
+    """What is to be remembered of one thing, by the names of the fields of ``recognition.memory.Memory``.
+
+    Args:
+        path: a mesh file, or a folder of captured frames.
+        name: decides all random draws, with the seed.
+        unit: of a mesh file, one of ``mesh.UNITS``; None if it is not known.
+        up: the up axis of a mesh file, "y" or "z".
+        upright: whether it only ever stands as its file has it.
+        sensor: through which it is looked at, see ``sensor.sensor_named``.
+        seed: of all random draws.
+
+    Raises:
+        MeshError, DatasetError, ObservationError: it cannot be looked at; why, in one sentence.
+    """
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+    if path.is_dir() and is_capture(path):
+        return _of_capture(path)
+    mesh = load_mesh(path, up, unit)
+    rotations = np.eye(3)[None] if upright else resting_poses(mesh)
+    lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
+    directions = np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), HELD_OUT)), rng.uniform(0, 2 * np.pi, HELD_OUT)
+    held_out = _sensed(mesh, look_at_origin(*directions), sensor, rng)
+    return {
+        "views": np.stack([_around(each, sensor, rng) for each in lying]).astype(np.float16),
+        "rotations": rotations.astype(np.float32),
+        "held_out": held_out.astype(np.float16),
+        "held_out_views": np.stack(directions, 1).astype(np.float32),
+        "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
+        "pictures": _picture(SimulatedCamera(mesh, 64).observe(look_at_origin(np.radians(25), np.radians(35)))),
+    }
+
+
+def _around(mesh: Mesh, sensor: str, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Embeddings of the views of the grid, (rings, azimuths, F): the mean without and with a sensor's errors.
+
+    Every other azimuth is looked at through the sensor; between them the embeddings are interpolated.
+    """
+    clean = SimulatedCamera(mesh)
+    ideal = embeddings([clean.observe(pose) for pose in GRID.poses])
+    sensed = _sensed(mesh, GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[:, ::2].reshape(-1, 4, 4), sensor, rng)
+    sensed = sensed.reshape(len(RINGS), AZIMUTHS // 2, -1)
+    whole = np.stack([sensed, unit(sensed + np.roll(sensed, -1, 1))], 2).reshape(len(RINGS), AZIMUTHS, -1)
+    return joined(ideal.reshape(whole.shape), whole)
+
+
+def _sensed(mesh: Mesh, poses: NDArray[np.float64], sensor: str, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Embeddings of a mesh from poses, (B, 4, 4), through a sensor, (B, F)."""
+    found = []
+    for k, pose in enumerate(poses):
+        if k % SETUP == 0:
+            camera = SensedCamera(mesh, sensor, rng.spawn(1)[0])
+        found.append(camera.observe(pose))
+    return embeddings(found)
+
+
+def _of_capture(folder: Path) -> Arrays:
+    """Of captured frames: each cell of the grid is what the nearest of them shows. Every fourth is held out."""
+    camera = CapturedCamera(read_capture(folder))
+    while True:
+        try:
+            frame = camera.observe(GRID.poses[0])
+        except NoViewLeftError:
+            break
+        try:
+            camera.object.add(frame)
+        except ObservationError as error:
+            camera.refused(error)
+    seen = [view for view in camera.object.observations if view.seen]
+    if not seen:
+        raise ObservationError(f"{folder}: none of its frames shows an object")
+    directions, each = np.stack([direction_of(view.pose) for view in seen]), embeddings(seen)
+    kept = np.arange(len(seen)) % 4 < 3 if len(seen) > 4 else np.ones(len(seen), bool)
+    arc = angle_between(GRID.directions[:, None], directions[kept][None])
+    views = np.where(arc.min(1)[:, None] < NEAR, each[kept][arc.argmin(1)], 0)
+    rest = np.flatnonzero(~kept) if not kept.all() else np.arange(len(seen))
+    held_out = np.resize(rest, HELD_OUT)
+    angles = np.stack([np.arcsin(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])], 1)
+    return {
+        "views": views.reshape(1, len(RINGS), AZIMUTHS, -1).astype(np.float16),
+        "rotations": np.eye(3, dtype=np.float32)[None],
+        "held_out": each[held_out].astype(np.float16),
+        "held_out_views": angles[held_out].astype(np.float32),
+        "radii": np.array([camera.object.object_frame.radius], np.float32),
+        "pictures": _picture(seen[0]),
+    }
+
+
+def _picture(view: Observation) -> NDArray[np.uint8]:
+    """A view of a thing as a small picture, (64, 64) uint8."""
+    from PIL import Image
+
+    return np.asarray(Image.fromarray(view.picture).resize((64, 64)))
+
+
+@lru_cache(maxsize=1)
+def _features() -> Features:
+    return Features(threads=1)
+
+
+def embeddings(observations: list[Observation]) -> NDArray[np.float32]:
+    """Embeddings of views from one camera, unit vectors, (B, F) float32; zero where nothing is seen."""
+    network = _features()
+    inputs = from_observations(network.card.input, observations)
+    parts = [network(inputs[start : start + BATCH]) for start in range(0, len(inputs), BATCH)]
+    return np.concatenate(parts) * np.array([view.seen for view in observations])[:, None]

@@ -1,0 +1,175 @@
+"""The memory of taught things: what each looks like from around, and how likely a view is given each of them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from nextview.errors import ModelError
+from nextview.files import checked_bytes, new_file
+from nextview.geometry.observation import Observation
+from nextview.geometry.viewsphere import direction_of, elevation_of
+from nextview.recognition.evidence import Evidence
+from nextview.recognition.inference import Features, Recogniser
+from nextview.recognition.model_card import MEMORY_SUFFIX, find_card
+from nextview.recognition.network_input import from_observations
+from nextview.recognition.novelty import Quantiles, unit
+
+RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)
+"""Elevations of the remembered views, degrees."""
+AZIMUTHS = 16
+"""Remembered views on a ring: the azimuth bins of a memory."""
+Float = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What T things look like, each in one or more resting poses: H of these in all, sorted by the class of the thing.
+
+    Attributes:
+        views: embedding of each remembered view, unit vectors, (H, rings, azimuths, F); zero where nothing is
+            remembered.
+        thing: which thing each resting pose is of, (H,) int64.
+        rotations: of each resting pose, from the file's axes, (H, 3, 3) float32.
+        held_out: embeddings of views through a sensor that are not remembered, K of each thing in its first resting
+            pose, (T, K, F): what calibration and reports are made of.
+        held_out_views: elevation and azimuth of each, radians, (T, K, 2) float32.
+        radii: object radius of each thing, metres, (T,) float32; NaN where it is not known.
+        pictures: a picture of each thing, (T, 64, 64) uint8.
+        head, head_bias: a linear classifier of embeddings for classes of several things, (F, C) and (C,).
+        quantiles: see ``Novelty``; of the negative similarity to the nearest remembered view.
+    """
+
+    views: Float
+    thing: NDArray[np.int64]
+    rotations: Float
+    held_out: Float
+    held_out_views: Float
+    radii: Float
+    pictures: NDArray[np.uint8]
+    head: Float
+    head_bias: Float
+    quantiles: Float
+
+    def __post_init__(self) -> None:
+        h, t, f = len(self.thing), len(self.radii), self.views.shape[-1]
+        k, c = self.held_out.shape[1], len(self.head_bias)
+        shapes = {"views": (h, len(RINGS), AZIMUTHS, f), "thing": (h,), "rotations": (h, 3, 3), "radii": (t,)}
+        shapes |= {"held_out": (t, k, f), "held_out_views": (t, k, 2), "pictures": (t, 64, 64), "head": (f, c)}
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values.shape != shape or 0 in shape or (name != "radii" and not np.isfinite(values).all()):
+                raise ModelError(f"no memory: {name} has the shape {values.shape}, or is not finite")
+        if sorted(set(self.thing.tolist())) != list(range(t)):
+            raise ModelError("no memory: resting poses of things that are not there")
+
+    def save(self, path: Path, overwrite: bool = False) -> str:
+        """Write a .safetensors file, embeddings in half precision; returns its SHA-256."""
+        arrays = {f.name: np.ascontiguousarray(getattr(self, f.name)) for f in fields(self)}
+        arrays |= {name: arrays[name].astype(np.float16) for name in ("views", "held_out")}
+        content = save(arrays)
+        with new_file(path, overwrite) as part:
+            part.write_bytes(content)
+        return hashlib.sha256(content).hexdigest()
+
+
+def read_memory(path: Path, sha256: str) -> Memory:
+    """Read what ``Memory.save`` wrote; ModelError if it is not that."""
+    try:
+        arrays = load(checked_bytes(path, sha256, "a memory"))
+        return Memory(**{f.name: arrays[f.name] for f in fields(Memory)})
+    except (SafetensorError, KeyError) as error:
+        raise ModelError(f"{path}: not a memory ({error})") from None
+
+
+def similarities(views: Float, embeddings: Float, elevations: Float) -> NDArray[np.float32]:
+    """How alike views are to what is remembered, between two rings interpolated: cosines, (B, H, azimuths) float32.
+
+    Args:
+        views: of the memory, ring by ring, (rings, H * azimuths, F) float32.
+        embeddings: of the views, unit vectors, (B, F) float32.
+        elevations: from which they were taken, radians, (B,).
+    """
+    place = np.interp(elevations, np.radians(RINGS), np.arange(len(RINGS)))
+    low = np.minimum(place.astype(np.int64), len(RINGS) - 2)
+    found = np.zeros((len(embeddings), views.shape[1]), np.float32)
+    for ring in range(len(RINGS)):
+        share = np.maximum(1 - np.abs(place - ring), 0) * ((ring == low) | (ring == low + 1))
+        rows = np.flatnonzero(share > 1e-6)
+        if len(rows):
+            found[rows] += share[rows, None].astype(np.float32) * (embeddings[rows] @ views[ring].T)
+    return found.reshape(len(embeddings), -1, AZIMUTHS)
+
+
+class TaughtRecogniser(Recogniser):
+    """Recognises taught things in each view by what is remembered of them; ``model`` is the path of its card."""
+
+    def __init__(self, model: str | Path, threads: int = 0) -> None:
+        self.card = find_card(model)
+        about = self.card.memory
+        if about is None:
+            raise ModelError(f"model {self.card.name} is no memory of things")
+        self.classes, self.azimuth_bins = self.card.classes, self.card.azimuth_bins
+        self.calibration = self.card.calibration
+        self.memory = read_memory(self.card.path, self.card.sha256)
+        self._features = Features(threads)
+        if self._features.card.sha256 != about.features_sha256:
+            raise ModelError(f"{self.card.path}: was taught with other features; teach it again with nextview learn")
+        h, things = len(self.memory.thing), len(about.things)
+        if (h, things) != (len(self.calibration.hypotheses), len(self.memory.radii)):
+            raise ModelError(f"{self.card.path}: holds {h} resting poses, and its card is of others")
+        self._views = by_ring(self.memory.views)
+        self.novelty = Quantiles(self.memory.quantiles, np.array([things]))
+
+    def __call__(self, observations: Sequence[Observation]) -> Evidence:
+        """Evidence of B views from one camera, see ``Recogniser``."""
+        inputs = from_observations(self.card.input, observations)
+        elevations = np.array([elevation_of(direction_of(o.pose)) for o in observations])
+        evidence = replace(self.from_inputs(inputs, elevations), seen=np.array([o.seen for o in observations]))
+        if self.card.size is None:
+            return evidence
+        radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
+        return replace(evidence, logits=evidence.logits + self.card.size.logits(radii))
+
+    def from_inputs(self, inputs: NDArray[Any], elevations: Float | None = None) -> Evidence:
+        """Evidence by shape alone, from what the network takes and the elevations of the cameras, radians, (B,)."""
+        if elevations is None:
+            raise ModelError("a memory of things needs the elevations of the views")
+        return self.evidence(self._features(inputs), elevations)
+
+    def evidence(self, embeddings: Float, elevations: Float) -> Evidence:
+        """Evidence of views by their embeddings, unit vectors, (B, F), and elevations, radians, (B,)."""
+        assert self.card.memory is not None
+        alike = similarities(self._views, embeddings, elevations)
+        logits = embeddings @ self.memory.head + self.memory.head_bias
+        novelty = -alike.max((1, 2)).astype(np.float64)
+        return Evidence(logits, azimuth_bins=self.card.memory.weight * alike, novelty=novelty)
+
+    def features(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
+        """The embeddings of views, (B, F)."""
+        return self._features(inputs)
+
+
+def by_ring(views: Float) -> NDArray[np.float32]:
+    """Remembered views, (H, rings, azimuths, F), ring by ring, (rings, H * azimuths, F) float32."""
+    h, rings, azimuths, f = views.shape
+    return np.ascontiguousarray(views.swapaxes(0, 1).reshape(rings, h * azimuths, f), np.float32)
+
+
+def joined(clean: Float, sensed: Float) -> NDArray[np.float32]:
+    """What is remembered of views, by their embeddings without and with a sensor's errors: the mean, (..., F)."""
+    return unit(np.asarray(clean, np.float32) + np.asarray(sensed, np.float32))
+
+
+def open_recogniser(model: str | Path, threads: int = 0) -> Recogniser:
+    """A recogniser, or a memory of taught things, by the name of a bundled model or the path of a card."""
+    card = find_card(model)
+    return (TaughtRecogniser if card.path.suffix == MEMORY_SUFFIX else Recogniser)(model, threads)
