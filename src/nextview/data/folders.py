@@ -82,7 +82,7 @@ def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> Listi
 
 
 def select(entries: list[Entry], dataset: Path, split: str | None, held_out: Path | None) -> list[Entry]:
-    """Those of one split, and those that the model of a card calls held out of its training, by mesh or scene."""
+    """Those of one split, and those (meshes, or scenes by their target) that a card calls held out of its training."""
     entries = [entry for entry in entries if split in (None, entry.split)]
     if not entries:
         raise DatasetError(f"{dataset}: nothing in CLASS/{split}/NAME below it")
@@ -98,12 +98,9 @@ def _walk(root: Path, suffixes: tuple[str, ...]) -> tuple[dict[Path, Path], list
     """All files with one of the suffixes by their relative paths, each folder once; and those that are left out."""
     files: dict[Path, Path] = {}
     left_out: list[tuple[Path, str]] = []
+    unreadable: list[OSError] = []
     seen, top = set[Path](), root.resolve()
-
-    def unreadable(error: OSError) -> None:
-        left_out.append((Path(error.filename).relative_to(root), f"{error.strerror}"))
-
-    for folder, below, names in os.walk(root, onerror=unreadable, followlinks=True):
+    for folder, below, names in os.walk(root, onerror=unreadable.append, followlinks=True):
         for path in sorted(Path(folder, name) for name in names):
             place = path.relative_to(root)
             if path.suffix.lower() not in suffixes:
@@ -121,7 +118,7 @@ def _walk(root: Path, suffixes: tuple[str, ...]) -> tuple[dict[Path, Path], list
                 below.remove(name)
             seen.add(real)
         below.sort()
-    return files, left_out
+    return files, left_out + [(Path(error.filename).relative_to(root), f"{error.strerror}") for error in unreadable]
 
 
 def _entry(place: Path, path: Path, split_first: bool) -> Entry | None:

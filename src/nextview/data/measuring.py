@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -81,14 +81,17 @@ def _measure(names: tuple[str, ...], files: dict[str, Path] | None, max_faces: i
         faces = None if camera is None else camera.face_ids(pose, depth)
         view = MeasuredView(depth, pose, store.intrinsics, surface, faces)
         for name, function in functions.items():
-            about = f"measure {name} of {object_name}: "
-            guard = nullcontext() if name in MEASURES else plugin_errors(lambda said, at=about: MeasureError(at + said))
-            with guard, np.errstate(over="ignore"):  # what is too large for float32 is told below
+            with _guard(name, object_name), np.errstate(over="ignore"):  # what is too large for float32 is told below
                 values[name][k] = function(view)
     for name, found in values.items():
         if not np.isfinite(found).all():
             raise MeasureError(f"measure {name} of {object_name}, view {np.isfinite(found).argmin()}, is not finite")
     return {f"measures/{name}": found for name, found in values.items()}
+
+
+def _guard(name: str, of: str) -> AbstractContextManager[None]:
+    """What a measure of a plugin raises becomes one sentence."""
+    return nullcontext() if name in MEASURES else plugin_errors(lambda s: MeasureError(f"measure {name} of {of}: {s}"))
 
 
 def keep(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,14 +21,6 @@ from nextview.policies.base import Evidence
 from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
 
 FORMAT = 1
-ARRAYS = ("logits", "depth_entropy", "labels", "splits", "conflicting")
-OPTIONAL = ("azimuth_bins", "of_size")
-KEYS = (
-    *ARRAYS, *OPTIONAL, "format", "names", "classes", "elevations", "azimuths", "distance", "calibration", "models",
-    "store", "commands",
-)  # fmt: skip
-GROUPS = ("map/", "valley/")
-"""The arrays of a file, and how the names of those begin of which there may be several; others are not read."""
 PACKED, SPARE = 100, 64 * 2**20
 """A file holds at most this many times its size, and so many bytes more."""
 SAME = 1e-5
@@ -55,7 +47,7 @@ class Predictions:
         models: name and SHA-256 of the recogniser ("recogniser") and of each map network ("lem").
         valley_classes: for each map, the classes for which its card says that the valley is the better view.
         calibration: how far a sum of the recogniser's logits is to be trusted.
-        azimuth_bins: see ``Evidence``, (N, V, C, azimuth bins) float32; None if the recogniser cannot tell them.
+        azimuth_bins: see ``Evidence``, (N, V, hypotheses, azimuth bins) float32; None if the recogniser cannot tell.
         of_size: what the object's size added to the logits, (N, C) float32; None if sizes are not known.
         store: absolute path of the view store they were made from; empty if it is not known.
         commands: all that made them, in order, from the meshes on; () if that is not known.
@@ -80,26 +72,24 @@ class Predictions:
 
     def __post_init__(self) -> None:
         n, v, c = len(self.names), len(self.sphere), len(self.classes)
+        h = len(self.calibration.hypotheses) or c
         if n == 0:
             raise PredictionsError("these predictions hold no objects")
         if c == 0:
             raise PredictionsError("these predictions name no classes")
-        wanted = {"logits": (n, v, c), "depth_entropy": (n, v), "labels": (n,), "splits": (n,), "conflicting": (n,)}
-        arrays = {name: getattr(self, name) for name in wanted}
-        for name, values in self.maps.items():
+        shapes: dict[str, tuple[int, ...]] = {
+            "logits": (n, v, c), "depth_entropy": (n, v), "labels": (n,), "splits": (n,), "conflicting": (n,),
+            "azimuth_bins": (n, v, h, *np.shape(self.azimuth_bins)[-1:]), "of_size": (n, c),
+        }  # fmt: skip
+        for name, values in (self._arrays() | {f"map {name}": values for name, values in self.maps.items()}).items():
             columns = self.sphere.azimuths if name.endswith("-sphere") else 3
-            wanted[f"map {name}"], arrays[f"map {name}"] = (n, v, self.sphere.rings, columns), values
-        if self.azimuth_bins is not None:
-            wanted["azimuth_bins"], arrays["azimuth_bins"] = (n, v, c, *self.azimuth_bins.shape[-1:]), self.azimuth_bins
-        if self.of_size is not None:
-            wanted["of_size"], arrays["of_size"] = (n, c), self.of_size
-        for name, shape in wanted.items():
-            if arrays[name].shape != shape:
-                raise PredictionsError(f"{name} of these predictions has the shape {arrays[name].shape}, not {shape}")
-            if arrays[name].dtype.kind not in KINDS.get(name, "f"):
-                raise PredictionsError(f"{name} of these predictions is of the wrong type, {arrays[name].dtype}")
-            if arrays[name].dtype.kind == "f" and not np.isfinite(arrays[name]).all():
-                bad = self.names[int(np.flatnonzero(~np.isfinite(arrays[name].reshape(n, -1)).all(1))[0])]
+            shape = shapes.get(name, (n, v, self.sphere.rings, columns))
+            if values.shape != shape:
+                raise PredictionsError(f"{name} of these predictions has the shape {values.shape}, not {shape}")
+            if values.dtype.kind not in KINDS.get(name, "f"):
+                raise PredictionsError(f"{name} of these predictions is of the wrong type, {values.dtype}")
+            if values.dtype.kind == "f" and not np.isfinite(values).all():
+                bad = self.names[int(np.isfinite(values.reshape(n, -1)).all(1).argmin())]
                 raise PredictionsError(f"{name} of object {bad} is not a finite number")
         if not all(isinstance(name, str) for name in (*self.names, *self.classes, *self.models)):
             raise PredictionsError("a name in these predictions is no text")
@@ -111,6 +101,10 @@ class Predictions:
     def __len__(self) -> int:
         return len(self.names)
 
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays that have a row for each object, without the maps."""
+        return {f.name: values for f in fields(self) if isinstance(values := getattr(self, f.name), np.ndarray)}
+
     @cached_property
     def log_evidence(self) -> NDArray[np.float32]:
         """What the recogniser says of each view, so that views can be summed, (N, V, D); see ``log_evidence_of``."""
@@ -119,7 +113,8 @@ class Predictions:
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
         """Whether enough of the object shows in each view to say anything of it, (N, V): else all classes are alike."""
-        return np.ptp(self.by_shape().logits, axis=2) > (SAME if len(self.classes) > 1 else -1)
+        seen = np.ptp(self.by_shape().logits, axis=2) > (SAME if len(self.classes) > 1 else -1)
+        return seen if self.azimuth_bins is None else seen | (np.ptp(self.azimuth_bins, axis=(2, 3)) > SAME)
 
     def evidence(self, objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
         """What the models say of objects (rows), (B,), each seen from one view, (B,)."""
@@ -144,13 +139,9 @@ class Predictions:
 
     def of_objects(self, kept: NDArray[np.int64]) -> Predictions:
         """Some of the objects, by their rows, (n,)."""
-        arrays = {name: getattr(self, name)[kept] for name in ("logits", "depth_entropy", "labels", "splits")}
+        arrays: dict[str, Any] = {name: values[kept] for name, values in self._arrays().items()}
         maps = {name: values[kept] for name, values in self.maps.items()}
-        optional = {
-            name: values[kept] for name in ("azimuth_bins", "of_size") if (values := getattr(self, name)) is not None
-        }
-        names = tuple(self.names[i] for i in kept)
-        return replace(self, **arrays, **optional, names=names, maps=maps, conflicting=self.conflicting[kept])
+        return replace(self, **arrays, maps=maps, names=tuple(self.names[i] for i in kept))
 
     def by_shape(self) -> Predictions:
         """What the recogniser says to those who do not know how large the objects are."""
@@ -158,10 +149,13 @@ class Predictions:
             return self
         return replace(self, logits=self.logits - self.of_size[:, None], of_size=None)
 
+    def with_size(self, of_size: NDArray[np.float32] | None) -> Predictions:
+        """The inverse of ``by_shape``: logits by size, (N, C), are added."""
+        return self if of_size is None else replace(self, logits=self.logits + of_size[:, None], of_size=of_size)
+
     def save(self, path: Path, overwrite: bool = False) -> None:
         """Write one .npz file, whole or not at all; ResultsError if that cannot be."""
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
-        arrays |= {name: values for name in OPTIONAL if (values := getattr(self, name)) is not None}
+        arrays: dict[str, Any] = self._arrays()
         arrays |= {f"map/{name}": values for name, values in self.maps.items()}
         arrays |= {f"valley/{name}": np.array(classes, np.str_) for name, classes in self.valley_classes.items()}
         arrays |= {
@@ -187,7 +181,7 @@ class Predictions:
             raise PredictionsError(f"{path}: there is no such file; make one with nextview predict")
         regular_file(path, "a predictions file", PredictionsError)
         try:
-            return cls._from(_arrays(path))
+            return cls._from(_read(path))
         except KeyError as error:
             raise PredictionsError(f"{path}: lacks {error.args[0]}") from None
         except PredictionsError as error:
@@ -203,36 +197,37 @@ class Predictions:
 
         if "format" not in f or f["format"].tolist() != FORMAT:
             raise PredictionsError(f"not a predictions file of format {FORMAT}; make it again")
-        arrays: dict[str, Any] = {name: f[name] for name in ARRAYS} | {name: f.get(name) for name in OPTIONAL}
+        arrays: dict[str, Any] = {
+            name: f[name] for name in ("logits", "depth_entropy", "labels", "splits", "conflicting")
+        }
         return cls(
             **arrays,
+            azimuth_bins=f.get("azimuth_bins"),
+            of_size=f.get("of_size"),
             maps=group("map/"),
             names=tuple(f["names"].tolist()),
             classes=tuple(f["classes"].tolist()),
             sphere=ViewSphere(tuple(f["elevations"].tolist()), int(f["azimuths"]), float(f["distance"])),
             models={kind: (name, sha) for kind, name, sha in f["models"].tolist()},
             valley_classes={name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
-            calibration=_calibration(f["calibration"]) if "calibration" in f else PLAIN_SUM,
+            calibration=decode_record(
+                str(f.get("calibration", "{}")).encode(), Calibration, "not a calibration", PredictionsError
+            ),
             store=str(f.get("store", "")),
             commands=tuple(f["commands"].tolist()) if "commands" in f else (),
         )
 
 
-def _calibration(text: NDArray[np.str_]) -> Calibration:
-    return decode_record(str(text).encode(), Calibration, "not a calibration", PredictionsError)
-
-
-def _arrays(path: Path) -> dict[str, NDArray]:
-    """The arrays of a file that are read, by name, after the sizes that they announce were held against the file's."""
+def _read(path: Path) -> dict[str, NDArray]:
+    """The arrays of a file by name, after the sizes that they announce were held against the file's."""
     with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-        wanted = [name for name in file.files if name in KEYS or name.startswith(GROUPS)]
-        members = {name: file.zip.getinfo(f"{name}.npy") for name in wanted}
-        if sum(member.file_size for member in members.values()) > PACKED * path.stat().st_size + SPARE:
+        members = file.zip.infolist()
+        if sum(member.file_size for member in members) > PACKED * path.stat().st_size + SPARE:
             raise PredictionsError("announces more than such a file can hold")
-        for member in members.values():
+        for member in members:
             with file.zip.open(member) as stream:
-                first = npy.read_magic(stream) == (1, 0)
-                shape, _, dtype = (npy.read_array_header_1_0 if first else npy.read_array_header_2_0)(stream)
+                npy.read_magic(stream)
+                shape, _, dtype = npy.read_array_header_1_0(stream)
             if math.prod(shape) * dtype.itemsize > member.file_size:
                 raise PredictionsError(f"{member.filename} announces more than it holds")
-        return {name: file[name] for name in wanted}
+        return dict(file)

@@ -126,9 +126,7 @@ def render(
 
     Args:
         dataset, path: folder of meshes, or of scenes, and the store.
-        sphere: the viewpoints.
-        size: side of the images, pixels.
-        options: see there.
+        sphere, size: the viewpoints, and the side of the images, pixels.
         workers, scheduler: see ``pool.each``; a scheduler's workers see the same files.
         overwrite: replace a store of other objects or settings.
 
@@ -194,18 +192,16 @@ def listing(dataset: Path, options: RenderOptions) -> Listing:
     return replace(found, entries=select(found.entries, dataset, options.split, options.held_out))
 
 
-def _deform(store: ViewStore) -> Deform:
-    return Deform(store.attributes.stretch, store.attributes.rotated)
-
-
 def rotations(store: ViewStore) -> NDArray[np.float64]:
     """By how much each object of a store was rotated about z when it was rendered, radians, (N,)."""
-    return np.array([_deform(store).draw(store.attributes.seed, name)[1] for name in store.names])
+    deform = Deform(store.attributes.stretch, store.attributes.rotated)
+    return np.array([deform.draw(store.attributes.seed, name)[1] for name in store.names])
 
 
 def deformed(store: ViewStore, mesh: Mesh, name: str) -> Mesh:
     """A mesh as it is deformed when a store's object of that name is rendered."""
-    return mesh if _deform(store) == Deform() else _deform(store)(mesh, store.attributes.seed, name)
+    deform = Deform(store.attributes.stretch, store.attributes.rotated)
+    return mesh if deform == Deform() else deform(mesh, store.attributes.seed, name)
 
 
 def _recipe(

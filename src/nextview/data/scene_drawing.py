@@ -52,12 +52,8 @@ def draw_scenes(
 
     Args:
         dataset, out: folder of meshes, and of scenes.
-        levels: of LEVELS.
-        scenes: how many at each level, of each split; each object once by default.
-        seed: decides everything.
-        split: only this one.
+        levels, scenes, seed, split, held_out: as of ``nextview scenes``.
         workers, scheduler: see ``pool.each``; a scheduler's workers see the same files.
-        held_out: draw scenes only around objects that the model of this card calls held out of its training.
 
     Yields:
         (name, None) for each scene that is there, (name, reason) for one that cannot be drawn.
@@ -69,9 +65,9 @@ def draw_scenes(
         check_new(out, folder=True)
     elif SceneLayout.load(there).seed != seed:
         raise DatasetError(f"{there}: was drawn with another seed; give another folder or the same seed")
-    todo = [task for task in wanted if not task.path.exists()]
-    lacking = set(todo)
-    yield from ((task.name, None) for task in wanted if task not in lacking)
+    done = {task for task in wanted if task.path.exists()}
+    yield from ((task.name, None) for task in wanted if task in done)
+    todo = [task for task in wanted if task not in done]
     files: dict[str, list[str]] = {}
     for entry in list_dataset(dataset):
         files.setdefault(entry.split, []).append(_relative(entry, dataset))
