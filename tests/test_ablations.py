@@ -54,10 +54,7 @@ def test_azimuth_bins_are_right_exactly_or_up_to_a_half_turn(tmp_path):
     features[3] += 1
     azimuth_bins = np.zeros((10, 40, 3, 8), np.float32)
     np.put_along_axis(azimuth_bins, np.repeat((features % 8)[:, :, None, None], 3, axis=2), 5, axis=3)
-    assert ABLATIONS["bins_told"](replace(p, azimuth_bins=azimuth_bins), store) == (
-        pytest.approx(0.6),
-        pytest.approx(0.9),
-    )
+    assert ABLATIONS["bins_told"](replace(p, azimuth_bins=azimuth_bins), store) == pytest.approx((0.6, 0.9))
     with pytest.raises(PredictionsError, match="tell no azimuth bins"):
         ABLATIONS["bins_told"](p, store)
 

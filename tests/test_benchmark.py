@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from pipeline import refused
 
 from nextview.benchmark.leaderboard import promised_risks
 from nextview.benchmark.published import ACCURACY, published, read_table
@@ -23,21 +24,16 @@ TEN = tuple(read_table(ACCURACY[10]))
 
 
 @pytest.fixture(scope="module")
-def folder(results):
-    return results
-
-
-@pytest.fixture(scope="module")
-def predictions(folder):
-    return Predictions.load(folder / "p.npz")
+def predictions(results):
+    return Predictions.load(results / "p.npz")
 
 
 def benchmark(predictions, out, **settings):
     return run_benchmark(predictions, out, BenchmarkSettings(**settings))
 
 
-def test_every_episode_is_a_row_and_is_what_it_says(folder, predictions):
-    rows = pd.read_parquet(folder / "out" / "episodes.parquet")
+def test_every_episode_is_a_row_and_is_what_it_says(results, predictions):
+    rows = pd.read_parquet(results / "out" / "episodes.parquet")
     assert len(rows) == 3 * 40 * rows[["policy", "threshold"]].drop_duplicates().shape[0]
     row_of = {name: i for i, name in enumerate(predictions.names)}
     for row in rows.sample(200, random_state=0).itertuples():
@@ -59,11 +55,11 @@ def test_every_episode_is_a_row_and_is_what_it_says(folder, predictions):
             assert all((b / b.sum()).max() < row.threshold for b in before)
 
 
-def test_the_summary_is_what_pandas_makes_of_the_episodes(folder, predictions):
-    rows = pd.read_parquet(folder / "out" / "episodes.parquet")
+def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
+    rows = pd.read_parquet(results / "out" / "episodes.parquet")
     rows["right"] = rows["answer"].astype(str) == rows["label"].astype(str)
     rows["clean"] = ~rows["object"].isin(np.array(predictions.names)[predictions.conflicting])
-    summary = pd.read_csv(folder / "out" / "summary.csv").set_index(["policy", "threshold", "measure"])["value"]
+    summary = pd.read_csv(results / "out" / "summary.csv").set_index(["policy", "threshold", "measure"])["value"]
     for (policy, threshold), cell in rows.groupby(["policy", "threshold"], observed=True):
         moved, sure = cell[cell.n_views > 1], cell[cell.stop == "confident"]
         by_class = cell.groupby("label", observed=True)
@@ -104,19 +100,17 @@ def test_python_and_the_command_give_the_same_numbers(predictions, tmp_path):
 
 
 def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes_nothing_from_it(
-    folder, tmp_path, capsys
+    results, tmp_path, capsys
 ):
     names = ("test_replay:Asked", "test_replay:Raises", "lcm", "best-99")
-    with pytest.raises(SystemExit):
-        main(["benchmark", str(folder / "p.npz"), str(tmp_path / "own"), "--policies", *names, "--runs", "1"])
-    sentences = capsys.readouterr().err
+    sentences = refused(capsys, "benchmark", results / "p.npz", tmp_path / "own", "--policies", *names, "--runs", "1")
     assert all(part in sentences for part in ("Raises", "thing_11", "lcm", "best-99"))
     found = load(tmp_path / "own")
     assert set(found.tables.summary.policy) == {"random", "test_replay:Asked"}
     assert set(found.settings["failures"]) == {"test_replay:Raises", "lcm", "best-99"}
 
 
-def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(folder, predictions, tmp_path):
+def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(results, predictions, tmp_path):
     bounds = RiskBounds((0.6, 0.8), tuple((0.2, 0.1) for _ in range(5)), 0.1)
     calibrated = replace(predictions, calibration=Calibration(0.7, 0.5, bounds))
     calibrated.save(tmp_path / "c.npz")
@@ -131,7 +125,7 @@ def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(fold
     assert row.confidence == pytest.approx((np.exp(total) / np.exp(total).sum()).max())
 
     benchmark(tmp_path / "c.npz", tmp_path / "plain", uncalibrated=True, **settings)
-    benchmark(folder / "p.npz", tmp_path / "as published", **settings)
+    benchmark(results / "p.npz", tmp_path / "as published", **settings)
     plain, published = (load(tmp_path / name).episodes("random", 0.9) for name in ("plain", "as published"))
     pd.testing.assert_frame_equal(plain, published)
 
@@ -145,10 +139,10 @@ def test_training_objects_are_never_mixed_with_test_objects(predictions, tmp_pat
     assert half.predictions.names == both.names[1::2]
 
 
-def test_the_page_of_the_reproduction_says_what_the_tables_say(folder, tmp_path):
+def test_the_page_of_the_reproduction_says_what_the_tables_say(results, tmp_path):
     page = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "reproduction.py"))["page"]
-    text = page(folder / "p.npz", samples=200)
-    benchmark(folder / "p.npz", tmp_path / "full", samples=200)
+    text = page(results / "p.npz", samples=200)
+    benchmark(results / "p.npz", tmp_path / "full", samples=200)
     summary = pd.read_csv(tmp_path / "full" / "summary.csv").set_index(["policy", "threshold", "measure"])["value"]
     tests = pd.read_csv(tmp_path / "full" / "tests.csv").set_index(["policy", "threshold", "measure"])
     for name in ("lem", "oracle-gain"):
@@ -170,10 +164,10 @@ def test_the_published_tables_agree_with_each_other(policy, column):
 
 
 def test_it_is_printed_with_a_sentence_where_nothing_differs_and_a_warning_where_objects_are_few(
-    folder, tmp_path, capsys
+    results, tmp_path, capsys
 ):
     run = ["--policies", "lem", "oracle-gain", "--runs", "3", "--samples", "200"]
-    main(["benchmark", str(folder / "p.npz"), str(tmp_path / "board"), *run])
+    main(["benchmark", str(results / "p.npz"), str(tmp_path / "board"), *run])
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     shown = " ".join(" ".join(lines).split())

@@ -11,7 +11,6 @@ import pytest
 
 from nextview.data.downloading import Archive, download
 from nextview.errors import DatasetError
-from nextview.files import only_one
 
 MESH = b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 NOISE = np.random.default_rng(0).bytes(600_000)
@@ -89,8 +88,3 @@ def test_what_is_not_the_published_file_leaves_nothing(tmp_path, options, publis
         download(server.archive(published), tmp_path)
     assert "\n" not in str(refusal.value)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_two_downloads_to_one_place_refuse_each_other(tmp_path):
-    with Server(GOOD) as server, only_one(tmp_path / "Shapes"), pytest.raises(DatasetError, match="another run"):
-        download(server.archive(), tmp_path)

@@ -1,6 +1,5 @@
 """Networks: shapes and numbers as published, checkpoints that load and nothing else, and ONNX with the same answers."""
 
-import math
 import os
 import pickle
 import sys
@@ -13,7 +12,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from nextview.errors import ModelError
-from nextview.learning.architectures import InvertedBottleneck, LiteNet, PointNet, ResNet, orthogonality
+from nextview.learning.architectures import InvertedBottleneck, LiteNet, PointNet, ResNet
 from nextview.learning.export import export_onnx
 from nextview.learning.runs import start_from
 
@@ -119,34 +118,18 @@ class Bomb:
         return os.mkdir, (self.path,)
 
 
-def truncated(path):
-    checkpoint(path)
-    path.write_bytes(path.read_bytes()[: 2 << 20])
-
-
-def wrong_shape(path):
-    state = checkpoint(path)
-    torch.save(state | {"layer2.0.conv1.weight": torch.zeros(128, 64, 1, 1)}, path)
-
-
-def not_finite(path):
-    state = checkpoint(path)
-    state["layer1.0.bn1.weight"][3] = float("nan")
-    torch.save(state, path)
+def damaged(path, name, value):
+    torch.save(checkpoint(path) | {name: value}, path)
 
 
 BROKEN = {
     "there is no such": lambda path: None,
     "cannot be a pickle": lambda path: path.write_bytes(pickle.dumps(Bomb(path.parent / "executed"))),
     "cannot be a pickle inside torch's own file": lambda path: torch.save({"x": Bomb(path.parent / "executed")}, path),
-    "truncated": truncated,
-    "empty": lambda path: path.write_bytes(b""),
-    "a list": lambda path: torch.save([torch.zeros(3)], path),
+    "truncated": lambda path: (checkpoint(path), path.write_bytes(path.read_bytes()[: 2 << 20])),
     "another network": lambda path: torch.save({"features.0.weight": torch.zeros(3)}, path),
-    "another depth": lambda path: checkpoint(path, 34),
-    "wrong shape": wrong_shape,
-    "flat": lambda path: torch.save(checkpoint(path) | {"conv1.weight": torch.zeros(64)}, path),
-    "not finite": not_finite,
+    "wrong shape": lambda path: damaged(path, "layer2.0.conv1.weight", torch.zeros(128, 64, 1, 1)),
+    "not finite": lambda path: damaged(path, "layer1.0.bn1.weight", torch.full((64,), torch.nan)),
 }
 
 
@@ -245,12 +228,6 @@ def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
     assert torch.allclose(a, torch.eye(3).expand(3, 3, 3))
     assert torch.allclose(b, torch.eye(64).expand(3, 64, 64))
     assert torch.allclose(network(cloud[:, torch.randperm(200)])[0], predicted, atol=1e-5)
-
-
-def test_orthogonality_of_rotations_and_scalings():
-    rotation = torch.linalg.qr(torch.randn(4, 3, 3)).Q
-    assert orthogonality(rotation) < 1e-5
-    assert orthogonality(2 * torch.eye(64).expand(2, 64, 64)).item() == pytest.approx(3 * math.sqrt(64))
 
 
 def test_export_keeps_the_answers(tmp_path):

@@ -138,17 +138,12 @@ def test_moving_the_world_and_the_poses_together_changes_nothing(tiny, elevation
 def mistakes():
     good = frame(pose_at(35, 0, 0.7, (0, 0, 0.08)))
     away = frame(pose_at(35, 0, 0.7, (0, 0, 0.08)), meshes=(TABLE,))
-    flipped = good.pose @ np.diag([1.0, -1.0, -1.0, 1.0])
     yield "the empty table", lambda: away, ObservationError
-    yield "OpenGL axes", lambda: replace(good, pose=flipped), ObservationError
     yield "an inverse pose", lambda: replace(good, pose=np.linalg.inv(good.pose)), ObservationError
     yield "no pose", lambda: replace(good, pose=None), ObservationError
     yield "millimetres", lambda: replace(good, depth=1000 * good.depth), ObservationError
-    yield (
-        "an observation",
-        lambda: Observation(np.full((16, 16), 3.0), SPHERE.poses[0], np.diag([16, 16, 1.0])),
-        SessionError,
-    )
+    seen = Observation(np.full((16, 16), 3.0), SPHERE.poses[0], np.diag([16, 16, 1.0]))
+    yield "an observation", lambda: seen, SessionError
 
 
 @pytest.mark.parametrize("after", [0, 1, 2])
@@ -202,9 +197,9 @@ def test_failed_and_unreachable_views_never_come(tiny, data, layout, name):
     session = begin(tiny, policy, sphere=sphere, max_views=6, distance=None, seed=data.draw(st.integers(0, 99)))
     mask = np.random.default_rng(data.draw(st.integers(0, 999))).random(len(sphere)) < data.draw(st.floats(0.05, 1))
     assume(mask.any())
-    session.reachable = (
-        mask if data.draw(st.booleans()) else (lambda pose: mask[np.abs(sphere.poses - pose).sum((1, 2)).argmin()])
-    )
+    session.reachable = mask
+    if data.draw(st.booleans()):
+        session.reachable = lambda pose: mask[np.abs(sphere.poses - pose).sum((1, 2)).argmin()]
     failed, visited = set(), set()
     while not session.done:
         if session.views or not callable(session.reachable):
@@ -257,11 +252,7 @@ def test_travel_in_seconds_is_weighed_as_travel_in_cells(tiny):
             return np.where(state.free, -self.travel_weight * travel, -np.inf).argmax(1)
 
     camera, rng = SimulatedCamera(sample_mesh("chair"), 16), np.random.default_rng(0)
-    costs = {
-        "cells": None,
-        "seconds": 3.5 * SPHERE.travel,
-        "matrix": rng.random((40, 40)),
-    }
+    costs = {"cells": None, "seconds": 3.5 * SPHERE.travel, "matrix": rng.random((40, 40))}
     costs["callable"] = lambda a, b: costs["matrix"][
         tuple(int(np.abs(SPHERE.poses - pose).sum((1, 2)).argmin()) for pose in (a, b))
     ]

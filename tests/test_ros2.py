@@ -58,11 +58,8 @@ def info_message(k=K, shape=SHAPE, d=(), p=None, **more):
 def transform_message(pose, child="optical", time=12.5):
     x, y, z, w = map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
     translation = message("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, pose[:3, 3]), strict=True)))
-    transform = message(
-        "geometry_msgs/msg/Transform",
-        translation=translation,
-        rotation=message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-    )
+    rotation = message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    transform = message("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
     fields = {"header": header("world", time), "child_frame_id": child, "transform": transform}
     return message("geometry_msgs/msg/TransformStamped", **fields)
 
