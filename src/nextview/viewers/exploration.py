@@ -34,15 +34,13 @@ class StoredViews:
     def __init__(self, store: ViewStore, row: int) -> None:
         self.sphere, self._intrinsics = store.sphere, store.intrinsics
         self._depth, self._image = store.depth(row), store.image(row)
-        radius = store.radii[row]
-        self._radius = float(radius) if np.isfinite(radius) and radius > 0 else None
+        radius = float(store.radii[row])
+        self._radius = radius if 0 < radius < np.inf else None
 
-    def observe(self, pose: NDArray[np.float64]) -> Observation:
+    def observe(self, pose: Float) -> Observation:
         """The stored view nearest to a pose, (4, 4), object frame; its own pose comes with it."""
-        view, _ = self.sphere.nearest(direction_of(pose))
-        return Observation(
-            self._depth[view], self.sphere.poses[view], self._intrinsics, self._radius, self._image[view]
-        )
+        k, _ = self.sphere.nearest(direction_of(pose))
+        return Observation(self._depth[k], self.sphere.poses[k], self._intrinsics, self._radius, self._image[k])
 
 
 @dataclass(frozen=True)
@@ -185,16 +183,16 @@ class Exploration:
 
     def restart(self) -> None:
         """Forget all views; a sensor errs anew in the same way."""
-        self._begin(self.shown, self._opened, self.sensor)
+        self.use_sensor(self.sensor)
 
     def _begin(self, shown: ShownObject, opened: Mesh | Camera, sensor: str | None) -> None:
         if sensor is not None and not isinstance(opened, Mesh):
             raise UsageError(f"{shown.name} has only stored views: no sensor can look at it")
-        cameras = [simulated(opened, sensor, self.seed) if isinstance(opened, Mesh) else opened for _ in self.systems]
-        walks = [
-            Walk(system, camera, self.start, self.seed) for system, camera in zip(self.systems, cameras, strict=True)
-        ]
+        walks = [Walk(system, self._camera(opened, sensor), self.start, self.seed) for system in self.systems]
         self.shown, self._opened, self.sensor, self.walks = shown, opened, sensor, walks
+
+    def _camera(self, opened: Mesh | Camera, sensor: str | None = None) -> Camera:
+        return simulated(opened, sensor, self.seed) if isinstance(opened, Mesh) else opened
 
     def compare(self, policies: Sequence[str | None]) -> None:
         """Use one policy, or two side by side; those that walked before keep their views."""
@@ -204,31 +202,29 @@ class Exploration:
 
     def step(self) -> None:
         """Let each policy take its next view, if there is one."""
-        for walk in self.walks:
-            if not walk.session.done:
-                walk.step()
+        self._take([walk for walk in self.walks if not walk.session.done])
 
     def walk_on(self) -> bool:
         """Let each policy that has not stopped take its next view. Returns whether any did."""
-        going = [walk for walk in self.walks if not walk.stopped and not walk.session.done]
-        for walk in going:
+        return self._take([walk for walk in self.walks if not walk.stopped and not walk.session.done])
+
+    def _take(self, walks: Sequence[Walk]) -> bool:
+        for walk in walks:
             walk.step()
-        return bool(going)
+        return bool(walks)
 
     def pictures(self) -> dict[str, NDArray[np.uint8]]:
         """Each object by name as seen from 20 degrees up, (H, W) uint8; without those that cannot be opened."""
         found = {}
         for name, shown in self.objects.items():
             with suppress(NextviewError):  # the page shows it when the object is chosen
-                opened = shown.open()
-                camera = simulated(opened) if isinstance(opened, Mesh) else opened
+                camera = self._camera(shown.open())
                 found[name] = camera.observe(look_at_origin(np.radians(20), np.radians(40))).picture
         return found
 
     def preview(self, where: Float) -> Observation:
         """What would be seen from a position, (3,), object radii, without noise; nothing is taken."""
-        pose = self.pose_towards(where)
-        return (simulated(self.mesh) if self.mesh is not None else self.walks[0].camera).observe(pose)
+        return self._camera(self._opened).observe(self.pose_towards(where))
 
     def pose_towards(self, position: Float) -> Float:
         """A level pose, (4, 4), in the direction of a position, (3,), as far away as the candidate views are."""

@@ -41,6 +41,7 @@ class Page:
     def __init__(self, exploration: Exploration, host: str = "127.0.0.1", port: int = 8080) -> None:
         self.exploration = exploration
         self.server = serve(host, port)
+        self.stop = self.server.stop
         self._lock, self._quiet = threading.RLock(), False
         self._scenes: list[WalkScene] = []
         self._cards: list[viser.GuiHtmlHandle] = []
@@ -57,10 +58,6 @@ class Page:
         """Where the page is."""
         host = self.server.get_host()
         return f"http://{'localhost' if host in ('0.0.0.0', '127.0.0.1') else host}:{self.server.get_port()}"
-
-    def stop(self) -> None:
-        """Serve it no more."""
-        self.server.stop()
 
     # What can be clicked
 
@@ -188,28 +185,21 @@ class Page:
         for k, walk in enumerate(self.exploration.walks):
             place = ((k - (n - 1) / 2) * APART, 0.0, 0.0)
             look, drag = partial(self._look, k), partial(self._drag, k)
-            scene = WalkScene(self.server, f"/walk{k}", place, walk, self.exploration.mesh, look, drag)
-            self._scenes.append(scene)
-        for walk in self.exploration.walks:
+            self._scenes.append(WalkScene(self.server, f"/walk{k}", place, walk, self.exploration.mesh, look, drag))
             panel = self.server.gui.add_panel()
             with panel.add_tab(walk.system.policy_name):
                 self._cards.append(self.server.gui.add_html(""))
             panel.dock_below(self._panels[-1]) if self._panels else panel.dock_right()
             panel.set_width(400)
             self._panels.append(panel)
-        self._stand_back(n)
+        position, at = np.array([0.0, -1.0, 0.55]) * (7.5 + 4.5 * (n - 1)), np.array([0.0, 0.0, 0.4])
+        if not np.allclose(self.server.initial_camera.position, position):
+            cameras = [self.server.initial_camera, *(client.camera for client in self.server.get_clients().values())]
+            for camera in cameras:
+                camera.position, camera.look_at = position, at
         label = self.exploration.shown.label
         self._label.content = "" if label is None else class_card(label)
         self._draw()
-
-    def _stand_back(self, walks: int) -> None:
-        position, at = np.array([0.0, -1.0, 0.55]) * (7.5 + 4.5 * (walks - 1)), np.array([0.0, 0.0, 0.4])
-        first = self.server.initial_camera
-        if np.allclose(first.position, position):
-            return
-        first.position, first.look_at = position, at
-        for client in self.server.get_clients().values():
-            client.camera.position, client.camera.look_at = position, at
 
     def _draw(self) -> None:
         with self.server.atomic():

@@ -34,13 +34,8 @@ class Recorder:
     - ``belief_now``, ``this_view_alone``, ``values``: bars over classes, and over the views that the policy considered.
     - ``maps/NAME``: predicted maps. ``log``: each step in words, with its warnings.
 
-    The file can be read at any time; it is complete once the session is done, or after ``close``.
-
-    Args:
-        path: of the recording, .rrd.
-
-    Raises:
-        UsageError: another suffix, or the file cannot be written.
+    The file can be read at any time; it is complete once the session is done, or after ``close``. UsageError if its
+    name does not end in .rrd, or it cannot be written.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -83,12 +78,8 @@ class Recorder:
         observation = view.observation
         height, width = observation.depth.shape
         pose = rr.Transform3D(translation=observation.pose[:3, 3], mat3x3=observation.pose[:3, :3])
-        pinhole = rr.Pinhole(
-            image_from_camera=observation.intrinsics,
-            resolution=(width, height),
-            camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=0.4,
-        )
+        how = {"camera_xyz": rr.ViewCoordinates.RDF, "image_plane_distance": 0.4}
+        pinhole = rr.Pinhole(image_from_camera=observation.intrinsics, resolution=(width, height), **how)
         for name in (f"world/views/{step}", "world/camera"):
             self._stream.log(name, pose, pinhole)
         points = observation.points if observation.seen else np.zeros((0, 3), np.float32)
@@ -134,17 +125,10 @@ class Recorder:
 def blueprint() -> rrb.Blueprint:
     """How the viewer arranges a recording at first."""
     camera, bars = "world/camera", {"belief": "belief_now", "this view alone": "this_view_alone", "values": "values"}
-    beside = rrb.Vertical(
-        rrb.Horizontal(
-            *(rrb.Spatial2DView(origin=camera, contents=[f"{camera}/{k}"], name=k) for k in ("image", "depth"))
-        ),
-        rrb.Horizontal(*(rrb.BarChartView(origin=origin, name=name) for name, origin in bars.items())),
-        rrb.Horizontal(
-            rrb.TimeSeriesView(origin="/", contents=["belief/**", "threshold"], name="belief over the steps"),
-            rrb.TimeSeriesView(origin="travel", name="travel"),
-        ),
-    )
-    scene = rrb.Vertical(
-        rrb.Spatial3DView(origin="world", name="object frame"), rrb.TextLogView(origin="log"), row_shares=[4, 1]
-    )
-    return rrb.Blueprint(rrb.Horizontal(scene, beside), rrb.TimePanel(timeline=TIMELINE), collapse_panels=True)
+    images = [rrb.Spatial2DView(origin=camera, contents=[f"{camera}/{k}"], name=k) for k in ("image", "depth")]
+    charts = [rrb.BarChartView(origin=origin, name=name) for name, origin in bars.items()]
+    belief = rrb.TimeSeriesView(origin="/", contents=["belief/**", "threshold"], name="belief over the steps")
+    rows = images, charts, [belief, rrb.TimeSeriesView(origin="travel", name="travel")]
+    scene, log = rrb.Spatial3DView(origin="world", name="object frame"), rrb.TextLogView(origin="log")
+    left, right = rrb.Vertical(scene, log, row_shares=[4, 1]), rrb.Vertical(*(rrb.Horizontal(*row) for row in rows))
+    return rrb.Blueprint(rrb.Horizontal(left, right), rrb.TimePanel(timeline=TIMELINE), collapse_panels=True)

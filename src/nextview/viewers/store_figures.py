@@ -73,10 +73,7 @@ def store_figure(store: ViewStore) -> Figure:
 def overlap_figure(maps: NDArray[np.floating], sphere: ViewSphere, title: str) -> Figure:
     """The map of every view, laid out as the views are (thesis, figure 14).
 
-    Args:
-        maps: (V, V) from 0 to 1; row = the view, column = the other view.
-        sphere: the viewpoints.
-        title: what the maps are.
+    ``maps`` are (V, V) from 0 to 1; row = the view, column = the other view.
     """
     rings, azimuths = sphere.rings, sphere.azimuths
     figure = PlainFigure(figsize=(1.65 * azimuths + 1.2, 1.15 * rings + 1.3), layout="constrained")
@@ -101,11 +98,9 @@ def overlap_figure(maps: NDArray[np.floating], sphere: ViewSphere, title: str) -
 def summary(store: ViewStore) -> dict[str, str]:
     """What a store holds, in words."""
     size = sum(file.stat().st_size for file in store.path.rglob("*") if file.is_file())
-    labels, rendered, views = store.labels, int(store.done.sum()), len(store.sphere)
+    rendered, views, side = int(store.done.sum()), len(store.sphere), store.attributes.size
     copies = sum(map(len, store.duplicates)) - len(store.duplicates)
-    conflicting = sum(len(set(labels[group])) > 1 for group in store.duplicates)
-    side = store.attributes.size
-    radii = median_radii(store)
+    conflicting = sum(len(set(store.labels[group])) > 1 for group in store.duplicates)
     shown = {
         "objects": f"{len(store):,} in {len(store.classes)} classes",
         "rendered": f"{rendered:,}",
@@ -114,7 +109,7 @@ def summary(store: ViewStore) -> dict[str, str]:
         "views": f"{rendered * views:,}  ({views} of {side} x {side} each)",
         "byte-identical copies": f"{copies:,}  ({conflicting} with several labels)",
         "size on disk": f"{size / 1e9:.2f} GB" if size > 1e9 else f"{size / 1e6:.1f} MB",
-        "median radius, m": ", ".join(f"{name} {radius:.2f}" for name, radius in radii.items()),
+        "median radius, m": ", ".join(f"{name} {radius:.2f}" for name, radius in median_radii(store).items()),
     }
     return {what: value for what, value in shown.items() if value}
 
@@ -130,12 +125,13 @@ def _class_bars(axes: Axes, store: ViewStore) -> None:
     labels, splits, done = store.labels, store.splits, store.done
     rows = np.arange(len(store.classes))
     start = np.zeros(len(rows))
-    parts = [(split or "objects", done & (splits == split), ORANGE if split == "test" else BLUE)
-             for split in ("train", "test", "")]  # fmt: skip
+    parts = [
+        (name, done & (splits == name), colour) for name, colour in (("train", BLUE), ("test", ORANGE), ("", BLUE))
+    ]
     for name, select, colour in [*parts, ("not rendered", ~done, "lightgrey")]:
         counts = np.bincount(labels[select], minlength=len(rows))
         if counts.any():
-            axes.barh(rows, counts, left=start, color=colour, label=name, height=0.72)
+            axes.barh(rows, counts, left=start, color=colour, label=name or "objects", height=0.72)
             start += counts
     for row, count in enumerate(start):
         axes.text(count, row, f" {int(count):,}", va="center", fontsize=9)

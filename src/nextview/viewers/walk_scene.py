@@ -21,11 +21,6 @@ BALL = 0.12
 """Radius of a candidate view, object radii."""
 
 
-def wxyz(pose: Float) -> Float:
-    """The rotation of a pose, (4, 4), as a quaternion, scalar first, (4,)."""
-    return np.asarray(Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))
-
-
 class WalkScene:
     """Draws a walk below one node of the scene; another walk needs another scene.
 
@@ -44,7 +39,7 @@ class WalkScene:
         drag: Callable[[Float, bool], None],
     ) -> None:
         self._scene, self._name, self._drag = server.scene, name, drag
-        self._root = server.scene.add_frame(name, show_axes=False, position=place)
+        self.remove = server.scene.add_frame(name, show_axes=False, position=place).remove
         self._drawn = 0
         self._object: viser.MeshHandle | None = None
         if mesh is not None:
@@ -64,10 +59,6 @@ class WalkScene:
             f"{name}/handle", 0.7, disable_rotations=True, position=first[:3, 3], depth_test=False
         )
         self._handle.on_update(self._dragged)
-
-    def remove(self) -> None:
-        """Take it out of the scene."""
-        self._root.remove()
 
     def _dragged(self, event: viser.TransformControlsEvent) -> None:
         if event.phase != "start":
@@ -94,7 +85,7 @@ class WalkScene:
             scale=0.5,
             color=rgb(ACCENT),
             image=np.repeat(observation.picture[..., None], 3, -1),
-            wxyz=wxyz(pose),
+            wxyz=Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True),
             position=pose[:3, 3],
             cast_shadow=False,
         )
