@@ -10,7 +10,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
-from importlib.metadata import entry_points
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -89,6 +88,8 @@ def plugin(path: str) -> Any:
 @cache
 def plugins(group: str) -> dict[str, str]:
     """What installed packages add, MODULE:NAME by name: the entry points of a group, "nextview.policies"."""
+    from importlib.metadata import entry_points
+
     return {entry.name: entry.value for entry in entry_points(group=group)}
 
 

@@ -21,7 +21,6 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 import numpy as np
-from filelock import FileLock, Timeout
 
 from nextview.errors import DatasetError, ModelError, NextviewError, ResultsError
 
@@ -137,6 +136,8 @@ def only_one(path: Path) -> Iterator[None]:
     Raises:
         DatasetError: another run is writing it, or its folder cannot be written.
     """
+    from filelock import FileLock, Timeout  # here, as whoever only recognises needs none
+
     place = path.absolute()
     file = place.with_name(f".{place.name}.lock")
     lock = FileLock(file, timeout=0)
