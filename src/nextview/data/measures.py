@@ -39,9 +39,7 @@ class Measure:
 
 
 MEASURES: dict[str, Measure] = {
-    "depth_entropy": Measure(
-        lambda view: entropy_of_depths(view.depths, view.depth.size), "depth", "Parisotto et al.; eq. 3"
-    )
+    "depth_entropy": Measure(lambda view: depth_entropy(view.depth), "depth", "Parisotto et al.; eq. 3")
 }
 """The thesis's own. Packages add theirs by entry points of the group GROUP."""
 GROUP = "nextview.measures"
@@ -81,14 +79,10 @@ def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
 def depth_entropy(depth: NDArray[np.floating]) -> float:
     """Shannon entropy, bits, of the values in a depth image (H, W), object radii, 0 where there is no object."""
     depth = object_depth(depth_image(depth).astype(np.float64, copy=False))
-    return entropy_of_depths(depth[depth > 0], depth.size)
-
-
-def entropy_of_depths(seen: NDArray[np.floating], pixels: int) -> float:
-    """The same, of the depth where there is an object, (n,), and how many pixels the image has."""
+    seen = depth[depth > 0]
     counts = np.bincount(np.rint(seen / QUANTUM).astype(np.int64), minlength=1)
-    counts[0] += pixels - seen.size
-    share = counts[counts > 0] / pixels
+    counts[0] += depth.size - seen.size
+    share = counts[counts > 0] / depth.size
     return float((share * np.log2(1 / share)).sum())
 
 

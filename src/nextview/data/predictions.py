@@ -77,9 +77,10 @@ class Predictions:
             raise PredictionsError("these predictions hold no objects")
         if c == 0:
             raise PredictionsError("these predictions name no classes")
+        bins = () if self.azimuth_bins is None else self.azimuth_bins.shape[-1:]
         shapes: dict[str, tuple[int, ...]] = {
             "logits": (n, v, c), "depth_entropy": (n, v), "labels": (n,), "splits": (n,), "conflicting": (n,),
-            "azimuth_bins": (n, v, h, *np.shape(self.azimuth_bins)[-1:]), "of_size": (n, c),
+            "azimuth_bins": (n, v, h, *bins), "of_size": (n, c),
         }  # fmt: skip
         for name, values in (self._arrays() | {f"map {name}": values for name, values in self.maps.items()}).items():
             columns = self.sphere.azimuths if name.endswith("-sphere") else 3
