@@ -132,12 +132,12 @@ class Residual(nn.Module):
         super().__init__()
         self.relu, outputs = nn.ReLU(inplace=True), width * (4 if narrow else 1)
         kernels = (
-            ((1, width, 1), (3, width, stride), (1, outputs, 1)) if narrow else ((3, width, stride), (3, width, 1))
+            [(1, width, 1), (3, width, stride), (1, outputs, 1)] if narrow else [(3, width, stride), (3, width, 1)]
         )
         self.length, before = len(kernels), inputs
         for k, (kernel, after, step) in enumerate(kernels, 1):
-            setattr(self, f"conv{k}", nn.Conv2d(before, after, kernel, step, kernel // 2, bias=False))
-            setattr(self, f"bn{k}", nn.BatchNorm2d(after))
+            self.add_module(f"conv{k}", nn.Conv2d(before, after, kernel, step, kernel // 2, bias=False))
+            self.add_module(f"bn{k}", nn.BatchNorm2d(after))
             before = after
         self.downsample = None
         if stride > 1 or inputs != outputs:
@@ -145,9 +145,10 @@ class Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         past = x if self.downsample is None else self.downsample(x)
-        for k in range(1, self.length):
-            x = self.relu(getattr(self, f"bn{k}")(getattr(self, f"conv{k}")(x)))
-        return self.relu(getattr(self, f"bn{self.length}")(getattr(self, f"conv{self.length}")(x)) + past)
+        for k in range(1, self.length + 1):
+            x = getattr(self, f"bn{k}")(getattr(self, f"conv{k}")(x))
+            x = self.relu(x + past if k == self.length else x)
+        return x
 
 
 class ResNet(RecogniserNetwork):
@@ -197,9 +198,7 @@ class PointLayer(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, relu: bool = True) -> None:
         super().__init__()
-        self.linear = nn.Linear(inputs, outputs)
-        self.norm = nn.BatchNorm1d(outputs)
-        self.relu = relu
+        self.linear, self.norm, self.relu = nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), relu
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.norm(self.linear(x).flatten(0, 1)).unflatten(0, x.shape[:2])
@@ -228,10 +227,8 @@ class PointNet(nn.Module):
 
     def __init__(self, rings: int, columns: int = 3, dropout: float = 0.3) -> None:
         super().__init__()
-        self.input_transform = Transform(3)
-        self.first = PointLayer(3, 64)
-        self.feature_transform = Transform(64)
-        self.second = PointLayer(64, 128)
+        self.input_transform, self.first = Transform(3), PointLayer(3, 64)
+        self.feature_transform, self.second = Transform(64), PointLayer(64, 128)
         self.third = PointLayer(128, 1024, relu=False)
         self.head = _dense((nn.Dropout(dropout),)).append(nn.Linear(256, rings * columns))
         # A ReLU whose input begins below zero stays dead: begin inside the range of the targets.
@@ -274,5 +271,4 @@ def map_columns(recipe: MapRecipe, sphere: ViewSphere) -> list[int]:
 def orthogonality(matrix: Tensor) -> Tensor:
     """How far matrices (B, k, k) are from orthogonal: mean Frobenius norm of I - A A^T (thesis, equation 2)."""
     gram = torch.bmm(matrix, matrix.transpose(1, 2))
-    eye = torch.eye(matrix.shape[1], device=matrix.device)
-    return (gram - eye).flatten(1).norm(dim=1).mean()
+    return (gram - torch.eye(matrix.shape[1], device=matrix.device)).flatten(1).norm(dim=1).mean()

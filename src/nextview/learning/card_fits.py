@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,18 +14,17 @@ from scipy.stats import beta, gaussian_kde
 from nextview.checks import number
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, ModelError, PredictionsError, UsageError
-from nextview.files import command
+from nextview.errors import DatasetError, PredictionsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.fitting_set import (
     FittingSet,
     blind_walks,
     card_to_fit,
+    check_recogniser,
     described,
     fitting_set,
     held_out_by,
     load_sensed,
-    recogniser_of,
 )
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.baselines import Random, RandomAll
@@ -78,57 +76,76 @@ def fit_calibration(
     """
     if not 0 < number(delta, "--delta") < 1:
         raise UsageError(f"delta is a probability between 0 and 1, not {delta}")
+    if sensed and validation is not None:
+        raise UsageError("predictions through sensors are of the objects that the card calls held out: no --validation")
     table = Predictions.load(predictions).by_shape()
     with card_to_fit(card) as (model, write):
-        if not model.is_recogniser:
-            raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
         if validation != 1:
-            recogniser_of(card, model, predictions, table)
-        data, table = _calibration_set(predictions, table, card, model, validation, split_seed, sensed)
+            check_recogniser(card, model, predictions, table)
+        if validation is None:
+            FittingSet.of_all(table)  # refuses the test split
+            table = _held_out(predictions, table, card, model)
+            data = FittingSet.joined([FittingSet.of_all(part) for part in (table, *load_sensed(sensed, table))])
+        else:
+            data = fitting_set(table, validation, split_seed)
         walks = 1 + 8000 // len(data)  # few objects are walked over more often
         calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=walks)
         risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
         calibration = replace(calibration, risk=risk)
         about = described(len(data) // (1 + len(sensed))) + ", clean and through sensors" * bool(sensed)
-        model = replace(model, calibration=calibration, fitted_to={**model.fitted_to, "calibration": about})
-        write(model.made_by(*table.commands, command()))
+        write("calibration", about, [table], calibration=calibration)
     before, after = (loss(data, c, np.random.default_rng([seed, 2]), walks=walks) for c in (PLAIN_SUM, calibration))
     return FittedCalibration(calibration, len(data), before, after)
 
 
-def _calibration_set(
-    path: Path,
-    table: Predictions,
-    card: Path,
-    model: ModelCard,
-    validation: float | None,
-    split_seed: int,
-    sensed: tuple[Path, ...],
-) -> tuple[FittingSet, Predictions]:
-    if validation is not None:
-        if sensed:
-            raise UsageError(
-                "predictions through sensors are of the objects that the card calls held out: no --validation"
-            )
-        return fitting_set(table, validation, split_seed), table
-    FittingSet.of_all(table)  # refuses the test split
+def _held_out(path: Path, table: Predictions, card: Path, model: ModelCard) -> Predictions:
     kept = held_out_by(model, table)
     if len(kept) == 0:
-        raise PredictionsError(f"{path}: holds no object that {card} calls held out; see --validation")
-    table = table.of_objects(kept)
-    return FittingSet.joined([FittingSet.of_all(part) for part in (table, *load_sensed(sensed, table))]), table
+        raise PredictionsError(f"{path}: holds no object that {card} calls held out of its training")
+    return table.of_objects(kept)
+
+
+@dataclass(frozen=True)
+class Walks:
+    """Walks over all objects of a set: as many in the local window as over the sphere, those last."""
+
+    data: FittingSet
+    objects: NDArray[np.int64]  # (walks,)
+    totals: Float  # log-evidence summed over the views so far, (walks, views, D)
+
+    @classmethod
+    def draw(cls, data: FittingSet, rng: np.random.Generator, n_views: int, walks: int) -> Walks:
+        """So many walks of each kind over every object."""
+        objects, views, n_views = np.tile(np.arange(len(data)), 2 * walks), [], min(n_views, len(data.sphere))
+        for policy in (Random(data.sphere), RandomAll(data.sphere)):
+            starts = rng.integers(len(data.sphere), size=walks * len(data))
+            views.append(blind_walks(data.sphere, policy, starts, n_views, rng))
+        evidence = data.log_evidence[objects[:, None], np.concatenate(views)].astype(np.float64)
+        return cls(data, objects, np.cumsum(evidence, axis=1))
+
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """Of the views so far, 1, 2, ..."""
+        return np.arange(1, self.totals.shape[1] + 1)
+
+    def loss(self, calibration: Calibration) -> float:
+        """Mean negative log-likelihood of the true class over all numbers of views, classes weighted evenly."""
+        logs = calibration.log_belief(self.totals, self.numbers, len(self.data.classes))
+        weights = self.data.weights[self.objects]
+        of_truth = of_true_class(logs, self.data.labels[self.objects])
+        return -float((weights / weights.sum() / len(self.numbers)) @ of_truth.sum(1))
 
 
 def fit_temperature(data: FittingSet, rng: np.random.Generator, n_views: int = 5, walks: int = 4) -> Calibration:
     """Temperature of one view and correlations of several, by maximum likelihood over 1 to ``n_views`` views."""
-    measure = _loss(data, rng, n_views, walks)
+    walked = Walks.draw(data, rng, n_views, walks)
 
     def calibration(parameters: Float) -> Calibration:
         temperature, correlation, *of_bins = parameters.tolist()
         return Calibration(temperature, correlation, bin_correlation=of_bins[0] if of_bins else None)
 
     def lost(parameters: Float) -> float:
-        return measure(calibration(parameters))
+        return walked.loss(calibration(parameters))
 
     begin = np.array([1.0, 0.5] if data.azimuth_bins is None else [1.0, 0.5, 0.1])
     bounds = [(0.01, 100.0), (0.0, 5.0), (0.0, 5.0)][: len(begin)]
@@ -136,26 +153,17 @@ def fit_temperature(data: FittingSet, rng: np.random.Generator, n_views: int = 5
     return calibration(np.round(fitted.x, 4))
 
 
+def calibration_of(predictions: Predictions, data: FittingSet, rng: np.random.Generator, walks: int = 4) -> Calibration:
+    """The calibration of predictions; fitted to some of them where their recogniser was not calibrated."""
+    known = predictions.calibration != PLAIN_SUM
+    return predictions.calibration if known else fit_temperature(data, rng, walks=walks)
+
+
 def loss(
     data: FittingSet, calibration: Calibration, rng: np.random.Generator, n_views: int = 5, walks: int = 4
 ) -> float:
     """Mean negative log-likelihood of the true class over 1 to ``n_views`` views; see ``fit_temperature``."""
-    return _loss(data, rng, n_views, walks)(calibration)
-
-
-def _loss(data: FittingSet, rng: np.random.Generator, n_views: int, walks: int) -> Callable[[Calibration], float]:
-    """That loss as a function of the calibration, over the same walks each time."""
-    n_views = min(n_views, len(data.sphere))
-    objects, views = _walks(data, n_views, walks, rng)
-    totals = np.cumsum(data.log_evidence[objects[:, None], views].astype(np.float64), axis=1)
-    numbers, labels = np.arange(1, n_views + 1), data.labels[objects]
-    weights = data.weights[objects] / data.weights[objects].sum() / n_views
-
-    def measure(calibration: Calibration) -> float:
-        logs = calibration.log_belief(totals, numbers, len(data.classes))
-        return -float(weights @ of_true_class(logs, labels).sum(1))
-
-    return measure
+    return Walks.draw(data, rng, n_views, walks).loss(calibration)
 
 
 def fit_risk(
@@ -167,16 +175,16 @@ def fit_risk(
     walks: int = 4,
 ) -> RiskBounds:
     """Error rates that can be promised among those who stop at a threshold, on either half of the walks."""
-    n_views = min(n_views, len(data.sphere))
-    objects, views = _walks(data, n_views, walks, rng)
-    totals = np.cumsum(data.log_evidence[objects[:, None], views].astype(np.float64), axis=1)
-    belief = calibration.belief(totals, np.arange(1, n_views + 1), len(data.classes))
-    sure, wrong = belief.max(2), belief.argmax(2) != data.labels[objects][:, None]
-    promised = np.zeros((n_views, len(THRESHOLDS)))
-    for k in range(n_views):
-        for half in np.split(np.arange(len(objects)), 2):
-            promise = _promise(sure[half, : k + 1], wrong[half, : k + 1], data.weights, delta)
-            promised[k] = np.maximum(promised[k], promise)
+    walked = Walks.draw(data, rng, n_views, walks)
+    belief = calibration.belief(walked.totals, walked.numbers, len(data.classes))
+    sure, wrong = belief.max(2), belief.argmax(2) != data.labels[walked.objects][:, None]
+    halves = np.split(np.arange(len(walked.objects)), 2)
+    promised = np.array(
+        [
+            np.max([_promise(sure[half, :n], wrong[half, :n], data.weights, delta) for half in halves], axis=0)
+            for n in walked.numbers
+        ]
+    )
     return RiskBounds(THRESHOLDS, tuple(map(tuple, np.round(promised, 5).tolist())), delta)
 
 
@@ -203,17 +211,6 @@ def error_bound(failed: Float, stopped: Float, weights: Float, delta: float) -> 
     variance = float(((weights * (failed - rate * stopped)) ** 2).sum()) / total**2
     effective = min(objects, rate * (1 - rate) / variance) if variance > 0 else objects
     return float(beta.ppf(1 - delta, effective * rate + 1, max(effective * (1 - rate), 1e-9)))
-
-
-def _walks(
-    data: FittingSet, n_views: int, walks: int, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Objects (2 * walks * N,) and views (2 * walks * N, views): the first half local, the second over the sphere."""
-    objects, views = np.tile(np.arange(len(data)), 2 * walks), []
-    for policy in (Random(data.sphere), RandomAll(data.sphere)):
-        starts = rng.integers(len(data.sphere), size=walks * len(data))
-        views.append(blind_walks(data.sphere, policy, starts, n_views, rng))
-    return objects, np.concatenate(views)
 
 
 RADII = np.geomspace(0.02, 20, 93)
@@ -251,31 +248,28 @@ def fit_size(store: Path, predictions: Path, card: Path) -> FittedSize:
     """
     views, predicted = ViewStore.open(store), Predictions.load(predictions)
     table = predicted.deduplicate().by_shape()
-    radii, labels = views.radii, views.labels
-    if np.isnan(radii[views.done]).any():
+    if np.isnan(views.radii[views.done]).any():
         raise DatasetError(f"{store}: does not know the unit of its meshes; tell it with nextview render --unit")
     row = {name: i for i, name in enumerate(views.names)}
     unknown = [name for name in predicted.names if name not in row]
     if unknown:
         raise PredictionsError(f"{predictions}: holds {unknown[0]!r}, which {store} does not")
     with card_to_fit(card) as (model, write):
-        recogniser_of(card, model, predictions, table)
+        check_recogniser(card, model, predictions, table)
         data, judged = FittingSet.of_all(table), [row[name] for name in table.names]
         of_training = views.done & (views.splits == "train") & np.isin(views.attributes.labels, table.classes)
         taught = np.setdiff1d(np.flatnonzero(of_training), [row[name] for name in predicted.names])
         classes = np.array([table.classes.index(name) if name in table.classes else -1 for name in views.classes])
-        log_density = densities(radii[taught], classes[labels[taught]], len(table.classes))
-        size, before, after = fit_weight(data, radii[judged], log_density)
+        log_density = densities(views.radii[taught], classes[views.labels[taught]], len(table.classes))
+        size, before, after = fit_weight(data, views.radii[judged], log_density)
         about = f"{len(taught)} objects of the training split, weighed on {len(data)} others"
-        model = replace(model, size=size, fitted_to={**model.fitted_to, "size": about})
-        write(model.made_by(*views.commands, *table.commands, command()))
+        write("size", about, [views, table], size=size)
     return FittedSize(size, len(taught), len(data), before, after)
 
 
 def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
     """Logarithm of the density of each class over log radius, at ``RADII``, (classes, R)."""
-    at, span = np.log(RADII), np.log(RADII[-1] / RADII[0])
-    density = np.empty((classes, len(RADII)))
+    span, density = np.log(RADII[-1] / RADII[0]), np.empty((classes, len(RADII)))
     for c in range(classes):
         logs = np.log(radii[labels == c])
         if len(logs) < 2 or np.ptp(logs) == 0:
@@ -283,7 +277,8 @@ def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
         middle = np.subtract(*np.percentile(logs, (75, 25))) / 1.34  # the deviation of a Gaussian with these quartiles
         deviation = logs.std(ddof=1)
         width = len(logs) ** -0.2 * (min(middle, deviation) or deviation)
-        density[c] = np.log((1 - ANY_SIZE) * gaussian_kde(logs, width / deviation)(at) + ANY_SIZE / span)
+        kernels = gaussian_kde(logs, width / deviation)(np.log(RADII))
+        density[c] = np.log((1 - ANY_SIZE) * kernels + ANY_SIZE / span)
     return density
 
 
@@ -325,20 +320,16 @@ def fit_valleys(predictions: Path, card: Path) -> FittedValleys:
         ModelError, PredictionsError: the arguments do not fit together.
     """
     table = Predictions.load(predictions)
-    with card_to_fit(card) as (model, write):
+    with card_to_fit(card, recogniser=False) as (model, write):
         if model.kind not in table.maps or table.models[model.kind] != (model.name, model.sha256):
             raise PredictionsError(f"{predictions}: holds no maps by {card}")
-        kept = held_out_by(model, table)
-        data = FittingSet.of_all(table).select(kept)
-        if len(kept) == 0:
-            raise PredictionsError(f"{predictions}: holds no object of which {card} says that it was not trained on it")
-        by_class = valley_gains(data.sphere, data.logits, table.maps[model.kind][kept], data.labels)
+        FittingSet.of_all(table)  # refuses the test split
+        kept = _held_out(predictions, table, card, model)
+        by_class = valley_gains(kept.sphere, kept.logits, kept.maps[model.kind], kept.labels)
         classes = tuple(table.classes[c] for c, gain in by_class.items() if gain > 0)
         gains = {table.classes[c]: round(gain, 4) for c, gain in by_class.items()}
         about = f"{len(kept)} objects of the training split, judged by {table.models['recogniser'][0]}"
-        fitted_to = {**model.fitted_to, "valleys": about}
-        model = replace(model, valley_classes=classes, valley_gain=gains, fitted_to=fitted_to)
-        write(model.made_by(*table.commands, command()))
+        write("valleys", about, [table], valley_classes=classes, valley_gain=gains)
     return FittedValleys(classes, gains, len(kept))
 
 
@@ -348,18 +339,14 @@ def valley_gains(
     """For each class, what the second view gains in belief in the truth at the valley rather than at the peak."""
     n, v, classes = logits.shape
     objects, first = np.repeat(np.arange(n), v), np.tile(np.arange(v), n)
-    state = EpisodeState(
-        current=first,
-        visited=np.eye(v, dtype=bool)[first],
-        belief=fuse(logits[objects, first][:, None]),
-        evidence=Evidence(logits[objects, first], {"map": maps[objects, first]}),
-        step=1,
-    )
-    rng = np.random.default_rng(0)  # the policies draw nothing
-    truth = []
-    for valley_classes in (tuple(range(classes)), ()):
-        second = MapPeak(sphere, "map", valley_classes).next_views(state, rng)
-        belief = fuse(np.stack([logits[objects, first], logits[objects, second]], 1))
-        truth.append(belief[np.arange(n * v), labels[objects]])
-    gain = truth[0] - truth[1]
+    seen = logits[objects, first]
+    visited, evidence = np.eye(v, dtype=bool)[first], Evidence(seen, {"map": maps[objects, first]})
+    state = EpisodeState(current=first, visited=visited, belief=fuse(seen[:, None]), evidence=evidence, step=1)
+
+    def belief_in_truth(valley_classes: tuple[int, ...]) -> Float:
+        policy = MapPeak(sphere, "map", valley_classes)
+        second = policy.next_views(state, np.random.default_rng(0))  # it draws nothing
+        return fuse(np.stack([seen, logits[objects, second]], 1))[np.arange(n * v), labels[objects]]
+
+    gain = belief_in_truth(tuple(range(classes))) - belief_in_truth(())
     return {int(c): float(gain[labels[objects] == c].mean()) for c in np.unique(labels)}

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -46,13 +45,9 @@ class ShippedRecogniser(nn.Module):
     def __init__(self, networks: Sequence[nn.Module]) -> None:
         super().__init__()
         self.networks = nn.ModuleList(networks)
-        bins = {getattr(network, "azimuths", 0) for network in networks}
+        bins = {network.azimuths for network in networks}
         self.azimuth_bins = bins.pop() if len(bins) == 1 else 0
-
-    @property
-    def outputs(self) -> list[str]:
-        """Names of what it gives."""
-        return ["logits", FEATURES_OUTPUT] + [BINS_OUTPUT] * bool(self.azimuth_bins)
+        self.outputs = ["logits", FEATURES_OUTPUT] + [BINS_OUTPUT] * bool(self.azimuth_bins)
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         x = x.float() / 255
@@ -70,19 +65,13 @@ class ShippedMap(nn.Module):
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network, self.whole = network, network.shape[1] > 3
+        self.outputs = ["map", "sphere"] if self.whole else ["map"]
 
-    def forward(self, seen: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+    def forward(self, seen: Tensor) -> tuple[Tensor, ...]:
         if seen.dtype == torch.uint8:
             seen = seen.float() / 255
         outputs = self.network(seen)[0]
-        return (outputs[..., [-1, 0, 1]], outputs) if self.whole else outputs
-
-
-def answer(network: nn.Module, inputs: NDArray) -> NDArray[np.float32]:
-    """The first output of a network in torch for inputs (B, ...)."""
-    with torch.no_grad():
-        outputs = network.eval()(torch.from_numpy(inputs))
-    return (outputs[0] if isinstance(outputs, tuple) else outputs).numpy()
+        return (outputs[..., [-1, 0, 1]], outputs) if self.whole else (outputs,)
 
 
 def export_onnx(
@@ -102,27 +91,23 @@ def export_onnx(
             opset_version=OPSET,
             verbose=False,
         )
-    model = _without_traces(_shrunk(program.model_proto, bits))
+    model = program.model_proto
+    if bits < 32:
+        _shrink(model.graph, bits)
+    # The exporter notes source lines and stack traces of the machine.
+    graph = model.graph
+    for part in (model, graph, *graph.node, *graph.value_info, *graph.input, *graph.output, *graph.initializer):
+        del part.metadata_props[:]
+        part.doc_string = ""
     onnx.checker.check_model(model, full_check=True)
     with new_file(path) as part:
         onnx.save(model, part)
 
 
-def _without_traces(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Without the source lines and stack traces of the machine, which the exporter notes."""
-    graph = model.graph
-    for part in (model, graph, *graph.node, *graph.value_info, *graph.input, *graph.output, *graph.initializer):
-        del part.metadata_props[:]
-        part.doc_string = ""
-    return model
-
-
-def _shrunk(model: onnx.ModelProto, bits: int) -> onnx.ModelProto:
+def _shrink(graph: onnx.GraphProto, bits: int) -> None:
     """Store large float32 weights in 16 or 8 bits and widen them where they are used."""
-    if bits == 32:
-        return model
     nodes, scales = [], []
-    for weight in model.graph.initializer:
+    for weight in graph.initializer:
         if weight.data_type != TensorProto.FLOAT or np.prod(weight.dims) < 1024:
             continue
         name, values = weight.name, numpy_helper.to_array(weight)
@@ -137,11 +122,10 @@ def _shrunk(model: onnx.ModelProto, bits: int) -> onnx.ModelProto:
         scales.append(numpy_helper.from_array(scale.astype(np.float32), f"{name}_scale"))
         nodes.append(helper.make_node("Cast", [small], [f"{name}_steps"], to=TensorProto.FLOAT))
         nodes.append(helper.make_node("Mul", [f"{name}_steps", f"{name}_scale"], [name]))
-    nodes += list(model.graph.node)
-    model.graph.initializer.extend(scales)
-    del model.graph.node[:]
-    model.graph.node.extend(nodes)
-    return model
+    nodes += list(graph.node)
+    graph.initializer.extend(scales)
+    del graph.node[:]
+    graph.node.extend(nodes)
 
 
 @dataclass(frozen=True)
@@ -150,6 +134,26 @@ class Exported:
 
     card: Path
     difference: float
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A network that is to ship, and how its file is judged."""
+
+    card: ModelCard
+    network: ShippedRecogniser | ShippedMap
+    sample: NDArray  # views on which file and network are compared
+    judging: NDArray[np.int64]  # validation objects
+    seen: Callable[[int], NDArray]  # views of an object, as the network takes them
+    scores: Callable[[NDArray[np.float32]], dict[str, Any]]  # of the answers for these objects, (N, V, ...)
+
+    def answers(self, card: Path) -> Callable[[NDArray], NDArray[np.float32]]:
+        """From views to what the file says of them."""
+        if self.card.is_recogniser:
+            recogniser = Recogniser(card)
+            return lambda seen: recogniser.from_inputs(seen).logits
+        network = MapNetwork(card)
+        return lambda seen: network.from_inputs(seen)[self.card.kind]
 
 
 def export_recogniser(
@@ -177,54 +181,46 @@ def export_recogniser(
         track: follows the validation views.
 
     Raises:
-        ModelError: a run is not finished or of another store, they do not fit together, or the file's answers differ
-            from the networks'; nothing is written then.
+        ModelError: a run is not finished or of another store, runs do not fit together, or the file's answers differ.
         ResultsError: the model exists.
     """
-    views, folders = ViewStore.open(store), (run, *also)
-    runs, recipes = [read_run(each) for each in folders], [read_recipe(each, RecogniserRecipe) for each in folders]
+    return _export(_recogniser((run, *also), store, name, note), out, bits, overwrite, track)
+
+
+def _recogniser(folders: Sequence[Path], store: Path, name: str | None, note: str) -> _Candidate:
+    views, runs = ViewStore.open(store), [read_run(each) for each in folders]
+    recipes = [read_recipe(each, RecogniserRecipe) for each in folders]
+    if len({(recipe.input, recipe.size) for recipe in recipes}) > 1:
+        raise ModelError(f"{folders[0]} and the others do not take the same: geometry or image, of one size")
     spec = InputSpec(recipes[0].input, recipes[0].size)
-    if {(recipe.input, recipe.size) for recipe in recipes} != {(spec.kind, spec.size)}:
-        raise ModelError(f"{run} and the others do not take the same: geometry or image, of one size")
     held_out = frozenset.intersection(*(frozenset(each.held_out) for each in runs))
     validated = frozenset.intersection(*(frozenset(each.validation) for each in runs))
     validation = np.flatnonzero(np.isin(views.names, list(validated)))
     if len(validation) == 0:
-        raise ModelError(f"{run} and the others have no validation object of {store} in common")
-    training = np.flatnonzero(views.done & (views.splits == "train") & ~np.isin(views.names, list(held_out)))
-    inputs = load_inputs(store, spec.size, spec.kind)
+        raise ModelError(f"{folders[0]} and the others have no validation object of {store} in common")
     networks = [run_network(each, recipe, views) for each, recipe in zip(folders, recipes, strict=True)]
     shipped = ShippedRecogniser(networks).eval()
-    model = ModelCard(
+    card = ModelCard(
         name or f"recogniser-{views.dataset}",
         "recogniser",
         spec,
         "",
-        Path(),
         network=" + ".join(network.name for network in networks),
         classes=tuple(views.classes),
         azimuth_bins=shipped.azimuth_bins,
-        training=Training(
-            f"{len(training)} objects of the training split, {len(views.sphere)} views each",
-            tuple(asdict(recipe) for recipe in recipes),
-        ),
+        training=_training(views, held_out, recipes),
         note=note,
         held_out=tuple(sorted(held_out)),
     ).made_by(*views.commands, *(line for each in runs for line in each.commands), command())
-    with _written(out, model, overwrite) as (part, finish):
-        export_onnx(shipped, inputs[validation[0], :2], "input", shipped.outputs, part.with_suffix(".onnx"), bits)
-        finish({}, 0.0)
-        recogniser = Recogniser(part)
-        sample = np.stack([inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]])
-        difference = float(np.abs(answer(shipped, sample) - recogniser.from_inputs(sample).logits).max())
-        if not difference < 0.1:
-            raise ModelError(
-                f"{part.stem}: its logits differ from the network's by up to {difference:.2g}; not written"
-            )
-        judging = deduplicate(views, validation)
-        logits = _of_each(lambda i: recogniser.from_inputs(inputs[i]).logits, judging, "validation views", track)
-        finish({_validation(judging): recogniser_scores(logits, views.labels[judging])}, difference)
-    return Exported(out / part.name, difference)
+    inputs, judging = load_inputs(store, spec.size, spec.kind), deduplicate(views, validation)
+    return _Candidate(
+        card,
+        shipped,
+        np.stack([inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]]),
+        judging,
+        lambda i: inputs[i],
+        lambda logits: recogniser_scores(logits, views.labels[judging]),
+    )
 
 
 def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet | LiteNet:
@@ -258,90 +254,83 @@ def export_map(
         track: follows the validation maps.
 
     Raises:
-        ModelError: the run is not finished, or the file's answers differ from the network's; nothing is written then.
-        ResultsError: the model exists.
+        ModelError, ResultsError: the run is not finished, the file's answers differ, or the model exists.
     """
+    return _export(_map(run, store, predictions, name, note), out, bits, overwrite, track)
+
+
+def _map(run: Path, store: Path, predictions: Path | None, name: str | None, note: str) -> _Candidate:
     views, recipe, noted = ViewStore.open(store), read_recipe(run, MapRecipe), read_run(run)
-    sphere, kind = views.sphere, map_name(recipe.measure)
+    kind, shape = map_name(recipe.measure), (-1, views.sphere.rings, 3)
     good: Good = "peak" if recipe.measure == CONFIDENCE else find_measure(recipe.measure).good
     values, there = target_of(recipe.measure, views, None if predictions is None else Predictions.load(predictions))
-    held_out = np.isin(views.names, noted.held_out)
-    training, validation = (
-        np.flatnonzero(views.done & there & (views.splits == "train") & part) for part in (~held_out, held_out)
-    )
+    usable = views.done & there & (views.splits == "train")
+    validation = np.flatnonzero(usable & np.isin(views.names, noted.held_out))
     if len(validation) == 0:
         raise ModelError(f"{run}: was not trained on {store}")
-    shipped = ShippedMap(load_run(map_network(recipe, sphere), run)).eval()
+    shipped = ShippedMap(load_run(map_network(recipe, views.sphere), run)).eval()
     spec = InputSpec(recipe.input, 0 if recipe.input == "cloud" else recipe.size)
-    sample = from_store(spec, views, int(validation[0]))[3:11]
-    model = ModelCard(
+    card = ModelCard(
         name or f"{kind.replace(':', '-')}-{views.dataset}",
         kind,
         spec,
         "",
-        Path(),
         network="PointNet with both transforms" if spec.kind == "cloud" else f"ResNet-{recipe.depth}",
         measure=recipe.measure,
         good=good,
         output="sphere" if shipped.whole else "window",
-        training=Training(
-            f"{len(training)} objects of the training split, {len(sphere)} views each", (asdict(recipe),)
-        ),
+        training=_training(views, noted.held_out, [recipe], there),
         note=note,
         held_out=noted.held_out,
     ).made_by(*noted.commands, command())
-    with _written(out, model, overwrite) as (part, finish):
-        outputs = ["map", "sphere"] if shipped.whole else ["map"]
-        export_onnx(shipped, sample, "seen", outputs, part.with_suffix(".onnx"), bits)
-        finish({}, 0.0)
-        predictor = MapNetwork(part)
-        difference = float(np.abs(answer(shipped, sample) - predictor.from_inputs(sample)[kind]).max())
-        if not difference < 0.02:
-            raise ModelError(f"{part.stem}: its maps differ from the network's by up to {difference:.2g}; not written")
-        judging, shape = deduplicate(views, validation), (-1, sphere.rings, 3)
-        maps = _of_each(
-            lambda i: predictor.from_inputs(from_store(spec, views, i))[kind], judging, "validation maps", track
-        )
-        true = values[judging][:, sphere.windows].reshape(shape)
-        finish({_validation(judging): map_scores(maps.reshape(shape), true)}, difference)
-    return Exported(out / part.name, difference)
+    judging = deduplicate(views, validation)
+    true = values[judging][:, views.sphere.windows].reshape(shape)
+    return _Candidate(
+        card,
+        shipped,
+        from_store(spec, views, int(validation[0]))[3:11],
+        judging,
+        lambda i: from_store(spec, views, i),
+        lambda maps: map_scores(maps.reshape(shape), true),
+    )
 
 
-@contextmanager
-def _written(
-    out: Path, model: ModelCard, overwrite: bool
-) -> Iterator[tuple[Path, Callable[[dict[str, Any], float], None]]]:
-    """A temporary path for a card, and the function that writes it beside its ONNX file; both appear at the end."""
-    if Path(model.name).name != model.name:
-        raise UsageError(f"--name is the name of a model, not a path: {model.name}")
+def _training(
+    views: ViewStore, held_out: Iterable[str], recipes: Sequence[Any], usable: NDArray[np.bool_] | bool = True
+) -> Training:
+    learned = views.done & usable & (views.splits == "train") & ~np.isin(views.names, list(held_out))
+    about = f"{learned.sum()} objects of the training split, {len(views.sphere)} views each"
+    return Training(about, tuple(asdict(recipe) for recipe in recipes))
+
+
+def _export(candidate: _Candidate, out: Path, bits: int, overwrite: bool, track: Track) -> Exported:
+    """Write ONNX file and card, once the file answers as the network does; both appear at the end."""
+    name, sample = candidate.card.name, candidate.sample
+    if Path(name).name != name:
+        raise UsageError(f"--name is the name of a model, not a path: {name}")
     for suffix in (".json", ".onnx"):
-        check_new(out / f"{model.name}{suffix}", overwrite)
+        check_new(out / f"{name}{suffix}", overwrite)
     with new_folder(out, overwrite=True) as folder:
-        part = folder / f"{model.name}.json"
+        part, weights = folder / f"{name}.json", folder / f"{name}.onnx"
+        example = np.resize(sample, (2, *sample.shape[1:]))
+        limit, end = (0.1, "input") if candidate.card.is_recogniser else (0.02, "seen")
+        export_onnx(candidate.network, example, end, candidate.network.outputs, weights, bits)
+        card = replace(candidate.card, sha256=sha256_of(weights))
+        write_card(part, card)
+        answers = candidate.answers(part)
+        with torch.no_grad():
+            expected = candidate.network(torch.from_numpy(sample))[0].numpy()
+        difference = float(np.abs(expected - answers(sample)).max())
+        if not difference < limit:
+            raise ModelError(f"{name}: its answers differ from the network's by up to {difference:.2g}; not written")
+        rows: list[NDArray[np.float32]] = []
 
-        def finish(scores: dict[str, Any], difference: float) -> None:
-            sha256 = sha256_of(part.with_suffix(".onnx"))
-            write_card(
-                part, replace(model, sha256=sha256, scores=scores, largest_difference_to_torch=round(difference, 4))
-            )
+        def judged() -> Iterator[int]:
+            for i in candidate.judging:
+                rows.append(answers(candidate.seen(int(i))))
+                yield len(rows)
 
-        yield part, finish
-
-
-def _validation(judging: NDArray[np.int64]) -> str:
-    return f"validation ({len(judging)} objects of the training split)"
-
-
-def _of_each(
-    function: Callable[[int], NDArray[np.float32]], objects: NDArray[np.int64], what: str, track: Track
-) -> NDArray[np.float32]:
-    """Stack what a function gives for each object."""
-    rows: list[NDArray[np.float32]] = []
-
-    def done() -> Iterator[int]:
-        for i in objects:
-            rows.append(function(int(i)))
-            yield len(rows)
-
-    track(done(), len(objects), what)
-    return np.stack(rows)
+        track(judged(), len(candidate.judging), "validation objects")
+        scores = {f"validation ({len(rows)} objects of the training split)": candidate.scores(np.stack(rows))}
+        write_card(part, replace(card, scores=scores, largest_difference_to_torch=round(difference, 4)))
+    return Exported(out / part.name, difference)

@@ -7,36 +7,37 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from nextview.data.predictions import SAME, Predictions
 from nextview.data.splits import deduplicated, divide, duplicate_groups
+from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, ModelError, PredictionsError
-from nextview.files import only_one
+from nextview.files import command, only_one
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence, Policy
 from nextview.recognition.belief import FixedLength, log_evidence_of
 from nextview.recognition.model_card import ModelCard, read_card, write_card
 from nextview.session.episode import run_episodes
 
+Indices = NDArray[np.int64]
 
-def hold_out(
-    labels: NDArray[np.int64], measured: NDArray[np.floating], folds: int, seed: int
-) -> list[NDArray[np.int64]]:
+
+def hold_out(labels: Indices, measured: NDArray[np.floating], folds: int, seed: int) -> list[Indices]:
     """Divide objects into parts, each to be held out from one network; every class is spread evenly."""
     if not 2 <= folds <= len(labels):
         raise DatasetError(f"{len(labels)} objects cannot be divided into {folds} folds")
     rng = np.random.default_rng([seed, folds])
     group = duplicate_groups(measured)
-    _, first = np.unique(group, return_index=True)  # one object stands for its group
-    first = rng.permutation(first)
+    first = rng.permutation(np.unique(group, return_index=True)[1])  # one object stands for its group
     first = first[np.argsort(labels[first], kind="stable")]  # dealt out class by class
     fold_of_group = np.empty(len(first), np.int64)
     fold_of_group[group[first]] = np.arange(len(first)) % folds
-    fold = fold_of_group[group]
-    return [np.flatnonzero(fold == k) for k in range(folds)]
+    return [np.flatnonzero(fold_of_group[group] == k) for k in range(folds)]
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class FittingSet:
     """What a held-out recogniser says of N objects from V views."""
 
     logits: NDArray[np.float32]  # (N, V, C)
-    labels: NDArray[np.int64]  # (N,)
+    labels: Indices  # (N,)
     sphere: ViewSphere
     classes: tuple[str, ...]
     azimuth_bins: NDArray[np.float32] | None = None  # (N, V, C, bins)
@@ -52,21 +53,18 @@ class FittingSet:
     @classmethod
     def of_all(cls, predictions: Predictions) -> FittingSet:
         """All objects of predictions, in their order."""
-        if (predictions.splits == "test").any():
-            raise PredictionsError("these predictions hold objects of the test split, to which nothing may be fitted")
         p = predictions
+        if (p.splits == "test").any():
+            raise PredictionsError("these predictions hold objects of the test split, to which nothing may be fitted")
         return cls(p.logits, p.labels, p.sphere, p.classes, p.azimuth_bins)
 
     @classmethod
     def joined(cls, parts: Sequence[FittingSet]) -> FittingSet:
         """All objects of some sets of the same classes and viewpoints, one set after the other."""
         bins = [part.azimuth_bins for part in parts if part.azimuth_bins is not None]
-        return replace(
-            parts[0],
-            logits=np.concatenate([part.logits for part in parts]),
-            labels=np.concatenate([part.labels for part in parts]),
-            azimuth_bins=np.concatenate(bins) if len(bins) == len(parts) else None,
-        )
+        logits, labels = (np.concatenate([getattr(part, name) for part in parts]) for name in ("logits", "labels"))
+        azimuth_bins = np.concatenate(bins) if len(bins) == len(parts) else None
+        return replace(parts[0], logits=logits, labels=labels, azimuth_bins=azimuth_bins)
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -104,7 +102,7 @@ def fitting_set(predictions: Predictions, validation: float, seed: int) -> Fitti
     return data.select(kept[deduplicated(predictions.labels[kept], predictions.depth_entropy[kept])])
 
 
-def held_out_by(card: ModelCard, predictions: Predictions) -> NDArray[np.int64]:
+def held_out_by(card: ModelCard, predictions: Predictions) -> Indices:
     """Indices of the objects that a card calls held out of its training, without duplicates."""
     once = deduplicated(predictions.labels, predictions.depth_entropy)
     return once[np.isin(np.array(predictions.names)[once], card.held_out)]
@@ -125,37 +123,40 @@ def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
     return loaded
 
 
-def blind_walks(
-    sphere: ViewSphere, policy: Policy, starts: NDArray[np.int64], n_views: int, rng: np.random.Generator
-) -> NDArray[np.int64]:
+def blind_walks(sphere: ViewSphere, policy: Policy, starts: Indices, n_views: int, rng: np.random.Generator) -> Indices:
     """Views in order, (E, views) int64, of a policy that knows only where it has been; ``starts`` is (E,)."""
 
-    def nothing(episodes: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
+    def nothing(episodes: Indices, views: Indices) -> Evidence:
         return Evidence(np.zeros((len(episodes), 1)))
 
     return run_episodes(nothing, sphere, policy, starts, FixedLength(max_views=n_views), rng).outcome.views
 
 
 @contextmanager
-def card_to_fit(path: Path) -> Iterator[tuple[ModelCard, Callable[[ModelCard], None]]]:
-    """A card and the function that writes it back; nobody else fits the same card meanwhile."""
+def card_to_fit(path: Path, recogniser: bool = True) -> Iterator[tuple[ModelCard, Callable[..., None]]]:
+    """A card and ``write(name, about, sources, **fields)``, for what was fitted to it; only one run fits it.
+
+    ``name`` and ``about`` are an entry of the card's ``fitted_to``; ``sources`` are what it was fitted to.
+    """
     with only_one(path):
         card, known = read_card(path), path.read_bytes()
+        if recogniser and not card.is_recogniser:
+            raise ModelError(f"{path}: is a {card.kind}, not a recogniser")
 
-        def write(fitted: ModelCard) -> None:
+        def write(name: str, about: str, sources: Sequence[Predictions | ViewStore], **fields: Any) -> None:
             nonlocal known
+            fitted = msgspec.structs.replace(card, **fields, fitted_to={**card.fitted_to, name: about})
+            lines = (line for source in sources for line in source.commands)
             if path.read_bytes() != known:
                 raise ModelError(f"{path}: was changed while this ran, and is left as it is; run the command again")
-            write_card(path, fitted)
+            write_card(path, fitted.made_by(*lines, command()))
             known = path.read_bytes()
 
         yield card, write
 
 
-def recogniser_of(path: Path, card: ModelCard, predictions: Path, table: Predictions) -> None:
-    """Refuse a card that is no recogniser's, and predictions by another recogniser."""
-    if not card.is_recogniser:
-        raise ModelError(f"{path}: is a {card.kind}, not a recogniser")
+def check_recogniser(path: Path, card: ModelCard, predictions: Path, table: Predictions) -> None:
+    """Refuse predictions by another recogniser than a card's."""
     if table.models["recogniser"][1] != card.sha256:
         raise PredictionsError(f"{predictions}: comes from another recogniser than {path}")
 

@@ -22,15 +22,7 @@ from nextview.files import check_new, command, new_folder, sha256_of
 from nextview.learning.export import export_onnx
 from nextview.learning.fitting_set import hold_out, load_sensed
 from nextview.learning.recipes import GainRecipe
-from nextview.learning.rollout import (
-    ReplayTable,
-    Value,
-    candidate_values,
-    fit_travel_weight,
-    judge,
-    mean_value,
-    rollout,
-)
+from nextview.learning.rollout import ReplayTable, Value, candidate_values, fit_travel_weight, judge_all, rollout
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.gain import (
@@ -142,51 +134,42 @@ def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np
 def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
     """Train the networks: after every epoch, the policy as it then is, at travel weight 0 and over all views."""
     rng, data = np.random.default_rng([recipe.seed, fold]), table.data
-    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
-    sphere, c = data.sphere, len(data.classes)
-    networks = _untrained(
-        mirrored_features(sphere, c, recipe.inputs, recipe.frame), mirrored(sphere), recipe, generator
-    )
-    drawn = rng.multinomial(len(data), np.full(len(data), 1 / len(data)), size=recipe.networks)
+    sphere, n, c = data.sphere, len(data), len(data.classes)
+    networks = _untrained(table, recipe, torch.Generator().manual_seed(int(rng.integers(2**31))))
+    drawn = rng.multinomial(n, np.full(n, 1 / n), size=recipe.networks)
     weights = torch.from_numpy(drawn * data.weights).float()
     optimiser = torch.optim.AdamW(networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay)
-    states_each = recipe.walks * (recipe.n_views - 1) * len(data)
-    steps = recipe.epochs * -(-states_each // recipe.batch)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.lr, total_steps=steps)
-    policy: Policy = RandomAll(sphere)
+    batches = -(-recipe.walks * (recipe.n_views - 1) * n // recipe.batch)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.lr, total_steps=recipe.epochs * batches)
+    policies: list[Policy] = [(Random, RandomAll)[i % 2](sphere) for i in range(recipe.walks)]
     for _ in range(recipe.epochs):
-        blind: list[Policy] = [Random(sphere), RandomAll(sphere)]
-        policies = [blind[i % 2] for i in range(recipe.walks)]
-        if isinstance(policy, Gain):
-            policies[::2] = [policy] * len(policies[::2])
         states = walk(table, policies, recipe, rng)
-        order = rng.permutation(len(states.objects))
-        for batch in np.array_split(order, -(-states_each // recipe.batch)):
+        for batch in np.array_split(rng.permutation(len(states.objects)), batches):
             seen, value, free = (torch.from_numpy(a[batch]) for a in (states.features, states.values, states.free))
             flipped = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
             seen = torch.where(flipped, seen[:, networks.features_flip], seen)
             value, free = (torch.where(flipped, a[:, networks.cells_flip], a) for a in (value, free))
             error = (((networks.each(seen) - value) ** 2) * free).sum(-1) / free.sum(-1).clamp(min=1)
-            loss = (weights[:, states.objects[batch]] * error).sum() / len(batch)
             optimiser.zero_grad()
-            loss.backward()
+            ((weights[:, states.objects[batch]] * error).sum() / len(batch)).backward()
             optimiser.step()
             schedule.step()
         policy = Gain(sphere, c, Score(deepcopy(networks)), recipe.inputs, frame=recipe.frame)
+        policies[::2] = [policy] * len(policies[::2])
         yield policy
 
 
-def _untrained(
-    features_flip: NDArray[np.int64], cells_flip: NDArray[np.int64], recipe: GainRecipe, generator: torch.Generator
-) -> Perceptrons:
-    widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(cells_flip)]))
+def _untrained(table: ReplayTable, recipe: GainRecipe, generator: torch.Generator) -> Perceptrons:
+    sphere = table.data.sphere
+    features_flip = mirrored_features(sphere, len(table.data.classes), recipe.inputs, recipe.frame)
+    widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)]))
     scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
     weights = [
         scale * torch.randn(recipe.networks, *width, generator=generator)
         for scale, width in zip(scales, widths, strict=True)
     ]
     biases = [torch.zeros(recipe.networks, 1, outputs) for _, outputs in widths]
-    return Perceptrons(weights, biases, features_flip, cells_flip)
+    return Perceptrons(weights, biases, features_flip, mirrored(sphere))
 
 
 def best_epoch(
@@ -195,11 +178,8 @@ def best_epoch(
     """After every epoch, the policies of the best epoch so far, and their mean value over all objects."""
     best = None
     for policies in zip(*folds, strict=True):
-        values = [
-            judge(table, policy, recipe.n_views, recipe.objective, np.random.default_rng([recipe.seed, 2]), rounds=4)
-            for table, policy in zip(tables, policies, strict=True)
-        ]
-        value = mean_value(values, [len(table.data) for table in tables])
+        judged = list(zip(tables, policies, strict=True))
+        value = judge_all(judged, recipe.n_views, recipe.objective, [recipe.seed, 2], rounds=4)
         if best is None or value.mean.mean() > best[1].mean.mean():
             best = policies, value
         yield best
@@ -284,19 +264,26 @@ def train_gain(
         track: follows the epochs.
 
     Raises:
-        UsageError: the card is not called NAME.json.
-        ResultsError: it exists.
+        UsageError, ResultsError: the card is not called NAME.json, or exists.
         PredictionsError: the predictions lack what the recipe takes, are of the test split or do not belong together.
-        DatasetError: the objects cannot be divided into so many folds.
-        ModelError: the ONNX file does not answer as the networks do; nothing is written then.
+        DatasetError, ModelError: there are too few objects for the folds; or the ONNX file's answers differ.
     """
     if out.suffix != ".json":
         raise UsageError(f"{out}: the card of a policy is called NAME.json")
     for path in (out, out.with_suffix(".onnx")):
         check_new(path, overwrite)
-    data = _Data(predictions, validation, sensed, recipe, folds)
-    best, value = _best_epoch(data.learned, data.validated, recipe, track)
-    policies = [replace(policy, scope="local" if local else "global") for policy in best]
+    data = _load(predictions, validation, sensed, recipe, folds)
+    best: list[tuple[tuple[Gain, ...], Value]] = []
+
+    def epochs() -> Iterator[int]:
+        trainings = [train(part, recipe, fold) for fold, part in enumerate(data.learned)]
+        for policies in best_epoch(trainings, data.validated, recipe):
+            best.append(policies)
+            yield len(best)
+
+    track(epochs(), recipe.epochs, "training")
+    chosen, value = best[-1]
+    policies = [replace(policy, scope="local" if local else "global") for policy in chosen]
     if travel_weight is None:
         judged = list(zip(data.validated, policies, strict=True))
         travel_weight = fit_travel_weight(judged, recipe.n_views, recipe.objective, recipe.seed)
@@ -306,53 +293,68 @@ def train_gain(
     return TrainedGain(out, data.objects, data.validated_on, value.mean, travel_weight, len(states), difference)
 
 
+@dataclass(frozen=True)
 class _Data:
     """What is learned from, and what validates: tables side by side, one pair for each fold."""
 
-    def __init__(
-        self, predictions: Path, validation: Path | None, sensed: tuple[Path, ...], recipe: GainRecipe, folds: int
-    ) -> None:
-        table = Predictions.load(predictions).deduplicate()
-        other = table if validation is None else Predictions.load(validation).deduplicate()
-        if (other.classes, other.sphere) != (table.classes, table.sphere):
-            raise PredictionsError(f"{validation}: is of other classes or viewpoints than {predictions}")
-        if sensed and validation is not None:
-            raise UsageError("predictions through sensors choose with those that are learned from: no --validation")
-        self.sources = [(path, p) for path, p in ((predictions, table), (validation, other)) if path is not None]
-        variants, self.sensed = load_sensed(sensed, table), bool(sensed)
-        self.sources += list(zip(sensed, variants, strict=True))
-        for path, p in self.sources:
-            _check(path, p, recipe)
-        everything = np.arange(len(table))
-        if validation is None:
-            validating = hold_out(table.labels, _shapes(table), folds, recipe.seed)
-            learning = [np.setdiff1d(everything, part) for part in validating]
-            self.validated_on = f"the same, each judged by networks of {folds - 1} other folds"
-        else:
-            validating, learning = [np.arange(len(other))], [everything[~np.isin(_targets(table), _targets(other))]]
-            self.validated_on = f"{len(other)} others"
-        self.rng = np.random.default_rng([recipe.seed, 1])
-        scenes = scenes_of(table)
-        others = scenes if validation is None else scenes_of(other)
-        self.learned = [ReplayTable.select(table, part, self.rng, variants, scenes) for part in learning]
-        self.validated = [ReplayTable.select(other, part, self.rng, variants, others) for part in validating]
-        self.objects = len(np.unique(np.concatenate(learning)))
+    sources: list[tuple[Path, Predictions]]
+    learned: list[ReplayTable]
+    validated: list[ReplayTable]
+    objects: int
+    learned_from: str
+    validated_on: str
+    rng: np.random.Generator
 
     def card(self, policy: Gain, recipe: GainRecipe) -> PolicyCard:
+        """The card of a policy that was trained on it, as yet without its table."""
+        _, table = self.sources[0]
         return PolicyCard(
             "gain",
             policy.scope,
-            policy.sphere.elevations,
-            policy.sphere.azimuths,
-            self.sources[0][1].classes,
+            table.sphere.elevations,
+            table.sphere.azimuths,
+            table.classes,
             {},
-            f"{self.objects} objects of the training split{', clean and through sensors' * self.sensed}, "
-            f"classes weighted evenly; epoch and travel weight chosen on {self.validated_on}",
+            f"{self.learned_from}, classes weighted evenly; epoch and travel weight chosen on {self.validated_on}",
             tuple(LearnedFrom(sha256_of(path), p.models) for path, p in self.sources),
             tuple((part.calibration.temperature, part.calibration.correlation) for part in self.learned),
             asdict(recipe),
             tuple(dict.fromkeys((*(line for _, p in self.sources for line in p.commands), command()))),
         )
+
+
+def _load(
+    predictions: Path, validation: Path | None, sensed: tuple[Path, ...], recipe: GainRecipe, folds: int
+) -> _Data:
+    table = Predictions.load(predictions).deduplicate()
+    other = table if validation is None else Predictions.load(validation).deduplicate()
+    if (other.classes, other.sphere) != (table.classes, table.sphere):
+        raise PredictionsError(f"{validation}: is of other classes or viewpoints than {predictions}")
+    if sensed and validation is not None:
+        raise UsageError("predictions through sensors choose with those that are learned from: no --validation")
+    variants = load_sensed(sensed, table)
+    sources = [
+        (predictions, table),
+        *([(validation, other)] if validation else []),
+        *zip(sensed, variants, strict=True),
+    ]
+    for path, p in sources:
+        _check(path, p, recipe)
+    everything = np.arange(len(table))
+    if validation is None:
+        validating = hold_out(table.labels, _shapes(table), folds, recipe.seed)
+        learning = [np.setdiff1d(everything, part) for part in validating]
+        validated_on = f"the same, each judged by networks of {folds - 1} other folds"
+    else:
+        validating, learning = [np.arange(len(other))], [everything[~np.isin(_targets(table), _targets(other))]]
+        validated_on = f"{len(other)} others"
+    rng, scenes = np.random.default_rng([recipe.seed, 1]), scenes_of(table)
+    others = scenes if validation is None else scenes_of(other)
+    learned = [ReplayTable.select(table, part, rng, variants, scenes) for part in learning]
+    validated = [ReplayTable.select(other, part, rng, variants, others) for part in validating]
+    objects = len(np.unique(np.concatenate(learning)))
+    learned_from = f"{objects} objects of the training split{', clean and through sensors' * bool(sensed)}"
+    return _Data(sources, learned, validated, objects, learned_from, validated_on, rng)
 
 
 def _targets(p: Predictions) -> list[str]:
@@ -380,19 +382,3 @@ def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
             f"{path}: holds no azimuth bins; train the recogniser with --azimuth-bins-weight, or give --frame camera "
             "and --inputs without azimuth_bin"
         )
-
-
-def _best_epoch(
-    learned: list[ReplayTable], validated: list[ReplayTable], recipe: GainRecipe, track: Track
-) -> tuple[tuple[Gain, ...], Value]:
-    """Train on each table; the policies of the best epoch by their value on the table of the same place."""
-    best: list[tuple[tuple[Gain, ...], Value]] = []
-
-    def epochs() -> Iterator[int]:
-        trainings = [train(part, recipe, fold) for fold, part in enumerate(learned)]
-        for policies in best_epoch(trainings, validated, recipe):
-            best.append(policies)
-            yield len(best)
-
-    track(epochs(), recipe.epochs, "training")
-    return best[-1]

@@ -63,11 +63,8 @@ def ready_inputs(path: Path, size: int, kind: InputKind = "geometry", track: Tra
     target = inputs_path(path, size, kind)
     if is_first() and not target.exists():
         with only_one(target):
-            track(
-                _compute(path, target, InputSpec(kind, size)),
-                int(ViewStore.open(path).done.sum()),
-                f"inputs of {path.name}",
-            )
+            objects = int(ViewStore.open(path).done.sum())
+            track(_compute(path, target, InputSpec(kind, size)), objects, f"inputs of {path.name}")
     while not target.exists():
         time.sleep(1)
     return load_inputs(path, size, kind)
@@ -79,8 +76,7 @@ def _compute(path: Path, target: Path, spec: InputSpec) -> Iterator[int]:
     chosen = np.flatnonzero(store.done).tolist()
     for first in chosen[:1]:  # a size that the views do not have is refused before anything is made
         from_store(spec, store, first)
-    shape = len(store), len(store.sphere)
-    places = np.zeros((*shape, 2), np.int64)
+    places = np.zeros((len(store), len(store.sphere), 2), np.int64)
     with new_folder(target) as part:
         with open(part / "views.lz4", "wb") as file:
             for done, (i, packed) in enumerate(each(partial(_packed, path, spec), chosen), 1):
@@ -104,13 +100,13 @@ def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedVi
     target, store = inputs_path(path, size, kind), ViewStore.open(path)
     file = target / "views.lz4"
     try:
-        with open(target / "index.npz", "rb") as index_file, np.load(index_file) as index:
+        with np.load(target / "index.npz") as index:
             places, shape = index["places"], tuple(index["size"].tolist())
         packed = np.memmap(file, np.uint8, "r") if file.stat().st_size else np.zeros(0, np.uint8)
+        if len(packed) != places[..., 1].sum():
+            raise ValueError(f"{len(packed)} bytes of {places[..., 1].sum()}")
     except Exception as error:  # zip files and NumPy raise whatever a damaged file makes them raise
         raise DatasetError(f"{target}: is damaged ({error}); {AGAIN}") from None
-    if len(packed) != places[..., 1].sum():
-        raise DatasetError(f"{target}: is damaged; {AGAIN}")
     there = places[..., 1].all(1)
     if there.shape != (len(store),) or (store.done & ~there).any():
         raise DatasetError(f"{target}: lacks objects that {path} holds by now; {AGAIN}")

@@ -23,16 +23,22 @@ from nextview.files import new_file
 from nextview.learning.recipes import Hardware
 
 
+class OwnBatches(IterableDataset):
+    """A data set that makes its own batches, from the epoch and the share of each batch that is this device's."""
+
+    epoch = 0
+    share = slice(None)
+
+
 class Batches(L.LightningDataModule):
-    """Data sets that make their own batches, from the epoch and the share of each batch that is this device's."""
+    """Sets of training and validation, each of which makes its own batches."""
 
     def __init__(self, training: IterableDataset, validation: IterableDataset) -> None:
         super().__init__()
         self.training, self.validation = training, validation
 
     def setup(self, stage: str) -> None:
-        share = slice(self.trainer.global_rank, None, self.trainer.world_size)
-        self.training.share = self.validation.share = share
+        self.training.share = self.validation.share = slice(self.trainer.global_rank, None, self.trainer.world_size)
 
     def train_dataloader(self) -> DataLoader:
         self.training.epoch = self.trainer.current_epoch
@@ -73,12 +79,22 @@ def save_whole(values: dict[str, Any], path: Path) -> None:
         part.write_bytes(written.getbuffer())
 
 
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """What ``save_whole`` wrote, by torch's reader that makes nothing but tensors and containers."""
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise ModelError(f"{path}: there is no such checkpoint") from None
+    except Exception as error:  # a damaged or foreign file raises whatever the reader stumbles over
+        what = f"a damaged checkpoint or one that torch cannot read safely ({type(error).__name__})"
+        raise ModelError(f"{path}: {what}; give another, or delete it to begin this training anew") from None
+
+
 class Log(L.Callback):
     """A row for every epoch in log/metrics.csv and in the checkpoint; Lightning's own log begins anew on a resume."""
 
     def __init__(self, out: Path) -> None:
-        self.path = out / "log/metrics.csv"
-        self.rows: list[dict[str, float]] = []
+        self.path, self.rows = out / "log/metrics.csv", list[dict[str, float]]()
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self.began = time.perf_counter()
@@ -139,14 +155,13 @@ def fit(
         # All of them describe what is meant here: a run that resumes, and data sets that make their own batches.
         warnings.filterwarnings("ignore", module="lightning")
         warnings.filterwarnings("ignore", message=".*LeafSpec")
-        several = hardware.devices > 1
         trainer = L.Trainer(
             max_epochs=recipe.epochs,
             precision=hardware.precision,
             accelerator=hardware.accelerator,
             devices=hardware.devices,
             # Batch norm sees the whole batch, as on one device; torch has this for GPUs alone.
-            sync_batchnorm=several and hardware.accelerator != "cpu" and torch.cuda.is_available(),
+            sync_batchnorm=hardware.devices > 1 and hardware.accelerator != "cpu" and torch.cuda.is_available(),
             logger=False,
             callbacks=callbacks,
             plugins=[WholeCheckpoints()],
@@ -156,7 +171,7 @@ def fit(
             log_every_n_steps=1,
         )
         last, best = out / "last.ckpt", out / "best.ckpt"
-        resume = last if last.exists() and _read(last) else None
+        resume = last if last.exists() and read_checkpoint(last) else None
         try:
             # Numbers too small for the normal format are slow on CPUs and mean nothing here.
             torch.set_flush_denormal(True)
@@ -164,7 +179,7 @@ def fit(
         finally:
             torch.set_flush_denormal(False)  # it holds for the whole process
     # Too few objects for one batch of validation leave nothing to choose by: the last epoch is kept.
-    module.load_state_dict(_read(best if best.exists() else last)["state_dict"])
+    module.load_state_dict(read_checkpoint(best if best.exists() else last)["state_dict"])
     return module
 
 
@@ -181,12 +196,3 @@ def optimiser(parameters: Any, recipe: Any, steps: int, falls: float) -> dict[st
 def is_first() -> bool:
     """Whether this process is the one of a training's that writes for all of them."""
     return rank_zero_only.rank == 0
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """A checkpoint, by torch's reader that makes nothing but tensors and containers."""
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged file raises whatever the reader stumbles over
-        what = type(error).__name__
-        raise ModelError(f"{path}: a damaged checkpoint ({what}); delete it to begin this training anew") from None

@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.utils.data import IterableDataset
 
 from nextview.data.measures import confidence_maps, normalise_per_object
 from nextview.data.predictions import Predictions
@@ -23,14 +22,14 @@ from nextview.errors import ModelError, PredictionsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.architectures import map_columns, map_network, orthogonality
 from nextview.learning.inputs import PackedViews, ready_inputs
-from nextview.learning.loop import fit, optimiser
+from nextview.learning.loop import OwnBatches, fit, optimiser
 from nextview.learning.recipes import Hardware, MapRecipe
 from nextview.learning.runs import new_run, read_run, refuse_seen, start_from, train_once
 from nextview.recognition.map_names import CONFIDENCE
 from nextview.recognition.network_input import cloud_input
 
 
-class Windows(IterableDataset):
+class Windows(OwnBatches):
     """Batches of (what the network sees, map (B, rings, columns)), new draws each epoch."""
 
     def __init__(
@@ -47,7 +46,7 @@ class Windows(IterableDataset):
         azimuths = (sphere.azimuth_index[:, None] + steps) % n
         self.around = np.arange(sphere.rings)[None, :, None] * n + azimuths[:, None, :]  # (V, rings, columns)
         self.mirror = [list(steps % n).index(-step % n) for step in steps]
-        self.recipe, self.training, self.epoch, self.share = recipe, training, 0, slice(None)
+        self.recipe, self.training = recipe, training
         self.batch = min(recipe.batch, len(objects) * recipe.views)
 
     def __len__(self) -> int:
@@ -64,8 +63,7 @@ class Windows(IterableDataset):
         else:  # the same spread of views every time
             objects, views = np.repeat(self.objects, self.recipe.views)[:n], (np.arange(n) * 7) % v
         mirrored = rng.random(n) < 0.5 * (self.training and self.recipe.mirror)
-        batches = np.arange(n).reshape(-1, batch)[:, self.share]
-        for here in batches:
+        for here in np.arange(n).reshape(-1, batch)[:, self.share]:
             points = rng.permutation(1024)[: self.recipe.points] if self.training else np.arange(1024)
             o, w, m = objects[here], views[here], mirrored[here]
             seen: NDArray[Any] = np.stack([self.seen[i, k] for i, k in zip(o, w, strict=True)])
@@ -83,11 +81,8 @@ class Windows(IterableDataset):
 
 def peak_loss(logits: Tensor, goal: Tensor, reach: int) -> Tensor:
     """Mean negative log-likelihood that a cell drawn by its logit lies within ``reach`` of the highest of ``goal``."""
-    _, rings, columns = goal.shape
-    ring, column = torch.meshgrid(torch.arange(rings), torch.arange(columns), indexing="ij")
-    ring, column = ring.flatten().to(goal.device), column.flatten().to(goal.device)
-    highest = goal.flatten(1).argmax(1)
-    away = torch.hypot((ring - ring[highest, None]).float(), (column - column[highest, None]).float())
+    cells = torch.cartesian_prod(*(torch.arange(float(n), device=goal.device) for n in goal.shape[1:]))
+    away = (cells - cells[goal.flatten(1).argmax(1), None]).norm(dim=2)
     likely = logits.flatten(1).log_softmax(1)
     return -likely.masked_fill(away > reach, -torch.inf).logsumexp(1).mean()
 
@@ -116,8 +111,7 @@ class MapModule(L.LightningModule):
         if self.recipe.output == "sphere":
             error = (error + F.mse_loss(predicted, true)) / 2
         if self.recipe.peak:
-            lost = peak_loss(near / self.recipe.sharpness, goal, self.recipe.reach)
-            error = error + self.recipe.peak * lost
+            error = error + self.recipe.peak * peak_loss(near / self.recipe.sharpness, goal, self.recipe.reach)
         return error + self.recipe.regular * sum(orthogonality(t.float()) for t in transforms)
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
@@ -173,7 +167,7 @@ def train_map(
 
     def fitted() -> nn.Module:
         cloud = recipe.input == "cloud"
-        seen = views.all_points() if cloud else ready_inputs(store, recipe.size, recipe.input, track)
+        seen = views.rows("points") if cloud else ready_inputs(store, recipe.size, recipe.input, track)
         windows, judging = (Windows(seen, values, views.sphere, part, recipe, part is training) for part in parts)
         L.seed_everything(recipe.seed, verbose=False)
         module = MapModule(recipe, views.sphere, recipe.epochs * len(windows))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -12,15 +13,17 @@ from numpy.typing import NDArray
 from nextview.data.predictions import Predictions
 from nextview.errors import UsageError
 from nextview.files import check_new, command, sha256_of
-from nextview.learning.card_fits import fit_temperature
+from nextview.learning.card_fits import calibration_of
 from nextview.learning.fitting_set import FittingSet, blind_walks, described, fitting_set
 from nextview.policies.base import Scope
 from nextview.policies.learned_tables import FixedRing, cells_from, cells_to
 from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
-from nextview.recognition.belief import PLAIN_SUM, Calibration, of_true_class
+from nextview.recognition.belief import Calibration, of_true_class
 
 Float = NDArray[np.float64]
 VARIANTS: tuple[tuple[str, Scope], ...] = (("", "global"), ("-local", "local"), ("-near", "global"))
+KINDS = ("fixed-sequence", "class-table", "fixed-ring")
+NAMES = [f"{kind}{suffix}" for suffix, _ in VARIANTS for kind in KINDS if (kind, suffix) != ("fixed-ring", "-near")]
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,7 @@ def fit_policies(
 ) -> FittedPolicies:
     """Learn the policies that follow a table: fixed sequence, fixed ring, class table.
 
-    Each in three variants: over the whole sphere (NAME), in the local window (NAME-local), and over the whole sphere at
-    a travel weight (NAME-near; a ring has none).
+    Each over the whole sphere (NAME), in the local window (NAME-local), and at a travel weight (NAME-near; no ring).
 
     Args:
         predictions: of the training split (nextview predict --split train).
@@ -57,52 +59,53 @@ def fit_policies(
         n_views: over which the ring and the class table are chosen.
         shrinkage: objects by whose weight the gains of one believed class are drawn towards those of all.
         travel_weight: of one cell of travel for NAME-near, in units of the logarithm of the belief in the true class.
-        seed: decides the walks behind the class table.
+        seed: of the walks behind the class table.
         overwrite: replace cards of these names.
 
     Raises:
-        UsageError, PredictionsError: the arguments make no sense, or nothing can be fitted to the predictions.
-        ResultsError: a card exists.
+        UsageError, PredictionsError, ResultsError: arguments without sense, nothing to fit to, or a card that exists.
     """
     if length < 1 or n_views < 2 or shrinkage < 0 or travel_weight < 0:
         raise UsageError("length has to be at least 1, views at least 2, shrinkage and travel weight not negative")
-    names = [f"{kind}{suffix}" for suffix, _ in VARIANTS for kind in ("fixed-sequence", "class-table", "fixed-ring")]
-    cards = {name: out / f"{name}.json" for name in names if name != "fixed-ring-near"}
+    cards = {name: out / f"{name}.json" for name in NAMES}
     for path in cards.values():
         check_new(path, overwrite)
     table = Predictions.load(predictions)
     data = fitting_set(table, validation, split_seed)
-    calibration, sphere = table.calibration, data.sphere
-    if calibration == PLAIN_SUM:  # its recogniser was not calibrated when these were made
-        calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=1 + 8000 // len(data))
+    calibration = calibration_of(table, data, np.random.default_rng([seed, 0]), walks=1 + 8000 // len(data))
     values = fit_class_table(data, n_views, shrinkage, calibration, np.random.default_rng(seed))
-    travel = sphere.travel[:: sphere.azimuths]  # from each ring to each cell
     settings = {"length": length, "n_views": n_views, "shrinkage": shrinkage, "seed": seed}
-    source = LearnedFrom(sha256_of(predictions), table.models)
     for suffix, scope in VARIANTS:
-        paid = travel_weight if suffix == "-near" else 0.0
+        settings["travel_weight"] = travel_weight if suffix == "-near" else 0.0
         card = PolicyCard(
             "fixed-ring",
             scope,
-            sphere.elevations,
-            sphere.azimuths,
-            data.classes,
+            table.sphere.elevations,
+            table.sphere.azimuths,
+            table.classes,
             {},
             described(len(data)),
-            (source,),
+            (LearnedFrom(sha256_of(predictions), table.models),),
             ((calibration.temperature, calibration.correlation),),
-            settings | {"travel_weight": paid},
+            settings,
             (*table.commands, command()),
         )
-        moves = fit_sequence(data, scope, length, calibration, paid)
-        tables = {"fixed-sequence": {"moves": moves.tolist()}}
-        tables["class-table"] = {"values": np.round(values - paid * travel, 5).tolist()}
-        if f"fixed-ring{suffix}" in cards:
-            ring, steps = fit_ring(data, scope, n_views, calibration)
-            tables["fixed-ring"] = {"ring": ring, "steps": steps}
-        for kind, entries in tables.items():
-            write_policy_card(cards[f"{kind}{suffix}"], msgspec.structs.replace(card, kind=kind, table=entries), True)
+        for kind, entries in _tables(data, calibration, card, values).items():
+            if (name := f"{kind}{suffix}") in cards:
+                write_policy_card(cards[name], msgspec.structs.replace(card, kind=kind, table=entries), overwrite=True)
     return FittedPolicies(tuple(cards.values()), len(data))
+
+
+def _tables(data: FittingSet, calibration: Calibration, card: PolicyCard, values: Float) -> dict[str, dict[str, Any]]:
+    """The tables of a scope and travel weight, by the kinds of their cards; ``values`` are those of the class table."""
+    length, n_views, paid = (card.settings[name] for name in ("length", "n_views", "travel_weight"))
+    travel = data.sphere.travel[:: data.sphere.azimuths]  # from each ring to each cell
+    ring, steps = fit_ring(data, card.scope, n_views, calibration)
+    return {
+        "fixed-sequence": {"moves": fit_sequence(data, card.scope, length, calibration, paid).tolist()},
+        "class-table": {"values": np.round(values - paid * travel, 5).tolist()},
+        "fixed-ring": {"ring": ring, "steps": steps},
+    }
 
 
 def log_belief(data: FittingSet, calibration: Calibration, total: NDArray[np.floating], n_views: int) -> Float:
@@ -114,58 +117,37 @@ def fit_sequence(
     data: FittingSet, scope: Scope, length: int, calibration: Calibration, travel_weight: float = 0.0
 ) -> NDArray[np.int64]:
     """The greedily best moves from each ring, for all objects and azimuths together: (rings, length) cells, int64."""
-    n = data.sphere.azimuths
-    rings = [n * ring + np.arange(n) for ring in range(data.sphere.rings)]
-    paths = [greedy_path(data, starts, scope, length, calibration, travel_weight) for starts in rings]
-    return np.array([cells_to(data.sphere)[path[:-1], path[1:]] for path in paths])
-
-
-def greedy_path(
-    data: FittingSet,
-    starts: NDArray[np.int64],
-    scope: Scope,
-    length: int,
-    calibration: Calibration,
-    travel_weight: float = 0.0,
-) -> NDArray[np.int64]:
-    """The greedily best path from ``starts``, views of one ring, for all objects and starts together."""
-    sphere = data.sphere
-    path = [int(sphere.ring[starts[0]]) * sphere.azimuths]
-
-    def log_evidence(place: int) -> Float:
-        return data.log_evidence[:, cells_from(sphere)[starts, place]].astype(np.float64)
-
-    total = log_evidence(path[0])
-    for k in range(2, min(length, len(sphere) - 1) + 2):
-        reachable = np.arange(len(sphere)) if scope == "global" else sphere.windows[path[-1]].ravel()
-        free = np.setdiff1d(reachable, path)
-        free = free if len(free) else np.setdiff1d(np.arange(len(sphere)), path)
-        beliefs = [log_belief(data, calibration, total + log_evidence(v), k).mean(1) for v in free]
-        value = np.array(beliefs) @ data.weights / len(data) - travel_weight * sphere.travel[path[-1], free]
-        path.append(int(free[np.argmax(value)]))
-        total += log_evidence(path[-1])
-    return np.array(path)
+    sphere, moves = data.sphere, []
+    for starts in np.arange(len(sphere)).reshape(sphere.rings, -1):
+        path, view = [int(starts[0])], cells_from(sphere)[starts]  # of each cell, (azimuths, V)
+        total = data.log_evidence[:, view[:, path[0]]].astype(np.float64)
+        for k in range(2, min(length, len(sphere) - 1) + 2):
+            reachable = np.arange(len(sphere)) if scope == "global" else sphere.windows[path[-1]].ravel()
+            free = np.setdiff1d(reachable, path)
+            free = free if len(free) else np.setdiff1d(np.arange(len(sphere)), path)
+            beliefs = [log_belief(data, calibration, total + data.log_evidence[:, view[:, v]], k).mean(1) for v in free]
+            value = np.array(beliefs) @ data.weights / len(data) - travel_weight * sphere.travel[path[-1], free]
+            path.append(int(free[np.argmax(value)]))
+            total += data.log_evidence[:, view[:, path[-1]]]
+        moves.append(cells_to(sphere)[path[:-1], path[1:]])
+    return np.array(moves)
 
 
 def fit_ring(data: FittingSet, scope: Scope, n_views: int, calibration: Calibration) -> tuple[int, int]:
     """The best ring to go to and the azimuth steps along it, over all starts, after 2 to ``n_views`` views."""
-    everywhere, nothing_drawn = np.arange(len(data.sphere)), np.random.default_rng(0)
-
-    def walks_from_everywhere(walk: tuple[int, int]) -> NDArray[np.int64]:
-        policy = FixedRing(data.sphere, *walk)
-        return blind_walks(data.sphere, policy, everywhere, min(n_views, len(data.sphere)), nothing_drawn)
+    sphere, n_views = data.sphere, min(n_views, len(data.sphere))
 
     def value(walk: tuple[int, int]) -> float:
+        policy, rng = FixedRing(sphere, *walk), np.random.default_rng(0)  # nothing is drawn
         total, sum_over_views = np.zeros(data.log_evidence.shape), 0.0
-        for k, views in enumerate(walks_from_everywhere(walk).T, 1):
+        for k, views in enumerate(blind_walks(sphere, policy, np.arange(len(sphere)), n_views, rng).T, 1):
             total += data.log_evidence[:, views]
             if k > 1:
-                belief = log_belief(data, calibration, total, k)
-                sum_over_views += float(data.weights @ belief.mean(1))
+                sum_over_views += float(data.weights @ log_belief(data, calibration, total, k).mean(1))
         return sum_over_views
 
-    steps = range(1, data.sphere.azimuths // 2 + 1) if scope == "global" else (1,)
-    return max(((ring, step) for ring in range(data.sphere.rings) for step in steps), key=value)
+    steps = range(1, sphere.azimuths // 2 + 1) if scope == "global" else (1,)
+    return max(((ring, step) for ring in range(sphere.rings) for step in steps), key=value)
 
 
 def fit_class_table(

@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.utils.data import IterableDataset
 
 from nextview.data.progress import Track, silently
 from nextview.data.rendering import rotations
@@ -24,9 +23,11 @@ from nextview.errors import DatasetError, UsageError
 from nextview.learning.architectures import recogniser_network
 from nextview.learning.fitting_set import hold_out
 from nextview.learning.inputs import PackedViews, ready_inputs
-from nextview.learning.loop import fit, optimiser
+from nextview.learning.loop import OwnBatches, fit, optimiser
 from nextview.learning.recipes import Hardware, RecogniserRecipe
 from nextview.learning.runs import new_run, refuse_seen, start_from, train_once
+
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -34,20 +35,17 @@ class Source:
     """Where views of the training objects come from: their own store or one of deformed copies."""
 
     inputs: NDArray[np.uint8] | PackedViews  # (rows, V, C, S, S)
-    row: NDArray[np.int64]  # of each object in the inputs, -1 for none
+    row: Indices  # of each object in the inputs, -1 for none
     azimuth_bins: NDArray[np.float32] | None = None  # (rows, V)
 
 
-class Views(IterableDataset):
+class Views(OwnBatches):
     """Batches of (input (B, C, S, S) uint8, label (B,), and azimuth bin (B,) where sources have it), new each epoch."""
 
-    def __init__(
-        self, sources: list[Source], objects: NDArray[np.int64], labels: NDArray[np.int64], recipe: RecogniserRecipe
-    ) -> None:
+    def __init__(self, sources: list[Source], objects: Indices, labels: Indices, recipe: RecogniserRecipe) -> None:
         self.sources, self.objects, self.labels, self.recipe = sources, objects, labels, recipe
         count = np.bincount(labels[objects])[labels[objects]]
         self.weights = count**-0.5 / (count**-0.5).sum()
-        self.epoch, self.share = 0, slice(None)
         views = recipe.views if recipe.balanced else min(recipe.views, sources[0].inputs.shape[1])
         self.drawn = len(objects) * views
         self.batch = min(recipe.batch, self.drawn)
@@ -70,8 +68,7 @@ class Views(IterableDataset):
         source[rows[source, objects] < 0] = 0
         row = rows[source, objects]
         view = (turn * np.array([own.inputs.shape[1] for own in self.sources])[source]).astype(int)
-        batches = np.arange(n).reshape(-1, self.batch)[:, self.share]
-        for batch in batches:
+        for batch in np.arange(n).reshape(-1, self.batch)[:, self.share]:
             images = [self.sources[source[k]].inputs[row[k], view[k]] for k in batch]
             drawn = [np.stack(images), self.labels[objects[batch]]]
             if self.sources[0].azimuth_bins is not None:
@@ -138,8 +135,7 @@ class RecogniserModule(L.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         hits, seen, lost = (self.trainer.strategy.reduce(x, reduce_op="sum") for x in (self.hits, self.seen, self.lost))
-        there = seen > 0
-        self.log("class_accuracy", (hits[there] / seen[there]).mean(), prog_bar=True)
+        self.log("class_accuracy", (hits / seen)[seen > 0].mean(), prog_bar=True)
         self.log("validation_loss", lost.sum() / seen.sum())
         for total in (self.hits, self.seen, self.lost):
             total.zero_()
@@ -150,13 +146,11 @@ class RecogniserModule(L.LightningModule):
         return optimiser(groups, self.recipe, self.steps, 0.5)
 
 
-class ValidationViews(IterableDataset):
+class ValidationViews(OwnBatches):
     """Every fifth view of the validation objects, shifted by one from object to object: all views get their turn."""
 
-    def __init__(
-        self, inputs: NDArray[np.uint8] | PackedViews, objects: NDArray[np.int64], labels: NDArray[np.int64]
-    ) -> None:
-        self.inputs, self.objects, self.labels, self.share = inputs, objects, labels, slice(None)
+    def __init__(self, inputs: NDArray[np.uint8] | PackedViews, objects: Indices, labels: Indices) -> None:
+        self.inputs, self.objects, self.labels = inputs, objects, labels
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
         for k, i in list(enumerate(self.objects))[self.share]:
@@ -166,8 +160,8 @@ class ValidationViews(IterableDataset):
 
 def fit_recogniser(
     sources: list[Source],
-    labels: NDArray[np.int64],
-    parts: tuple[NDArray[np.int64], NDArray[np.int64]],
+    labels: Indices,
+    parts: tuple[Indices, Indices],
     recipe: RecogniserRecipe,
     out: Path,
     weights: Path | None = None,
@@ -196,17 +190,16 @@ def part_way(start: dict[str, Tensor], end: dict[str, Tensor], way: float) -> di
     }
 
 
-def mirror_planes(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.float64]:
+def mirror_planes(store: ViewStore, objects: Indices) -> NDArray[np.float64]:
     """Azimuth of the plane of symmetry of each class, steps of the store's viewpoints, (classes,)."""
     n = store.sphere.azimuths
     measured = store.measure()[objects].reshape(len(objects), -1, n).astype(np.float64)
     measured -= measured.mean((1, 2), keepdims=True)
-    planes = np.arange(n)[: max(1, n // 2)]  # the plane through a view also holds the one opposite
-    symmetry = np.stack(
-        [(measured * measured[:, :, (2 * plane - np.arange(n)) % n]).sum((1, 2)) for plane in planes], 1
-    )
-    labels = store.labels[objects]
-    return np.array([planes[symmetry[labels == c].sum(0).argmax()] for c in range(len(store.classes))], np.float64)
+    planes = range(max(1, n // 2))  # the plane through a view also holds the one opposite
+    mirrored = [measured[:, :, (2 * plane - np.arange(n)) % n] for plane in planes]
+    symmetry = np.stack([(measured * image).sum((1, 2)) for image in mirrored], 1)
+    of_class = [symmetry[store.labels[objects] == c].sum(0) for c in range(len(store.classes))]
+    return np.argmax(of_class, 1).astype(np.float64)
 
 
 def azimuth_bins(store: ViewStore, azimuths: int, planes: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -220,9 +213,8 @@ def azimuth_bins(store: ViewStore, azimuths: int, planes: NDArray[np.float64]) -
 def side_loss(likely: Tensor, label: Tensor, side: Tensor) -> Tensor:
     """Mean cross-entropy of the azimuth bin given the true class; between two bins, both count by their nearness."""
     own = likely[torch.arange(len(label), device=label.device), label]
-    low, n = side.floor(), own.shape[1]
-    share = (side - low)[:, None]
-    low = low.long()[:, None]
+    low, n = side.floor().long()[:, None], own.shape[1]
+    share = side[:, None] - low
     return -((1 - share) * own.gather(1, low % n) + share * own.gather(1, (low + 1) % n)).mean()
 
 
@@ -275,31 +267,31 @@ def train_recogniser(
     if recipe.azimuth_bins_weight:
         azimuths, planes = views.sphere.azimuths, mirror_planes(views, training)
     aside = [views.names[i] for i in validation]
-    for held in held_out.values():
-        refuse_seen(weights, [*aside, *(views.names[i] for i in held)])
-    sources = [_source(path, views, training, recipe, planes, track) for path in (store, *deformed)]
-    made = [ViewStore.open(path) for path in (store, *deformed)]
+    unseen = {folder: [*aside, *(views.names[i] for i in held)] for folder, held in held_out.items()}
+    for names in unseen.values():
+        refuse_seen(weights, names)
+    stores = [views, *map(ViewStore.open, deformed)]
+    sources = [_source(each, views, training, recipe, planes, track) for each in stores]
     for folder, held in held_out.items():
-        run = new_run(recipe, weights, [*aside, *(views.names[i] for i in held)], aside, made)
         split = np.setdiff1d(training, held), validating
         fitted = sources, views.labels, split, recipe, folder, weights, hardware, azimuths
+        run = new_run(recipe, weights, unseen[folder], aside, stores)
         train_once(folder, run, partial(fit_recogniser, *fitted))
     return list(held_out)
 
 
 def _source(
-    path: Path,
+    store: ViewStore,
     views: ViewStore,
-    needed: NDArray[np.int64],
+    needed: Indices,
     recipe: RecogniserRecipe,
     planes: NDArray[np.float64] | None,
     track: Track,
 ) -> Source:
     """Inputs of a store, and the row of each object of ``views`` in them, -1 for none."""
-    store = ViewStore.open(path)
     row = {name: i for i, name in enumerate(store.names)}
     rows = np.array([row.get(name, -1) for name in views.names])
     if (rows[needed] < 0).all():
-        raise DatasetError(f"{path}: holds none of the training objects")
-    inputs = ready_inputs(path, recipe.size, recipe.input, track)
+        raise DatasetError(f"{store.path}: holds none of the training objects")
+    inputs = ready_inputs(store.path, recipe.size, recipe.input, track)
     return Source(inputs, rows, None if planes is None else azimuth_bins(store, views.sphere.azimuths, planes))

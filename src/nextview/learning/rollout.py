@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import SceneSight, scenes_of, sight_of
 from nextview.errors import PredictionsError
-from nextview.learning.card_fits import fit_temperature
+from nextview.learning.card_fits import calibration_of
 from nextview.learning.fitting_set import FittingSet
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.baselines import Random
 from nextview.policies.gain import Gain
-from nextview.recognition.belief import PLAIN_SUM, Calibration, FixedLength, of_true_class
+from nextview.recognition.belief import Calibration, FixedLength, of_true_class
 from nextview.session.episode import run_episodes
 
 Float = NDArray[np.float64]
@@ -55,8 +55,7 @@ class ReplayTable:
         parts = [part.of_objects(kept) for part in (predictions, *sensed)]
         data = FittingSet.joined([FittingSet.of_all(part) for part in parts])
         maps = {name: np.concatenate([part.maps[name] for part in parts]) for name in predictions.maps}
-        known = predictions.calibration != PLAIN_SUM
-        calibration = predictions.calibration if known else fit_temperature(data, rng)
+        calibration = calibration_of(predictions, data, rng)
         scenes = scenes or scenes_of(predictions)
         return cls(data, maps, calibration, None if scenes is None else scenes.of_scenes(np.tile(kept, len(parts))))
 
@@ -105,8 +104,7 @@ def rollout(
 
 def value_after(table: ReplayTable, total: Float, n_views: NDArray | int, kind: str) -> Float:
     """The value, (N, ...), of sums of the log-evidence, (N, ..., D), after ``n_views`` views, by one of OBJECTIVES."""
-    logs = table.calibration.log_belief(total, n_views, len(table.data.classes))
-    return value_of(logs, table.data.labels, kind)
+    return value_of(table.calibration.log_belief(total, n_views, len(table.data.classes)), table.data.labels, kind)
 
 
 def value_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
@@ -136,9 +134,7 @@ def judge(
     table: ReplayTable, policy: Policy, n_views: int, kind: str, rng: np.random.Generator, rounds: int = 8
 ) -> Value:
     """Follow a policy ``rounds`` times over every object."""
-    data = table.data
-    weights = data.weights / len(data) / rounds
-    reached = np.zeros((2, n_views - 1))
+    weights, reached = table.data.weights / len(table.data) / rounds, np.zeros((2, n_views - 1))
     for _ in range(rounds):
         for moment in rollout(table, policy, n_views, rng):
             k = moment.state.step
@@ -152,24 +148,20 @@ TRAVEL_WEIGHTS = (0.0, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.012, 0
 """Of a grid cell of travel, in the unit of the objective."""
 
 
-def mean_value(parts: Sequence[Value], sizes: Sequence[int]) -> Value:
-    """Mean over all objects of values of policies that were judged on ``sizes`` objects each."""
-    return Value(*(np.average([getattr(p, name) for p in parts], 0, sizes) for name in ("mean", "travel")))
+def judge_all(
+    judged: Sequence[tuple[ReplayTable, Policy]], n_views: int, kind: str, seed: int | list[int], rounds: int = 8
+) -> Value:
+    """Mean value over the objects of all tables, each followed by a policy of its own; see ``judge``."""
+    values = [judge(*pair, n_views, kind, np.random.default_rng(seed), rounds) for pair in judged]
+    sizes = [len(table.data) for table, _ in judged]
+    return Value(*(np.average([getattr(value, name) for value in values], 0, sizes) for name in ("mean", "travel")))
 
 
 def fit_travel_weight(judged: Sequence[tuple[ReplayTable, Gain]], n_views: int, kind: str, seed: int) -> float:
     """The lowest of TRAVEL_WEIGHTS at which policies never travel farther than a random walk in the local window."""
-
-    def travel(policies: Iterable[Policy]) -> Float:
-        tables = [table for table, _ in judged]
-        values = [
-            judge(table, policy, n_views, kind, np.random.default_rng(seed))
-            for table, policy in zip(tables, policies, strict=True)
-        ]
-        return mean_value(values, [len(table.data) for table in tables]).travel
-
-    limit = travel(Random(table.data.sphere) for table, _ in judged)
-    for travel_weight in TRAVEL_WEIGHTS:
-        if (travel(replace(policy, travel_weight=travel_weight) for _, policy in judged) <= limit).all():
-            return travel_weight
+    limit = judge_all([(table, Random(table.data.sphere)) for table, _ in judged], n_views, kind, seed).travel
+    for weight in TRAVEL_WEIGHTS:
+        paying = [(table, replace(policy, travel_weight=weight)) for table, policy in judged]
+        if (judge_all(paying, n_views, kind, seed).travel <= limit).all():
+            return weight
     return TRAVEL_WEIGHTS[-1]

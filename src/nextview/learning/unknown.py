@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
@@ -20,10 +19,9 @@ from nextview.checks import whole
 from nextview.data.folders import list_dataset
 from nextview.data.pool import WorkerDied, each
 from nextview.data.progress import Track, silently
-from nextview.data.splits import deduplicated
+from nextview.data.splits import deduplicate
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, MeshError, ModelError
-from nextview.files import command
+from nextview.errors import DatasetError, MeshError
 from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Camera
 from nextview.learning.fitting_set import card_to_fit
@@ -35,6 +33,7 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 
 Float = NDArray[np.float64]
+Features = NDArray[np.float32]
 
 FAMILIES = ("primitives", "turned", "stretched", "cut", "joined")
 """The first needs no mesh."""
@@ -103,12 +102,10 @@ def turned_on_a_lathe(profile: Float, sides: int) -> tuple[Float, NDArray[np.int
     angle = 2 * np.pi * np.arange(sides) / sides
     radius, height = profile[:, 0, None], np.broadcast_to(profile[:, 1, None], (len(profile), sides))
     vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1).reshape(-1, 3)
-    low = (np.arange(len(profile) - 1)[:, None] * sides + np.arange(sides)).ravel()
-    after = (np.arange(len(profile) - 1)[:, None] * sides + (np.arange(sides) + 1) % sides).ravel()
-    faces = np.concatenate(
-        [np.stack([low, after, after + sides], 1), np.stack([low, after + sides, low + sides], 1)]
-    ).astype(np.int32)
-    return vertices, faces
+    first, step = np.arange(len(profile) - 1)[:, None] * sides, np.arange(sides)
+    low, after = (first + step).ravel(), (first + (step + 1) % sides).ravel()
+    corners = [low, after, after + sides], [low, after + sides, low + sides]
+    return vertices, np.concatenate([np.stack(corner, 1) for corner in corners]).astype(np.int32)
 
 
 def _joined(parts: list[tuple[Float, NDArray[np.int32]]]) -> tuple[Float, NDArray[np.int32]]:
@@ -135,28 +132,29 @@ def fit_novelty(
     rng: np.random.Generator,
     n_views: int = 5,
 ) -> Novelty:
-    """A novelty score, standardised and calibrated on objects that the recogniser was not trained on."""
+    """A novelty score, standardised and calibrated on objects that the recogniser was not trained on.
+
+    ``known`` and ``outliers`` are features of views, (rows, F); ``held_out`` those of objects, (objects, views, F).
+    """
     middle, directions, _ = principal_components(known, DISTANCE_DIRECTIONS)
     kept = rng.permutation(len(known))[:NEIGHBOURS]
-    neighbours = unit((known[kept] - middle) @ directions)
     hidden, hidden_bias, output, output_bias = fit_perceptron(known, labels, outliers, rng)
-    hidden_bias = hidden_bias + middle @ hidden  # of features from which the middle is taken away
     raw = Novelty(
         middle=middle.astype(np.float32),
         directions=_as_stored(directions),
-        neighbours=_as_stored(neighbours),
+        neighbours=_as_stored(unit((known[kept] - middle) @ directions)),
         hidden=_as_stored(hidden),
-        hidden_bias=hidden_bias.astype(np.float32),
+        hidden_bias=(hidden_bias + middle @ hidden).astype(np.float32),  # the middle is taken from features first
         output=output.astype(np.float32),
         output_bias=output_bias.astype(np.float32),
         standard=np.array([[0, 1], [0, 1]], np.float32),
         quantiles=np.zeros((1, 2), np.float32),
         objects=np.array([len(held_out)]),
     )
-    parts = raw.parts(held_out.reshape(-1, held_out.shape[-1]))
-    standard = np.stack([parts.mean(0), parts.std(0)], 1).astype(np.float32)
-    ready = replace(raw, standard=standard)
-    scores = ready.scores(held_out.reshape(-1, held_out.shape[-1])).reshape(held_out.shape[:2])
+    rows = held_out.reshape(-1, held_out.shape[-1])
+    parts = raw.parts(rows)
+    ready = replace(raw, standard=np.stack([parts.mean(0), parts.std(0)], 1).astype(np.float32))
+    scores = ready.scores(rows).reshape(held_out.shape[:2])
     return replace(ready, quantiles=quantiles(scores, held_out_labels, n_views))
 
 
@@ -167,9 +165,8 @@ def _as_stored(table: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def principal_components(rows: Float, most: int) -> tuple[Float, Float, Float]:
     """Middle (F,), directions (F, D) and variances along these (D,) of the largest components, in descending order."""
-    middle = rows.mean(0)
+    middle, f = rows.mean(0), rows.shape[1]
     centred = rows - middle
-    f = rows.shape[1]
     variances, directions = eigh(centred.T @ centred / len(rows), subset_by_index=[max(0, f - most), f - 1])
     kept = variances > 1e-6 * variances.max()
     return middle, directions[:, kept][:, ::-1], variances[kept][::-1]
@@ -179,18 +176,18 @@ def fit_perceptron(
     known: Float, labels: NDArray[np.int64], outliers: Float, rng: np.random.Generator
 ) -> tuple[Float, Float, Float, Float]:
     """A perceptron with one hidden layer of tanh that is above zero for outliers."""
-    middle, directions, variances = principal_components(np.concatenate([known, outliers]), PERCEPTRON_DIRECTIONS)
+    rows = np.concatenate([known, outliers])
+    middle, directions, variances = principal_components(rows, PERCEPTRON_DIRECTIONS)
     whiten = directions / np.sqrt(variances)
-    rows = ((np.concatenate([known, outliers]) - middle) @ whiten).astype(np.float32)
+    rows = ((rows - middle) @ whiten).astype(np.float32)
     truth = np.repeat([0.0, 1.0], [len(known), len(outliers)]).astype(np.float32)
     count = np.bincount(labels)
-    weights = np.concatenate([1 / count[labels] / (count > 0).sum(), np.full(len(outliers), 1 / len(outliers))]) / 2
-    weights = weights.astype(np.float32)
+    of_known = 1 / count[labels] / (count > 0).sum()
+    weights = np.concatenate([of_known, np.full(len(outliers), 1 / len(outliers))]).astype(np.float32) / 2
     d = rows.shape[1]
-    cuts = np.cumsum([d * HIDDEN, HIDDEN, HIDDEN])
 
     def layers(parameters: Float) -> tuple[Float, Float, Float, Float]:
-        first, bias, second, last = np.split(parameters, cuts)
+        first, bias, second, last = np.split(parameters, np.cumsum([d * HIDDEN, HIDDEN, HIDDEN]))
         return first.reshape(d, HIDDEN), bias, second, last
 
     def loss(parameters: Float) -> tuple[float, Float]:
@@ -244,8 +241,8 @@ class KnownViews:
     """The first ``wanted`` of some stored views of an object in which anything is seen."""
 
     store: str
-    card: str
     row: int
+    name: str
     views: tuple[int, ...]
     wanted: int
 
@@ -255,10 +252,8 @@ class OutlierViews:
     """Views of a synthetic outlier, made of two meshes, from the viewpoints and at the size of a store."""
 
     store: str
-    card: str
     family: str
-    mesh: str
-    other: str
+    meshes: tuple[str, str]
     views: tuple[int, ...]
     seed: int
     sensor: str | None
@@ -296,117 +291,78 @@ def fit_unknown(
     whole(outliers, "the number of outliers", 1)
     views, rng = ViewStore.open(store), np.random.default_rng(seed)
     with card_to_fit(card) as (model, write):
-        if not model.is_recogniser:
-            raise ModelError(f"{card}: is a {model.kind}, not a recogniser")
-        learned, held_out = _known(views, model, card)
-        known, calibrating = (
-            _Items(views, card, model, learned, LEARNED_VIEWS, rng),
-            _Items(views, card, model, held_out, HELD_OUT_VIEWS, rng),
-        )
-        for items, path in zip((known, calibrating), sensed or (), strict=False):
-            items.add_sensed(path, rng)
-        synthetic = _outliers(views, meshes, card, model, (outliers, seed, sensed is not None), rng)
-        novel = features_of(outlier_features, synthetic, workers, track, "synthetic outliers")
-        if not any(map(len, novel)):
+        learned, held_out = (dict(zip(*part, strict=True)) for part in _known(views, model, card))
+        known = _draw(views, learned, LEARNED_VIEWS, rng)
+        judging = _draw(views, held_out, HELD_OUT_VIEWS, rng)
+        if sensed:
+            known += _draw(ViewStore.open(sensed[0]), learned, LEARNED_VIEWS, rng)
+            judging += _draw(ViewStore.open(sensed[1]), held_out, HELD_OUT_VIEWS, rng)
+        synthetic = _outliers(views, meshes, model, (outliers, seed, sensed is not None), rng)
+        see = partial(features_of, card, workers, track)
+        novel = [rows for rows in see(outlier_features, synthetic, "synthetic outliers") if len(rows)]
+        if not novel:
             raise DatasetError(f"{meshes}: no outlier could be made of its meshes")
-        ordinary = features_of(known_features, known.views, workers, track, "objects that it was trained on")
-        others = features_of(known_features, calibrating.views, workers, track, "held-out objects")
+        ordinary = see(known_features, known, "objects that it was trained on")
+        others = see(known_features, judging, "held-out objects")
         enough = [k for k, rows in enumerate(others) if len(rows) == HELD_OUT_VIEWS]
         novelty = fit_novelty(
             np.concatenate([rows for rows in ordinary if len(rows)]),
-            known.labels.repeat([len(rows) for rows in ordinary]),
-            np.concatenate([rows for rows in novel if len(rows)]),
+            np.repeat([learned[item.name] for item in known], [len(rows) for rows in ordinary]),
+            np.concatenate(novel),
             np.stack([others[k] for k in enough]),
-            calibrating.labels[enough],
+            np.array([held_out[judging[k].name] for k in enough]),
             rng,
         )
-        number = sum(len(rows) > 0 for rows in novel)
-        write(
-            msgspec.structs.replace(model, novelty_sha256="")
-        )  # killed between the two files, this leaves no hash of another score
-        sha256 = novelty.save(novelty_path(model.path), overwrite=True)
-        about = (
-            f"{len(learned)} objects of the training split and {number} synthetic outliers, calibrated on "
-            f"{len(held_out)} others" + ", clean and through sensors" * (sensed is not None)
-        )
-        model = msgspec.structs.replace(model, novelty_sha256=sha256, fitted_to={**model.fitted_to, "novelty": about})
-        write(model.made_by(*views.commands, command()))
-    return FittedUnknown(len(learned), number, len(held_out))
+        about = f"{len(learned)} objects of the training split and {len(novel)} synthetic outliers, calibrated on "
+        about += f"{len(held_out)} others" + ", clean and through sensors" * (sensed is not None)
+        # Killed between the two files, this leaves a card without a score, not one with the hash of another.
+        write("novelty", "nothing, the fit was cut off", [views], novelty_sha256="")
+        write("novelty", about, [views], novelty_sha256=novelty.save(novelty_path(model.path), overwrite=True))
+    return FittedUnknown(len(learned), len(novel), len(held_out))
 
 
-def _known(views: ViewStore, model: ModelCard, card: Path) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the objects that a recogniser was trained on, and of those held out."""
-    known = np.array([name in model.classes for name in views.classes])[views.labels]
-    usable = np.flatnonzero(views.done & (views.splits != "test") & known)
+def _known(views: ViewStore, model: ModelCard, card: Path) -> list[tuple[list[str], list[int]]]:
+    """Names and labels of the objects that a recogniser was trained on, and of those held out."""
+    labels = np.array([model.classes.index(c) if c in model.classes else -1 for c in views.classes])[views.labels]
+    usable = np.flatnonzero(views.done & (views.splits != "test") & (labels >= 0))
     aside = np.isin(np.array(views.names)[usable], model.held_out)
     learned, held_out = usable[~aside], usable[aside]
     if len(learned) == 0 or len(held_out) == 0:
         raise DatasetError(f"{views.path}: holds no object that {card} was trained on, or none that it calls held out")
-    return learned, held_out[deduplicated(views.labels[held_out], views.measure()[held_out])]
+    parts = learned, deduplicate(views, held_out)
+    return [([views.names[i] for i in part], labels[part].tolist()) for part in parts]
 
 
-class _Items:
-    """Views of known objects, drawn at random, and the labels of their objects."""
-
-    def __init__(
-        self,
-        store: ViewStore,
-        card: Path,
-        model: ModelCard,
-        rows: NDArray[np.int64],
-        wanted: int,
-        rng: np.random.Generator,
-    ) -> None:
-        self.names, self.card, self.wanted = [store.names[i] for i in rows], card, wanted
-        classes = np.array([model.classes.index(name) if name in model.classes else -1 for name in store.classes])
-        self.views, self.labels = self._draw(store, rows, rng), classes[store.labels[rows]]
-
-    def add_sensed(self, path: Path, rng: np.random.Generator) -> None:
-        """Add views of the same objects from another store."""
-        store = ViewStore.open(path)
-        done = store.done
-        row = {name: i for i, name in enumerate(store.names) if done[i]}
-        there = [k for k, name in enumerate(self.names) if name in row]
-        if not there:
-            raise DatasetError(f"{path}: holds none of {len(self.names)} objects, {self.names[0]} among them")
-        self.views += self._draw(store, np.array([row[self.names[k]] for k in there]), rng)
-        self.labels = np.concatenate([self.labels, self.labels[there]])
-
-    def _draw(self, store: ViewStore, rows: NDArray[np.int64], rng: np.random.Generator) -> list[KnownViews]:
-        path, card, n = str(store.path.absolute()), str(self.card.absolute()), len(store.sphere)
-        return [KnownViews(path, card, int(i), tuple(rng.permutation(n).tolist()), self.wanted) for i in rows]
+def _draw(store: ViewStore, names: Iterable[str], wanted: int, rng: np.random.Generator) -> list[KnownViews]:
+    """Views in random order of those of some objects that a store holds."""
+    row = {store.names[i]: i for i in np.flatnonzero(store.done).tolist()}
+    there, path = [name for name in names if name in row], str(store.path.absolute())
+    if not there:
+        raise DatasetError(f"{store.path}: holds none of the objects to fit to")
+    n = len(store.sphere)
+    return [KnownViews(path, row[name], name, tuple(rng.permutation(n).tolist()), wanted) for name in there]
 
 
 def _outliers(
-    views: ViewStore,
-    meshes: Path,
-    card: Path,
-    model: ModelCard,
-    options: tuple[int, int, bool],
-    rng: np.random.Generator,
+    views: ViewStore, meshes: Path, model: ModelCard, options: tuple[int, int, bool], rng: np.random.Generator
 ) -> list[OutlierViews]:
     """So many synthetic outliers from a seed, every second one through sensors if wanted."""
     number, seed, sensed = options
-    paths = [
-        str(e.path.absolute())
-        for e in list_dataset(meshes)
-        if e.split in ("train", "") and e.name not in model.held_out
-    ]
-    if not paths:
+    entries = [e for e in list_dataset(meshes) if e.split in ("train", "") and e.name not in model.held_out]
+    if not entries:
         raise DatasetError(f"{meshes}: holds no mesh to make outliers of")
-    place = str(views.path.absolute()), str(card.absolute())
-    outliers = []
-    for k, at in enumerate(rng.integers(len(paths), size=(number, 2))):
+    paths, outliers = [str(e.path.absolute()) for e in entries], []
+    for k, (one, other) in enumerate(rng.integers(len(paths), size=(number, 2))):
         chosen = tuple(rng.permutation(len(views.sphere))[:OUTLIER_VIEWS].tolist())
         sensor = "mix" if sensed and (k // len(FAMILIES)) % 2 else None
-        family, seed_of_it = FAMILIES[k % len(FAMILIES)], k + seed * number
-        outliers.append(OutlierViews(*place, family, paths[at[0]], paths[at[1]], chosen, seed_of_it, sensor))
+        place, family = str(views.path.absolute()), FAMILIES[k % len(FAMILIES)]
+        outliers.append(OutlierViews(place, family, (paths[one], paths[other]), chosen, k + seed * number, sensor))
     return outliers
 
 
-def known_features(item: KnownViews) -> NDArray[np.float32]:
+def known_features(card: str, item: KnownViews) -> Features:
     """Features of stored views in which anything is seen, (views, F)."""
-    store, recogniser = _open(item.store, item.card)
+    store, recogniser = _open(item.store, card)
     seen = np.any(store.depth(item.row) > 0, axis=(1, 2))
     views = np.array([view for view in item.views if seen[view]][: item.wanted], np.int64)
     if not len(views):
@@ -414,36 +370,30 @@ def known_features(item: KnownViews) -> NDArray[np.float32]:
     return recogniser.features(from_store(recogniser.card.input, store, item.row, views))
 
 
-def outlier_features(item: OutlierViews) -> NDArray[np.float32]:
+def outlier_features(card: str, item: OutlierViews) -> Features:
     """Features of views of a synthetic outlier, (views, F); none if it cannot be made, or is not seen."""
-    store, recogniser = _open(item.store, item.card)
+    store, recogniser = _open(item.store, card)
     try:
-        mesh = load_mesh(item.mesh)
-        other = load_mesh(item.other) if item.family == "joined" else mesh
-        mesh = synthetic_outlier(item.family, mesh, other, np.random.default_rng(item.seed))
+        mesh, *others = map(load_mesh, item.meshes if item.family == "joined" else item.meshes[:1])
+        mesh = synthetic_outlier(item.family, mesh, (others or [mesh])[0], np.random.default_rng(item.seed))
     except MeshError:  # a mesh of the folder that cannot be read, or a part without area
         return NONE
     if item.sensor is None:
         camera: Camera = SimulatedCamera(mesh, store.attributes.size, store.sphere.distance)
     else:
         camera = SensedCamera(mesh, item.sensor, np.random.default_rng([item.seed, 1]))
-    observations = [camera.observe(store.sphere.poses[view]) for view in item.views]
-    kept = [o for o in observations if o.seen]
+    kept = [o for view in item.views if (o := camera.observe(store.sphere.poses[view])).seen]
     return recogniser.features(from_observations(recogniser.card.input, kept)) if kept else NONE
 
 
 def features_of(
-    function: Callable[[Any], NDArray[np.float32]],
-    items: Sequence[Any],
-    workers: int | None,
-    track: Track,
-    what: str,
-) -> list[NDArray[np.float32]]:
-    """What a function gives for each item, in their order, computed side by side."""
+    card: Path, workers: int | None, track: Track, function: Callable[..., Features], items: Sequence[Any], what: str
+) -> list[Features]:
+    """What a function of a card and an item gives for each item, in their order, computed side by side."""
     features = dict.fromkeys(items, NONE)
 
     def work() -> Iterator[int]:
-        for done, (item, result) in enumerate(each(function, items, workers), 1):
+        for done, (item, result) in enumerate(each(partial(function, str(card.absolute())), items, workers), 1):
             if isinstance(result, WorkerDied):
                 raise DatasetError(f"{what}: {result}")
             features[item] = result
