@@ -22,6 +22,11 @@ EXPORTED = "{found.card}: largest difference between torch and ONNX on real view
 COMMANDS = {
     "recognise": Command(f"{CLI}.recognise:recognise", "say what an object is: a mesh file, or captured views"),
     "demo": Command(f"{CLI}.recognise:demo", "recognise a sample object, and draw the episode"),
+    "learn": Command(
+        f"{LEARNING}.learn:learn_things",
+        "teach it your things: scans, or depth frames; minutes",
+        "{found}\nnext: nextview recognise MESH --models {out}; what was learned is drawn in {out}/learned.png",
+    ),
     "explore": Command(f"{CLI}.explore:explore", "choose views in the browser, and see what is believed"),
     "capture": Command(f"{CLI}.recognise:capture", "write depth images of a mesh, as a camera would take them"),
     "list": Command(f"{CLI}.listing:show", "list the bundled models, or the view measures"),

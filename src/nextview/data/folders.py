@@ -1,7 +1,8 @@
 """Folders of meshes: which files are objects, of which class and split, and what is left out.
 
 Understood are CLASS/MESH, CLASS/SPLIT/MESH and SPLIT/CLASS/MESH, each also with folders between the last of these and
-the mesh (CLASS/ID/models/MESH). Links are followed.
+the mesh (CLASS/ID/models/MESH). Where all meshes lie in the folder itself, each is a class of its
+own. Links are followed.
 """
 
 from __future__ import annotations
@@ -70,6 +71,8 @@ def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> Listi
     files, left_out = _walk(root, suffixes)
     split_first = {place.parts[0] for place in files if len(place.parts) > 1} <= set(SPLITS)
     found = {place: _entry(place, path, split_first) for place, path in files.items()}
+    if all(len(place.parts) == 1 for place in files) and suffixes == FORMATS:
+        found = {place: Entry(path, path.stem, path.stem, "", "MESH") for place, path in files.items()}
     left_out += [(place, "not in a class folder") for place, entry in found.items() if entry is None]
     entries = [entry for entry in found.values() if entry is not None]
     if not entries:

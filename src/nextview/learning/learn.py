@@ -20,7 +20,7 @@ from nextview.files import command, new_file, new_folder, only_one
 from nextview.learning.learned_picture import draw_learned
 from nextview.learning.memory_fit import VIEWS, fit_memory, size_evidence
 from nextview.learning.teaching import Arrays, teach
-from nextview.learning.things import Source, find_things
+from nextview.learning.things import Found, Source, find_things
 from nextview.recognition.belief import Calibration
 from nextview.recognition.memory import AZIMUTHS, Memory, read_memory
 from nextview.recognition.model_card import (
@@ -49,8 +49,8 @@ class Learned:
     Attributes:
         out: the folder.
         things: how many, of so many ``classes``.
-        accuracy: share of the cases in which held-out views are named right after 1, 2, 3 and 5 of them, by shape
-            alone; things of a class of several by the others of that class.
+        accuracy: share of the cases in which held-out views are named right after 1, 2, 3 and 5 of them; things of a
+            class of several by the others of that class.
         confused: pairs of things that are most often taken for each other, with the share of the cases.
         notes: what there is to know, a sentence each.
         left_out: what could not be learned and why, a phrase each.
@@ -63,6 +63,18 @@ class Learned:
     confused: tuple[tuple[str, str, float], ...]
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """In words."""
+        classes = "" if self.classes == self.things else f" of {self.classes} classes"
+        one, two, three, _ = (f"{share:.0%}" for share in self.accuracy)
+        lines = [
+            f"{self.things} things{classes} learned: {one} named right after one view, {two} after two, {three} after three"
+        ]
+        lines += [f"confused: {a} and {b} ({share:.0%} of the cases)" for a, b, share in self.confused[:5]]
+        if len(self.confused) > 5:
+            lines.append(f"and {len(self.confused) - 5} pairs less often")
+        return "\n".join(lines + [*self.notes] + [f"left out: {phrase}" for phrase in self.left_out])
 
 
 @dataclass(frozen=True)
@@ -134,9 +146,8 @@ def learn_things(
     elif card_path.exists() and not overwrite:
         check = f"{out}: knows things already; --add puts others beside them, --overwrite replaces them"
         raise UsageError(check)
-    found = find_things(folder) if not (remove and folder.resolve() == out.resolve()) else None
-    sources = [] if found is None else _new(found.things, known)
-    left_out = [] if found is None else list(found.left_out)
+    found = Found([], []) if add and folder.resolve() == out.resolve() else find_things(folder)
+    sources, left_out = _new(found.things, known), list(found.left_out)
     part = out.with_name(f".{out.name}.part")
     with only_one(out):
         taught = known
@@ -255,7 +266,7 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
     stacked = {name: np.stack([arrays[name] for _, arrays in taught]) for name in PER_THING}
     stacked["radii"] = stacked["radii"][:, 0]
     joint = {name: np.concatenate([arrays[name] for _, arrays in taught]) for name in ("views", "rotations")}
-    fit = fit_memory(joint["views"], thing, label, stacked["held_out"], stacked["held_out_views"])
+    fit = fit_memory(joint["views"], thing, label, *(stacked[name] for name in PER_THING[:3]))
     memory = Memory(thing=thing, head=fit.head, head_bias=fit.head_bias, quantiles=fit.quantiles, **joint, **stacked)
     things = tuple(Thing(source.name, str(source.path), n) for (source, _), n in zip(taught, poses, strict=True))
     features = find_card(FEATURES)

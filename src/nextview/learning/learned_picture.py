@@ -32,7 +32,7 @@ def draw_learned(path: Path, pictures: Mapping[str, NDArray[np.uint8]], fit: Fit
         axes.spines[side].set_visible(False)
     axes.spines["bottom"].set_color(QUIET)
     axes.tick_params(axis="x", length=0, colors=INK)
-    axes.set_title("named right, % of cases, by shape", size=10, color=INK, loc="left")
+    axes.set_title("named right, % of cases", size=10, color=INK, loc="left")
     axes.set_xlabel("views", size=10, color=INK)
     pairs = [(names[a], names[b], share) for a, b, share in fit.confused[:PAIRS]]
     heading = "confused most, share of the cases after two views" if pairs else "no two things are confused"

@@ -22,7 +22,7 @@ MOST_THINGS = 150
 """Things whose held-out views are judged: a drawn part of more."""
 DRAWS, VIEWS, FOLDS = 4, (1, 2, 3, 5), 5
 LEVELS = 101
-SIZE_ERROR = 0.07
+SIZE_ERROR = 0.05
 """Deviation of the logarithm of a radius that a sensor measures."""
 FAR = -1e3
 
@@ -41,7 +41,12 @@ class Fit:
 
 
 def fit_memory(
-    views: Float, thing: NDArray[np.int64], label: NDArray[np.int64], held_out: Float, held_out_views: Float
+    views: Float,
+    thing: NDArray[np.int64],
+    label: NDArray[np.int64],
+    held_out: Float,
+    held_out_views: Float,
+    radii: Float,
 ) -> Fit:
     """Fit by the held-out views of the things, most likely after 1, 2, 3 and 5 of them.
 
@@ -54,6 +59,7 @@ def fit_memory(
         label: class of each thing, ascending, (T,).
         held_out: embeddings of views that are not remembered, (T, K, F).
         held_out_views: their elevations and azimuths, radians, (T, K, 2).
+        radii: object radius of each thing, metres, (T,); NaN where it is not known.
     """
     views, held_out = np.asarray(views, np.float32), np.asarray(held_out, np.float32)
     rng = np.random.default_rng(0)
@@ -65,11 +71,13 @@ def fit_memory(
         if several[t]:
             alike[row][:, (fold[thing] == fold[t]) & several[thing]] = FAR
     heads, whole = _heads(views, thing, label, several, fold, held_out, judged)
+    size = size_evidence(radii, label)
+    measured = radii * np.exp(rng.normal(0, SIZE_ERROR, len(radii)))  # as a sensor would measure it
+    sizes = np.float32(0) if size is None else size.logits(measured)[judged, None]
     drawn = np.stack([np.stack([rng.permutation(held_out.shape[1]) for _ in range(DRAWS)]) for _ in judged])
     grid = [(w, c, h) for h in (HEADS if several.any() else (0.0,)) for w in WEIGHTS for c in CORRELATIONS]
-    scored = [
-        (_belief(alike, heads, held_out_views[judged], drawn, label[thing], len(whole[1]), each), each) for each in grid
-    ]
+    where, of_class = held_out_views[judged], label[thing]
+    scored = [(_belief(w * alike, h * heads + sizes, where, drawn, of_class, c), (w, c, h)) for w, c, h in grid]
     truth = label[judged]
     loss = [-np.mean([of_true_class(logs, truth).mean() for logs in beliefs]) for beliefs, _ in scored]
     beliefs, (weight, correlation, head) = scored[int(np.argmin(loss))]
@@ -135,23 +143,19 @@ def _ridge(x: Float, y: NDArray[np.int64], classes: int) -> tuple[Float, Float]:
 
 def _belief(
     alike: Float,
-    heads: Float,
+    logits: Float,
     where: Float,
     drawn: NDArray[np.int64],
     hypotheses: NDArray[np.int64],
-    classes: int,
-    settings: tuple[float, float, float],
+    correlation: float,
 ) -> list[NDArray[np.float64]]:
     """Log-belief after so many drawn views as VIEWS says, (T, draws, classes) each."""
-    weight, correlation, head = settings
     calibration = Calibration(1.0, 1.0, None, correlation, tuple(hypotheses.tolist()))
     found = []
-    total = np.stack(
-        [log_evidence_of(head * h, weight * a, z) for h, a, z in zip(heads, alike, where[..., 1], strict=True)]
-    )
+    total = [log_evidence_of(x, a, z) for x, a, z in zip(logits, alike, where[..., 1], strict=True)]
     for k in VIEWS:
         sums = np.stack([t[d[:, :k]].sum(1) for t, d in zip(total, drawn, strict=True)])
-        found.append(calibration.log_belief(sums, k, classes))
+        found.append(calibration.log_belief(sums, k, logits.shape[-1]))
     return found
 
 
@@ -172,8 +176,8 @@ def _confused(
 def size_evidence(radii: Float, label: NDArray[np.int64]) -> SizeEvidence | None:
     """How likely each size is for the things of each class; None where no size is known.
 
-    Each thing of a class adds a Student distribution (3 degrees of freedom) of the logarithm of its radius; half hidden
-    things look smaller. A class of which no size is known has none.
+    Each thing of a class adds a normal distribution of the logarithm of its radius, and a tenth of a wide one: half
+    hidden things look smaller. A class of which no size is known has none.
     """
     known = np.isfinite(radii)
     if not known.any():
@@ -186,7 +190,7 @@ def size_evidence(radii: Float, label: NDArray[np.int64]) -> SizeEvidence | None
         # Things of a class differ in size, and the fewer are known the wider their sizes may lie.
         wide = SIZE_ERROR if (label == c).sum() == 1 else max(SIZE_ERROR, 0.5 * own.std() if len(own) > 1 else 0.3)
         if len(own):
-            student = (1 + ((grid[:, None] - own) / wide) ** 2 / 3) ** -2
-            density[c] = np.log(student.mean(1) / wide)
+            off = (grid[:, None] - own) / wide
+            density[c] = np.log((0.9 * np.exp(-(off**2) / 2) + 0.1 / 4 * np.exp(-(off**2) / 32)).mean(1) / wide + 1e-9)
     density[~np.isin(np.arange(len(density)), label[known])] = density.max()
     return SizeEvidence.from_arrays(np.exp(grid), density, 1.0)

@@ -32,6 +32,8 @@ class EpisodeState:
         episodes: which episodes these are, (B,) int64: where an oracle looks up its truth. Live there is one, 0.
         azimuth_bins: belief, over all views, in the azimuth bin that is seen from the current view, if the object is
             of each class, (B, classes, azimuth bins) float64; None unless the policy needs it.
+        joint: belief, over all views, in each hypothesis of ``Calibration.hypotheses`` seen from each azimuth bin from
+            here, (B, hypotheses, azimuth bins) float64; None unless the policy needs it.
         reachable: which views the camera can be brought to, (B, V) bool; None for all.
         travel: cost to go from here to each view, grid cells, (B, V) float64; None for the travel of the viewpoints.
         places: unit vectors towards where the camera really stood, the last one here, (B, step, 3) float64; None where
@@ -53,6 +55,7 @@ class EpisodeState:
     places: Float | None = None
     observations: Sequence[Sequence[Observation]] | None = None
     visibility: Float | None = None
+    joint: Float | None = None
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -73,7 +76,7 @@ class Policy(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of maps that it wants in the evidence, "azimuth_bins", "observations", "visibility"."""
+        """Names of maps that it wants in the evidence, "azimuth_bins", "joint", "observations", "visibility"."""
         ...
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:

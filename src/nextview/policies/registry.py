@@ -12,11 +12,12 @@ from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Spread, Unidirectional, Visibility
+from nextview.policies.discriminate import Discriminate
 from nextview.policies.gain import Gain, VisibleGain
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card
 from nextview.recognition.map_names import SPHERE, in_order
-from nextview.recognition.model_card import MAPS
+from nextview.recognition.model_card import MAPS, MEMORY_SUFFIX
 
 POLICIES: dict[str, Callable[[Any], Policy]] = {
     "random": Random,
@@ -71,6 +72,8 @@ def make_policy(
     if by_map is not None:
         return by_map
     card = _card(name)
+    if card is not None and card.with_suffix(MEMORY_SUFFIX).exists():
+        return Discriminate.from_card(card, sphere, None if classes is None else tuple(classes))
     if card is not None:
         policy = read_policy(card, sphere, classes)
         return _visible(policy, name) if name.startswith(VISIBLE) else policy
@@ -90,7 +93,7 @@ def make_policy_anywhere(
 ) -> Policy:
     """A policy by name for live use, whatever the viewpoints: see ``policies.off_grid``."""
     card = _card(name.partition("@")[0])
-    if card is not None:
+    if card is not None and not card.with_suffix(MEMORY_SUFFIX).exists():
         about = read_policy_card(card)
         viewpoints = ViewSphere(about.elevations, about.azimuths)
     elif _on_grid(name, maps) and not isinstance(viewpoints, ViewSphere):
@@ -145,7 +148,7 @@ def _visible(policy: Policy, name: str) -> Policy:
 
 
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
-    if not isinstance(policy, Gain | Visibility | VisibleGain):
+    if not isinstance(policy, Discriminate | Gain | Visibility | VisibleGain):
         raise PolicyError(f"{name}: this policy does not weigh travel")
     try:
         return replace(policy, travel_weight=float(travel_weight))

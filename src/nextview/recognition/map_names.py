@@ -31,7 +31,7 @@ def measure_of(name: str) -> str:
 
 def maps_among(needs: Sequence[str]) -> list[str]:
     """Those of a policy's needs that are maps."""
-    return [name for name in needs if name not in ("azimuth_bins", "observations", "visibility")]
+    return [name for name in needs if name not in ("azimuth_bins", "joint", "observations", "visibility")]
 
 
 def in_order(maps: Iterable[str]) -> list[str]:

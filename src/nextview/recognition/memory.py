@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,7 @@ class Memory:
         return hashlib.sha256(content).hexdigest()
 
 
+@lru_cache(maxsize=2)
 def read_memory(path: Path, sha256: str) -> Memory:
     """Read what ``Memory.save`` wrote; ModelError if it is not that."""
     try:
@@ -127,7 +129,7 @@ class TaughtRecogniser(Recogniser):
         if (h, things) != (len(self.calibration.hypotheses), len(self.memory.radii)):
             raise ModelError(f"{self.card.path}: holds {h} resting poses, and its card is of others")
         self._views = by_ring(self.memory.views)
-        self.novelty = Quantiles(self.memory.quantiles, np.array([things]))
+        self.novelty = Quantiles(self.memory.quantiles, np.array([self.memory.held_out[..., 0].size]))
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
         """Evidence of B views from one camera, see ``Recogniser``."""

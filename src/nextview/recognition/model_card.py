@@ -21,6 +21,8 @@ RECOGNISER = "recogniser-modelnet10"
 FEATURES = "features"
 """The bundled network that knows no classes: what taught things are remembered by."""
 MEMORY_SUFFIX = ".safetensors"
+DISCRIMINATE = "discriminate"
+"""The policy of a memory of things; its card is that of the memory."""
 COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}
 """Recognisers that are bundled, by the name of the models they belong to."""
 MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}
@@ -188,7 +190,7 @@ def find_models(models: str | Path) -> Collection:
     bundled = {name: BUNDLED / f"{card}.json" for name, card in MAPS.items()}
     folder = Path(models)
     if str(models) in COLLECTIONS:
-        return Collection(BUNDLED / f"{COLLECTIONS[str(models)]}.json", bundled, {})
+        return _with_memory(Collection(BUNDLED / f"{COLLECTIONS[str(models)]}.json", bundled, {}))
     if not folder.is_dir():
         known = ", ".join(COLLECTIONS)
         raise ModelError(f"{folder}: is neither a folder with models nor the name of bundled ones ({known})")
@@ -208,4 +210,11 @@ def find_models(models: str | Path) -> Collection:
     if "recogniser" not in networks:
         raise ModelError(f"{folder}: holds no card of a recogniser; nextview learn makes one")
     own = {kind: paths[0] for kind, paths in networks.items()}
-    return Collection(own.pop("recogniser"), bundled | own, policies)
+    return _with_memory(Collection(own.pop("recogniser"), bundled | own, policies))
+
+
+def _with_memory(found: Collection) -> Collection:
+    """With the policy that needs no more than a memory of things, where the recogniser is one."""
+    if not found.recogniser.with_suffix(MEMORY_SUFFIX).exists():
+        return found
+    return Collection(found.recogniser, found.maps, {DISCRIMINATE: found.recogniser} | found.policies)

@@ -174,10 +174,12 @@ class Episodes:
 
     def _state(self, taken: Taken, going: NDArray[np.bool_]) -> EpisodeState:
         """What the policy may see of the episodes that go on."""
-        step, needs, azimuth_bins = taken.step, self.policy.needs, None
+        step, needs, azimuth_bins, joint = taken.step, self.policy.needs, None, None
+        total, weighed, classes = step.total[going], np.maximum(step.seen, 1)[going], step.belief.shape[1]
         if "azimuth_bins" in needs:
-            classes, weighed = step.belief.shape[1], np.maximum(step.seen, 1)[going]
-            azimuth_bins = self.calibration.azimuth_bins(step.total[going], weighed, classes, taken.azimuth[going])
+            azimuth_bins = self.calibration.azimuth_bins(total, weighed, classes, taken.azimuth[going])
+        if "joint" in needs:
+            joint = self.calibration.joint(total, weighed, classes, taken.azimuth[going])
         state = EpisodeState(
             step.views[going],
             taken.visited[going],
@@ -187,6 +189,7 @@ class Episodes:
             step.episodes[going],
             azimuth_bins,
             places=None if taken.places is None else taken.places[going],
+            joint=joint,
             observations=self._observations(step, step.episodes[going]) if "observations" in needs else None,
         )
         return replace(state, visibility=self._visibility(step, state)) if "visibility" in needs else state

@@ -27,7 +27,8 @@ from nextview.policies.registry import make_policy_anywhere, with_cards
 from nextview.recognition.belief import Stopping
 from nextview.recognition.inference import MapNetwork, Models, Recogniser, open_maps
 from nextview.recognition.map_names import SPHERE
-from nextview.recognition.model_card import find_models
+from nextview.recognition.memory import open_recogniser
+from nextview.recognition.model_card import DISCRIMINATE, find_models
 from nextview.session.recognition import Recognition
 from nextview.session.session import FrameCamera, Session
 
@@ -184,7 +185,7 @@ def load(
     Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
     found = find_models(models)
     sphere = viewpoints_of(viewpoints)
-    recogniser = Recogniser(found.recogniser, threads)
+    recogniser = open_recogniser(found.recogniser, threads)
     if unknown and recogniser.novelty is None:
         raise ModelError(f"{found.recogniser}: cannot tell unknown objects; nextview fit unknown teaches it")
     if policy is None:
@@ -221,7 +222,9 @@ def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> Cap
 
 
 def _default_policy(own: dict[str, Path], sphere: Viewpoints, recogniser: Recogniser) -> tuple[str, Policy]:
-    """ "gain", where one fits, else "spread", which asks for nothing."""
+    """For taught things "discriminate"; "gain", where one fits, else "spread", which asks for nothing."""
+    if (memory := own.get(DISCRIMINATE)) is not None:
+        return DISCRIMINATE, make_policy_anywhere(str(memory), sphere, (), recogniser.classes)
     try:
         gain = make_policy_anywhere(str(own.get("gain", "gain")), sphere, (), recogniser.classes)
         grid = getattr(gain, "sphere", None)

@@ -1,0 +1,86 @@
+"""The policy that tells taught things apart: it looks where the things that are believed most look least alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import OtherUseError, PolicyError
+from nextview.geometry.viewsphere import Viewpoints, azimuth_of
+from nextview.policies.base import EpisodeState, best_view, check_weight, travel_from
+from nextview.recognition.memory import AZIMUTHS, RINGS, read_memory
+from nextview.recognition.model_card import read_card
+
+Float = NDArray[np.float64]
+LEADING = 24
+"""Pairs of a thing, in a resting pose, and an azimuth that are weighed against each other: those believed most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Discriminate:
+    """Goes where the view is expected to tell most of which thing it is, less the weighted travel.
+
+    For each candidate view the memory says what each leading hypothesis, a thing and the azimuth it is seen from, would
+    show there. If one of them is true, the others keep the likelihood that the memory's calibrated weight gives their
+    likeness to it; the expected logarithm of the belief in the true class is what the view is worth (expected
+    information: Denzler and Brown, IEEE TPAMI 2002; Borotschnig et al., Image and Vision Computing 2000).
+
+    Attributes:
+        viewpoints: the candidates, anywhere.
+        views: remembered views of each hypothesis, (H, rings, azimuths, F), unit vectors; zero where nothing is known.
+        classes: class of each hypothesis, (H,).
+        weight: of a cosine, as a log-likelihood.
+        travel_weight: of a grid cell of travel.
+    """
+
+    viewpoints: Viewpoints
+    views: NDArray[np.floating]
+    classes: NDArray[np.int64]
+    weight: float
+    travel_weight: float = 0.0
+    needs: tuple[str, ...] = ("joint",)
+
+    def __post_init__(self) -> None:
+        check_weight(self.travel_weight)
+
+    @classmethod
+    def from_card(cls, path: Path, viewpoints: Viewpoints, classes: tuple[str, ...] | None = None) -> Discriminate:
+        """For the things of a memory, by its card; OtherUseError if ``classes`` are not those of its things."""
+        card = read_card(path)
+        if card.memory is None:
+            raise PolicyError(f"{path}: is no memory of things")
+        if classes is not None and card.classes != tuple(classes):
+            raise OtherUseError(f"{path}: discriminates other things ({', '.join(card.classes[:10])})")
+        views = read_memory(card.path, card.sha256).views
+        return cls(viewpoints, views, np.array(card.calibration.hypotheses), card.memory.weight)
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        values = self.view_values(state)
+        return best_view(self.viewpoints, state, values + 1e-9 * rng.random(values.shape))
+
+    def view_values(self, state: EpisodeState) -> Float:
+        if state.joint is None:
+            raise PolicyError("this policy needs the belief in things and azimuths together: models made by learn")
+        here = self.viewpoints.azimuth[state.current] if state.places is None else azimuth_of(state.places[:, -1])
+        worth = [self._worth(joint, azimuth) for joint, azimuth in zip(state.joint, here, strict=True)]
+        return np.stack(worth) - self.travel_weight * travel_from(self.viewpoints, state)
+
+    def _worth(self, joint: Float, here: float) -> Float:
+        """Expected log-belief in the true class after each view, (V,), from the belief (H, azimuths) seen from here."""
+        flat = joint.ravel()
+        leading = np.argpartition(-flat, LEADING - 1)[:LEADING] if len(flat) > LEADING else np.arange(len(flat))
+        hypothesis, azimuth = np.divmod(leading, AZIMUTHS)
+        belief = flat[leading] / flat[leading].sum()
+        ahead = np.rint((self.viewpoints.azimuth - here) / (2 * np.pi) * AZIMUTHS).astype(np.int64)
+        ring = np.abs(np.degrees(self.viewpoints.elevation)[:, None] - RINGS).argmin(1)
+        shown = self.views[hypothesis[:, None], ring, (azimuth[:, None] + ahead) % AZIMUTHS].astype(np.float32)
+        shown = shown.swapaxes(0, 1)
+        alike = shown @ shown.swapaxes(1, 2)  # (V, leading, leading)
+        known = shown.any(2)
+        alike = np.where(known[:, :, None] & known[:, None], alike, 1)  # what is not known tells nothing
+        kept = np.exp(-self.weight * (1 - alike.astype(np.float64))) * belief
+        same = self.classes[hypothesis][:, None] == self.classes[hypothesis]
+        return np.log((kept * same).sum(2) / kept.sum(2)) @ belief
