@@ -80,11 +80,6 @@ def knows_truth(entry: str) -> bool:
     return is_oracle(entry) or entry.split("-")[0] in ("best", "worst", "high", "low")
 
 
-def _gain(t: EpisodeSpecs, scope: Scope) -> Policy:
-    p, evidence = t.predictions, t.predictions.log_evidence
-    return OracleGain(p.sphere, evidence, len(p.classes), p.labels, t.objects, scope, p.calibration)
-
-
 IN_SCENES = ("visibility", f"{VISIBLE}{DEFAULT}", "true-visible_share-all")
 """Entries that make a difference only where things hide an object."""
 
@@ -95,12 +90,10 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
     n, v = sphere.azimuths, len(sphere)
     maps = [name for name in in_order(specs.predictions.maps) if not name.endswith(SPHERE)]
     names = [*policy_names(), *(each for name in maps for each in (name, f"{name}-peak")), MORE]
-    names = [*names, *(name for name in bundled_policies() if _fits(name, specs)), *ORACLES]
-    among = [name for name in IN_SCENES if not name.startswith(VISIBLE) or _fits(name, specs)]
-    names = [*(name for name in names if name not in IN_SCENES), *(among if specs.scenes is not None else [])]
-    names = [name for name in names if _ready(name, specs)]
+    names = [name for name in (*names, *bundled_policies(), *ORACLES) if name not in IN_SCENES]
     if specs.scenes is not None:
-        return names
+        return [name for name in (*names, *IN_SCENES) if _ready(name, specs)]
+    names = [name for name in names if _ready(name, specs)]
     names += [f"{kind}-{min(5, v)}" for kind in FIXED if kind != "orbit"]
     return names + [f"orbit-{k}" for k in sorted({n, v})]
 
@@ -113,6 +106,7 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
     p = specs.predictions
     there = {"visibility", *p.maps, *(TRUE + name for name in known_maps(p))}
     there |= {"azimuth_bins"} if p.azimuth_bins is not None else set()
+    there |= {"joint"} if p.calibration.hypotheses else set()
     lacking = [wanted for wanted in policy.needs if wanted not in there]
     if lacking:
         bins = lacking[0] == "azimuth_bins"
@@ -126,13 +120,15 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
     if name in MAP_ORACLES:
         return _oracle(specs, *MAP_ORACLES[name])
     if name in GAINS:
-        return _gain(specs, GAINS[name])
+        return OracleGain(p.sphere, p.log_evidence, len(p.classes), p.labels, specs.objects, GAINS[name], p.calibration)
     if true := TRUE_MEASURE.fullmatch(name):
         values = true_measure(p, true[1])[specs.objects].astype(np.float64)
         return OracleMeasure(p.sphere, values, true[2] == "-peak")
-    by_map = _map_oracle(name, specs)
-    if by_map is not None:
-        return by_map
+    match = MAP_ORACLE.fullmatch(name)
+    true, base, how = match.groups("") if match else ("", "", "")
+    predicted = [name for name in p.maps if how == "-oracle-valley" and not name.endswith(SPHERE)]
+    if base in (known_maps(p) if true else predicted):
+        return _oracle(specs, true, base, how)
     known = plain in policy_names() or map_policy(plain, p.sphere, (), p.maps) is not None
     card = plain.removeprefix(VISIBLE)
     if known or card in bundled_policies() or card.endswith(".json") or ":" in name:
@@ -140,14 +136,6 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
     names = [*policy_names(), *map_policy_names(p.maps), *bundled_policies(), *ORACLES]
     names += ["true-MEASURE-all", *(f"{kind}-K" for kind in FIXED)]
     raise EntryError(f"no policy is called {name!r}; there are {', '.join(names)}")
-
-
-def _map_oracle(name: str, specs: EpisodeSpecs) -> Policy | None:
-    """The oracle of that name, see ``MAP_ORACLE``; None if it is none, or its map is not known."""
-    match, p = MAP_ORACLE.fullmatch(name), specs.predictions
-    true, base, how = match.groups("") if match else ("", "", "")
-    predicted = [name for name in p.maps if how == "-oracle-valley" and not name.endswith(SPHERE)]
-    return _oracle(specs, true, base, how) if base in (known_maps(p) if true else predicted) else None
 
 
 def _oracle(t: EpisodeSpecs, true: str, base: str, how: str) -> Policy:
@@ -159,18 +147,10 @@ def _oracle(t: EpisodeSpecs, true: str, base: str, how: str) -> Policy:
 
 
 def _ready(name: str, specs: EpisodeSpecs) -> bool:
-    """Whether the predictions, and the view store behind them, hold what an entry needs."""
+    """Whether an entry is for these classes and views, and the predictions and their view store hold what it needs."""
     try:
         entry_policy(name, specs)
-    except EntryError:
-        return False
-    return True
-
-
-def _fits(name: str, specs: EpisodeSpecs) -> bool:
-    try:
-        _make(name, specs)
-    except OtherUseError:
+    except (EntryError, OtherUseError):
         return False
     return True
 

@@ -97,19 +97,12 @@ def _means(
     top: Float, bottom: Float, labels: NDArray[np.int64], classes: tuple[str, ...], weights: Float | None
 ) -> Iterator[tuple[str, str, Float, Float, Float]]:
     """Ratios of sums over objects (N, M): over all of them, as the mean over classes ("class_"), and in each class."""
-    everything = np.ones(len(labels), bool)
-    groups = [("", "", everything), ("", "class_", everything)]
-    groups += [(classes[index], "", labels == index) for index in np.unique(labels)]
-    for label, over, here in groups:
-
-        def mean(w: Float, over: str = over, here: NDArray[np.bool_] = here) -> Float:
-            if over:
-                return metrics.class_mean(top, bottom, labels, w)
-            return metrics.ratio(top[here], bottom[here], w[:, here])
-
-        value = mean(np.ones((1, len(labels))))[0]
-        low, high = (np.full_like(value, np.nan),) * 2 if weights is None else st.interval(mean(weights))
-        yield label, over, value, low, high
+    every = np.ones(len(labels), bool)
+    in_classes = [(classes[index], "", labels == index) for index in np.unique(labels)]
+    for label, over, here in (("", "", every), ("", "class_", every), *in_classes):
+        drawn = np.zeros((1, len(labels))) if weights is None else weights
+        value, samples = st.estimate(top[here], bottom[here], drawn[:, here], labels if over else None)
+        yield label, over, value, *st.interval(samples)
 
 
 def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.DataFrame:

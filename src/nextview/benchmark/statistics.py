@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
+from nextview.data import metrics
+
 Float = NDArray[np.float64]
 
 
@@ -19,6 +21,14 @@ def interval(samples: Float, level: float = 0.95) -> tuple[Float, Float]:
     empty = np.isnan(samples).all(0)
     low, high = np.nanquantile(np.where(empty, 0, samples), [(1 - level) / 2, (1 + level) / 2], axis=0)
     return np.where(empty, np.nan, low), np.where(empty, np.nan, high)
+
+
+def estimate(top: Float, bottom: Float, weights: Float, labels: NDArray[np.int64] | None = None) -> tuple[Float, Float]:
+    """Ratios of sums over objects (N, M), with ``labels`` their means over classes: (M,), and samples, (S, M)."""
+    once = np.ones((1, len(top)))
+    if labels is None:
+        return metrics.ratio(top, bottom, once)[0], metrics.ratio(top, bottom, weights)
+    return metrics.class_mean(top, bottom, labels, once)[0], metrics.class_mean(top, bottom, labels, weights)
 
 
 def bootstrap_p(difference: Float, samples: Float) -> Float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -60,13 +61,17 @@ def summarise(
     grid: Grid, reference: str, samples: int, rng: np.random.Generator, promised: Mapping[float, float] | None = None
 ) -> Tables:
     """All tables of a grid."""
-    weights = target_weights(grid.specs.predictions.names, samples, rng)
-    cells = list(grid.cells())
+    weights, cells = target_weights(grid.specs.predictions.names, samples, rng), list(grid.cells())
     summary, drawn = _summary(grid, cells, weights)
-    tests = _tests(grid, cells, summary, drawn, reference)
-    per_class, risks = _per_class(grid, cells, weights), _risks(summary, promised or {})
-    levels = by_level(grid, reference, samples, rng)
-    return Tables(summary, per_class, tests, _sweep(grid), _reliability(grid, cells), risks, levels)
+    return Tables(
+        summary,
+        _per_class(grid, cells, weights),
+        _tests(grid, cells, summary, drawn, reference),
+        _sweep(grid),
+        _reliability(grid, cells),
+        _risks(summary, promised or {}),
+        by_level(grid, reference, samples, rng),
+    )
 
 
 def _measures(grid: Grid, ends: Outcomes) -> dict[str, tuple[Float, Float]]:
@@ -93,31 +98,26 @@ def _measures(grid: Grid, ends: Outcomes) -> dict[str, tuple[Float, Float]]:
 
 def _columns(grid: Grid, cells: list[Cell], names: tuple[str, ...] | None = None) -> tuple[list, Float, Float]:
     """The measures of all cells side by side: (policy, threshold, measure), tops (N, M), bottoms (N, M)."""
-    keys, tops, bottoms = [], [], []
-    for policy, threshold, ends in cells:
-        for measure, (top, bottom) in _measures(grid, ends).items():
-            if names is None or measure in names:
-                keys.append((policy, threshold, measure))
-                tops.append(top)
-                bottoms.append(bottom)
-    return keys, np.stack(tops, 1), np.stack(bottoms, 1)
+    found = {
+        (policy, threshold, measure): sums
+        for policy, threshold, ends in cells
+        for measure, sums in _measures(grid, ends).items()
+        if names is None or measure in names
+    }
+    tops, bottoms = zip(*found.values(), strict=True)
+    return list(found), np.stack(tops, 1), np.stack(bottoms, 1)
 
 
 def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFrame, dict[tuple, Float]]:
     labels, classes = grid.specs.predictions.labels, comparable_classes(grid.specs.predictions)
-    duplicate_groups = np.ones((1, weights.shape[1]))
     keys, top, bottom = _columns(grid, cells)
-    value, drawn = metrics.ratio(top, bottom, duplicate_groups)[0], metrics.ratio(top, bottom, weights)
-    per_class = [i for i, key in enumerate(keys) if key[2] in ("accuracy", "travel_moved", "n_views")]
-    keys += [(keys[i][0], keys[i][1], f"class_{keys[i][2]}") for i in per_class]
-    top, bottom = top[:, per_class], bottom[:, per_class]
-    value = np.concatenate([value, metrics.class_mean(top, bottom, labels, duplicate_groups)[0]])
-    drawn = np.concatenate([drawn, metrics.class_mean(top, bottom, labels, weights)], 1)
-    low, high = st.interval(drawn)
-    rows = []
-    for i, (policy, threshold, measure) in enumerate(keys):
-        beside = published(policy, threshold, measure, classes)
-        rows.append((policy, threshold, measure, value[i], low[i], high[i], beside))
+    of_class = [i for i, key in enumerate(keys) if key[2] in ("accuracy", "travel_moved", "n_views")]
+    keys += [(keys[i][0], keys[i][1], f"class_{keys[i][2]}") for i in of_class]
+    over_objects = st.estimate(top, bottom, weights)
+    over_classes = st.estimate(top[:, of_class], bottom[:, of_class], weights, labels)
+    value, drawn = (np.concatenate(both, -1) for both in zip(over_objects, over_classes, strict=True))
+    numbers = zip(keys, value, *st.interval(drawn), strict=True)
+    rows = [(*key, *number, published(*key, classes)) for key, *number in numbers]
     for policy, threshold, ends in cells:
         right = grid.right(ends.answer)
         error = metrics.calibration_error(ends.confidence, right.ravel())
@@ -134,11 +134,10 @@ def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
     rows = []
     for index in np.unique(p.labels):
         here, label = p.labels == index, p.classes[index]
-        value = metrics.ratio(top[here], bottom[here], np.ones((1, int(here.sum()))))[0]
-        low, high = st.interval(metrics.ratio(top[here], bottom[here], weights[:, here]))
-        for i, (policy, threshold, measure) in enumerate(keys):
+        value, drawn = st.estimate(top[here], bottom[here], weights[:, here])
+        for (policy, threshold, measure), *number in zip(keys, value, *st.interval(drawn), strict=True):
             beside = published(policy, threshold, measure, classes, label)
-            rows.append((policy, threshold, label, measure, value[i], low[i], high[i], beside))
+            rows.append((policy, threshold, label, measure, *number, beside))
     return _frame(rows, ["policy", "threshold", "label", "measure", "value", "low", "high", "published"])
 
 
@@ -148,21 +147,18 @@ def _tests(
     value = summary.set_index(["policy", "threshold", "measure"])["value"].to_dict()
     right = {(policy, threshold): grid.right(ends.answer) for policy, threshold, ends in cells}
     rows = []
-    for policy, threshold in right:
+    for (policy, threshold), measure in product(right, TESTED):
         if policy == reference or (reference, threshold) not in right:
             continue
-        for measure in TESTED:
-            ours, theirs = (policy, threshold, measure), (reference, threshold, measure)
-            difference = np.array([value[ours] - value[theirs]])
-            samples = (drawn[ours] - drawn[theirs])[:, None]
-            low, high = st.interval(samples)
-            paired = np.nan
-            if measure == "accuracy":
-                paired = st.mcnemar(right[policy, threshold], right[reference, threshold])
-            rows.append((*ours, difference[0], low[0], high[0], st.bootstrap_p(difference, samples)[0], paired))
+        ours, theirs = (policy, threshold, measure), (reference, threshold, measure)
+        difference, samples = np.array([value[ours] - value[theirs]]), (drawn[ours] - drawn[theirs])[:, None]
+        found = np.stack([difference, *st.interval(samples), st.bootstrap_p(difference, samples)])[:, 0]
+        tested = measure == "accuracy"
+        paired = st.mcnemar(right[policy, threshold], right[reference, threshold]) if tested else np.nan
+        rows.append((*ours, *found, paired))
     table = _frame(rows, ["policy", "threshold", "measure", "difference", "low", "high", "p", "mcnemar"])
     for column in ("p", "mcnemar"):
-        table[f"{column}_holm"] = _holm(table, "measure", column)
+        table[f"{column}_holm"] = table.groupby("measure")[column].transform(lambda p: st.holm(p.to_numpy()))
     return table
 
 
@@ -174,10 +170,6 @@ def _sweep(grid: Grid) -> pd.DataFrame:
             curve = top.mean(0).reshape(len(SWEEP), -1)
             points += [(name, t, *values) for t, values in zip(SWEEP, curve, strict=True)]
     return _frame(points, ["policy", "threshold", *measures])
-
-
-def _holm(table: pd.DataFrame, family: str, column: str) -> pd.Series:
-    return table.groupby(family)[column].transform(lambda p: st.holm(p.to_numpy()))
 
 
 def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
