@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -68,9 +68,7 @@ class Learned:
         """In words."""
         classes = "" if self.classes == self.things else f" of {self.classes} classes"
         one, two, three, _ = (f"{share:.0%}" for share in self.accuracy)
-        lines = [
-            f"{self.things} things{classes} learned: {one} named right after one view, {two} after two, {three} after three"
-        ]
+        lines = [f"{self.things} things{classes} learned; named right after 1, 2, 3 views: {one}, {two}, {three}"]
         lines += [f"confused: {a} and {b} ({share:.0%} of the cases)" for a, b, share in self.confused[:5]]
         if len(self.confused) > 5:
             lines.append(f"and {len(self.confused) - 5} pairs less often")
@@ -206,7 +204,7 @@ def _teach(
     for source in sources:
         file = part / f"{source.name}.safetensors"
         # A file that was changed since, or other options, make it anew.
-        stamp = repr((str(source.path.resolve()), source.path.stat().st_mtime_ns, how))
+        stamp = repr((str(source.path.resolve()), source.path.stat().st_mtime_ns, replace(how, any_size=False)))
         if (arrays := _finished(file, stamp)) is not None:
             taught.append((source, arrays))
         else:

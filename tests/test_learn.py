@@ -1,0 +1,200 @@
+"""Teaching things: what a folder holds, what is remembered, added and forgotten, and what recognises them then."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pipeline import refused, write_off
+from scipy.special import logsumexp
+
+import nextview
+from nextview.benchmark.replay import make_specs, replay, truncate
+from nextview.cli.main import main
+from nextview.data.predictions import Predictions
+from nextview.data.samples import sample_mesh
+from nextview.errors import DatasetError, NextviewError, UsageError
+from nextview.geometry.mesh import UNITS, load_mesh, make_mesh
+from nextview.geometry.resting import resting_poses, rotated
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.learning.learn import learn
+from nextview.policies.base import EpisodeState
+from nextview.policies.discriminate import Discriminate
+from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, reorient
+from nextview.recognition.evidence import Evidence
+from nextview.recognition.memory import AZIMUTHS, RINGS, by_ring, read_memory, similarities
+from nextview.recognition.model_card import read_card
+
+THINGS = ("chair", "monitor", "table")
+FORTY = ViewSphere.named("40")
+
+
+@pytest.fixture(scope="module")
+def scans(shared) -> Path:
+    """Three meshes in one folder, centimetres."""
+    return shared("scans", lambda folder: [write_off(folder / f"{name}.off", sample_mesh(name)) for name in THINGS])
+
+
+@pytest.fixture(scope="module")
+def taught(shared, scans) -> Path:
+    return shared("taught", lambda folder: learn(scans, folder / "mine", upright=True, workers=0)) / "mine"
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_taught_things_are_recognised_through_a_sensor(taught, scans):
+    system = nextview.load(models=taught)
+    assert system.policy_name == "discriminate"
+    assert system.classes == THINGS
+    for name in THINGS:
+        result = system.recognise(scans / f"{name}.off", sensor="wrist", seed=1)
+        assert (result.answer, result.confident) == (name, True)
+        np.testing.assert_allclose(result.views[-1].belief.sum(), 1)
+
+
+def test_predictions_of_taught_things_replay_with_their_policy(tmp_path, taught, scans, capsys):
+    store, table = tmp_path / "shown.zarr", tmp_path / "shown.npz"
+    main(["render", str(scans), str(store), "--sensor", "wrist", "--rotated", "--workers", "0"])
+    main(["predict", str(store), str(table), "--models", str(taught), "--workers", "0"])
+    specs = make_specs(Predictions.load(table), 4, 0)
+    for policy in ("random-all", str(taught / "memory.json")):
+        ends = truncate(replay(policy, specs, 3, 0), Stopping(0.999, 3))
+        assert (ends.answer == specs.labels).mean() > 0.9
+
+
+def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(tmp_path, taught, scans, capsys):
+    more, models = tmp_path / "more", tmp_path / "models"
+    more.mkdir()
+    shutil.copytree(taught, models)
+    slab = make_mesh(sample_mesh("table").vertices * (1, 0.2, 1), sample_mesh("table").faces)
+    write_off(more / "bench.off", slab)
+    before = read_memory(taught / "memory.safetensors", read_card(taught / "memory.json").sha256)
+    learn(more, models, upright=True, add=True, workers=0)
+    card = read_card(models / "memory.json")
+    assert card.classes == ("bench", *THINGS)
+    np.testing.assert_array_equal(read_memory(card.path, card.sha256).views[1:], before.views)
+    learn(models, models, add=True, remove=("bench",))
+    card = read_card(models / "memory.json")
+    assert card.classes == THINGS
+    np.testing.assert_array_equal(read_memory(card.path, card.sha256).held_out, before.held_out)
+    assert "is all it knows" in learn(models, models, add=True, remove=THINGS[1:]).notes[0]
+    with pytest.raises(UsageError, match="knows nothing called 'mug'"):
+        learn(models, models, add=True, remove=("mug",))
+    with pytest.raises(UsageError, match=r"chair is known already"):
+        learn(scans, models, add=True)
+    assert "knows things already; --add" in refused(capsys, "learn", str(scans), str(models))
+
+
+def test_a_run_that_was_stopped_goes_on_and_gives_the_same(tmp_path, taught, scans, monkeypatch):
+    again = []
+
+    def stopping(done, total, what):
+        for count in done:
+            if count == 2:
+                raise KeyboardInterrupt
+            again.append(count)
+
+    with pytest.raises(KeyboardInterrupt):
+        learn(scans, tmp_path / "mine", upright=True, workers=0, track=stopping)
+    assert not (tmp_path / "mine").exists()
+    counts = []
+    learn(scans, tmp_path / "mine", upright=True, workers=0, track=lambda done, total, what: counts.extend(done))
+    assert counts[0] == 2  # what was finished is not looked at again
+    assert (tmp_path / "mine/memory.safetensors").read_bytes() == (taught / "memory.safetensors").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
+
+
+def test_what_is_wrong_with_a_folder_is_one_sentence_and_nothing_is_lost(tmp_path, scans, capsys):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "holds no mesh" in refused(capsys, "learn", str(empty), str(tmp_path / "out"))
+    (empty / "view.png").write_bytes(b"")
+    assert "holds no mesh" in refused(capsys, "learn", str(empty), str(tmp_path / "out"))
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    for name in ("chair", "seat"):
+        shutil.copy(scans / "chair.off", mixed / f"{name}.off")
+    (mixed / "broken.off").write_text("OFF\n3 1 0\n0 0 0\n")
+    small = load_mesh(scans / "chair.off")
+    write_off(mixed / "small.off", replace(small, vertices=small.vertices / 1000))
+    how = {"unit": "cm", "upright": True, "workers": 0}
+    with pytest.raises(DatasetError, match=r"small\.off: is .* times smaller than most others; is it in another unit"):
+        learn(mixed, tmp_path / "out", **how)
+    found = learn(mixed, tmp_path / "out", any_size=True, **how)
+    assert found.things == 3
+    assert any("chair and seat look the same" in note for note in found.notes)
+    assert [phrase for phrase in found.left_out if "broken.off" in phrase]
+    assert "broken" in str(found)
+
+
+def test_classes_of_several_things_and_one_alone(tmp_path, scans):
+    folder = tmp_path / "classes"
+    for k, stretch in enumerate((0.8, 1.2)):
+        for name in THINGS[:2]:
+            (folder / name).mkdir(parents=True, exist_ok=True)
+            mesh = sample_mesh(name)
+            write_off(folder / name / f"{name}_{k}.off", make_mesh(mesh.vertices * (1, stretch, 1), mesh.faces))
+    found = learn(folder, tmp_path / "two", upright=True, workers=0)
+    assert (found.things, found.classes) == (4, 2)
+    assert found.accuracy[2] > 0.9  # by the other things of the class
+    card = read_card(tmp_path / "two/memory.json")
+    assert card.calibration.hypotheses == (0, 0, 1, 1)
+
+
+def test_belief_in_classes_is_the_sum_over_their_things_and_azimuths():
+    rng = np.random.default_rng(0)
+    calibration = Calibration(1.0, 1.0, None, 0.4, (0, 0, 1, 2, 2, 2))
+    logits, bins = rng.normal(0, 2, (3, 3)), rng.normal(0, 4, (3, 6, AZIMUTHS))
+    azimuth = np.array([0, 3, 7]) * 2 * np.pi / AZIMUTHS
+    total = log_evidence_of(logits, bins, azimuth).sum(0)
+    belief, joint = calibration.belief(total, 3, 3), calibration.joint(total, 3, 3, azimuth[2])
+    pointing = np.stack([reorient(b, a) for b, a in zip(bins, azimuth, strict=True)]).sum(0) / 1.8
+    by_hand = logits.mean(0) + [logsumexp(pointing[k]) for k in ([0, 1], [2], [3, 4, 5])]
+    np.testing.assert_allclose(np.log(belief), by_hand - logsumexp(by_hand), atol=1e-9)
+    marginal = joint.sum(1)
+    np.testing.assert_allclose([marginal[:2].sum(), marginal[2], marginal[3:].sum()], belief, atol=1e-12)
+    with pytest.raises(NextviewError, match="not of every class"):
+        Calibration(hypotheses=(0, 2))
+
+
+def test_similarity_is_a_cosine_between_rings_interpolated():
+    rng = np.random.default_rng(0)
+    views = rng.normal(size=(3, len(RINGS), AZIMUTHS, 5)).astype(np.float32)
+    seen = rng.normal(size=(2, 5)).astype(np.float32)
+    found = similarities(by_ring(views), seen, np.radians([27.0, 80.0]))
+    np.testing.assert_allclose(found[0], (views[:, 1] + views[:, 2]) @ seen[0] / 2, rtol=1e-4)
+    np.testing.assert_allclose(found[1], views[:, 4] @ seen[1], rtol=1e-4)
+
+
+@pytest.mark.parametrize("place", [3, 21, 38])
+def test_the_policy_goes_where_two_things_differ(place):
+    # Two things that look alike from everywhere but from one view; the object's azimuth is known, and not zero.
+    views = np.zeros((2, len(RINGS), AZIMUTHS, 2), np.float32)
+    views[..., 0] = 1
+    ring, azimuth = divmod(place, 8)
+    views[1, ring, (2 * azimuth + 5) % AZIMUTHS] = (0, 1)
+    policy = Discriminate(FORTY, views, np.array([0, 1]), 40.0)
+    current = 10
+    joint = np.zeros((1, 2, AZIMUTHS))
+    joint[0, :, (2 * (current % 8) + 5) % AZIMUTHS] = 0.5
+    visited = np.arange(40)[None] == current
+    evidence = Evidence(np.zeros((1, 2)))
+    state = EpisodeState(np.array([current]), visited, np.full((1, 2), 0.5), evidence, 1, joint=joint)
+    assert policy.next_views(state, np.random.default_rng(0)).tolist() == [place]
+
+
+def test_a_box_rests_on_its_faces_and_keeps_its_size():
+    corners = np.array([[x, y, z] for x in (0, 3) for y in (0, 2) for z in (0, 1)], float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([(a, b, c) for a, b, c, d in quads] + [(a, c, d) for a, b, c, d in quads])
+    box = make_mesh(corners, faces, unit="cm")
+    found = resting_poses(box)
+    np.testing.assert_array_equal(found[0], np.eye(3))
+    ups = np.abs(found[:, 2])
+    assert all(np.isclose(up.max(), 1, atol=1e-6) for up in ups)  # a face is down, never an edge
+    for rotation in found:
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+        assert rotated(box, rotation).metres == pytest.approx(np.sqrt(14) / 2 * UNITS["cm"])
