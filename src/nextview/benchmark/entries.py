@@ -121,9 +121,9 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
         return _oracle(specs, *MAP_ORACLES[name])
     if name in GAINS:
         return OracleGain(p.sphere, p.log_evidence, len(p.classes), p.labels, specs.objects, GAINS[name], p.calibration)
-    if true := TRUE_MEASURE.fullmatch(name):
-        values = true_measure(p, true[1])[specs.objects].astype(np.float64)
-        return OracleMeasure(p.sphere, values, true[2] == "-peak")
+    if measured := TRUE_MEASURE.fullmatch(name):
+        values = true_measure(p, measured[1])[specs.objects].astype(np.float64)
+        return OracleMeasure(p.sphere, values, measured[2] == "-peak")
     match = MAP_ORACLE.fullmatch(name)
     true, base, how = match.groups("") if match else ("", "", "")
     predicted = [name for name in p.maps if how == "-oracle-valley" and not name.endswith(SPHERE)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -115,7 +116,7 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
     )
 
 
-def _title(test: dict[str, float] | None, best: str, reference: str, at: float) -> str:
+def _title(test: Mapping[Any, Any] | None, best: str, reference: str, at: float) -> str:
     if test is None:
         return f"{best} at threshold {at:g}"
     if test["p_holm"] >= board.SIGNIFICANT:
@@ -156,7 +157,7 @@ def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:
     return table.sort_values(["wrong", "confidence"], ascending=False, kind="stable").head(most)
 
 
-def _failures(results: Results, best: str, at: float, store: ViewStore | None) -> list[dict[str, Any]]:
+def _failures(results: Results, best: str, at: float, store: ViewStore | None) -> list[dict[Any, Any]]:
     """The worst failures of a policy, each with its most confident episode."""
     p, episodes = results.predictions, results.episodes(best, at)
     names, found = np.asarray(episodes["object"].astype(str)), []

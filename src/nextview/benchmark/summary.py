@@ -117,7 +117,7 @@ def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFram
     over_classes = st.estimate(top[:, of_class], bottom[:, of_class], weights, labels)
     value, drawn = (np.concatenate(both, -1) for both in zip(over_objects, over_classes, strict=True))
     numbers = zip(keys, value, *st.interval(drawn), strict=True)
-    rows = [(*key, *number, published(*key, classes)) for key, *number in numbers]
+    rows = [(*key, *number, published(key[0], key[1], key[2], classes)) for key, *number in numbers]
     for policy, threshold, ends in cells:
         right = grid.right(ends.answer)
         error = metrics.calibration_error(ends.confidence, right.ravel())

@@ -153,15 +153,16 @@ def _thing(others: Sequence[str], folder: Path, level: str, short: bool, rng: np
     if short or (others and rng.random() < OBJECTS[level]):
         file = others[int(rng.integers(len(others)))]
         return Placement(file, mesh_hash(folder / file), *_rounded(*there, rng.uniform(*OBJECT_RADIUS)))
-    return Block(*_rounded(*there, *rng.uniform(*FOOTPRINT, 2), rng.uniform(*BOX_HEIGHT[level])))
+    x, y, azimuth, *size = _rounded(*there, *rng.uniform(*FOOTPRINT, 2), rng.uniform(*BOX_HEIGHT[level]))
+    return Block(x, y, azimuth, size[0], size[1], size[2])
 
 
 def _wall(rng: np.random.Generator) -> Block:
     """A wall, across the way from the target."""
     away, towards, lean = rng.uniform(*WALL_AWAY), rng.uniform(0, 2 * np.pi), rng.uniform(-0.3, 0.3)
     x, y, azimuth = away * np.cos(towards), away * np.sin(towards), towards + np.pi / 2 + lean
-    width, height = rng.uniform(*WALL_WIDTH), rng.uniform(*WALL_HEIGHT)
-    return Block(*_rounded(x, y, azimuth, width, WALL_DEPTH, height), wall=True)
+    x, y, azimuth, width, height = _rounded(x, y, azimuth, rng.uniform(*WALL_WIDTH), rng.uniform(*WALL_HEIGHT))
+    return Block(x, y, azimuth, width, WALL_DEPTH, height, wall=True)
 
 
 def _stood(thing: Placement | Block, folder: Path, floor: float) -> Item | None:
