@@ -176,7 +176,7 @@ def test_the_policy_goes_where_two_things_differ(place):
     views[..., 0] = 1
     ring, azimuth = divmod(place, 8)
     views[1, ring, (2 * azimuth + 5) % AZIMUTHS] = (0, 1)
-    policy = Discriminate(FORTY, views, np.array([0, 1]), 40.0)
+    policy = Discriminate(FORTY, views, np.array([0, 1]))
     current = 10
     joint = np.zeros((1, 2, AZIMUTHS))
     joint[0, :, (2 * (current % 8) + 5) % AZIMUTHS] = 0.5

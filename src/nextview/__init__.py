@@ -72,6 +72,7 @@ __all__ = [
     "UsageError",
     "View",
     "ViewSphere",
+    "learn",
     "load",
     "load_mesh",
     "make_policy",
@@ -80,9 +81,13 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """The simulated camera, imported when it is used: a robot does without."""
+    """The simulated camera and ``learn``, imported when they are used: a robot does without."""
     if name == "SimulatedCamera":
         from nextview.simulation.simulated import SimulatedCamera
 
         return SimulatedCamera
+    if name == "learn":
+        from nextview.learning.learn import learn
+
+        return learn
     raise AttributeError(f"module 'nextview' has no attribute {name!r}")

@@ -54,12 +54,12 @@ def predict(
 def summed_up(p: Predictions) -> list[str]:
     """How often the recogniser is right in each split, from single views and from all of them."""
     lines: list[str] = []
-    if p.calibration.hypotheses:  # taught things: what is said of azimuths counts, and belief is what tells
-        logs = p.calibration.log_belief(p.log_evidence, 1, len(p.classes))
-        of_all = p.calibration.log_belief(p.log_evidence.sum(1), len(p.sphere), len(p.classes))
-    else:
-        logs, of_all = p.logits, p.logits.sum(1)
-    right, fused = logs.argmax(2) == p.labels[:, None], of_all.argmax(1) == p.labels
+    answers, of_all = p.logits.argmax(2), p.logits.sum(1).argmax(1)
+    if p.calibration.hypotheses:  # taught things: what is said of azimuths tells
+        classes = len(p.classes)
+        answers = p.calibration.log_belief(p.log_evidence, 1, classes).argmax(2)
+        of_all = p.calibration.log_belief(p.log_evidence.sum(1), len(p.sphere), classes).argmax(1)
+    right, fused = answers == p.labels[:, None], of_all == p.labels
     for split in np.unique(p.splits):
         here = p.splits == split
         shares = f"right from one view {right[here].mean():.3f}, from all {len(p.sphere)} {fused[here].mean():.3f}"

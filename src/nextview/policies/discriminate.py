@@ -15,6 +15,8 @@ from nextview.recognition.memory import AZIMUTHS, RINGS, read_memory
 from nextview.recognition.model_card import read_card
 
 Float = NDArray[np.float64]
+WEIGHT = 40.0
+"""Of a cosine, as a log-likelihood: for one view whose noise is not known yet."""
 LEADING = 24
 """Pairs of a thing, in a resting pose, and an azimuth that are weighed against each other: those believed most."""
 
@@ -24,22 +26,20 @@ class Discriminate:
     """Goes where the view is expected to tell most of which thing it is, less the weighted travel.
 
     For each candidate view the memory says what each leading hypothesis, a thing and the azimuth it is seen from, would
-    show there. If one of them is true, the others keep the likelihood that the memory's calibrated weight gives their
-    likeness to it; the expected logarithm of the belief in the true class is what the view is worth (expected
-    information: Denzler and Brown, IEEE TPAMI 2002; Borotschnig et al., Image and Vision Computing 2000).
+    show there. If one of them is true, the others keep the likelihood of their likeness to it. A view is worth the
+    expected logarithm of the belief in the true class (expected information: Denzler and Brown, IEEE TPAMI 2002;
+    Borotschnig et al., Image and Vision Computing 2000).
 
     Attributes:
         viewpoints: the candidates, anywhere.
         views: remembered views of each hypothesis, (H, rings, azimuths, F), unit vectors; zero where nothing is known.
         classes: class of each hypothesis, (H,).
-        weight: of a cosine, as a log-likelihood.
         travel_weight: of a grid cell of travel.
     """
 
     viewpoints: Viewpoints
     views: NDArray[np.floating]
     classes: NDArray[np.int64]
-    weight: float
     travel_weight: float = 0.0
     needs: tuple[str, ...] = ("joint",)
 
@@ -55,7 +55,7 @@ class Discriminate:
         if classes is not None and card.classes != tuple(classes):
             raise OtherUseError(f"{path}: discriminates other things ({', '.join(card.classes[:10])})")
         views = read_memory(card.path, card.sha256).views
-        return cls(viewpoints, views, np.array(card.calibration.hypotheses), card.memory.weight)
+        return cls(viewpoints, views, np.array(card.calibration.hypotheses))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         values = self.view_values(state)
@@ -81,6 +81,6 @@ class Discriminate:
         alike = shown @ shown.swapaxes(1, 2)  # (V, leading, leading)
         known = shown.any(2)
         alike = np.where(known[:, :, None] & known[:, None], alike, 1)  # what is not known tells nothing
-        kept = np.exp(-self.weight * (1 - alike.astype(np.float64))) * belief
+        kept = np.exp(-WEIGHT * (1 - alike.astype(np.float64))) * belief
         same = self.classes[hypothesis][:, None] == self.classes[hypothesis]
         return np.log((kept * same).sum(2) / kept.sum(2)) @ belief

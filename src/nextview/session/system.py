@@ -111,10 +111,12 @@ class System:
             ObservationError: the object is found in none of the captured views.
         """
         if isinstance(what, str | Path):
-            folder = Path(what).is_dir()
-            if not folder and not isinstance(up, str | None):
+            if Path(what).is_dir():
+                what = _camera_of(Path(what), up)
+            elif up is None or isinstance(up, str):
+                what = load_mesh(what, up, unit)
+            else:
                 raise MeshError(f"{what}: the up axis of a mesh file is y or z, not {up}")
-            what = _camera_of(Path(what), up) if folder else load_mesh(what, up, unit)
         if isinstance(what, Mesh):
             what = simulated(what, sensor, seed)
         elif sensor is not None:
