@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.data.measured_view import MeasuredView
+from research.mesh_view import MeshView
 from research.seen_area import seen_area
 
 
@@ -26,7 +27,7 @@ def view_area(view: MeasuredView) -> float:
     return len(view.depths) / view.depth.size
 
 
-def visible_area_ratio(view: MeasuredView) -> float:
+def visible_area_ratio(view: MeshView) -> float:
     """Area of the surface that is seen, over the area of the whole surface; what is hidden of a face does not count.
 
     Plemenos and Benayada 1996, Polonsky et al. 2005 ("visibility ratio"), Dutagaci et al. 2010 ("ratio of visible
@@ -38,7 +39,7 @@ def visible_area_ratio(view: MeasuredView) -> float:
     return min(float(seen_area(view).sum() / view.surface.areas.sum()), 1.0)
 
 
-def surface_visibility(view: MeasuredView) -> float:
+def surface_visibility(view: MeshView) -> float:
     """Area of the faces of which anything is seen, over the area of all faces: the ratio of visible area by faces.
 
     Secord et al. 2011 ("surface visibility"), Dutagaci et al. 2010; thesis, section 3.4.1, by "the mesh area visible
@@ -50,7 +51,7 @@ def surface_visibility(view: MeasuredView) -> float:
     return float(view.surface.areas[view.pixels[0]].sum() / view.surface.areas.sum())
 
 
-def viewpoint_entropy(view: MeasuredView) -> float:
+def viewpoint_entropy(view: MeshView) -> float:
     """Shannon entropy of the shares that the faces have in the object's projected area.
 
     Vázquez et al. 2001, without their background; Dutagaci et al. 2010 ("surface area entropy"); thesis, section 3.4.1
@@ -59,6 +60,5 @@ def viewpoint_entropy(view: MeasuredView) -> float:
     Returns:
         Bits; 0 where one face is seen or none.
     """
-    view.surface  # noqa: B018  # says if there is none
     pixels = view.pixels[1]
     return bits(pixels / pixels.sum()) if len(pixels) else 0.0

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.measured_view import Surface
+from research.mesh_view import Surface
 
 SAME = 1e-6
 """Vertices no farther apart than this, object radii, are one: many files hold each triangle with corners of its own."""

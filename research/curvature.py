@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from nextview.data.measured_view import MeasuredView
 from research.area import bits
 from research.bending import bent
+from research.mesh_view import MeshView
 from research.seen_area import seen_area, seen_share
 
 LEVELS = 32
@@ -14,7 +14,7 @@ LEVELS = 32
 are rounding, is one level and no border of two."""
 
 
-def curvature_entropy(view: MeasuredView) -> float:
+def curvature_entropy(view: MeshView) -> float:
     """Shannon entropy of the distribution of Gaussian curvature over the visible surface.
 
     The curvature of a vertex is its angle deficit over a third of the area around it (thesis, equation 4, and
@@ -33,7 +33,7 @@ def curvature_entropy(view: MeasuredView) -> float:
     return bits(weight / weight.sum()) if weight.sum() > 0 else 0.0
 
 
-def mean_curvature(view: MeasuredView) -> float:
+def mean_curvature(view: MeshView) -> float:
     """Mean curvature, unsigned, integrated over the visible surface: how much it bends at its edges.
 
     Secord et al. 2011 ("mean curvature"); thesis, section 3.4.4; see ``BentSurface.mean_of_faces``. Concave and convex
@@ -45,7 +45,7 @@ def mean_curvature(view: MeasuredView) -> float:
     return float((bent(view.surface).mean_of_faces[view.pixels[0]] * seen_share(view)).sum())
 
 
-def gaussian_curvature(view: MeasuredView) -> float:
+def gaussian_curvature(view: MeshView) -> float:
     """Gaussian curvature, unsigned, integrated over the visible surface: how much it bends at its corners.
 
     Secord et al. 2011 ("Gaussian curvature"); thesis, section 3.4.4; see ``BentSurface.gaussian_of_faces``.

@@ -1,6 +1,6 @@
 """The measures of the thesis's chapter 3, and one that it suggests, with what each needs and which values are good.
 
-nextview measure views.zarr ModelNet10 --measures research.measures:view_area
+nextview measure views.zarr --measures research.measures:view_area
 """
 
 from __future__ import annotations

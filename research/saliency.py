@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.measured_view import MeasuredView
 from research.bending import BentSurface, bent
+from research.mesh_view import MeshView
 from research.seen_area import seen_area
 
 UNIT = 0.006
@@ -23,7 +23,7 @@ BLOCK = 1000
 """Points whose neighbours are looked at in one go."""
 
 
-def mesh_saliency(view: MeasuredView) -> float:
+def mesh_saliency(view: MeshView) -> float:
     """Saliency of the visible surface, integrated over it.
 
     Lee et al. 2005, Secord et al. 2011, Dutagaci et al. 2010; thesis, section 3.4.4. Lee sums over the visible

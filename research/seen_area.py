@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.measured_view import MeasuredView
+from research.mesh_view import MeshView
 
 GRAZING = 0.05
 """Where a surface turns farther from the camera than this cosine, it counts as turned so far: one row of pixels more or
 less on a plane that is seen from its edge would else decide over as much area as all the rest."""
 
 
-def seen_area(view: MeasuredView) -> NDArray[np.float64]:
+def seen_area(view: MeshView) -> NDArray[np.float64]:
     """How much is seen of each of the faces in ``view.pixels``, (k,), square object radii; computed once for a view.
 
     A pixel shows z^2 / (fx fy |n . r|) of a face: z is its depth, n the face's unit normal, r the pixel's ray whose
@@ -31,7 +31,7 @@ def seen_area(view: MeasuredView) -> NDArray[np.float64]:
     return view.__dict__["seen_area"]
 
 
-def seen_share(view: MeasuredView) -> NDArray[np.float64]:
+def seen_share(view: MeshView) -> NDArray[np.float64]:
     """Which share is seen of each of these faces, (k,), about 0 .. 1; 0 of a face without area."""
     areas = view.surface.areas[view.pixels[0]]
     return np.divide(seen_area(view), areas, out=np.zeros(len(areas)), where=areas > 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nextview.data.measured_view import MeasuredView
+from research.mesh_view import MeshView
 
 LIKED, SPREAD = 22.5, 45.0
 """Elevation that people like best, and the width of their liking, degrees (Secord et al. 2011, after Blanz et al.)."""
@@ -29,7 +30,7 @@ def above_preference(view: MeasuredView) -> float:
     return float(np.exp(-(((elevation - LIKED) / SPREAD) ** 2) / 2))
 
 
-def base_avoidance(view: MeasuredView) -> float:
+def base_avoidance(view: MeshView) -> float:
     """Share of the visible pixels that do not show the object's base: the underside of its lowest part.
 
     Secord et al. 2011 ("base"), turned round so that more is better; thesis, section 3.4.5. The base is seen from below

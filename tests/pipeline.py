@@ -21,7 +21,7 @@ from onnx import TensorProto, helper, numpy_helper
 from scipy.spatial.transform import Rotation
 
 from nextview.cli.main import main
-from nextview.data.measured_view import MeasuredView, Surface
+from nextview.data.measured_view import MeasuredView
 from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
 from nextview.data.store import ViewStore
@@ -31,7 +31,6 @@ from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import BINS_OUTPUT
 from nextview.recognition.map_names import measure_of
-from nextview.simulation.simulated import SimulatedCamera
 
 SPHERE = ViewSphere.named("40")
 CLASSES = ["ball", "box", "pillar"]
@@ -234,10 +233,3 @@ def of_depth(depth, distance=3.0) -> MeasuredView:
     """What a measure is handed where the depth alone is known, from straight ahead."""
     depth = np.asarray(depth)
     return MeasuredView(depth, look_at_origin(0, 0, distance), pinhole(max(depth.shape), distance))
-
-
-def view_of(mesh: Mesh, pose, size=224, distance=3.0) -> MeasuredView:
-    """What a measure is handed of a mesh that is seen from a pose."""
-    camera = SimulatedCamera(mesh, size, distance)
-    seen = camera.observe(pose)
-    return MeasuredView(seen.depth, pose, seen.intrinsics, Surface(mesh.vertices, mesh.faces), camera.face_ids(pose))

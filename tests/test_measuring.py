@@ -84,19 +84,3 @@ def test_nothing_is_left_of_a_measure_that_fails(store, name, problem):
     with pytest.raises(MeasureError, match=problem):
         list(measure(store, [name], workers=0))
     assert ViewStore.open(store).measures == ["depth_entropy"]
-
-
-def test_a_measure_that_needs_the_mesh_is_given_the_one_that_was_rendered(store, furniture, tmp_path):
-    list(measure(store, ["own_measures:pixels"], workers=0, meshes=furniture))
-    views = ViewStore.open(store)
-    seen = (views.group["depth"][:] > 0).sum((2, 3))
-    np.testing.assert_allclose(views.measure("own_measures:pixels"), seen, rtol=0.1)
-    shutil.copytree(furniture, tmp_path / "meshes")
-    file = tmp_path / "meshes/chair/train/chair_0.off"
-    file.write_text(file.read_text() + "\n")
-    shutil.rmtree(store / "measures/own_measures:pixels")
-    with pytest.raises(DatasetError, match=r"chair_0.off: is not the mesh that .*views.zarr was rendered from"):
-        list(measure(store, ["own_measures:pixels"], workers=0, meshes=tmp_path / "meshes"))
-    file.unlink()
-    with pytest.raises(DatasetError, match="holds no mesh called chair_0"):
-        list(measure(store, ["own_measures:pixels"], workers=0, meshes=tmp_path / "meshes"))

@@ -3,22 +3,23 @@
 import numpy as np
 import pytest
 import trimesh
-from pipeline import of_depth, view_of
+from pipeline import of_depth
 from skimage.draw import disk, polygon
 from skimage.measure import perimeter_crofton
 
-from nextview.cli.main import main
 from nextview.data.checking import check
 from nextview.data.measures import find_measure
 from nextview.data.measuring import measure
 from nextview.data.rendering import Deform, RenderOptions, deformed, render
 from nextview.data.store import ViewStore
-from nextview.errors import MeasureError
+from nextview.errors import DatasetError, MeasureError
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from research.area import view_area
 from research.depth_spread import BIN, depth_distribution, max_depth
+from research.measure import main as measure_with_meshes
 from research.measures import MEASURES as ADDED
+from research.mesh_view import view_of
 from research.silhouette import silhouette_length
 
 SPHERE = ViewSphere.named("12")
@@ -99,9 +100,9 @@ def views(tmp_path):
 
 
 def test_all_measures_of_a_store_and_its_meshes(views):
-    with pytest.raises(MeasureError, match="needs the meshes: name the folder"):
+    with pytest.raises(MeasureError, match="needs the meshes, not the depth alone"):
         next(measure(views, ["all"], workers=0))
-    main(["measure", str(views), str(views.parent / "meshes"), "--measures", "all", "--workers", "0"])
+    measure_with_meshes(views, views.parent / "meshes", workers=0)
     store = ViewStore.open(views)
     assert set(store.measures) == set(MEASURES)
     row = store.names.index("box")
@@ -115,7 +116,7 @@ def test_all_measures_of_a_store_and_its_meshes(views):
 def test_a_deformed_store_is_measured_on_the_deformed_meshes(views):
     meshes = views.parent / "meshes"
     list(render(meshes, views.parent / "new.zarr", SPHERE, 64, RenderOptions(3, Deform(0.8, True)), workers=0))
-    list(measure(views.parent / "new.zarr", ["visible_area_ratio"], workers=0, meshes=meshes))
+    measure_with_meshes(views.parent / "new.zarr", meshes, ("visible_area_ratio",), workers=0)
     store = ViewStore.open(views.parent / "new.zarr")
     row = store.names.index("box")
     new = deformed(store, load_mesh(meshes / "box/box.off"), "box")
@@ -149,3 +150,14 @@ def test_a_measure_of_ones_own_is_kept_by_its_import_path(views, tmp_path, monke
     }.items():
         with pytest.raises(MeasureError, match=problem):
             list(measure(views, [name], workers=0))
+
+
+def test_measures_take_the_meshes_that_were_rendered_and_no_others(views):
+    meshes = views.parent / "meshes"
+    file = meshes / "box/box.off"
+    file.write_text(file.read_text() + "\n")
+    with pytest.raises(DatasetError, match=r"box.off: is not the mesh that .*views.zarr was rendered from"):
+        measure_with_meshes(views, meshes, ("visible_area_ratio",), workers=0)
+    file.unlink()
+    with pytest.raises(DatasetError, match="holds no mesh called box"):
+        measure_with_meshes(views, meshes, ("visible_area_ratio",), workers=0)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from pipeline import of_depth, view_of
+from pipeline import of_depth
 from scipy.spatial.transform import Rotation
 
 from nextview.data.folders import list_dataset
@@ -18,6 +18,7 @@ from research import measures as table
 from research.area import bits
 from research.bending import BentSurface
 from research.gradient_entropy import gradient_entropy, visible_normals
+from research.mesh_view import FaceCamera, view_of
 from research.semantic import base_avoidance
 
 SPHERE = ViewSphere.named("40")
@@ -217,7 +218,7 @@ def test_a_wire_before_a_wall_is_seen_in_each_pixel_that_it_fills(gap, aside):
         pose = look_at_origin(0.2, azimuth, 3.0)
         seen = camera.observe(pose).depth
         row, column = np.nonzero(seen)
-        ids = camera.face_ids(pose, np.rint(seen * 1e4) / 1e4)[row, column]
+        ids = FaceCamera(mesh, 224).face_ids(pose, np.rint(seen * 1e4) / 1e4)[row, column]
         x, y = column + 0.5, row + 0.5
         points = (np.stack([x, y, np.ones(len(x))], 1) @ np.linalg.inv(camera.intrinsics).T) * seen[row, column, None]
         before = (points @ pose[:3, :3].T + pose[:3, 3])[:, 0] > gap / 2
@@ -227,8 +228,8 @@ def test_a_wire_before_a_wall_is_seen_in_each_pixel_that_it_fills(gap, aside):
 
 @pytest.mark.parametrize("size", range(1, 12))
 def test_every_pixel_of_the_smallest_images_shows_a_face(size):
-    camera = SimulatedCamera(load_mesh(SAMPLES / "chair.off"), size)
-    np.testing.assert_array_equal(camera.face_ids(CORNER) >= 0, camera.observe(CORNER).depth > 0)
+    view = view_of(load_mesh(SAMPLES / "chair.off"), CORNER, size)
+    np.testing.assert_array_equal(view.face_ids >= 0, view.depth > 0)
     assert np.isfinite([measure(view_of(CUBE, CORNER, size)) for measure in MEASURES.values()]).all()
 
 

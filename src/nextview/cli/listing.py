@@ -21,8 +21,8 @@ def show(
 ) -> None:
     """List the bundled models, or the view measures: what makes a view good.
 
-    A measure that needs the depth is computed from a view store alone. One that needs the mesh also takes the folder of
-    meshes that the store was rendered from. MODULE:FUNCTION is a measure of your own (docs/add_a_measure.md).
+    A measure that needs the depth is computed from a view store alone. Of those that need the mesh, and of measures of
+    your own, docs/add_a_measure.md tells.
     """
     if what == "measures":
         from nextview.data.measures import all_measures

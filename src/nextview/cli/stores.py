@@ -12,7 +12,6 @@ from nextview.data import checking, measuring, rendering, scene_drawing
 from nextview.data.splits import some_objects
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
-from nextview.geometry.mesh import MAX_FACES
 from nextview.geometry.viewsphere import ViewSphere
 
 Split = Literal["train", "test", "val"]
@@ -116,13 +115,9 @@ def check(
 
 def measure(
     store: Path,  # view store made by nextview render
-    # the dataset folder that it was rendered from: measures that need the mesh find there which face each pixel shows
-    meshes: Path | None = None,
     /,
-    # names (see nextview list measures), all, or MODULE:FUNCTION for one of your own; by default all that need the
-    # depth alone, or with MESHES all
+    # names (see nextview list measures), or MODULE:FUNCTION of your own; by default all that need the depth alone
     measures: tuple[str, ...] = (),
-    max_faces: int = MAX_FACES,  # of a mesh, as for nextview render
     split: Split | None = None,  # only this split
     # only the objects that this model, bundled or a card (NAME.json), calls held out of its training
     held_out: str | None = None,
@@ -132,8 +127,8 @@ def measure(
 ) -> None:
     """Compute view measures of every rendered object and keep them in the store. Resumes where it was."""
     select = some_objects(ViewStore.open(store), split, held_out, objects)
-    on = workers.workers, workers.scheduler
-    follow(measuring.measure(store, measures, *on, meshes, max_faces, select, overwrite), f"measuring {store.name}")
+    steps = measuring.measure(store, measures, **vars(workers), objects=select, overwrite=overwrite)
+    follow(steps, f"measuring {store.name}")
 
 
 def track_all(done: Iterable[tuple[str, str | None]], total: int, what: str, before: int = 0) -> list[str]:

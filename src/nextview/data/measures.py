@@ -24,8 +24,7 @@ QUANTUM = 1e-3
 class Measure:
     """A view measure: a function from a view to a finite number, and what is to be known of it.
 
-    It needs the depth alone, or the mesh and which face each pixel shows. Good views have high or low values of it, by
-    its source.
+    It needs the depth alone, or the mesh too. Good views have high or low values of it, by its source.
     """
 
     function: Callable[[MeasuredView], float]
@@ -72,7 +71,7 @@ def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(each for name in names for each in (all_measures() if name == "all" else (name,))))
     for name in names:
         if find_measure(name).needs == "mesh" and not meshes:
-            raise MeasureError(f"the measure {name} needs the meshes: name the folder that the store was rendered from")
+            raise MeasureError(f"the measure {name} needs the meshes, not the depth alone (docs/add_a_measure.md)")
     return names
 
 

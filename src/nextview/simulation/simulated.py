@@ -29,24 +29,8 @@ def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
-def _fill(found: NDArray[np.int32], z: NDArray[np.float32], step: int) -> None:
-    """Fill every other of the columns that are ``step`` apart, where both neighbours show one face and it does, too.
-
-    The inverse depth of a plane changes evenly over the picture.
-    """
-    reach = (found.shape[1] - 1) // (2 * step) * 2 * step  # the last column that was asked
-    left, middle, right = (slice(begin, begin + reach, 2 * step) for begin in (0, step, 2 * step))
-    one, before, after = found[:, left], z[:, left], z[:, right]
-    both = before + after
-    off = np.abs(z[:, middle] * both - 2 * before * after)
-    same = (one == found[:, right]) & (one >= 0) & (off < LEVEL * both)
-    np.copyto(found[:, middle], one, where=same)
-
-
 NOTHING, TARGET, OTHER, TABLE_TOP = np.arange(4, dtype=np.uint8)  # what a pixel shows
 NEARER = 1e-4  # how much nearer than the target something has to be to hide it, object radii: the table touches it
-APART = 4  # pixels of a row between those that are asked first which face they show; a power of 2
-LEVEL = 2e-4  # what stands no farther before a face is not told from it, object radii: two steps of a store's depth
 LARGEST = 16_384  # pixels that an image may be high or wide
 
 
@@ -118,36 +102,6 @@ class SimulatedCamera:
             image[bound] = shade.reshape(height, width)
             depth[bound] = np.where(hit, hits["tfar"], 0).reshape(height, width)
         return Observation(depth, pose, self.intrinsics, self.radius, image)
-
-    def face_ids(self, pose: NDArray[np.float64], depth: NDArray[np.floating] | None = None) -> NDArray[np.int32]:
-        """Which face of the mesh each pixel shows.
-
-        Where two pixels of a row show one face, so does all between them, unless the depth tells that something stands
-        before it: half of the rays are saved.
-
-        (H, W) int32, -1 for none. ``depth`` is what ``observe`` saw from the pose, if it is known.
-        """
-        pose = checked_pose(pose)
-        z = (self.observe(pose).depth if depth is None else depth).astype(np.float32, copy=False)
-        found, seen = np.full(self.shape, -1, np.int32), z > 0
-        self._cast(pose, seen, found, slice(0, None, APART))
-        for step in (APART >> k for k in range(1, APART.bit_length())):
-            _fill(found, z, step)
-            self._cast(pose, seen & (found < 0), found, slice(step, None, 2 * step))
-        return found
-
-    def _cast(
-        self, pose: NDArray[np.float64], where: NDArray[np.bool_], found: NDArray[np.int32], columns: slice
-    ) -> None:
-        """Look what some pixels show, of some columns; the nearest face alone: distances and normals cost more."""
-        chosen = np.zeros(self.shape, bool)
-        chosen[:, columns] = where[:, columns]
-        pixels = np.flatnonzero(chosen)
-        if len(pixels):
-            rays = self._rays.reshape(-1, 3).take(pixels, 0)  # by a mask it takes four times as long
-            rays = rays @ np.ascontiguousarray(pose[:3, :3].astype(np.float32).T)
-            origins = np.tile(pose[:3, 3].astype(np.float32), len(rays)).reshape(-1, 3)
-            found.reshape(-1)[pixels] = self._scene.run(origins, rays)
 
     def _bound(self, rotation: NDArray[np.float32], origin: NDArray[np.float32]) -> tuple[slice, slice]:
         """Rows and columns that hold the projection of every vertex; the whole image if one is behind the camera."""
