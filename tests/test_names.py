@@ -20,7 +20,7 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.session.style import to_svg
-from nextview.viewers.store_figures import object_figure, overlap_figure, store_figure
+from nextview.viewers.store_figures import object_figure, store_figure
 
 MATH = "$x^{$"
 """What matplotlib takes for a formula, and a broken one."""
@@ -48,7 +48,6 @@ def test_pictures_of_a_store_and_of_an_episode(tmp_path):
     with matplotlib.rc_context({"svg.fonttype": "none"}):
         assert f"{MATH}  ·  {MATH}" in texts(to_svg(object_figure(store, 0)))
         assert {f"{MATH}.zarr", MATH} <= {*texts(to_svg(store_figure(store)))}
-        assert MATH in texts(to_svg(overlap_figure(np.eye(12), store.sphere, MATH)))
         main(["recognise", str(mesh), "--max-views", "1", "--figure", str(tmp_path / "episode.svg")])
     assert any(text.startswith(f"{MATH}.off: ") for text in texts((tmp_path / "episode.svg").read_text()))
 

@@ -1,6 +1,6 @@
 """Every command that writes: what exists is refused and unchanged, --overwrite replaces it, nothing is left beside it.
 
-Commands that write into what they are given (measure, check --repair, fit into a card) and download are not here.
+Commands that write into what they are given (measure, fit into a card) and download are not here.
 """
 
 import shutil
@@ -23,18 +23,13 @@ WRITES = {
     "capture": (f"capture {SAMPLE}", "folder", "--radius 0.4 --viewpoints 12"),
     "scenes": ("scenes {furniture}", "folder", "--scenes 1 --level light --split test --workers 0"),
     "render": ("render {furniture}", "v.zarr", "--viewpoints 12 --size 16 --split test --workers 0"),
-    "overlap": ("overlap {views}", "o", "--workers 0"),
     "inspect": ("inspect {views}", "v.png"),
     "predict": ("predict {views}", "p.npz", "--models {models} --maps lem --split test --workers 0"),
     "fit policies": ("fit policies {training}", "folder", "--validation 1 --length 2 --n-views 2"),
     "evaluate": ("evaluate {predictions}", "folder", "--split test --samples 10"),
     "benchmark": ("benchmark {predictions}", "folder", "--split test --runs 1 --samples 10 --policies random"),
     "report": ("report {results}/out", "r.html"),
-    "train gain": (
-        "train gain {training}",
-        "g.json",
-        f"{GAIN} --folds 2 --epochs 1",
-    ),
+    "train gain": ("train gain {training}", "g.json", f"{GAIN} --folds 2 --epochs 1"),
     "train recogniser": ("train recogniser {views}", "folder", SMALL),
     "train map": ("train map {views}", "folder", SMALL),
 }
@@ -47,7 +42,7 @@ OWN_ONLY = {"scenes", "render", "train recogniser", "train map"}
 
 @pytest.fixture(scope="session")
 def made(furniture, views, models, predictions, results, tmp_path_factory):
-    """What the commands work on; the store is a copy, for overlap adds to it."""
+    """What the commands work on; the store is a copy."""
     folder = tmp_path_factory.mktemp("made")
     training, own = folder / "p.npz", folder / "views.zarr"
     Predictions.load(predictions).of_split("train").save(training)

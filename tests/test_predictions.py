@@ -10,7 +10,6 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from pipeline import SPHERE, some_predictions
@@ -19,7 +18,7 @@ from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import render
 from nextview.data.store import ViewStore
-from nextview.errors import PredictionsError
+from nextview.errors import PredictionsError, ResultsError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration, RiskBounds
@@ -153,20 +152,18 @@ if __name__ == "__main__":
 """
 
 
-def test_a_killed_run_goes_on_where_it_was_and_a_later_calibration_needs_no_other(views, models, predictions, tmp_path):
+def test_a_killed_run_goes_on_where_it_was(views, models, predictions, tmp_path):
     out, (recognisers, maps) = tmp_path / "again.npz", cards(models)
     (tmp_path / "killed.py").write_text(KILLED)
     killed = subprocess.run([sys.executable, tmp_path / "killed.py", views, models, out], check=False)
     assert killed.returncode == -signal.SIGKILL
     assert not out.exists()
     steps = list(predict(views, out, recognisers, maps, workers=1))
-    assert steps[0] == (2, 18)
+    assert 2 <= steps[0][0] < 18  # the worker may have finished another one before it ended
     assert not out.with_name("again.npz.part").exists()
     np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(predictions).logits)
-    later = msgspec.structs.replace(recognisers[0], calibration=Calibration(0.5, 0.25))
-    assert list(predict(views, out, [later], maps, workers=1)) == [(18, 18)]
-    assert Predictions.load(out).calibration == Calibration(0.5, 0.25)
-    np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(predictions).logits)
+    with pytest.raises(ResultsError, match="exists; give another name"):
+        next(predict(views, out, recognisers, maps, workers=1))
 
 
 def test_an_array_that_announces_more_than_the_file_holds_is_refused_before_it_takes_memory(tmp_path):

@@ -82,10 +82,9 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
     for card in (BUNDLED / "recognition/bundled").glob("*.json"):
         assert f"--name {card.stem}" in planned or f"{card.stem.partition('-')[0]} runs/" in planned
     for command in ("render ModelNet10 sensed-held-out.zarr --sensor mix", "fit calibration", "fit size", "fit valleys",
-                    "fit policies", "train gain", "measure", "evaluate", "benchmark",
-                    "report"):  # fmt: skip
+                    "fit policies", "train gain", "evaluate", "benchmark", "report"):  # fmt: skip
         assert f"nextview {command} " in planned
-    for script in ("train_agent ppo validation.npz", "plan views.zarr volumetric coverage"):
+    for script in ("measure views.zarr", "train_agent ppo validation.npz", "plan views.zarr volumetric coverage"):
         assert f"python -m research.{script}" in planned
     assert "research.measure_study test.npz validation.npz --out measures" in planned
     assert "docs/results.md" in planned

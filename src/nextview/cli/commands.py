@@ -35,7 +35,6 @@ COMMANDS = {
     "render": Command(f"{CLI}.stores:render", "render every view of a dataset into a view store"),
     "check": Command(f"{CLI}.stores:check", "check that a view store is sound"),
     "measure": Command(f"{CLI}.stores:measure", "compute view measures, into the store"),
-    "overlap": Command(f"{CLI}.pictures:overlap", "compute which part of a view each other view shows"),
     "inspect": Command(f"{CLI}.pictures:inspect", "draw what a view store holds, or one object of it"),
     "train recogniser": Command(
         f"{LEARNING}.recogniser_training:train_recogniser",
@@ -108,5 +107,5 @@ COMMANDS = {
     "report": Command("nextview.benchmark.report:report", "write one HTML page of a benchmark's results", "{found}"),
 }
 """By name, in the order in which they are listed."""
-RESUMES = ("render", "measure", "predict", "train recogniser", "train map", "learn", "scenes", "overlap")
+RESUMES = ("render", "measure", "predict", "train recogniser", "train map", "learn", "scenes")
 """Beginnings of the commands that go on where an interrupted run was stopped."""

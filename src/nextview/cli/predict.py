@@ -30,7 +30,7 @@ def predict(
     # --unit) and the card of the recogniser says what sizes mean (nextview fit size)
     by_shape: bool = False,
     workers: Workers = Workers(),
-    overwrite: bool = False,  # replace predictions of other objects or models
+    overwrite: bool = False,  # replace the predictions that are there
 ) -> None:
     """Run the recogniser and the map networks over every view of a store, once. Resumes where it was."""
     if len(recogniser) > 1 and not held_out:

@@ -95,13 +95,12 @@ def render(
 def check(
     store: Path,  # view store made by nextview render
     /,
-    repair: bool = False,  # take damaged objects out, so that the next nextview render makes them anew
     workers: Workers = Workers(),
 ) -> None:
-    """Read every object of a view store, hold its arrays against each other. Ends with status 2 if one is damaged."""
+    """Read every object of a view store, against its checksums. Ends with status 2 if one is damaged."""
     views = ViewStore.open(store)
     done = int(views.done.sum())
-    damaged = track_all(checking.check(store, repair, **vars(workers)), done, f"checking {store.name}")
+    damaged = track_all(checking.check(store, **vars(workers)), done, f"checking {store.name}")
     for reason in views.failures.values():
         console.print(f"left out: {reason}", style="yellow")
     for name, held in checking.incomplete(store).items():
@@ -109,8 +108,7 @@ def check(
     missing = len(views) - done - len(views.failures)
     console.print(f"{store}: {done - len(damaged)} objects are sound, {len(damaged)} damaged, {missing} not rendered")
     if damaged:
-        what = ("" if repair else "with --repair, ") + "nextview render makes them anew"
-        raise DatasetError(f"{store}: {len(damaged)} of {done} objects are damaged; {what}")
+        raise DatasetError(f"{store}: {len(damaged)} of {done} objects are damaged; remove the store and render again")
 
 
 def measure(

@@ -46,8 +46,7 @@ def predict(
 ) -> Iterator[tuple[int, int]]:
     """Write the predictions of a store's rendered objects.
 
-    What is done is kept in a folder beside ``out``, so that a run that was killed goes on from there. Where ``out``
-    holds the same objects and models, only what their cards say beside the networks is brought up to date.
+    What is done is kept in a folder beside ``out``, so that a run that was killed goes on from there.
 
     Args:
         path, out: the view store, and the .npz file to make.
@@ -63,20 +62,15 @@ def predict(
     Raises:
         DatasetError: the store holds no such objects, or a class that the recogniser does not know; or one of them
             kills its process.
-        PredictionsError: ``out`` comes from another store or other models.
-        ResultsError: ``out`` cannot be written.
+        ResultsError: ``out`` exists, or cannot be written.
     """
     path, out = Path(path), Path(out)
-    check_new(out, overwrite=True)
+    check_new(out, overwrite)
     store = ViewStore.open(path)
     objects, judge = _judged(store, recognisers, split, held_out)
     plan = _plan(store, objects, recognisers, maps)
     of_size = _size_logits(store.radii[objects], judge, recognisers) if size else None
     with writing(out):
-        if out.exists() and not overwrite:
-            _renew(out, plan, of_size)
-            yield len(objects), len(objects)
-            return
         key = hashlib.sha256(repr((plan.names, plan.models)).encode() + plan.depth_entropy.tobytes()).hexdigest()
         place = out.with_name(f".{out.name}.part").absolute()
         if not (place / key).exists():  # an earlier run with other objects or models is of no use
@@ -134,20 +128,6 @@ def _plan(
         store=str(store.path.resolve()),
         commands=tuple(dict.fromkeys(made_by)),
     )
-
-
-def _renew(out: Path, plan: Predictions, of_size: NDArray[np.float32] | None) -> None:
-    """Bring predictions of the same objects, views and models up to date with the cards; refuse others."""
-    there = Predictions.load(out)
-    same = (there.names, there.models) == (plan.names, plan.models)
-    if not same or not np.array_equal(there.depth_entropy, plan.depth_entropy):
-        raise PredictionsError(f"{out}: holds other objects or models; give another name, or --overwrite")
-    changes = {name: getattr(plan, name) for name in ("valley_classes", "calibration", "store")}
-    renewed = replace(there.by_shape(), **changes).with_size(of_size)
-    same = all(getattr(there, name) == value for name, value in changes.items())
-    sizes = [None if logits is None else logits.tobytes() for logits in (there.of_size, of_size)]
-    if not same or sizes[0] != sizes[1]:
-        renewed.save(out, overwrite=True)
 
 
 def _size_logits(

@@ -33,8 +33,6 @@ POINT_UNIT = 1 / 32767
 PENDING, DONE, FAILED = 0, 1, 2
 PLANNED = 5
 """Views of a plan: the thesis's longest episode."""
-OVERLAP = "overlap"
-"""The array of ``data.overlap``."""
 RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
 """The arrays that rendering makes; others are added later. Those of cluttered scenes, see ``data.scene_views``:"""
 SCENE = ("scene/depth", "scene/owner", "scene/reachable", "measures/visible_share", "measures/clearance")
@@ -135,7 +133,7 @@ class ViewStore:
     @property
     def added(self) -> list[str]:
         """Names of the arrays that were added later."""
-        files = [*self.path.glob("[!.]*/*/zarr.json"), *self.path.glob(f"{OVERLAP}/zarr.json")]
+        files = self.path.glob("[!.]*/*/zarr.json")
         return sorted({file.parent.relative_to(self.path).as_posix() for file in files} - {*self.rendered})
 
     def note(self, **changes: Any) -> None:
@@ -168,7 +166,6 @@ class ViewStore:
             "measures/depth_entropy": ((v,), "float32", 0),
             "radius": ((), "float64", np.nan),
             "status": ((), "uint8", PENDING),
-            OVERLAP: ((v, v), "float32", np.nan),
             "scene/depth": ((v, scene, scene), "uint16", 0),
             "scene/owner": ((v, scene, scene), "uint8", 0),
             "scene/reachable": ((v,), "bool", False),
@@ -193,10 +190,10 @@ class ViewStore:
     def _remedy(self, name: str) -> str:
         """What makes an array that is missing or damaged."""
         if name in self.rendered:
-            return f"nextview check {self.path} --repair, and nextview render makes it anew"
+            return "remove the store and render again"
         kind, _, rest = name.partition("/")
-        makers = {"measures": f"nextview measure {self.path} --measures {rest}", OVERLAP: "nextview overlap"}
-        return f"{makers.get(kind, 'the command that made it')} makes it"
+        maker = f"nextview measure {self.path} --measures {rest}" if kind == "measures" else "the command that made it"
+        return f"{maker} makes it"
 
     def holds(self, name: str) -> bool:
         """Whether there is an array of that name."""
@@ -243,12 +240,6 @@ class ViewStore:
         with zarr.config.set({"array.write_empty_chunks": True}):  # zeros too: what has no chunk is missing
             for name, values in arrays.items():
                 self.group[name][i] = values
-
-    def forget(self, i: int) -> None:
-        """Count object i as not rendered, and remove its values from the arrays that were added."""
-        self.write(i, {"status": np.array(PENDING, np.uint8)})
-        for name in self.added:
-            self._chunk(self.array(name), i).unlink(missing_ok=True)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -298,14 +289,13 @@ class ViewStore:
 
     @property
     def done(self) -> NDArray[np.bool_]:
-        """Objects that are rendered, (N,). One whose status cannot be read counts as not rendered."""
-        array, done = self.array("status"), np.zeros(len(self), bool)
-        with suppress(Exception):  # a damaged chunk raises whatever its codec makes of it
-            return array[:] == DONE
-        for i in range(len(self)):
-            with suppress(Exception):
-                done[i] = array[i] == DONE
-        return done
+        """Objects that are rendered, (N,)."""
+        try:
+            return self.array("status")[:] == DONE
+        except DatasetError:
+            raise
+        except Exception as error:  # a damaged chunk raises whatever its codec makes of it
+            raise DatasetError(f"{self.path}: status cannot be read ({error}); {self._remedy('status')}") from None
 
     @property
     def failures(self) -> dict[str, str]:

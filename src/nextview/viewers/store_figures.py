@@ -1,4 +1,4 @@
-"""Pictures of a view store: one object from all sides, the whole data set, and the overlap of views."""
+"""Pictures of a view store: one object from all sides, and the whole data set."""
 
 from __future__ import annotations
 
@@ -67,31 +67,6 @@ def store_figure(store: ViewStore) -> Figure:
     axes.set_title("mean depth entropy of the views, bits", fontsize=11)
     if store.done.any() and "depth_entropy" in store.measures:
         _draw_map(axes, store.sphere, store.measure()[store.done].mean(0))
-    return figure
-
-
-def overlap_figure(maps: NDArray[np.floating], sphere: ViewSphere, title: str) -> Figure:
-    """The map of every view, laid out as the views are (thesis, figure 14).
-
-    ``maps`` are (V, V) from 0 to 1; row = the view, column = the other view.
-    """
-    rings, azimuths = sphere.rings, sphere.azimuths
-    figure = PlainFigure(figsize=(1.65 * azimuths + 1.2, 1.15 * rings + 1.3), layout="constrained")
-    figure.suptitle(title, fontsize=13)
-    panels = figure.subplots(rings, azimuths, squeeze=False)
-    for view in range(len(sphere)):
-        ring, azimuth = divmod(view, azimuths)
-        axes = panels[rings - 1 - ring, azimuth]
-        shown = axes.imshow(maps[view].reshape(rings, azimuths), origin="lower", vmin=0, vmax=1, aspect="auto")
-        axes.plot(azimuth, ring, "o", color="white", markeredgecolor="black", markersize=5)
-        axes.set(xticks=[], yticks=[])
-        if ring == 0:
-            axes.set_xlabel(f"{sphere.angles(view)[1]:g}°")
-        if azimuth == 0:
-            axes.set_ylabel(f"{sphere.angles(view)[0]:g}°")
-    figure.supxlabel("azimuth", fontsize=11)
-    figure.supylabel("elevation", fontsize=11)
-    figure.colorbar(shown, ax=panels, label="share of the view's points, scaled", shrink=0.8, pad=0.01)
     return figure
 
 
