@@ -76,13 +76,13 @@ def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(tmp_pa
     card = read_card(models / "memory.json")
     assert card.classes == ("bench", *THINGS)
     np.testing.assert_array_equal(read_memory(card.path, card.sha256).views[1:], before.views)
-    learn(models, models, add=True, remove=("bench",))
+    learn(models, models, remove=("bench",))
     card = read_card(models / "memory.json")
     assert card.classes == THINGS
     np.testing.assert_array_equal(read_memory(card.path, card.sha256).held_out, before.held_out)
-    assert "is all it knows" in learn(models, models, add=True, remove=THINGS[1:]).notes[0]
+    assert "is all it knows" in learn(models, models, remove=THINGS[1:]).notes[0]
     with pytest.raises(UsageError, match="knows nothing called 'mug'"):
-        learn(models, models, add=True, remove=("mug",))
+        learn(models, models, remove=("mug",))
     with pytest.raises(UsageError, match=r"chair is known already"):
         learn(scans, models, add=True)
     assert "knows things already; --add" in refused(capsys, "learn", str(scans), str(models))

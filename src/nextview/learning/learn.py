@@ -16,7 +16,7 @@ from safetensors.numpy import load_file, save_file
 from nextview.data.pool import WorkerDied, each
 from nextview.data.progress import Track, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
-from nextview.files import command, new_file, new_folder, only_one
+from nextview.files import check_new, command, new_file, new_folder, only_one
 from nextview.learning.learned_picture import draw_learned
 from nextview.learning.memory_fit import VIEWS, fit_memory, size_evidence
 from nextview.learning.teaching import Arrays, teach
@@ -124,7 +124,7 @@ def learn_things(
         out: folder to write.
         how: how things are looked at.
         add: put the things beside those that ``out`` knows; the old ones are not looked at again.
-        remove: forget the things of these names in ``out``; with --add only, and ``folder`` may be ``out`` then.
+        remove: forget the things of these names in ``out``; nothing is added where ``folder`` is ``out``, too.
         workers: processes; one for each core by default; 0 to work in this one.
         scheduler: address of a dask.distributed scheduler whose workers see the same files, to use instead.
         overwrite: replace what ``out`` knows.
@@ -135,16 +135,15 @@ def learn_things(
         ResultsError: ``out`` is there, and neither ``add`` nor ``overwrite``.
     """
     folder, out = Path(folder), Path(out)
-    if remove and not add:
-        raise UsageError("--remove goes with --add: it changes what is known")
     card_path, old, known = out / f"{NAME}.json", None, list[Pair]()
-    if add:
+    if add or remove:
         old = read_card(card_path)
         known = _known(old, read_memory(old.path, old.sha256), remove)
     elif card_path.exists() and not overwrite:
-        check = f"{out}: knows things already; --add puts others beside them, --overwrite replaces them"
-        raise UsageError(check)
-    found = Found([], []) if add and folder.resolve() == out.resolve() else find_things(folder)
+        raise UsageError(f"{out}: knows things already; --add puts others beside them, --overwrite replaces them")
+    else:
+        check_new(out, overwrite, folder=True)
+    found = Found([], []) if remove and folder.resolve() == out.resolve() else find_things(folder)
     sources, left_out = _new(found.things, known), list(found.left_out)
     part = out.with_name(f".{out.name}.part")
     with only_one(out):
