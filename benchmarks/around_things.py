@@ -21,6 +21,7 @@ from scene_pictures import COLOURS, SIZE, picture
 
 import nextview
 from nextview.data.folders import list_dataset
+from nextview.data.scene_drawing import Meshes, draw_scene
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.recognition.belief import FixedLength
@@ -29,7 +30,6 @@ from nextview.session.session import Session
 from nextview.session.style import BLUE, STYLE
 from nextview.simulation.robot_camera import RobotCamera
 from nextview.simulation.scene import Scene, build_scene, footprint
-from nextview.simulation.scene_drawing import Meshes, draw_scene
 from nextview.simulation.simulated import OTHER, TARGET
 
 SHOWS = 0.15

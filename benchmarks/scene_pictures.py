@@ -16,13 +16,13 @@ import tyro
 from matplotlib.figure import Figure
 
 from nextview.data.folders import list_dataset
+from nextview.data.scene_drawing import Meshes, draw_scene
 from nextview.errors import UsageError
 from nextview.geometry.depth import headlight
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.session.style import STYLE
 from nextview.simulation.scene import Scene, build_scene
-from nextview.simulation.scene_drawing import Meshes, draw_scene
 from nextview.simulation.scene_layout import LEVELS
 from nextview.simulation.simulated import OTHER, TABLE_TOP, TARGET, SceneCamera
 

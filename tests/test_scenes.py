@@ -11,15 +11,14 @@ from matplotlib.path import Path as Outline
 import nextview
 from nextview.data.checking import check
 from nextview.data.rendering import RenderOptions, render
-from nextview.data.scene_drawing import draw_scenes
+from nextview.data.scene_drawing import SPREAD, TOLERANCE, draw_scenes
 from nextview.data.scene_views import scene_views
-from nextview.data.store import ViewStore
+from nextview.data.store import PENDING, ViewStore
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.simulation.robot_camera import RobotCamera
 from nextview.simulation.scene import TABLE, Scene, block_item, build_scene, footprint, separation
-from nextview.simulation.scene_drawing import SPREAD, TOLERANCE
 from nextview.simulation.scene_layout import LEVELS, Block, SceneLayout
 from nextview.simulation.simulated import (
     NOTHING,
@@ -181,7 +180,7 @@ def test_a_store_of_scenes_goes_on_where_it_was_cut_off(cluttered_views, clutter
     begun.close()
     opened = ViewStore.open(path)
     assert opened.done.sum() == 1
-    opened.forget(int(np.flatnonzero(opened.done)[0]))
+    opened.write(int(np.flatnonzero(opened.done)[0]), {"status": np.array(PENDING, np.uint8)})
     assert len(list(render(cluttered, path, GRID, 48, options, workers=0))) == 6
     whole, cut = ViewStore.open(cluttered_views), ViewStore.open(path)
     for name in whole.rendered:

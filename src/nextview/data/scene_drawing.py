@@ -1,4 +1,8 @@
-"""Draw a folder of scenes around the objects of a dataset, on all cores, resumable."""
+"""Draw a folder of scenes around the objects of a dataset, on all cores, resumable.
+
+Things are set beside a target, where nothing stands yet, until so much of it shows as it should. No physics: they stand
+upright on the table. Their footprints, which are convex hulls, never overlap.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nextview.checks import whole
 from nextview.data.folders import Entry, list_dataset, select
@@ -15,11 +20,42 @@ from nextview.data.pool import each
 from nextview.data.store import writing
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.files import check_new
-from nextview.simulation.scene_drawing import Meshes, draw_scene
-from nextview.simulation.scene_layout import LEVELS, SUFFIX, SceneLayout
+from nextview.geometry.mesh import Mesh
+from nextview.geometry.ray_caster import RayCaster
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.simulation.scene import (
+    FOOTPRINT,
+    HEIGHT,
+    TABLE,
+    Item,
+    Scene,
+    block_item,
+    cached_mesh,
+    footprint,
+    mesh_hash,
+    place,
+    separation,
+)  # fmt: skip
+from nextview.simulation.scene_layout import LEVELS, SUFFIX, Block, Placement, SceneLayout
+from nextview.simulation.simulated import SimulatedCamera, visible_shares
 
-MOST = 100_000
-"""Scenes at each level, of each split."""
+GRID = ViewSphere.named("40")
+SIZE, COARSE = 112, 48  # pixels of the pictures that tell how much of the target shows: in the end, and while drawing
+SPREAD, TOLERANCE = 0.04, 0.02  # how far a scene's wanted share lies from its level's at most, and how well it is met
+FEWEST, MOST = 3, 20  # things around a target
+TRIES, LAYOUTS_TRIED = 200, 20  # things that are tried for one layout, and layouts for one scene
+GAP = 0.04  # between things, at least, object radii
+AWAY = {"light": (0.5, 2.6), "medium": (0.5, 2.3), "heavy": (0.5, 2.1)}  # from the target's middle, object radii
+OBJECT_RADIUS = (0.5, 1.1)
+FEWEST_OBJECTS = 2  # of things that are no boxes or walls, if there are any meshes for them
+OBJECTS = {"light": 0.7, "medium": 0.6, "heavy": 0.4}  # share of objects among objects and boxes
+BOX_HEIGHT = {"light": HEIGHT, "medium": HEIGHT, "heavy": (1.4, 2.9)}  # what is low hides nothing from above
+LEAST = {"light": 0.0, "medium": 0.0, "heavy": 0.008}  # what a thing hides at least: the table is soon full
+WALLS = {"light": (0.8, 0.2, 0.0), "medium": (0.5, 0.4, 0.1), "heavy": (0.3, 0.4, 0.3)}  # chances of 0, 1 and 2
+WALL_AWAY, WALL_WIDTH, WALL_DEPTH, WALL_HEIGHT = (1.2, 1.9), (2.0, 3.5), 0.1, (1.0, 2.6)
+POOL = 8  # meshes that are tried in one scene, at several places each: reading them takes longest
+LARGEST = 100_000  # triangles of an object around the target: larger ones are passed over, for the sake of time
+MOST_SCENES = 100_000  # at each level, of each split
 
 
 @dataclass(frozen=True)
@@ -91,7 +127,7 @@ def tasks(
     if unknown or not levels:
         raise UsageError(f"the level of a scene is {', '.join(LEVELS)}, not {unknown[0] if unknown else 'none'}")
     if scenes is not None:
-        whole(scenes, "the number of scenes at each level", 1, MOST)
+        whole(scenes, "the number of scenes at each level", 1, MOST_SCENES)
     whole(seed, "a seed", 0, 2**31 - 1)
     found: list[Task] = []
     entries = select(list_dataset(dataset), dataset, split, held_out)
@@ -118,3 +154,133 @@ def _draw(meshes: dict[str, Meshes], seed: int, task: Task) -> str | None:
     except (MeshError, DatasetError) as error:
         return str(error)
     return None
+
+
+@dataclass(frozen=True)
+class Meshes:
+    """The mesh files that may stand around a target: a folder, and paths below it, with forward slashes, sorted."""
+
+    folder: Path
+    files: tuple[str, ...]
+
+
+def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) -> SceneLayout:
+    """A scene of some level around a target, a mesh file of the folder; seed and name decide all that is random.
+
+    Raises:
+        MeshError: the target cannot be used.
+        DatasetError: no layout shows as much of it as the level wants; or a file cannot be read.
+    """
+    rng = np.random.default_rng([seed, *name.encode()])
+    mesh = cached_mesh(meshes.folder / target)
+    others = [file for file in meshes.files if file != target]
+    others = [others[i] for i in rng.permutation(len(others))[:POOL]]
+    hiding = _Hiding(mesh)
+    for _ in range(LAYOUTS_TRIED):
+        goal = LEVELS[level] + rng.uniform(-SPREAD, SPREAD)
+        placed = _layout(mesh, others, meshes.folder, hiding, level, goal, rng)
+        if placed is not None:
+            scene = Scene(mesh, tuple(item for _, item in placed))
+            objects = tuple(thing for thing, _ in placed if isinstance(thing, Placement))
+            blocks = tuple(thing for thing, _ in placed if isinstance(thing, Block))
+            shares = tuple(_rounded(*visible_shares(scene, GRID.poses, SIZE, GRID.distance)))
+            unreachable = tuple(np.flatnonzero(~scene.reachable(GRID.poses[:, :3, 3])).tolist())
+            middle = Placement(target, mesh_hash(meshes.folder / target))
+            return SceneLayout(name, level, seed, middle, objects, blocks, shares, unreachable)
+    raise DatasetError(f"{meshes.folder / target}: no layout of {LAYOUTS_TRIED} lets {LEVELS[level]:.0%} of it show")
+
+
+class _Hiding:
+    """What of a target shows from the 40 views, as rays from the cameras to the points of its surface that they see."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        camera = SimulatedCamera(mesh, COARSE, GRID.distance)
+        eyes, rays, views = [], [], []
+        for view, pose in enumerate(GRID.poses):
+            seen = camera.observe(pose)
+            rows, columns = np.nonzero(seen.depth)
+            (fx, _, cx), (_, fy, cy) = seen.intrinsics[:2]
+            ahead = np.stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones(len(rows))], 1)
+            rays.append(seen.depth[rows, columns, None] * ahead @ pose[:3, :3].T)
+            eyes.append(np.broadcast_to(pose[:3, 3], rays[-1].shape))
+            views.append(np.full(len(rows), view))
+        self.eyes, self.rays = (np.concatenate(rows).astype(np.float32) for rows in (eyes, rays))
+        self.views = np.concatenate(views)
+        self.whole = np.maximum(np.bincount(self.views, minlength=len(GRID)), 1)
+
+    def by(self, item: Item, still: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which of the rays that are still free end on something first, (R,)."""
+        length, _ = RayCaster([(item.vertices, item.faces)]).cast(self.eyes[still], self.rays[still])
+        hidden = np.zeros(len(still), bool)
+        hidden[still] = length < 1
+        return hidden
+
+    def share(self, still: NDArray[np.bool_]) -> float:
+        """Share of the target that shows, on the average over the views."""
+        return float((np.bincount(self.views[still], minlength=len(GRID)) / self.whole).mean())
+
+
+Thing = tuple[Placement | Block, Item]
+
+
+def _layout(
+    mesh: Mesh, others: Sequence[str], folder: Path, hiding: _Hiding, level: str, goal: float, rng: np.random.Generator
+) -> list[Thing] | None:
+    """Things around a target, of which they leave about so much to see; None if that does not come about."""
+    walls = int(rng.choice(3, p=WALLS[level]))
+    middle, floor = footprint(mesh.vertices), float(mesh.vertices[:, 2].min())
+    placed: list[Thing] = []
+    free = np.ones(len(hiding.views), bool)
+    for _ in range(TRIES):
+        share = hiding.share(free)
+        if len(placed) >= FEWEST + walls and share <= goal + TOLERANCE:
+            return placed
+        if len(placed) == MOST:
+            return None
+        objects = sum(isinstance(thing, Placement) for thing, _ in placed)
+        short = bool(others) and objects < FEWEST_OBJECTS
+        thing = _wall(rng) if len(placed) < walls else _thing(others, folder, level, short, rng)
+        item = _stood(thing, folder, floor)
+        if item is None or np.abs(item.footprint).max() > TABLE:
+            continue
+        if min(separation(item.footprint, other) for other in [middle, *(i.footprint for _, i in placed)]) < GAP:
+            continue
+        left = free & ~hiding.by(item, free)
+        if goal - TOLERANCE <= hiding.share(left) <= share - LEAST[level] * (not short):
+            placed.append((thing, item))
+            free = left
+    return None
+
+
+def _thing(others: Sequence[str], folder: Path, level: str, short: bool, rng: np.random.Generator) -> Placement | Block:
+    """An object or a box, anywhere around; an object where there are too few."""
+    away, towards, azimuth = rng.uniform(*AWAY[level]), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)
+    there = away * np.cos(towards), away * np.sin(towards), azimuth
+    if short or (others and rng.random() < OBJECTS[level]):
+        file = others[int(rng.integers(len(others)))]
+        return Placement(file, mesh_hash(folder / file), *_rounded(*there, rng.uniform(*OBJECT_RADIUS)))
+    x, y, azimuth, *size = _rounded(*there, *rng.uniform(*FOOTPRINT, 2), rng.uniform(*BOX_HEIGHT[level]))
+    return Block(x, y, azimuth, size[0], size[1], size[2])
+
+
+def _wall(rng: np.random.Generator) -> Block:
+    """A wall, across the way from the target."""
+    away, towards, lean = rng.uniform(*WALL_AWAY), rng.uniform(0, 2 * np.pi), rng.uniform(-0.3, 0.3)
+    x, y, azimuth = away * np.cos(towards), away * np.sin(towards), towards + np.pi / 2 + lean
+    x, y, azimuth, width, height = _rounded(x, y, azimuth, rng.uniform(*WALL_WIDTH), rng.uniform(*WALL_HEIGHT))
+    return Block(x, y, azimuth, width, WALL_DEPTH, height, wall=True)
+
+
+def _stood(thing: Placement | Block, folder: Path, floor: float) -> Item | None:
+    """On the table; None for a mesh that is too large, or damaged."""
+    try:
+        if isinstance(thing, Block):
+            return block_item(thing, floor)
+        return place(cached_mesh(folder / thing.mesh, LARGEST), thing, floor)
+    except MeshError:
+        return None
+
+
+def _rounded(*values: float) -> list[float]:
+    """Few digits are enough, and JSON holds them exactly."""
+    return [round(float(value), 4) for value in values]
