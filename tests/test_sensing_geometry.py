@@ -7,10 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pipeline import INTRINSICS, SHAPE, TABLE, box, cast, pose_at
+from scipy.ndimage import binary_dilation
 
 from nextview.geometry.mesh import make_mesh
 from nextview.sensing import ObjectFrame
 from nextview.sensing.facets import estimate_noise, fit_facets
+from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import enclose, smallest_circle, upright_axes
 from nextview.sensing.segmentation import Samples, find_plane
 
@@ -156,3 +158,20 @@ def test_holes_are_filled_but_what_lies_behind_is_not():
     assert (filled[of_box] > 0).mean() > 0.99
     assert (filled[~of_box & (holed > 0)] == 0).all()
     np.testing.assert_allclose(filled[of_box & (filled > 0)], clean[of_box & (filled > 0)], atol=0.01)
+
+
+def test_a_mask_that_is_too_wide_loses_what_is_behind_and_keeps_what_is_thin():
+    depth = np.full((120, 160), 0.8, np.float32)
+    true = np.zeros(depth.shape, bool)
+    true[30:80, 40:100] = True
+    true[45:60, 60:80] = False  # a hole, through which the background is seen
+    slope = np.linspace(0, 0.05, 60, dtype=np.float32)
+    depth[30:80, 40:100] = np.where(true[30:80, 40:100], 0.5 + slope, 0.8)
+    depth[80, 40:100] = 0.65  # pixels that hang between object and background
+    wide = binary_dilation(true, iterations=4)
+    np.testing.assert_array_equal(trimmed(depth, wide), true)
+    np.testing.assert_array_equal(trimmed(depth, true), true)
+    rod = np.zeros(depth.shape, bool)
+    rod[100:103, 20:140] = True
+    depth[rod] = 0.5
+    np.testing.assert_array_equal(trimmed(depth, rod), rod)

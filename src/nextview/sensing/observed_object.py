@@ -18,6 +18,7 @@ from nextview.geometry.viewsphere import DISTANCE
 from nextview.sensing import segmentation
 from nextview.sensing.facets import ROWS, Facets, Noise, estimate_noise, fit_facets, look_again, virtual_pose
 from nextview.sensing.frame import Frame
+from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
 from nextview.sensing.plausibility import ViewWarning, check_frame, check_observation, check_views, refuse_far
 from nextview.sensing.segmentation import Footprint, Plane, Samples, find_plane, mistake_in_pose, refine_plane, sample
@@ -218,6 +219,10 @@ class ObservedObject:
         """The sightings so far, mended where a cluster has grown, and that of a new frame; and the side of a cell."""
         if frame.mask is not None:
             mask = frame.mask
+            if self.known is None:  # else its size does not hang on pixels at the edge
+                mask = trimmed(frame.depth, mask)
+                if plane is not None:
+                    mask &= segmentation.above_plane(frame, plane, noise)
         elif self.known is not None:
             if self.box is not None:
                 mask = segmentation.inside_box(frame, self.box)

@@ -1,0 +1,48 @@
+"""Masks as segmenters give them: pixels at their edge that belong to what is behind are taken away."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion, minimum_filter
+
+EDGE = 6
+"""A segmenter's edge may be off by so many pixels."""
+STEP = 0.01
+"""Neighbouring pixels of one surface differ by at most this part of their depth, and THICK."""
+THICK = 0.004
+"""Metres."""
+Mask = NDArray[np.bool_]
+
+
+def trimmed(depth: NDArray[np.float32], mask: Mask) -> Mask:
+    """The pixels of a mask that hang together with its inside without a step in depth, (H, W) bool.
+
+    Up to EDGE pixels at the edge of a mask may show the background, or hang in the air before it. The inside is what is
+    farther from the edge; of a thing that is too thin for that, as much farther as leaves a third of it. From there the
+    mask grows back over pixels as near as their neighbours.
+
+    Args:
+        depth: metres, (H, W), 0 where nothing was measured.
+        mask: (H, W) bool.
+    """
+    measured = mask & (depth > 0)
+    rows, columns = np.flatnonzero(measured.any(1)), np.flatnonzero(measured.any(0))
+    if not len(rows):
+        return mask
+    part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    own, z = measured[part], depth[part].astype(np.float64)
+    whole = np.pad(mask[part], 1)
+    for width in range(EDGE, 0, -1):
+        inside = binary_erosion(whole, np.ones((3, 3), bool), width)[1:-1, 1:-1] & own
+        if 3 * inside.sum() >= own.sum():
+            break
+    else:
+        return mask
+    found = inside
+    for _ in range(EDGE):
+        nearest = minimum_filter(np.where(found, z, np.inf), 3, mode="constant", cval=np.inf)
+        found |= own & (np.abs(z - nearest) < STEP * z + THICK)
+    trimmed_mask = np.zeros_like(mask)
+    trimmed_mask[part] = found
+    return trimmed_mask
