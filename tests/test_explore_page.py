@@ -71,16 +71,6 @@ def test_a_name_means_nothing_in_the_page_and_a_sensor_may_be_any():
         page.stop()
 
 
-def test_what_cannot_be_done_changes_nothing(page):
-    for _ in range(40):
-        page.exploration.step()
-    page._look(0, 5)
-    assert len(page.exploration.walks[0].views) == 40
-    page._act(lambda: page._changed(lambda: page.exploration.compare(["no such policy"])), None)
-    assert page._policy.value == "gain"
-    assert page.exploration.policies == ["gain"]
-
-
 def sockets(page, **headers):
     """A connection that sends what the page's own scripts send, with headers of the caller's choice."""
     address = f"ws://127.0.0.1:{page.server.get_port()}"

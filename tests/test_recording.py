@@ -1,8 +1,5 @@
 """A recording holds what the session held: read back by Rerun's own reader."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pipeline import INTRINSICS, box, cast, pose_at
@@ -12,14 +9,11 @@ pytest.importorskip("rerun", reason="the extra 'record' is not installed")
 from rerun.chunk import RrdReader
 
 import nextview
-from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
 from nextview.geometry.observation import Observation
 from nextview.sensing import Frame
 from nextview.session.system import simulated
 from nextview.viewers.recording import Recorder
-
-SAMPLE = Path(__file__).parent.parent / "samples" / "table.off"
 
 
 class Recording:
@@ -126,13 +120,3 @@ def test_a_recording_under_way_can_be_read_and_one_that_is_closed_is_complete(tm
     assert Recording(path).rows.keys() == recording.rows.keys()
     session.update(seen)  # goes on, unrecorded
     assert path.stat().st_size == size
-
-
-def test_the_command_writes_one_and_prints_the_same(tmp_path, capsys):
-    main(["recognise", str(SAMPLE), "--start", "3", "--json"])
-    plain = capsys.readouterr().out
-    main(["recognise", str(SAMPLE), "--start", "3", "--json", "--record", str(tmp_path / "new" / "episode.rrd")])
-    assert capsys.readouterr().out == plain
-    recording = Recording(tmp_path / "new" / "episode.rrd")
-    assert len(recording.steps("belief/table", "Scalars:scalars")) == len(json.loads(plain)["views"])
-    assert [path.name for path in (tmp_path / "new").iterdir()] == ["episode.rrd"]

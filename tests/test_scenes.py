@@ -8,7 +8,6 @@ import pytest
 import trimesh
 from matplotlib.path import Path as Outline
 
-import nextview
 from nextview.data.checking import check
 from nextview.data.rendering import RenderOptions, render
 from nextview.data.scene_drawing import SPREAD, TOLERANCE, draw_scenes
@@ -206,14 +205,3 @@ def test_a_robot_sees_the_target_that_it_was_told_of(named):
     either = (seen.depth > 0) | (expected.depth > 0)
     assert both.sum() > (0.9 if named in ("known", "box") else 0.75) * either.sum()
     assert (frame.mask is not None) == (named in ("known", "mask"))
-
-
-def test_a_session_runs_live_in_a_scene(cluttered, furniture):
-    layout = SceneLayout.load(sorted(cluttered.rglob("*medium*.json"))[0])
-    camera = RobotCamera(build_scene(layout, furniture), "stereo", np.random.default_rng(1), "known")
-    session = nextview.load(policy="random", threshold=1.0, max_views=3).session_with(camera, start=1)
-    session.reachable = camera.reachable
-    result = session.run(camera)
-    assert len(result.views) == 3
-    assert result.seen
-    assert all(layout.visible[view.index] > 0 and view.index not in layout.unreachable for view in result.views)
