@@ -3,14 +3,12 @@
 import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.special import softmax
 
 torch = pytest.importorskip("torch")
 L = pytest.importorskip("lightning")
@@ -27,7 +25,7 @@ from nextview.learning.architectures import ResNet, ViewMap
 from nextview.learning.export import export_map, export_recogniser, run_network
 from nextview.learning.fitting_set import hold_out
 from nextview.learning.inputs import load_inputs
-from nextview.learning.map_training import MapModule, Windows, train_map
+from nextview.learning.map_training import Windows, train_map
 from nextview.learning.recipes import THESIS_MAP, THESIS_RECOGNISER, Hardware, MapRecipe, RecogniserRecipe
 from nextview.learning.recogniser_training import (
     Source,
@@ -35,7 +33,6 @@ from nextview.learning.recogniser_training import (
     augment,
     azimuth_bins,
     mirror_planes,
-    part_way,
     side_loss,
     train_recogniser,
 )
@@ -60,20 +57,15 @@ SMALL_MAP = MapRecipe(size=16, epochs=1, views=2, batch=4, validation=0.25)
 def views_of(recipe, objects=6, views=V):
     """Inputs whose pixels say which object and view they are."""
     which = np.arange(objects * views, dtype=np.uint8).reshape(objects, views, 1, 1, 1)
-    labels = np.arange(objects) % 2
     source = Source(np.broadcast_to(which, (objects, views, 4, 2, 2)), np.arange(objects))
-    return Views([source], np.arange(objects), labels, recipe)
-
-
-def drawn(views):
-    return [int(x) for images, _ in views for x in images[:, 0, 0, 0]]
+    return Views([source], np.arange(objects), np.arange(objects) % 2, recipe)
 
 
 def test_the_published_recipe_sees_every_view_once_an_epoch_in_a_new_order():
-    views = views_of(replace(THESIS_RECOGNISER, batch=5))
-    first = drawn(views)
-    views.epoch = 1
-    second = drawn(views)
+    views, orders = views_of(replace(THESIS_RECOGNISER, batch=5)), []
+    for views.epoch in (0, 1):
+        orders.append([int(x) for images, _ in views for x in images[:, 0, 0, 0]])
+    first, second = orders
     assert sorted(first) == sorted(second) == list(range(6 * V))
     assert first != second
     labels = np.concatenate([label for _, label in views])
@@ -113,16 +105,6 @@ def test_devices_share_every_batch(balanced):
         assert torch.equal(torch.stack([la, lb], 1).flatten(), labels)
 
 
-def test_augmented_background_stays_empty():
-    torch.manual_seed(0)
-    x = torch.zeros(8, 1, 32, 32)
-    assert augment(x)[0].abs().max() == 0
-    x[:, :, 8:24, 8:24] = 0.5
-    y, _ = augment(x)
-    assert y.shape == x.shape
-    assert (y[:, :, 16, 16] > 0).float().mean() > 0.5
-
-
 def test_augment_says_which_views_it_mirrored():
     torch.manual_seed(0)
     x = torch.zeros(64, 1, 32, 32)
@@ -131,15 +113,6 @@ def test_augment_says_which_views_it_mirrored():
     on_the_right = y[..., 16:].sum((1, 2, 3)) > y[..., :16].sum((1, 2, 3))
     assert torch.equal(on_the_right, mirrored)
     assert 16 < mirrored.sum() < 48
-
-
-def test_part_of_the_way_is_between_the_beginning_and_the_end():
-    start = {"weight": torch.tensor([0.0, 2.0]), "count": torch.tensor(3)}
-    end = {"weight": torch.tensor([1.0, 0.0]), "count": torch.tensor(8)}
-    between = part_way(start, end, 0.75)
-    np.testing.assert_allclose(between["weight"], [0.75, 0.5])
-    assert between["count"] == 8
-    assert torch.equal(part_way(start, end, 1.0)["weight"], end["weight"])
 
 
 def test_map_batches_hold_each_view_with_its_own_map():
@@ -163,46 +136,14 @@ def test_map_batches_hold_each_view_with_its_own_map():
     assert 0 < sum(flips) < 16
 
 
-def within_one_cell(at, other):
-    return abs(at // 3 - other // 3) + abs(at % 3 - other % 3) <= 1
-
-
-@pytest.mark.parametrize("reach", [0, 1])
-def test_the_peak_weighs_in_which_cell_of_the_window_is_highest(monkeypatch, reach):
-    rng, sphere = np.random.default_rng(0), ViewSphere.named("40")
-    output, true = rng.random((2, 4, 5, 8)).astype(np.float32)
-    module = MapModule(MapRecipe(peak=0.3, sharpness=0.1, reach=reach), sphere, 1)
-    monkeypatch.setattr(module, "forward", lambda seen: (torch.from_numpy(output),))
-    monkeypatch.setattr(module, "log", lambda *args, **options: None)
-    loss = module.training_step((torch.zeros(4), torch.from_numpy(true)), 0)
-    near, goal = (values[:, :, [-1, 0, 1]].reshape(4, 15) for values in (output, true))
-    counts = [[k == best or (reach and within_one_cell(k, best)) for k in range(15)] for best in goal.argmax(1)]
-    chance = (softmax(near / 0.1, 1) * counts).sum(1)
-    squared = (((near - goal) ** 2).mean() + ((output - true) ** 2).mean()) / 2
-    assert loss.item() == pytest.approx(squared - 0.3 * np.log(chance).mean(), rel=1e-5)
-
-
 def test_folds_divide_every_class_evenly_and_keep_twins_together():
-    rng = np.random.default_rng(0)
-    labels = np.repeat(["a", "b"], [12, 8])
-    measured = rng.random((20, 5))
+    labels, measured = np.repeat([0, 1], [12, 8]), np.random.default_rng(0).random((20, 5))
     measured[15] = measured[3]  # one mesh, two labels
-    labels = (labels == "b").astype(np.int64)
     folds = hold_out(labels, measured, 3, seed=1)
     assert sorted(np.concatenate(folds)) == list(range(20))
     counts = np.array([np.bincount(labels[fold], minlength=2) for fold in folds])
     assert np.ptp(counts, axis=0).max() <= 2  # a twin of the other class may shift one
     assert any({3, 15} <= set(fold) for fold in folds)
-    assert any((a != b).any() for a, b in zip(folds, hold_out(labels, measured, 3, 2), strict=True) if len(a) == len(b))
-
-
-def measured_store(path, values, labels, facts=None):
-    """A store of which only the depth-entropy of the views matters."""
-    entries = [Entry(path / f"{i}.off", f"object_{i}", "abcdef"[label], "train") for i, label in enumerate(labels)]
-    store = ViewStore.create(path / "views.zarr", describe(entries, SPHERE, 16, facts or {}))
-    store.group["measures/depth_entropy"][:] = values
-    store.group["status"][:] = DONE
-    return store
 
 
 def test_the_mirror_plane_is_the_one_that_maps_the_views_into_each_other(tmp_path):
@@ -214,7 +155,9 @@ def test_the_mirror_plane_is_the_one_that_maps_the_views_into_each_other(tmp_pat
         profile = rng.random((2, 5))
         distance = np.minimum((azimuth - plane) % 8, (plane - azimuth) % 8)
         values.append(profile[:, distance].ravel())
-    store = measured_store(tmp_path, np.array(values), labels)
+    entries = [Entry(tmp_path / f"{i}.off", f"object_{i}", "abc"[label], "train") for i, label in enumerate(labels)]
+    store = ViewStore.create(tmp_path / "views.zarr", describe(entries, SPHERE, 16, {}))
+    store.group["measures/depth_entropy"][:], store.group["status"][:] = np.array(values), DONE
     assert mirror_planes(store, np.arange(15)).tolist() == [0, 1, 2]
     assert azimuth_bins(store, 8, np.array([0.0, 1.0, 2.0])).reshape(15, 2, 8)[:, :, 0].tolist() == [
         [(-label) % 8] * 2 for label in labels
@@ -239,14 +182,8 @@ def test_the_side_between_two_steps_counts_by_nearness():
     torch.manual_seed(0)
     likely = torch.randn(3, 4, 8).log_softmax(2)
     label, side = torch.tensor([0, 3, 1]), torch.tensor([2.0, 5.25, 7.5])
-    expected = -(
-        likely[0, 0, 2]
-        + 0.75 * likely[1, 3, 5]
-        + 0.25 * likely[1, 3, 6]
-        + 0.5 * likely[2, 1, 7]
-        + 0.5 * likely[2, 1, 0]
-    )
-    assert side_loss(likely, label, side) == pytest.approx(float(expected) / 3, rel=1e-5)
+    between = 0.75 * likely[1, 3, 5] + 0.25 * likely[1, 3, 6] + 0.5 * likely[2, 1, 7] + 0.5 * likely[2, 1, 0]
+    assert side_loss(likely, label, side) == pytest.approx(-float(likely[0, 0, 2] + between) / 3, rel=1e-5)
 
 
 # Runs
@@ -276,9 +213,7 @@ class SmallNet(torch.nn.Module):
 
 def train(out, recipe=RECIPE, hardware=Hardware(), stop=None):
     """Train on the small set; ``stop`` is (epoch, batch, "raise" or "kill")."""
-    torch.set_num_threads(
-        1
-    )  # sums of several threads depend on how many there are, and a test before may have set that
+    torch.set_num_threads(1)  # sums of several threads depend on how many there are
     sources, labels = data()
     recogniser.recogniser_network, usual = SmallNet, recogniser.recogniser_network
     if stop:
@@ -312,10 +247,6 @@ def uninterrupted(tmp_path_factory):
     return train(out), out
 
 
-def last_weights(out):
-    return torch.load(out / "last.ckpt", weights_only=True)["state_dict"]
-
-
 @pytest.mark.parametrize("stop", [(1, 2), (0, 1)], ids=["middle", "first"])
 def test_a_run_that_failed_and_resumed_is_the_same_to_the_bit(tmp_path, uninterrupted, stop):
     whole, folder = uninterrupted
@@ -323,12 +254,9 @@ def test_a_run_that_failed_and_resumed_is_the_same_to_the_bit(tmp_path, uninterr
         train(tmp_path, stop=(*stop, "raise"))
     assert (tmp_path / "last.ckpt").exists() == (stop[0] > 0)
     assert same(train(tmp_path), whole)
-    ours, theirs = last_weights(tmp_path), last_weights(folder)
-    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
     log, expected = read_log(tmp_path), read_log(folder)
-    assert {name: log[name] for name in log if name != "seconds"} == {
-        name: expected[name] for name in expected if name != "seconds"
-    }
+    del log["seconds"], expected["seconds"]
+    assert log == expected
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
@@ -389,11 +317,10 @@ def test_a_run_without_progress_stops_and_stays_stopped(tmp_path):
     assert again.weight.item() == 2
 
 
-@pytest.mark.parametrize("damage", [lambda b: b[: len(b) // 2], lambda b: b"not a checkpoint"])
-def test_a_damaged_checkpoint_is_named(tmp_path, damage):
+def test_a_damaged_checkpoint_is_named(tmp_path):
     fitting.fit(Scripted([1.0]), One(), One(), tmp_path, "score", "min", EXACT)
     last = tmp_path / "last.ckpt"
-    last.write_bytes(damage(last.read_bytes()))
+    last.write_bytes(last.read_bytes()[: last.stat().st_size // 2])
     with pytest.raises(ModelError, match=r"last\.ckpt: a damaged checkpoint .* delete it"):
         fitting.fit(Scripted([1.0, 1.0]), One(), One(), tmp_path, "score", "min", EXACT)
 
@@ -419,8 +346,8 @@ def test_trained_models_have_cards_and_run(trained, views):
     assert card.classes == ("chair", "monitor", "table")
     assert [part.split()[0] for part in card.scores] == ["validation"]  # training leaves the test split alone
     assert card.held_out == tuple(sorted(run.held_out))
-    assert set(card.held_out) < {name for name, split in zip_names(views) if split == "train"}
-    assert card.training.commands[-1] == card.training.commands[-1].strip()
+    store = ViewStore.open(views)
+    assert set(card.held_out) < {n for n, split in zip(store.names, store.splits, strict=True) if split == "train"}
     evidence = Recogniser(trained / "models/tiny.json").from_inputs(np.zeros((3, 4, 16, 16), np.uint8))
     assert evidence.logits.shape == (3, 3)
     assert np.exp(evidence.azimuth_bins).sum(2) == pytest.approx(np.ones((3, 3)), abs=1e-4)
@@ -433,11 +360,6 @@ def test_trained_models_have_cards_and_run(trained, views):
     with pytest.raises(UsageError, match="not a path"):
         export_map(trained / "runs/lem", views, trained / "models", name="../tiny")
     assert (trained / "models/tiny.onnx").read_bytes() == before
-
-
-def zip_names(path):
-    store = ViewStore.open(path)
-    return zip(store.names, store.splits, strict=True)
 
 
 def test_several_runs_are_averaged(trained, views, tmp_path):
@@ -508,26 +430,3 @@ def test_what_is_no_finished_run_is_not_exported(trained, views, tmp_path):
     with pytest.raises(ModelError, match="damaged"):
         export_map(tmp_path, views, tmp_path / "models")
     assert not (tmp_path / "models").exists()
-
-
-def test_inputs_are_those_of_the_store(trained, views):
-    inputs = load_inputs(views, 16)
-    assert inputs.shape == (18, 40, 4, 16, 16)
-    assert (inputs[3, 4:6] == from_store(InputSpec("geometry", 16), ViewStore.open(views), 3)[4:6]).all()
-
-
-@pytest.mark.long
-def test_two_devices_train_one_network(views, tmp_path):
-    """As Lightning starts them; each is a process of its own."""
-    run = tmp_path / "run"
-    options = ["--devices", "2", "--accelerator", "cpu", "--precision", "32-true", "--epochs", "1", "--size", "16"]
-    command = [sys.executable, "-m", "nextview.cli.main", "train", "recogniser", str(views), str(run), *options]
-    command += ["--views", "2", "--batch", "4", "--validation", "0.25"]
-    done = subprocess.run(
-        command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    assert "MEMBER: 2/2" in done.stderr
-    assert (run / "network.pt").exists()
-    state = torch.load(run / "last.ckpt", weights_only=True)
-    assert state["global_step"] == 9 * 2 // 4  # the batch is that of all devices together
