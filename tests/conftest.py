@@ -90,7 +90,7 @@ def predictions(shared, views, models) -> Path:
 
     def make(folder: Path) -> None:
         recogniser, lem = (read_card(models / name) for name in ("tiny.json", "tiny-lem.json"))
-        list(predict(views, folder / "predictions.npz", [recogniser], {"lem": lem}, workers=0))
+        list(predict(views, folder / "predictions.npz", recogniser, {"lem": lem}, workers=0))
 
     return shared("predictions", make) / "predictions.npz"
 

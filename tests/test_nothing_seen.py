@@ -161,7 +161,7 @@ def test_predictions_and_cameras_have_one_idea_of_nothing(tmp_path):
     looks = [Observation(depth, pose, store.intrinsics) for depth, pose in both]
     assert min(look.visible for look in looks) > 0.006 * 112**2
     card = make_recogniser(tmp_path, ["ball"])
-    list(predict(tmp_path / "store.zarr", tmp_path / "said.npz", [read_card(card)], {}, workers=0))
+    list(predict(tmp_path / "store.zarr", tmp_path / "said.npz", read_card(card), {}, workers=0))
     said = Predictions.load(tmp_path / "said.npz").logits[0].any(1)
     np.testing.assert_array_equal(said, [look.seen for look in looks])
     assert not said.all()

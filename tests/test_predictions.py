@@ -107,7 +107,7 @@ def test_nothing_is_unpickled(tmp_path):
 
 
 def cards(models: Path) -> tuple:
-    return [read_card(models / "tiny.json")], {"lem": read_card(models / "tiny-lem.json")}
+    return read_card(models / "tiny.json"), {"lem": read_card(models / "tiny-lem.json")}
 
 
 def test_predictions_are_what_the_networks_say_of_each_look(views, models, predictions):
@@ -146,24 +146,24 @@ from nextview.recognition.model_card import read_card
 if __name__ == "__main__":
     views, models, out = map(Path, sys.argv[1:])
     maps = {"lem": read_card(models / "tiny-lem.json")}
-    for done, _ in predict(views, out, [read_card(models / "tiny.json")], maps, workers=1):
+    for done, _ in predict(views, out, read_card(models / "tiny.json"), maps, workers=1):
         if done == 2:
             os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
 def test_a_killed_run_goes_on_where_it_was(views, models, predictions, tmp_path):
-    out, (recognisers, maps) = tmp_path / "again.npz", cards(models)
+    out, (recogniser, maps) = tmp_path / "again.npz", cards(models)
     (tmp_path / "killed.py").write_text(KILLED)
     killed = subprocess.run([sys.executable, tmp_path / "killed.py", views, models, out], check=False)
     assert killed.returncode == -signal.SIGKILL
     assert not out.exists()
-    steps = list(predict(views, out, recognisers, maps, workers=1))
+    steps = list(predict(views, out, recogniser, maps, workers=1))
     assert 2 <= steps[0][0] < 18  # the worker may have finished another one before it ended
     assert not out.with_name("again.npz.part").exists()
     np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(predictions).logits)
     with pytest.raises(ResultsError, match="exists; give another name"):
-        next(predict(views, out, recognisers, maps, workers=1))
+        next(predict(views, out, recogniser, maps, workers=1))
 
 
 def test_an_array_that_announces_more_than_the_file_holds_is_refused_before_it_takes_memory(tmp_path):

@@ -93,18 +93,18 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
         list(render(shop / "meshes", Path(views), SPHERE, 32, workers=1, options=RenderOptions(unit="m")))
 
     test = shop / "test.npz"
-    list(predict(Path(views), test, [read_card(Path(card))], {}, "test", workers=1))
+    list(predict(Path(views), test, read_card(Path(card)), {}, "test", workers=1))
     by_shape = Predictions.load(test)
     assert by_shape.of_size is None
     main(["fit", "size", views, honest, card])
     assert read_card(Path(card)).fitted_to["size"].startswith("8 objects of the training split, ")
-    list(predict(Path(views), test, [read_card(Path(card))], {}, "test", workers=1))  # nothing is predicted again
+    list(predict(Path(views), test, read_card(Path(card)), {}, "test", workers=1, overwrite=True))
     known = Predictions.load(test)
     assert (known.logits.argmax(2) == known.labels[:, None]).all()
     np.testing.assert_allclose(known.by_shape().logits, by_shape.logits, atol=1e-5)
-    list(predict(Path(views), test, [read_card(Path(card))], {}, "test", size=False, workers=1))
+    list(predict(Path(views), test, read_card(Path(card)), {}, "test", size=False, workers=1, overwrite=True))
     np.testing.assert_allclose(Predictions.load(test).logits, by_shape.logits, atol=1e-5)
-    list(predict(Path(views), tmp_path / "new.npz", [read_card(Path(card))], {}, "test", workers=1))
+    list(predict(Path(views), tmp_path / "new.npz", read_card(Path(card)), {}, "test", workers=1))
     np.testing.assert_allclose(Predictions.load(tmp_path / "new.npz").logits, known.logits, atol=1e-5)
 
     recogniser = Recogniser(card)

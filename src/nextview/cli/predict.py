@@ -20,10 +20,8 @@ def predict(
     /,
     split: Split | None = None,  # only this split
     models: str = "modelnet10",  # bundled models by name, or a folder with models of your own
-    recogniser: tuple[str, ...] = (),  # instead, name of a bundled model or path of a card. Several with --held-out
-    # let each object be judged by a recogniser from whose training it was held out (nextview train recogniser --folds
-    # makes such), and leave out those that all were trained on
-    held_out: bool = False,
+    recogniser: str | None = None,  # instead, name of a bundled model or path of a card
+    held_out: bool = False,  # only objects that were held out from the training of the recogniser
     # maps to predict with those models, or NAME=CARD for others; all that those models predict by default
     maps: tuple[str, ...] | None = None,
     # recognise by shape alone. By default the size of the objects counts too, where the store knows it (nextview render
@@ -33,8 +31,6 @@ def predict(
     overwrite: bool = False,  # replace the predictions that are there
 ) -> None:
     """Run the recogniser and the map networks over every view of a store, once. Resumes where it was."""
-    if len(recogniser) > 1 and not held_out:
-        raise UsageError("several recognisers can only share the work with --held-out")
     if out.suffix != ".npz":
         raise UsageError(f"{out}: predictions are one .npz file; end the name in .npz")
     found, cards = find_models(models), {}
@@ -43,8 +39,7 @@ def predict(
         if not card and name not in found.maps:
             raise ModelError(f"no network of {models} predicts the map {name!r}; there are {', '.join(found.maps)}")
         cards[name] = find_card(card or found.maps[name])
-    judges = [find_card(r) for r in recogniser or (found.recogniser,)]
-    what = judges, cards, split, held_out, not by_shape
+    what = find_card(recogniser or found.recogniser), cards, split, held_out, not by_shape
     follow(predicting.predict(store, out, *what, **vars(workers), overwrite=overwrite), f"predicting {store.name}")
     for line in summed_up(Predictions.load(out)):
         console.print(line)

@@ -35,7 +35,7 @@ Arrays = dict[str, NDArray[np.float32]]
 def predict(
     path: Path,
     out: Path,
-    recognisers: Sequence[ModelCard],
+    recogniser: ModelCard,
     maps: dict[str, ModelCard],
     split: str | None = None,
     held_out: bool = False,
@@ -50,7 +50,7 @@ def predict(
 
     Args:
         path, out: the view store, and the .npz file to make.
-        recognisers: cards; each object is judged by the first of them, or see ``held_out``.
+        recogniser: its card.
         maps: card of the network for each map.
         size: let the recogniser know how large the objects are, where store and card tell.
         split, held_out, overwrite: as of ``nextview predict``.
@@ -67,9 +67,10 @@ def predict(
     path, out = Path(path), Path(out)
     check_new(out, overwrite)
     store = ViewStore.open(path)
-    objects, judge = _judged(store, recognisers, split, held_out)
-    plan = _plan(store, objects, recognisers, maps)
-    of_size = _size_logits(store.radii[objects], judge, recognisers) if size else None
+    objects = _asked(store, recogniser, split, held_out)
+    plan, radii, of_size = _plan(store, objects, recogniser, maps), store.radii[objects], None
+    if size and recogniser.size is not None and not np.isnan(radii).all():
+        of_size = recogniser.size.logits(radii).astype(np.float32)
     with writing(out):
         key = hashlib.sha256(repr((plan.names, plan.models)).encode() + plan.depth_entropy.tobytes()).hexdigest()
         place = out.with_name(f".{out.name}.part").absolute()
@@ -77,8 +78,8 @@ def predict(
             shutil.rmtree(place, ignore_errors=True)
             (place / key).mkdir(parents=True)
         files = [place / key / f"{i}.npz" for i in objects]
-        items = [item for item in zip(objects.tolist(), judge.tolist(), files, strict=True) if not item[2].exists()]
-        cards = [_card_file(card) for card in recognisers], {name: _card_file(card) for name, card in maps.items()}
+        items = [item for item in zip(objects.tolist(), files, strict=True) if not item[1].exists()]
+        cards = _card_file(recogniser), {name: _card_file(card) for name, card in maps.items()}
         work = partial(_predict_object, json.dumps((str(store.path.absolute()), *cards)))
         yield from counted(work, items, len(objects), lambda it: f"{path}: {store.names[it[0]]}", workers, scheduler)
         arrays = _together(files)
@@ -88,29 +89,29 @@ def predict(
         shutil.rmtree(place)
 
 
-def _judged(
-    store: ViewStore, recognisers: Sequence[ModelCard], split: str | None, held_out: bool
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The objects to predict (rows of the store), and which recogniser judges each (index)."""
+def _asked(store: ViewStore, recogniser: ModelCard, split: str | None, held_out: bool) -> NDArray[np.int64]:
+    """The objects to predict, rows of the store."""
     objects = some_objects(store, split)
-    judge = np.zeros(len(objects), np.int64)
     if held_out:
-        judge = judges(recognisers, [store.names[i] for i in objects])
-        objects, judge = objects[judge >= 0], judge[judge >= 0]
+        if not recogniser.held_out:
+            raise DatasetError(f"recogniser {recogniser.name} does not name what was held out from its training")
+        targets = np.array([name.partition("@")[0] for name in store.names])  # in scenes; all of the name for others
+        held = np.isin(store.names, recogniser.held_out) | np.isin(targets, recogniser.held_out)
+        objects = objects[held[objects]]
     if len(objects) == 0:
-        raise DatasetError(f"{store.path}: holds no object that was held out from the training of the recognisers")
-    unknown = sorted({store.classes[label] for label in store.labels[objects]} - set(recognisers[0].classes))
+        raise DatasetError(f"{store.path}: holds no object that was held out from the training of the recogniser")
+    unknown = sorted({store.classes[label] for label in store.labels[objects]} - set(recogniser.classes))
     if unknown:
-        raise DatasetError(f"{store.path}: recogniser {recognisers[0].name} does not know the class {unknown[0]!r}")
-    return objects, judge
+        raise DatasetError(f"{store.path}: recogniser {recogniser.name} does not know the class {unknown[0]!r}")
+    return objects
 
 
 def _plan(
-    store: ViewStore, objects: NDArray[np.int64], recognisers: Sequence[ModelCard], maps: dict[str, ModelCard]
+    store: ViewStore, objects: NDArray[np.int64], recogniser: ModelCard, maps: dict[str, ModelCard]
 ) -> Predictions:
     """What store and cards say of the objects; what the networks say is still to come."""
-    classes = recognisers[0].classes
-    own = [card for card in (*recognisers, *maps.values()) if card.path.parent != BUNDLED]
+    classes = recogniser.classes
+    own = [card for card in (recogniser, *maps.values()) if card.path.parent != BUNDLED]
     made_by = [*store.commands, *(line for card in own for line in card.training.commands), command()]
     return Predictions(
         logits=np.zeros((len(objects), len(store.sphere), len(classes)), np.float32),
@@ -122,25 +123,12 @@ def _plan(
         splits=store.splits[objects],
         conflicting=conflicting_objects(store)[objects],
         sphere=store.sphere,
-        models={"recogniser": identity(recognisers), **{name: identity([card]) for name, card in maps.items()}},
+        models={name: (card.name, card.sha256) for name, card in ({"recogniser": recogniser} | maps).items()},
         valley_classes={name: card.valleys(classes) for name, card in maps.items()},
-        calibration=recognisers[0].calibration,
+        calibration=recogniser.calibration,
         store=str(store.path.resolve()),
         commands=tuple(dict.fromkeys(made_by)),
     )
-
-
-def _size_logits(
-    radii: NDArray[np.float64], judge: NDArray[np.int64], recognisers: Sequence[ModelCard]
-) -> NDArray[np.float32] | None:
-    """Logits by the size of the objects, (N, C); None if no recogniser knows of sizes, or the store of none."""
-    if np.isnan(radii).all() or all(card.size is None for card in recognisers):
-        return None
-    logits = np.zeros((len(radii), len(recognisers[0].classes)), np.float32)
-    for j, card in enumerate(recognisers):
-        if card.size is not None:
-            logits[judge == j] = card.size.logits(radii[judge == j])
-    return logits
 
 
 def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
@@ -151,47 +139,25 @@ def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
     return (several.sum(1) > 1)[group] & store.done
 
 
-def judges(recognisers: Sequence[ModelCard], names: Sequence[str]) -> NDArray[np.int64]:
-    """Which recogniser judges each object: the first from whose training it was held out; -1 for none."""
-    first = recognisers[0]
-    for card in recognisers:
-        if not card.held_out:
-            raise DatasetError(f"recogniser {card.name} does not name the objects that were held out from its training")
-        for what in ("classes", "azimuth_bins"):
-            if getattr(card, what) != getattr(first, what):
-                raise DatasetError(f"recognisers {first.name} and {card.name} do not know the same {what}")
-    targets = [name.partition("@")[0] for name in names]  # in scenes; all of the name for others
-    held_out = np.array([np.isin(names, card.held_out) | np.isin(targets, card.held_out) for card in recognisers])
-    return np.where(held_out.any(0), held_out.argmax(0), -1)
-
-
-def identity(cards: Sequence[ModelCard]) -> tuple[str, str]:
-    """Name and SHA-256 of a model; of several together, their names and the hash of their hashes."""
-    if len(cards) == 1:
-        return cards[0].name, cards[0].sha256
-    return "+".join(c.name for c in cards), hashlib.sha256("".join(c.sha256 for c in cards).encode()).hexdigest()
-
-
 def _card_file(card: ModelCard) -> str:
     return str(card.path.with_suffix(".json").absolute())
 
 
 @lru_cache(maxsize=1)
-def _open(files: str) -> tuple[ViewStore, list[Recogniser], dict[str, MapNetwork]]:
+def _open(files: str) -> tuple[ViewStore, Recogniser, dict[str, MapNetwork]]:
     """Each process has its own store and networks, and one thread: objects are what runs side by side."""
-    store, recognisers, maps = json.loads(files)
+    store, recogniser, maps = json.loads(files)
     networks = {name: MapNetwork(card, threads=1) for name, card in maps.items()}
-    return ViewStore.open(store), [open_recogniser(Path(card), threads=1) for card in recognisers], networks
+    return ViewStore.open(store), open_recogniser(Path(recogniser), threads=1), networks
 
 
-def _predict_object(files: str, item: tuple[int, int, Path]) -> None:
+def _predict_object(files: str, item: tuple[int, Path]) -> None:
     """Write maps, azimuth bins and logits of all views of one object, whole or not at all.
 
     A view in which nothing is seen is no evidence: its logits are all the same.
     """
-    i, judge, file = item
-    store, recognisers, maps = _open(files)
-    recogniser = recognisers[judge]
+    i, file = item
+    store, recogniser, maps = _open(files)
     specs = {recogniser.card.input} | {network.card.input for network in maps.values()}
     inputs = {spec: from_store(spec, store, i) for spec in specs}
     batches = [slice(start, start + BATCH) for start in range(0, len(store.sphere), BATCH)]

@@ -137,8 +137,7 @@ def train_map(
         store: view store made by nextview render, with the 40 views and the measure (nextview measure).
         out: folder for checkpoints, logs and network.pt, the network of the epoch with the lowest squared error.
         predictions: for --measure confidence, of the store's training split, by the recogniser whose confidence is to
-            be predicted; or out-of-fold ones (nextview train recogniser --folds, export each, nextview predict
-            --held-out --recogniser CARD CARD).
+            be predicted.
         weights: folder of a finished run of the same depth and input from which a ResNet starts: a recogniser's, or a
             map network's to go on with.
         recipe: how to train.

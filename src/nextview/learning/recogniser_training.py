@@ -1,4 +1,4 @@
-"""The stage from a view store to a trained recogniser, or to one for each fold."""
+"""The stage from a view store to a trained recogniser."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from nextview.data.progress import Track, silently
 from nextview.data.rendering import rotations
 from nextview.data.splits import check_any, deduplicate, split_training
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, UsageError
+from nextview.errors import DatasetError
 from nextview.learning.architectures import recogniser_network
-from nextview.learning.fitting_set import hold_out
 from nextview.learning.inputs import PackedViews, ready_inputs
 from nextview.learning.loop import OwnBatches, fit, optimiser
 from nextview.learning.recipes import Hardware, RecogniserRecipe
@@ -223,8 +222,6 @@ def train_recogniser(
     out: Path,
     deformed: tuple[Path, ...] = (),
     weights: Path | None = None,
-    folds: int = 0,
-    fold: int | None = None,
     recipe: RecogniserRecipe = RecogniserRecipe(),
     hardware: Hardware = Hardware(),
     track: Track = silently,
@@ -238,46 +235,31 @@ def train_recogniser(
             --rotated --seed 1 and so on) or through sensors (--sensor mix); their views may be others.
         weights: start from a published checkpoint, torchvision's of the same depth or EfficientNet-Lite0's, or go on
             from the run in this folder, on other data or for longer.
-        folds: train so many recognisers instead, OUT/fold0 and so on, each without its share of the training objects,
-            for out-of-fold predictions.
-        fold: train only this one of them, 0 the first.
         recipe: how to train.
         hardware: on what.
         track: follows the preparation of the inputs.
 
     Returns:
-        Folders of the finished runs.
+        The folder of the finished run.
 
     Raises:
-        UsageError: there is no such fold.
         DatasetError: a store cannot be used, or another process trains in the same folder.
         ModelError: the weights cannot be used, or have seen what is held out; or ``out`` holds another run.
     """
-    if fold is not None and not 0 <= fold < folds:
-        raise UsageError(f"there is no fold {fold} of {folds}: they are counted from 0")
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation, recipe.seed)
     check_any(views, training, validation)
-    held_out = {out: training[:0]}
-    if folds:
-        parts = hold_out(views.labels[training], views.measure()[training], folds, recipe.seed)
-        held_out = {out / f"fold{k}": training[part] for k, part in enumerate(parts) if fold in (None, k)}
     validating = deduplicate(views, validation)  # copies of one mesh count once
     azimuths, planes = 0, None
     if recipe.azimuth_bins_weight:
         azimuths, planes = views.sphere.azimuths, mirror_planes(views, training)
     aside = [views.names[i] for i in validation]
-    unseen = {folder: [*aside, *(views.names[i] for i in held)] for folder, held in held_out.items()}
-    for names in unseen.values():
-        refuse_seen(weights, names)
+    refuse_seen(weights, aside)
     stores = [views, *map(ViewStore.open, deformed)]
     sources = [_source(each, views, training, recipe, planes, track) for each in stores]
-    for folder, held in held_out.items():
-        split = np.setdiff1d(training, held), validating
-        fitted = sources, views.labels, split, recipe, folder, weights, hardware, azimuths
-        run = new_run(recipe, weights, unseen[folder], aside, stores)
-        train_once(folder, run, partial(fit_recogniser, *fitted))
-    return list(held_out)
+    fitted = sources, views.labels, (training, validating), recipe, out, weights, hardware, azimuths
+    train_once(out, new_run(recipe, weights, aside, aside, stores), partial(fit_recogniser, *fitted))
+    return [out]
 
 
 def _source(

@@ -167,7 +167,7 @@ def refuse_seen(weights: Path | None, held_out: list[str]) -> None:
     if 0 < len(seen) < len(set(held_out)):
         raise ModelError(
             f"{weights}: was trained on {len(seen)} of the {len(set(held_out))} objects that this network must not "
-            f"have seen, {seen[0]} among them; take its --seed and --validation, and no folds but its own"
+            f"have seen, {seen[0]} among them; take its --seed and --validation"
         )
 
 
