@@ -15,12 +15,8 @@ from nextview.benchmark.run import BenchmarkSettings, run_benchmark
 from nextview.cli.ending import printable
 from nextview.cli.main import main
 from nextview.data.folders import list_dataset
-from nextview.data.rendering import render
-from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
-from nextview.geometry.viewsphere import ViewSphere
 from nextview.session.style import to_svg
-from nextview.viewers.store_figures import object_figure, store_figure
 
 MATH = "$x^{$"
 """What matplotlib takes for a formula, and a broken one."""
@@ -39,15 +35,11 @@ def test_a_figure_shows_a_name_as_it_is(name):
     assert shown.count(f"of {name}") == 1
 
 
-def test_pictures_of_a_store_and_of_an_episode(tmp_path):
+def test_a_picture_of_an_episode(tmp_path):
     mesh = tmp_path / "meshes" / MATH / f"{MATH}.off"
     mesh.parent.mkdir(parents=True)
     trimesh.creation.box([1, 2, 3]).export(mesh)
-    list(render(tmp_path / "meshes", tmp_path / f"{MATH}.zarr", ViewSphere.named("12"), 16, workers=0))
-    store = ViewStore.open(tmp_path / f"{MATH}.zarr")
     with matplotlib.rc_context({"svg.fonttype": "none"}):
-        assert f"{MATH}  ·  {MATH}" in texts(to_svg(object_figure(store, 0)))
-        assert {f"{MATH}.zarr", MATH} <= {*texts(to_svg(store_figure(store)))}
         main(["recognise", str(mesh), "--max-views", "1", "--figure", str(tmp_path / "episode.svg")])
     assert any(text.startswith(f"{MATH}.off: ") for text in texts((tmp_path / "episode.svg").read_text()))
 

@@ -23,7 +23,6 @@ WRITES = {
     "capture": (f"capture {SAMPLE}", "folder", "--radius 0.4 --viewpoints 12"),
     "scenes": ("scenes {furniture}", "folder", "--scenes 1 --level light --split test --workers 0"),
     "render": ("render {furniture}", "v.zarr", "--viewpoints 12 --size 16 --split test --workers 0"),
-    "inspect": ("inspect {views}", "v.png"),
     "predict": ("predict {views}", "p.npz", "--models {models} --maps lem --split test --workers 0"),
     "fit policies": ("fit policies {training}", "folder", "--validation 1 --length 2 --n-views 2"),
     "evaluate": ("evaluate {predictions}", "folder", "--split test --samples 10"),

@@ -35,7 +35,6 @@ COMMANDS = {
     "render": Command(f"{CLI}.stores:render", "render every view of a dataset into a view store"),
     "check": Command(f"{CLI}.stores:check", "check that a view store is sound"),
     "measure": Command(f"{CLI}.stores:measure", "compute view measures, into the store"),
-    "inspect": Command(f"{CLI}.pictures:inspect", "draw what a view store holds, or one object of it"),
     "train recogniser": Command(
         f"{LEARNING}.recogniser_training:train_recogniser",
         "train a recogniser",

@@ -1,0 +1,193 @@
+"""Pictures of a view store: one object from all sides, or the whole data set, whose numbers are printed.
+
+python -m research.inspect_store views.zarr [views.png] [--object table_0399]
+"""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+import tyro
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from nextview.cli.ending import orderly_end
+from nextview.cli.progress import console
+from nextview.cli.sources import check_file
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError
+from nextview.files import new_file
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.session.style import BLUE, PlainFigure
+
+ORANGE = "#e08a2e"
+MAPS_ACROSS = 6
+CELL = 112
+"""Largest side of one view in a mosaic, pixels."""
+
+
+def object_figure(store: ViewStore, i: int) -> Figure:
+    """Shaded images and depth of all views of object i, and the map of every measure that the store holds of it.
+
+    Rows are rings, the horizon lowest; columns are azimuths. A dot marks the view that measures most.
+    """
+    sphere = store.sphere
+    names = [name for name in store.measures if store.has(f"measures/{name}", i)]
+    names.sort(key=lambda name: name != "depth_entropy")  # the thesis's first
+    wide = sphere.azimuths / sphere.rings
+    rows, columns = (2, 1) if wide > 3 else (1, 2)
+    heights = [rows * (14 / columns / wide + 0.6), 2.2 * -(-len(names) // MAPS_ACROSS)]
+    figure = PlainFigure(figsize=(14, sum(heights)), layout="constrained")
+    split = f", {store.splits[i]} split" if store.splits[i] else ""
+    figure.suptitle(f"{store.names[i]}  ·  {store.classes[store.labels[i]]}{split}", fontsize=14)
+    top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=heights))
+
+    left, right = top.subplots(rows, columns)
+    step = -(-store.image(i).shape[-1] // CELL)
+    image, depth = (_mosaic(views[:, ::step, ::step], sphere) for views in (store.image(i), store.depth(i)))
+    left.imshow(image, cmap="gray", vmin=0, vmax=255)
+    shown = right.imshow(np.ma.masked_equal(depth, 0), cmap="viridis_r")
+    right.set_facecolor("black")
+    top.colorbar(shown, ax=right, label="object radii", shrink=0.8, pad=0.01)
+    for axes, title in ((left, "shaded image"), (right, "depth")):
+        axes.set_title(title)
+        _ticks(axes, sphere, image.shape[1] / sphere.azimuths, downwards=True)
+    across = min(max(len(names), 3), MAPS_ACROSS)
+    panels = np.ravel(bottom.subplots(-(-len(names) // across), across, squeeze=False))
+    for axes in panels[len(names) :]:
+        axes.axis("off")
+    for axes, name in zip(panels, names, strict=False):
+        best = _draw_map(axes, sphere, store.read(f"measures/{name}", i))
+        elevation, azimuth = sphere.angles(best)
+        axes.set_title(name.replace("_", " "), fontsize=11)
+        axes.set_xlabel(f"most from {azimuth:g}°, {elevation:g}° up", fontsize=9)
+        axes.plot(best % sphere.azimuths, best // sphere.azimuths, "o", color="white", markeredgecolor="black")
+    return figure
+
+
+def store_figure(store: ViewStore) -> Figure:
+    """Objects of each class and split, and the mean depth entropy of the views."""
+    figure = PlainFigure(figsize=(14, max(5.5, 0.24 * len(store.classes) + 1.5)), layout="constrained")
+    figure.suptitle(store.path.name, fontsize=14)
+    left, right = np.asarray(figure.subfigures(1, 2, width_ratios=[1.5, 1], wspace=0.04))
+    _class_bars(left.subplots(), store)
+    axes = right.subplots()
+    axes.set_title("mean depth entropy of the views, bits", fontsize=11)
+    if store.done.any() and "depth_entropy" in store.measures:
+        _draw_map(axes, store.sphere, store.measure()[store.done].mean(0))
+    return figure
+
+
+def summary(store: ViewStore) -> dict[str, str]:
+    """What a store holds, in words."""
+    size = sum(file.stat().st_size for file in store.path.rglob("*") if file.is_file())
+    rendered, views, side = int(store.done.sum()), len(store.sphere), store.attributes.size
+    copies = sum(map(len, store.duplicates)) - len(store.duplicates)
+    conflicting = sum(len(set(store.labels[group])) > 1 for group in store.duplicates)
+    shown = {
+        "objects": f"{len(store):,} in {len(store.classes)} classes",
+        "rendered": f"{rendered:,}",
+        "left out": f"{len(store.failures):,}",
+        "not rendered yet": f"{len(store) - rendered - len(store.failures):,}",
+        "views": f"{rendered * views:,}  ({views} of {side} x {side} each)",
+        "byte-identical copies": f"{copies:,}  ({conflicting} with several labels)",
+        "size on disk": f"{size / 1e9:.2f} GB" if size > 1e9 else f"{size / 1e6:.1f} MB",
+        "median radius, m": ", ".join(f"{name} {radius:.2f}" for name, radius in median_radii(store).items()),
+    }
+    return {what: value for what, value in shown.items() if value}
+
+
+def median_radii(store: ViewStore) -> dict[str, float]:
+    """Of the objects of each class, metres; empty where the unit of the meshes is not known."""
+    radii, labels = store.radii, store.labels
+    known = store.done & np.isfinite(radii)
+    return {store.classes[c]: float(np.median(radii[known & (labels == c)])) for c in np.unique(labels[known])}
+
+
+def _class_bars(axes: Axes, store: ViewStore) -> None:
+    labels, splits, done = store.labels, store.splits, store.done
+    rows = np.arange(len(store.classes))
+    start = np.zeros(len(rows))
+    parts = [
+        (name, done & (splits == name), colour) for name, colour in (("train", BLUE), ("test", ORANGE), ("", BLUE))
+    ]
+    for name, select, colour in [*parts, ("not rendered", ~done, "lightgrey")]:
+        counts = np.bincount(labels[select], minlength=len(rows))
+        if counts.any():
+            axes.barh(rows, counts, left=start, color=colour, label=name or "objects", height=0.72)
+            start += counts
+    for row, count in enumerate(start):
+        axes.text(count, row, f" {int(count):,}", va="center", fontsize=9)
+    axes.set_yticks(rows, store.classes)
+    axes.set_ylim(max(len(rows), 6) - 0.5, -0.5)  # a few classes get bars no thicker than those of many
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlim(0, start.max() * 1.1)
+    axes.set_xlabel("objects")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1, 1), ncols=3)
+
+
+def _draw_map(axes: Axes, sphere: ViewSphere, values: NDArray[np.floating]) -> int:
+    """Values of the views, (V,), by ring and azimuth; returns the view of the highest."""
+    shown = axes.imshow(values.reshape(sphere.rings, sphere.azimuths), origin="lower", aspect="auto")
+    axes.figure.colorbar(shown, ax=axes, pad=0.02)
+    _ticks(axes, sphere)
+    return int(values.argmax())
+
+
+def _mosaic(views: NDArray, sphere: ViewSphere) -> NDArray:
+    """(V, H, W) to one image, the first ring lowest."""
+    _, height, width = views.shape
+    grid = views.reshape(sphere.rings, sphere.azimuths, height, width)[::-1]
+    return grid.transpose(0, 2, 1, 3).reshape(sphere.rings * height, sphere.azimuths * width)
+
+
+def _ticks(axes: Axes, sphere: ViewSphere, side: float = 1, downwards: bool = False) -> None:
+    """Azimuths and elevations, at the middle of cells of a side."""
+    middle, every = side / 2 - 0.5, 2 if sphere.azimuths > 6 else 1
+    elevations = [f"{e:g}°" for e in sphere.elevations]
+    azimuths = [f"{360 * k / sphere.azimuths:g}°" for k in range(sphere.azimuths)]
+    axes.set_xticks((middle + side * np.arange(sphere.azimuths))[::every], azimuths[::every], fontsize=8)
+    rows = elevations[::-1] if downwards else elevations
+    axes.set_yticks(middle + side * np.arange(sphere.rings), rows, fontsize=8)
+    axes.tick_params(length=0)
+
+
+def inspect(store: Path, out: Path | None = None, /, object: str | None = None, overwrite: bool = False) -> None:
+    """Draw what a view store holds: classes, counts, failures; or one object from all sides.
+
+    Args:
+        store: view store made by nextview render.
+        out: picture to make (PNG, PDF or SVG); STORE.png or OBJECT.png here if not given.
+        object: name of the object to draw instead of the whole store.
+        overwrite: replace the picture if it exists.
+    """
+    views = ViewStore.open(store)
+    out = out or Path(f"{object or store.resolve().stem}.png")
+    check_file(out, overwrite)
+    if object is not None:
+        if object not in views.names:
+            near = get_close_matches(object, views.names, 3, 0) or views.names[:3]
+            raise DatasetError(f"{store}: has no object {object!r}; there are {', '.join(near)} and others")
+        row = views.names.index(object)
+        if not views.done[row]:
+            raise DatasetError(f"{store}: {object} is not rendered ({views.failures.get(object, 'not yet')})")
+        figure = object_figure(views, row)
+    else:
+        for what, value in summary(views).items():
+            console.print(f"{what:22} {value}", soft_wrap=True)
+        for reason in views.failures.values():
+            console.print(f"left out: {reason}", style="yellow")
+        figure = store_figure(views)
+    with new_file(out, overwrite) as part:
+        figure.savefig(part, dpi=150, facecolor="white")
+    console.print(f"{out}")
+
+
+if __name__ == "__main__":
+    with orderly_end("nothing was written"):
+        tyro.cli(inspect)
