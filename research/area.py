@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.measured_view import MeasuredView
+from nextview.data.measures import MeasuredView
 from research.mesh_view import MeshView
 from research.seen_area import seen_area
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nextview.data.measured_view import MeasuredView
+from nextview.data.measures import MeasuredView
 
 BIN = 0.01
 """Width of the depth histogram's bins, object radii: a hundred across the object's radius."""

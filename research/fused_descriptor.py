@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nextview.data.measured_view import MeasuredView
+from nextview.data.measures import MeasuredView
 from research.area import bits
 
 LEVELS = 256

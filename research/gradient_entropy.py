@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, rfft2
 
-from nextview.data.measured_view import MeasuredView
+from nextview.data.measures import MeasuredView
 from research.area import bits
 
 ACCURACY = 0.1

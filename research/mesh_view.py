@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.measured_view import MeasuredView
+from nextview.data.measures import MeasuredView
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.observation import checked_pose, pinhole
 from nextview.geometry.ray_caster import embree_scene

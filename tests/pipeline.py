@@ -21,7 +21,7 @@ from onnx import TensorProto, helper, numpy_helper
 from scipy.spatial.transform import Rotation
 
 from nextview.cli.main import main
-from nextview.data.measured_view import MeasuredView
+from nextview.data.measures import MeasuredView
 from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
 from nextview.data.store import ViewStore

@@ -8,11 +8,10 @@ import pytest
 import trimesh
 from matplotlib.path import Path as Outline
 
-from nextview.data.checking import check
 from nextview.data.rendering import RenderOptions, render
 from nextview.data.scene_drawing import SPREAD, TOLERANCE, draw_scenes
 from nextview.data.scene_views import scene_views
-from nextview.data.store import PENDING, ViewStore
+from nextview.data.store import PENDING, ViewStore, check
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin

@@ -7,11 +7,10 @@ from pipeline import of_depth
 from skimage.draw import disk, polygon
 from skimage.measure import perimeter_crofton
 
-from nextview.data.checking import check
 from nextview.data.measures import find_measure
 from nextview.data.measuring import measure
 from nextview.data.rendering import Deform, RenderOptions, deformed, render
-from nextview.data.store import ViewStore
+from nextview.data.store import ViewStore, check
 from nextview.errors import DatasetError, MeasureError
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.viewsphere import ViewSphere

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from nextview.cli.progress import console, follow, track
-from nextview.data import checking, measuring, rendering, scene_drawing
+from nextview.data import measuring, rendering, scene_drawing
+from nextview.data import store as view_store
 from nextview.data.splits import some_objects
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
@@ -100,11 +101,9 @@ def check(
     """Read every object of a view store, against its checksums. Ends with status 2 if one is damaged."""
     views = ViewStore.open(store)
     done = int(views.done.sum())
-    damaged = track_all(checking.check(store, **vars(workers)), done, f"checking {store.name}")
+    damaged = track_all(view_store.check(store, **vars(workers)), done, f"checking {store.name}")
     for reason in views.failures.values():
         console.print(f"left out: {reason}", style="yellow")
-    for name, held in checking.incomplete(store).items():
-        console.print(f"{name}: of {held} of {done} objects only", style="yellow")
     missing = len(views) - done - len(views.failures)
     console.print(f"{store}: {done - len(damaged)} objects are sound, {len(damaged)} damaged, {missing} not rendered")
     if damaged:

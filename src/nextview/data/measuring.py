@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.checks import plugin_errors
-from nextview.data.measured_view import MeasuredView
-from nextview.data.measures import MEASURES, find_measure, names_of
+from nextview.data.measures import MEASURES, MeasuredView, find_measure, names_of
 from nextview.data.pool import counted
 from nextview.data.store import DEPTH_UNIT, ViewStore, opened, writing
 from nextview.errors import MeasureError

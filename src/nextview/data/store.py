@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from nextview.data.folders import Entry
+from nextview.data.pool import each
 from nextview.errors import DatasetError
 from nextview.files import decode_record, new_folder, only_one
 from nextview.geometry.depth import POINTS
@@ -358,3 +359,27 @@ def writing(path: Path) -> Iterator[None]:
         except OSError as error:
             reason = f"cannot be written ({error.strerror or error}); what is done is kept, run again to go on"
             raise DatasetError(f"{path}: {reason}") from None
+
+
+def check(path: Path, workers: int | None = None, scheduler: str | None = None) -> Iterator[tuple[str, str | None]]:
+    """Read every array of every rendered object: every chunk is there and has its checksum.
+
+    Yields:
+        (name, None) for each sound object, (name, what is wrong with it) for a damaged one.
+    """
+    store = ViewStore.open(path)
+    for name in store.rendered:
+        store.array(name)  # says what is wrong
+    objects = np.flatnonzero(store.done).tolist()
+    for i, problem in each(partial(_check_object, path.absolute()), objects, workers, scheduler):
+        yield store.names[i], None if problem is None else f"{problem}"
+
+
+def _check_object(path: Path, i: int) -> str | None:
+    store = opened(path)
+    try:
+        for name in (*store.rendered, *(name for name in store.added if store.has(name, i))):
+            store.read(name, i)
+    except DatasetError as error:
+        return str(error)
+    return None
