@@ -33,7 +33,7 @@ from nextview.learning.loop import is_first
 from nextview.learning.recipes import THESIS_RECOGNISER, Hardware, RecogniserRecipe
 from nextview.learning.recogniser_training import train_recogniser
 from nextview.session.style import ACCENT, BLUE, legend, new_figure, percent_axis, to_png
-from nextview.viewers.training_curves import draw_curves
+from research.training_curves import draw_curves
 
 TABLE, FIGURE = "grid.csv", "grid.png"
 
@@ -230,8 +230,8 @@ def main(
         hardware: on what.
     """
     table = train_grid(store, out, recipe, depths=depths, batches=batches, hardware=hardware, track=progress)
-    draw_curves(sorted(out.glob("resnet*-batch*")))
     if is_first():
+        draw_curves(sorted(out.glob("resnet*-batch*")))
         with new_file(out / FIGURE, True) as part:
             to_png(grid_figure(read_grid(table)), part)
 

@@ -41,7 +41,7 @@ from nextview.recognition.inference import MapNetwork, Recogniser
 from nextview.recognition.model_card import read_card
 from nextview.recognition.network_input import InputSpec, from_store
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.viewers.training_curves import read_log
+from research.training_curves import read_log
 
 V = 5
 SPHERE = ViewSphere((0.0, 30.0), 8, 3.0)
@@ -393,7 +393,7 @@ def test_a_network_goes_on_from_a_run(trained, views, tmp_path):
     last = torch.load(tmp_path / "lem/network.pt", weights_only=True)["resnet.fc.weight"]
     assert torch.equal(last, maps.resnet.fc.weight)  # a rate of 0 leaves the weights that it was given
     with pytest.raises(ModelError, match=r"was trained on .* objects that this network must not"):
-        train_recogniser(views, tmp_path / "seen", weights=run, recipe=SMALL, folds=2)
+        train_recogniser(views, tmp_path / "seen", weights=run, recipe=replace(SMALL, validation=0.5))
     with pytest.raises(ModelError, match="other first weights"):
         train_map(views, tmp_path / "lem", recipe=replace(SMALL_MAP, lr=0.0))
     with pytest.raises(ModelError, match=r"another recipe \(epochs was 1, not 2\)"):
@@ -406,11 +406,11 @@ def test_a_network_goes_on_from_a_run(trained, views, tmp_path):
 
 def test_the_published_networks_train_on_images_and_clouds(views, tmp_path):
     image = replace(THESIS_RECOGNISER, depth=18, epochs=1, size=32, views=1, batch=4, validation=0.25)
-    assert train_recogniser(views, tmp_path / "image", recipe=image, folds=2, fold=1) == [tmp_path / "image/fold1"]
-    run = read_run(tmp_path / "image/fold1")
+    assert train_recogniser(views, tmp_path / "image", recipe=image) == [tmp_path / "image"]
+    run = read_run(tmp_path / "image")
     assert run.recipe == asdict(image)
-    assert set(run.validation) < set(run.held_out)
-    assert torch.load(tmp_path / "image/fold1/network.pt", weights_only=True)["conv1.weight"].shape == (64, 1, 7, 7)
+    assert set(run.validation) == set(run.held_out)
+    assert torch.load(tmp_path / "image/network.pt", weights_only=True)["conv1.weight"].shape == (64, 1, 7, 7)
     cloud = replace(THESIS_MAP, epochs=1, views=1, points=64, validation=0.25)
     train_map(views, tmp_path / "cloud", recipe=cloud)
     made = export_map(tmp_path / "cloud", views, tmp_path, name="published")

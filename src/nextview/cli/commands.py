@@ -17,7 +17,7 @@ class Command:
 
 
 CLI, LEARNING = "nextview.cli", "nextview.learning"
-CURVES, THESIS = "nextview.viewers.training_curves:draw_curves", f"{LEARNING}.recipes:THESIS"
+THESIS = f"{LEARNING}.recipes:THESIS"
 EXPORTED = "{found.card}: largest difference between torch and ONNX on real views {found.difference:.2g}"
 COMMANDS = {
     "recognise": Command(f"{CLI}.recognise:recognise", "say what an object is: a mesh file, or captured views"),
@@ -39,15 +39,13 @@ COMMANDS = {
         f"{LEARNING}.recogniser_training:train_recogniser",
         "train a recogniser",
         "next: nextview export recogniser {out} {store} MODELS",
-        CURVES,
-        f"{THESIS}_RECOGNISER",
+        thesis=f"{THESIS}_RECOGNISER",
     ),
     "train map": Command(
         f"{LEARNING}.map_training:train_map",
         "train a network that predicts a measure of views",
         "next: nextview export map {out} {store} MODELS",
-        CURVES,
-        f"{THESIS}_MAP",
+        thesis=f"{THESIS}_MAP",
     ),
     "train gain": Command(
         f"{LEARNING}.gain_training:train_gain",

@@ -1,4 +1,7 @@
-"""How a training went, epoch by epoch (thesis, figure 20)."""
+"""How trainings went, epoch by epoch (thesis, figure 20): the log of each run is drawn as its curves.png.
+
+python -m research.training_curves runs/lem [runs/other ...]
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,12 @@ import csv
 from pathlib import Path
 
 import matplotlib
+import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from nextview.cli.ending import orderly_end
+from nextview.errors import ResultsError
 from nextview.files import new_file
 from nextview.session.style import ACCENT, INK, LIGHT_BLUE, STYLE, PlainFigure, to_png
 
@@ -19,8 +25,11 @@ VALIDATION = "validation_"
 
 def read_log(run: Path) -> dict[str, list[float]]:
     """The log of a training run, its columns by name, a value for every epoch."""
-    with (run / "log/metrics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    try:
+        with (run / "log/metrics.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+    except FileNotFoundError:
+        raise ResultsError(f"{run}: holds no log of a training") from None
     return {name: [float(row[name]) for row in rows] for name in rows[0]}
 
 
@@ -53,10 +62,13 @@ def training_curves(log: dict[str, list[float]]) -> Figure:
     return figure
 
 
-def draw_curves(runs: list[Path]) -> None:
+def draw_curves(runs: list[Path], /) -> None:
     """Draw the log of each run that was trained as its curves.png."""
-    from nextview.learning.loop import is_first
-
-    for run in runs if is_first() else ():  # of the processes of a training on several devices, one draws
+    for run in runs:
         with new_file(run / "curves.png", overwrite=True) as part:
             to_png(training_curves(read_log(run)), part)
+
+
+if __name__ == "__main__":
+    with orderly_end("nothing was written"):
+        tyro.cli(draw_curves)
