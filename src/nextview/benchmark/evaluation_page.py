@@ -1,15 +1,13 @@
-"""The stage that judges the models behind some predictions: a folder of numbers, figures and one HTML page."""
+"""The stage that judges the models behind some predictions: a folder of tables and one HTML page."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure
 from msgspec.structs import replace
 
@@ -19,10 +17,8 @@ from nextview.benchmark.page import numbers, origin, picture, render
 from nextview.benchmark.published import comparable_classes, published_recognisers
 from nextview.benchmark.run import chosen_split
 from nextview.data.predictions import Predictions
-from nextview.data.progress import Track, silently
 from nextview.files import check_new, new_folder, sha256_of
 from nextview.recognition.model_card import find_card, write_card
-from nextview.session.style import to_png
 
 
 @dataclass(frozen=True)
@@ -35,7 +31,7 @@ class EvaluationSettings:
             only the first; the published numbers count them all.
         cards: of the models that made the predictions; their scores are noted on these.
         samples: of the bootstrap.
-        seed: decides the bootstrap, the orders of views and the examples.
+        seed: decides the bootstrap and the orders of views.
     """
 
     split: Literal["train", "test", "val"] | None = None
@@ -51,16 +47,14 @@ def write_evaluation(
     settings: EvaluationSettings = EvaluationSettings(),
     *,
     overwrite: bool = False,
-    track: Track = silently,
 ) -> Evaluation:
     """Judge recogniser and maps on every view: accuracy, confusions, calibration, map scores, beside the published.
 
     Args:
         predictions: made by nextview predict.
-        out: folder for numbers, tables, figures and evaluate.html.
+        out: folder for tables (.csv), settings and evaluate.html.
         settings: what is judged.
         overwrite: replace the files of an earlier evaluation.
-        track: follows the writing of the figures.
 
     Raises:
         UsageError: the predictions hold several splits, and none is chosen.
@@ -82,43 +76,28 @@ def write_evaluation(
         "objects": len(p),
     }
     found = evaluate(p, settings.samples, np.random.default_rng([settings.seed, 0]))
-    figures = all_figures(found, p, np.random.default_rng([settings.seed, 1]))
-    records = {name: _records(frame) for name, frame in found.tables().items()}
-    results = {"settings": made, "left_out": found.left_out, **records}
     with new_folder(out, overwrite) as part:
         for name, frame in found.tables().items():
             frame.to_csv(part / f"{name}.csv", index=False)
-        (part / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
-        track(_draw(figures, part), len(figures), "writing figures")
-        (part / "evaluate.html").write_text(page(found, p, made, figures), encoding="utf-8")
+        notes = {"settings": made, "left_out": found.left_out}
+        (part / "evaluate.json").write_text(json.dumps(notes, indent=1) + "\n")
+        (part / "evaluate.html").write_text(page(found, p, made), encoding="utf-8")
     for path, card in noted.items():
         write_card(path.with_suffix(".json"), card)
     return found
 
 
-def _draw(figures: dict[str, Figure], folder: Path) -> Iterator[int]:
-    for done, (name, figure) in enumerate(figures.items(), 1):
-        to_png(figure, folder / f"{name}.png")
-        yield done
-
-
-def _records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    rows = frame.astype(object).to_dict("records")
-    return [{str(k): v for k, v in row.items() if v is not None and v == v} for row in rows]
-
-
-def all_figures(e: Evaluation, p: Predictions, rng: np.random.Generator) -> dict[str, Figure]:
-    """Every figure by the name of its file; the generator draws the examples."""
-    figures = {
+def _figures(e: Evaluation, p: Predictions) -> dict[str, Figure]:
+    """Every figure by its name on the page."""
+    return {
         "fusion": draw.fusion_curve(e),
         "reliability": draw.evaluated_reliability(e),
         "confusion_one_view": draw.evaluated_confusion(e, 1, p.classes),
         "confusion_all_views": draw.evaluated_confusion(e, len(p.sphere), p.classes),
     }
-    return figures | {f"{name}_examples": draw.example_maps(p, name, rng) for name in e.maps["map"].unique()}
 
 
-def page(e: Evaluation, p: Predictions, settings: dict[str, Any], figures: dict[str, Figure]) -> str:
+def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
     """The whole page as text."""
     v, curve, c = len(p.sphere), e.fusion.set_index("n_views"), p.calibration
     counts = e.accuracy.query("n_views == 1 and measure == 'accuracy' and label != ''").set_index("label")["objects"]
@@ -139,7 +118,7 @@ def page(e: Evaluation, p: Predictions, settings: dict[str, Any], figures: dict[
         bins=", ".join(f"{curve.calibration_error[k]:.3f} after {k}" for k in e.reliability["n_views"].unique()),
         maps={kind: numbers(rows, "by", "label", "measure") for kind, rows in e.maps.groupby("map", sort=False)},
         baselines=[by for by in e.maps["by"].unique() if by != "network"],
-        figures={name: picture(figure) for name, figure in figures.items()},
+        figures={name: picture(figure) for name, figure in _figures(e, p).items()},
         left_out=e.left_out,
         made=made,
     )

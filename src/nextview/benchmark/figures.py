@@ -5,22 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from nextview.benchmark.entries import is_oracle
-from nextview.benchmark.evaluation import Evaluation, judged_objects
+from nextview.benchmark.evaluation import Evaluation
 from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold
 from nextview.benchmark.page import words
 from nextview.benchmark.run import Results
-from nextview.benchmark.true_maps import true_map
-from nextview.data.predictions import Predictions
 from nextview.recognition.map_names import LCM, LEM
-from nextview.session import style
 from nextview.session.style import ACCENT, BLUE, GREY, INK, LIGHT_BLUE, legend, new_figure, percent_axis
 
 COLOURS = {
@@ -33,10 +28,6 @@ OWN = ("#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff704
 """For all others, in turn."""
 MOST = 8
 """Curves of policies that a robot could follow, at most."""
-EXAMPLES, ROWS = 5, 12
-"""Examples of maps of each class, from the best to the worst, and classes at most."""
-TRUE_PEAK: dict[str, Any] = {"marker": "o", "color": "white", "markeredgecolor": INK, "markersize": 6.5}
-PREDICTED_PEAK: dict[str, Any] = {"marker": "x", "color": ACCENT, "markeredgewidth": 1.8, "markersize": 5}
 
 
 def ceiling(results: Results) -> list[str]:
@@ -199,43 +190,3 @@ def evaluated_reliability(e: Evaluation) -> Figure:
     for (n, rows), colour in zip(e.reliability.groupby("n_views"), ("#7cc4ec", LIGHT_BLUE, BLUE, INK), strict=False):
         curves[f"{n} view{'s' * (n > 1)}  {errors[n]:.3f}"] = rows, {"color": colour}
     return _reliability(curves, "in the answer", "calibration error")
-
-
-def example_maps(p: Predictions, name: str, rng: np.random.Generator) -> Figure:
-    """True maps (left) beside predicted ones (thesis, figures 25 to 28), a row a class, from the best to the worst.
-
-    One random view of every object is drawn; those shown stand at equal steps of its squared error. Of many classes,
-    those shown stand at equal steps of the class's mean error.
-    """
-    kept = judged_objects(p, name)
-    view, labels = rng.integers(len(p.sphere), size=len(kept)), p.labels[kept]
-    true, predicted = true_map(p, name)[kept, view], p.maps[name][kept, view]
-    error = ((true.astype(np.float64) - predicted) ** 2).mean((1, 2))
-    classes = np.unique(labels)
-    order = np.argsort([error[labels == index].mean() for index in classes], kind="stable")
-    classes = classes[np.sort(order[_steps(len(classes), ROWS)])]
-    gap = np.full((true.shape[1], 1), np.nan)
-    with matplotlib.rc_context(style.STYLE):
-        figure = style.PlainFigure((9.6, 0.6 + 1.3 * len(classes)))
-        grid = figure.subplots(len(classes), EXAMPLES, squeeze=False, gridspec_kw={"hspace": 0.35, "wspace": 0.12})
-    for axes in grid.flat:
-        axes.set_axis_off()
-    for row, index in zip(grid, classes, strict=True):
-        row[0].text(-0.1, 0.5, words(p.classes[index]), ha="right", va="center", transform=row[0].transAxes)
-        here = np.flatnonzero(labels == index)
-        here = here[np.argsort(error[here], kind="stable")]
-        for axes, at in zip(row, here[_steps(len(here), EXAMPLES)], strict=False):
-            pair = np.hstack([true[at], gap, predicted[at]])
-            axes.imshow(pair, cmap="viridis", vmin=0, vmax=1, origin="lower", aspect="auto")
-            for values, look in ((true[at], TRUE_PEAK), (predicted[at], PREDICTED_PEAK)):
-                ring, column = np.unravel_index(values.argmax(), values.shape)
-                axes.plot([column, column + values.shape[1] + 1], [ring, ring], linestyle="", **look)
-            thing = p.names[kept[at]].removeprefix(p.classes[index]).strip("_") or p.names[kept[at]]
-            axes.set_title(f"{thing[-12:]} view {view[at]}: {error[at]:.3f}", fontsize=7.5)
-    marks = [Line2D([], [], linestyle="", **look) for look in (TRUE_PEAK, PREDICTED_PEAK)]
-    figure.legend(marks, ["true peak", "predicted peak"], loc="upper right", ncols=2, bbox_to_anchor=(0.9, 1))
-    return figure
-
-
-def _steps(n: int, most: int) -> NDArray[np.int64]:
-    return np.unique(np.rint(np.linspace(0, n - 1, min(n, most))).astype(np.int64))

@@ -92,7 +92,7 @@ COMMANDS = {
     "evaluate": Command(
         "nextview.benchmark.evaluation_page:write_evaluation",
         "judge a recogniser and its maps on every view",
-        "numbers, figures and evaluate.html are in {out}",
+        "tables and evaluate.html are in {out}",
         f"{CLI}.leaderboard_table:print_evaluation",
     ),
     "benchmark": Command(

@@ -105,53 +105,24 @@ def _risks(risks: list[Any]) -> Table:
 
 
 def print_evaluation(found: Evaluation) -> None:
-    """Print the scores of the recogniser and of each map."""
-    console = Terminal()
-    console.print(_recogniser_table(found))
-    for name in found.maps["map"].unique():
-        console.print(_map_table(found, name))
+    """Print how often the recogniser is right, and how good each map is; its page says more."""
+    console, right = Terminal(), numbers(found.accuracy, "n_views", "label", "measure")
+    views = int(found.accuracy["n_views"].max())
+    lines = {"mean of objects": "accuracy", "without duplicates": "clean_accuracy", "size not known": "shape_accuracy"}
+    shown = Table("share of right answers", "one view", f"all {views} views")
+    for heading, measure in (lines | {"mean of classes": "class_accuracy"}).items():
+        if (1, "", measure) in right:
+            shown.add_row(heading, *(_cell(right[n_views, "", measure], 3) for n_views in (1, views)))
+    console.print(shown)
+    headings = {"mse": "MSE", "d0": "d = 0", "d_le_1": "d <= 1", "d_lt_2": "d < 2", "regret": "regret"}
+    maps = found.maps[(found.maps["by"] == "network") & (found.maps["label"] == "")]
+    scores, shown = numbers(maps, "map", "measure"), Table("mean of objects", *headings.values())
+    for name in maps["map"].unique():
+        shown.add_row(name.upper(), *(_cell(scores[name, each], 4 if each == "mse" else 3) for each in headings))
+    if len(maps):
+        console.print(shown)
     for name, why in found.left_out.items():
         console.print(f"{name}: {why}")
-
-
-def _recogniser_table(found: Evaluation) -> Table:
-    """Accuracy of each class and of all, from one view and from all views fused."""
-    views = int(found.accuracy["n_views"].max())
-    shown = Table("share of right answers", "objects", "one view", f"all {views} views")
-    right = numbers(found.accuracy, "n_views", "label", "measure")
-    objects = found.accuracy.groupby(["label", "measure"])["objects"].first()
-    labels = [label for label in found.accuracy["label"].unique() if label]
-    lines = [(label.replace("_", " "), label, "accuracy") for label in labels]
-    lines += [("mean of classes", "", "class_accuracy"), ("mean of objects", "", "accuracy")]
-    lines += [("  without duplicates", "", "clean_accuracy")]
-    if "shape_accuracy" in set(found.accuracy["measure"]):
-        lines += [("  size not known", "", "shape_accuracy")]
-    for heading, label, measure in lines:
-        cells = (_cell(right[n_views, label, measure], 3) for n_views in (1, views))
-        shown.add_row(heading, str(objects[label, measure]), *cells, end_section=label == labels[-1])
-    published = right[1, "", "accuracy"].published
-    if isfinite(published):
-        shown.add_row("  published", "", f"{published:.3f}")
-    return shown
-
-
-def _map_table(found: Evaluation, name: str) -> Table:
-    """Scores of a map over objects and classes, beside the published ones and the baselines."""
-    measures = {"mse": "MSE", "d0": "d = 0", "d_le_1": "d <= 1", "d_lt_2": "d < 2", "regret": "regret"}
-    scores = numbers(found.maps[(found.maps["map"] == name) & (found.maps["label"] == "")], "by", "measure")
-    baselines = [by for by in found.maps["by"].unique() if by != "network"]
-    printed = any(isfinite(score.published) for score in scores.values())
-    caption = "published: squared error over objects, peaks over classes (table 4)" if printed else None
-    shown = Table(name.upper(), "mean of objects", "of classes", "published", *baselines, caption=caption)
-    shown.columns[1].no_wrap = True
-    for measure, heading in measures.items():
-        digits = 4 if measure == "mse" else 3
-        over_objects, over_classes = scores["network", measure], scores["network", f"class_{measure}"]
-        published = over_objects.published if measure == "mse" else over_classes.published
-        rest = [over_classes.value, published, *(scores[by, measure].value for by in baselines)]
-        cells = (f"{value:.{digits}f}" if isfinite(value) else "-" for value in rest)
-        shown.add_row(heading, _cell(over_objects, digits), *cells)
-    return shown
 
 
 def _cell(number: Number, digits: int) -> Text:
