@@ -91,15 +91,7 @@ def predict(
 
 def _asked(store: ViewStore, recogniser: ModelCard, split: str | None, held_out: bool) -> NDArray[np.int64]:
     """The objects to predict, rows of the store."""
-    objects = some_objects(store, split)
-    if held_out:
-        if not recogniser.held_out:
-            raise DatasetError(f"recogniser {recogniser.name} does not name what was held out from its training")
-        targets = np.array([name.partition("@")[0] for name in store.names])  # in scenes; all of the name for others
-        held = np.isin(store.names, recogniser.held_out) | np.isin(targets, recogniser.held_out)
-        objects = objects[held[objects]]
-    if len(objects) == 0:
-        raise DatasetError(f"{store.path}: holds no object that was held out from the training of the recogniser")
+    objects = some_objects(store, split, recogniser if held_out else None)
     unknown = sorted({store.classes[label] for label in store.labels[objects]} - set(recogniser.classes))
     if unknown:
         raise DatasetError(f"{store.path}: recogniser {recogniser.name} does not know the class {unknown[0]!r}")

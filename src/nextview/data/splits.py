@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nextview.checks import whole
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
-from nextview.recognition.model_card import find_card
+from nextview.recognition.model_card import ModelCard, find_card
 
 
 def duplicate_groups(measured: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -76,14 +76,16 @@ def sample(objects: NDArray[np.int64], count: int | None = None) -> NDArray[np.i
 
 
 def some_objects(
-    store: ViewStore, split: str | None = None, held_out: str | Path | None = None, count: int | None = None
+    store: ViewStore, split: str | None = None, held_out: ModelCard | str | Path | None = None, count: int | None = None
 ) -> NDArray[np.int64]:
     """Indices of the rendered objects of a store that are asked for, sorted."""
     chosen = store.done & (True if split is None else store.splits == split)
+    of = "" if split is None else f" of the split {split!r}"
     if held_out is not None:
+        card = held_out if isinstance(held_out, ModelCard) else find_card(held_out)
         targets = [name.partition("@")[0] for name in store.names]  # in scenes; all of the name for others
-        chosen &= np.isin(targets, find_card(held_out).held_out)
+        chosen &= np.isin(targets, card.held_out) | np.isin(store.names, card.held_out)
+        of += f" that {card.name} calls held out"
     if not chosen.any():
-        of = (f" of the split {split!r}" if split else "") + (f" that {held_out} calls held out" if held_out else "")
         raise DatasetError(f"{store.path}: holds no rendered object{of}")
     return sample(np.flatnonzero(chosen), count)
