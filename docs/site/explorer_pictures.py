@@ -34,7 +34,6 @@ def shoot(browser: Browser, page: Page, views: int, path: Path) -> None:
             tab.wait_for_timeout(100)
     tab.locator(".mantine-Notification-closeButton").first.click()  # it draws in software: that is meant so
     tab.mouse.move(660, 800)  # away from the button
-    page._took.clear()  # how long it took tells of this machine
     page._draw()
     tab.wait_for_timeout(SETTLES)
     tab.screenshot(path=path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from html import escape
 from io import BytesIO
 
@@ -58,22 +58,10 @@ def class_card(label: str) -> str:
     return f'{STYLE}<div class="nv">Its class is <b>{escape(label)}</b>; no policy knows.</div>'
 
 
-def gallery(pictures: Mapping[str, NDArray[np.uint8]]) -> str:
-    """Small pictures in a row, with their names."""
-    width = 225 // max(len(pictures), 3)
-    shown = [(name, _image(image, width)) for name, image in pictures.items()]
-    return f'{STYLE}<div class="nv">{_row(shown)}</div>'
-
-
 def _image(pixels: NDArray[np.uint8], width: int) -> str:
     file = BytesIO()
     Image.fromarray(pixels).save(file, "png")
     return f'<img width="{width}" src="data:image/png;base64,{b64encode(file.getvalue()).decode()}">'
-
-
-def _row(pictures: list[tuple[str, str]]) -> str:
-    """Pictures, as HTML, with what stands below each."""
-    return "".join(f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>" for below, image in pictures)
 
 
 def _figures(walk: Walk, view: View) -> str:
@@ -87,7 +75,7 @@ def _figures(walk: Walk, view: View) -> str:
         grid = view.values.reshape(walk.sphere.rings, walk.sphere.azimuths)
         order = np.argsort(walk.sphere.elevations)[::-1]
         found.append(("value of each view", _image(heat(grid[order]), CELL * grid.shape[1])))
-    return _row(found)
+    return "".join(f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>" for below, image in found)
 
 
 def _table(rows: Iterable[Iterable[str]]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -16,10 +15,10 @@ from nextview.checks import whole
 from nextview.data.folders import list_dataset
 from nextview.data.samples import SAMPLES, sample_mesh
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, NextviewError, UsageError
+from nextview.errors import DatasetError, UsageError
 from nextview.geometry.mesh import FORMATS, Mesh, load_mesh
 from nextview.geometry.observation import Camera, Observation
-from nextview.geometry.viewsphere import direction_of, level_pose, look_at_origin
+from nextview.geometry.viewsphere import direction_of, level_pose
 from nextview.recognition.belief import FixedLength
 from nextview.session.session import Session
 from nextview.session.system import System, load, simulated
@@ -212,15 +211,6 @@ class Exploration:
         for walk in walks:
             walk.step()
         return bool(walks)
-
-    def pictures(self) -> dict[str, NDArray[np.uint8]]:
-        """Each object by name as seen from 20 degrees up, (H, W) uint8; without those that cannot be opened."""
-        found = {}
-        for name, shown in self.objects.items():
-            with suppress(NextviewError):  # the page shows it when the object is chosen
-                camera = self._camera(shown.open())
-                found[name] = camera.observe(look_at_origin(np.radians(20), np.radians(40))).picture
-        return found
 
     def preview(self, where: Float) -> Observation:
         """What would be seen from a position, (3,), object radii, without noise; nothing is taken."""

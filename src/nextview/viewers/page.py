@@ -18,14 +18,12 @@ from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import map_policy_names, policy_names
 from nextview.recognition.model_card import find_models
 from nextview.simulation.sensor import SENSORS
-from nextview.viewers.card import class_card, gallery, preview_card, walk_card
+from nextview.viewers.card import class_card, preview_card, walk_card
 from nextview.viewers.exploration import Exploration
 from nextview.viewers.server import serve
 from nextview.viewers.walk_scene import WalkScene
 
 NOTHING, CLEAN = "nothing", "clean renders"
-GALLERY = 6
-"""As many objects are shown as pictures; more as a list."""
 APART = 8.5
 """Between two objects side by side, object radii."""
 PAUSE = 0.5
@@ -70,11 +68,6 @@ class Page:
         gui.main_panel.dock_left()
         gui.add_markdown(HELP)
         self._object = gui.add_dropdown("Object", list(exploration.objects), initial_value=exploration.shown.name)
-        if len(exploration.objects) <= GALLERY:
-            self._object.visible = False
-            gui.add_html(gallery(exploration.pictures()))
-            names = gui.add_button_group("Object", list(exploration.objects))
-            names.on_click(lambda event: setattr(self._object, "value", names.value))
         self._label = gui.add_html("")  # and no Markdown: viser would take a name for HTML
         self._policy = gui.add_dropdown("Policy", policies, initial_value=exploration.policies[0])
         self._second = gui.add_dropdown("Compare with", self._policies, initial_value=second)
