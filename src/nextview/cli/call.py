@@ -5,10 +5,8 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import is_dataclass
 from importlib import import_module
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
@@ -39,7 +37,7 @@ def call(name: str, command: Command, arguments: Sequence[str], track: Callable[
     signature, hints = inspect.signature(function), get_type_hints(function, include_extras=True)
     parameters = []
     for parameter in signature.parameters.values():
-        kind = _none_first(hints[parameter.name])
+        kind = hints[parameter.name]
         if text := _comments(function).get(parameter.name):
             kind = Annotated[kind, tyro.conf.arg(help=text)]
         if parameter.name != "track":
@@ -62,16 +60,6 @@ def call(name: str, command: Command, arguments: Sequence[str], track: Callable[
     text = inspect.cleandoc(function.__doc__ or "").replace("``", "")
     run.__doc__ = re.sub(r"(?<=\S)\n(?: {8,})?(?=\S)", " ", text)  # a paragraph a line: tyro would keep where lines end
     return tyro.cli(run, prog=f"nextview {name}", args=arguments, config=CONFIG), called
-
-
-def _none_first(kind: Any) -> Any:
-    """A type whose unions begin with None: tyro checks those without typeguard, whose import takes 50 ms."""
-    if is_dataclass(kind):
-        hints = get_type_hints(kind, include_extras=True)
-        kind.__annotations__ = {name: _none_first(each) for name, each in hints.items()}
-    elif isinstance(kind, UnionType) or get_origin(kind) is Union:
-        kind = Union[tuple(sorted(get_args(kind), key=lambda each: each is not NoneType))]  # noqa: UP007
-    return kind
 
 
 def _comments(function: Callable[..., Any]) -> dict[str, str]:
