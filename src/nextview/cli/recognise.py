@@ -92,27 +92,16 @@ def show(camera: Any, name: str, system: System, output: Output, start: int | No
             result.plot(part, name)
 
 
-@dataclass(frozen=True)
-class Captured:
-    """How it is captured."""
-
-    table: bool = False  # the object stands on a table, which is seen too
-    masks: bool = False  # write masks of the object also with --table. Without a table they are always written
-    radius: float | None = None  # object radius, metres, if the file's unit does not tell
-    distance: float = 3.0  # of the camera from the object's centre, object radii
-    jitter: float = 0.0  # standard deviation of the camera's direction from the viewpoint's, degrees
-
-
 def capture(
     mesh: Path,  # OFF, OBJ, PLY, STL or GLB file of one object that stands upright
     folder: Path,  # to write, in the layout of the BOP challenge; whole or not there at all
     /,
     viewpoints: Literal["40", "12"] = "40",  # from where it is captured, as in nextview recognise
-    captured: Captured = Captured(),
+    table: bool = False,  # the object stands on a table, which is seen too; without one, masks are written
+    radius: float | None = None,  # object radius, metres, if the file's unit does not tell
     up: Literal["y", "z"] | None = None,  # the file's up axis; z if not given, but y for GLB
     unit: Unit | None = None,  # the file's unit of length
     max_faces: int = MAX_FACES,  # refuse a mesh of more triangles, or a file of more than 60 bytes for each of these
-    seed: int = 0,  # decides the jitter
     overwrite: bool = False,  # replace the files of an earlier capture
 ) -> None:
     """Write captured views of a mesh: depth images, poses, intrinsics, as ``nextview recognise FOLDER`` reads them."""
@@ -120,11 +109,10 @@ def capture(
 
     check_new(folder, overwrite, folder=True)
     loaded = load_mesh(mesh, up, unit, max_faces)
-    metres = loaded.metres if captured.radius is None else captured.radius
+    metres = loaded.metres if radius is None else radius
     if metres is None:
         raise UsageError(f"{mesh}: how large is it? Give the file's --unit or the object's --radius in metres")
-    table, sphere = captured.table, ViewSphere.named(viewpoints)
-    setting = Setting(metres, captured.distance, table, captured.masks or not table, captured.jitter)
-    frames = write_capture(loaded, folder, sphere, setting, np.random.default_rng(seed), overwrite)
+    sphere, setting = ViewSphere.named(viewpoints), Setting(metres, table=table, masks=not table)
+    frames = write_capture(loaded, folder, sphere, setting, np.random.default_rng(0), overwrite)
     track(frames, len(sphere), f"capturing {mesh.name}")
     console.print(f"{folder}: {len(sphere)} views; look at them with: nextview recognise {folder}")
