@@ -89,9 +89,9 @@ def test_pictures_come_from_the_store_of_the_predictions_while_it_is_the_same(ma
     other = p.depth_entropy.copy()
     other[3, 5] += 0.5
     for change, why in (
-        ({"store": str(tmp_path / "gone.zarr")}, "no view store at"),
-        ({"store": ""}, "do not name"),
-        ({"depth_entropy": other}, "has changed"),
+        ({"store": str(tmp_path / "gone.zarr")}, "gone.zarr: "),
+        ({"store": ""}, "do not say which view store"),
+        ({"depth_entropy": other}, "holds other views"),
     ):
         store, why_not = pictures_of(replace(p, **change))
         assert store is None

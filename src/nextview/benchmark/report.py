@@ -20,10 +20,11 @@ from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.page import numbers, origin, picture, render
 from nextview.benchmark.published import COLUMNS, published_threshold
 from nextview.benchmark.run import Results, load
+from nextview.benchmark.true_maps import stored_rows
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import scene_views
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, ResultsError
+from nextview.errors import EntryError, ResultsError
 from nextview.files import check_new, new_file
 from nextview.geometry.depth import headlight
 from nextview.policies.registry import DEFAULT
@@ -180,18 +181,11 @@ def pictures_of(predictions: Predictions, store: Path | None = None) -> tuple[Vi
         if given.sphere != predictions.sphere or not set(given.names) & set(predictions.names):
             raise ResultsError(f"{store}: holds no views of these objects from these viewpoints")
         return given, ""
-    remedy = "give it with --store"
-    if not predictions.store:
-        return None, f"No pictures: the predictions do not name the view store they were made from; {remedy}."
     try:
-        named = ViewStore.open(predictions.store)
-        row = {name: i for i, name in enumerate(named.names)}
-        rows = [row.get(name, -1) for name in predictions.names]
-        same = named.sphere == predictions.sphere and -1 not in rows
-        same = same and np.array_equal(named.measure()[rows], predictions.depth_entropy)
-    except DatasetError:
-        return None, f"No pictures: there is no view store at {predictions.store} any more; {remedy}."
-    return (named, "") if same else (None, f"No pictures: the view store {predictions.store} has changed; {remedy}.")
+        stored_rows(predictions, "measures/depth_entropy")  # which tells whether it is the same store
+    except EntryError as error:
+        return None, f"No pictures: {error}; give their view store with --store."
+    return ViewStore.open(predictions.store), ""
 
 
 def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
