@@ -20,7 +20,6 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning import card_fits as calibration
 from nextview.learning.card_fits import error_bound, fit_calibration, fit_risk, fit_temperature, loss, valley_gains
 from nextview.learning.fitting_set import FittingSet, blind_walks, card_to_fit, fitting_set
-from nextview.learning.policy_tables import fit_class_table, fit_policies, fit_ring, fit_sequence
 from nextview.learning.unknown import FAMILIES, fit_novelty, fit_unknown, synthetic_outlier
 from nextview.policies.baselines import Random
 from nextview.policies.learned_tables import ClassTable, cells_from, cells_to
@@ -28,6 +27,7 @@ from nextview.policies.registry import make_policy
 from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.inference import Recogniser
 from nextview.recognition.model_card import read_card
+from research.fit_policies import fit_class_table, fit_policies, fit_ring, fit_sequence
 
 SPHERE = ViewSphere.named("40")
 SMALL = ViewSphere((0.0, 30.0, 60.0), 4)

@@ -13,7 +13,7 @@ from nextview.cli.main import main
 from nextview.data.predictions import Predictions
 
 SAMPLE = str(Path(__file__).parent.parent / "samples/chair.off")
-FITS = {name for name in COMMANDS if name.startswith("fit ")} - {"fit policies"}
+FITS = {name for name in COMMANDS if name.startswith("fit ")}
 GAIN = "--walks 1 --networks 1 --inputs belief view"
 SMALL = "--size 32 --epochs 1 --views 2 --batch 8 --validation 0.3"
 WRITES = {
@@ -24,7 +24,7 @@ WRITES = {
     "scenes": ("scenes {furniture}", "folder", "--scenes 1 --level light --split test --workers 0"),
     "render": ("render {furniture}", "v.zarr", "--viewpoints 12 --size 16 --split test --workers 0"),
     "predict": ("predict {views}", "p.npz", "--models {models} --maps lem --split test --workers 0"),
-    "fit policies": ("fit policies {training}", "folder", "--validation 1 --length 2 --n-views 2"),
+    "learn": (f"learn {Path(SAMPLE).parent}", "folder", "--upright --workers 0"),
     "evaluate": ("evaluate {predictions}", "folder", "--split test --samples 10"),
     "benchmark": ("benchmark {predictions}", "folder", "--split test --runs 1 --samples 10 --policies random"),
     "report": ("report {results}/out", "r.html"),
@@ -33,8 +33,6 @@ WRITES = {
     "train map": ("train map {views}", "folder", SMALL),
 }
 """Arguments before the output, the name of the output, and arguments after it."""
-FILES = {"fit policies"}
-"""They put files of their own into a folder, which may hold others."""
 OWN_ONLY = {"scenes", "render", "train recogniser", "train map"}
 """They go on with an unfinished output of their own, and replace no folder of anything else."""
 
@@ -72,7 +70,7 @@ def test_what_exists_is_refused_and_overwritten_on_demand_only(name, made, tmp_p
     tops = {path.relative_to(tmp_path).parts[0] for path in tmp_path.iterdir()}
     assert all(top.startswith(Path(out).stem) for top in tops), tops  # nothing else is left, no lock either
 
-    folder = (tmp_path / out).is_dir() and name not in FILES
+    folder = (tmp_path / out).is_dir()
     mine = dict.fromkeys(written, b"mine") if not folder else {tmp_path / out / "mine.txt": b"mine"}
     for path in tmp_path.iterdir():
         shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -77,11 +77,13 @@ def test_bundled_models_are_what_their_cards_say():
     cards = bundled_cards()
     assert {card.kind for card in cards.values()} >= {"recogniser", "lem"}
     assert {path.suffix for path in BUNDLED.iterdir()} <= {".onnx", ".json", ".safetensors"}  # nothing that is pickled
-    assert sum(card.path.stat().st_size for card in cards.values()) < 60e6
+    assert sum(card.path.stat().st_size for card in cards.values()) < 90e6
     for card in cards.values():
         training = card.training
         assert training.data
         assert training.commands
+        if card.kind == "features" or card.memory is not None:
+            continue
         assert training.recipes
         judged = [of.split(" (")[0] for of in card.scores]
         assert judged == (["validation", "test", "test"] if card.size else ["validation", "test"])

@@ -79,12 +79,17 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
     result = snakemake(tmp_path, "-n", "-p", config=(f"data={tmp_path / 'ModelNet10'}",))
     assert result.returncode == 0, result.stdout + result.stderr
     planned = result.stdout + result.stderr
-    for card in (BUNDLED / "recognition/bundled").glob("*.json"):
+    for card in (BUNDLED / "recognition/bundled").glob("*-modelnet10.json"):
         assert f"--name {card.stem}" in planned or f"{card.stem.partition('-')[0]} runs/" in planned
     for command in ("render ModelNet10 sensed-held-out.zarr --sensor mix", "fit calibration", "fit size", "fit valleys",
-                    "fit policies", "train gain", "evaluate", "benchmark", "report"):  # fmt: skip
+                    "train gain", "evaluate", "benchmark", "report"):  # fmt: skip
         assert f"nextview {command} " in planned
-    for script in ("measure views.zarr", "train_agent ppo validation.npz", "plan views.zarr volumetric coverage"):
+    for script in (
+        "fit_policies validation.npz policies",
+        "measure views.zarr",
+        "train_agent ppo validation.npz",
+        "plan views.zarr volumetric coverage",
+    ):
         assert f"python -m research.{script}" in planned
     assert "research.measure_study test.npz validation.npz --out measures" in planned
     assert "docs/results.md" in planned
@@ -107,7 +112,7 @@ def test_a_small_run_of_the_whole_graph(tmp_path):
     assert "| one view, all objects | " in page
     assert f"{float(alone[4]):.3f} (" in page
     assert (tmp_path / "docs/images/front.png").stat().st_size > 10_000
-    for card in (BUNDLED / "recognition/bundled").glob("*.json"):
+    for card in (BUNDLED / "recognition/bundled").glob("*-modelnet10.json"):
         assert (tmp_path / "landed" / card.name).exists()
     again = snakemake(tmp_path, *small, "-n", config=("data=",))
     assert "Nothing to be done" in again.stdout + again.stderr

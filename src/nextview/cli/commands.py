@@ -84,11 +84,6 @@ COMMANDS = {
         "find classes whose best views are a map's valleys",
         "{found.objects} objects: the valley is better for these classes: {found.classes}",
     ),
-    "fit policies": Command(
-        f"{LEARNING}.policy_tables:fit_policies",
-        "learn simple policies: sequence, ring, class table",
-        "{found.objects} objects: run one with --policy {out}/NAME.json",
-    ),
     "evaluate": Command(
         "nextview.benchmark.evaluation_page:write_evaluation",
         "judge a recogniser and its maps on every view",

@@ -1,4 +1,7 @@
-"""The tables of ``nextview.policies.learned_tables``: those after whose views the true class is believed most."""
+"""Learn the tables of ``nextview.policies.learned_tables``: those after whose views the true class is believed most.
+
+python -m research.fit_policies predictions.npz policies [--validation 1] [--travel-weight 0.01] ...
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,10 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 
+from nextview.cli.ending import orderly_end
 from nextview.data.predictions import Predictions
 from nextview.errors import UsageError
 from nextview.files import check_new, command, sha256_of
@@ -176,3 +181,9 @@ def fit_class_table(
     # A cell is met once in so many views of a walk: what one object weighs in the sums over all walks.
     met = walks * (min(n_views, len(sphere)) - 1) / sphere.rings
     return (gains + shrinkage * met * shared) / np.maximum(weight + shrinkage * met, 1e-12)
+
+
+if __name__ == "__main__":
+    with orderly_end("nothing was written"):
+        found = tyro.cli(fit_policies, config=(tyro.conf.PositionalRequiredArgs,))
+        print(f"{found.objects} objects: run one of these with --policy: {', '.join(map(str, found.cards))}")
