@@ -11,6 +11,7 @@ from nextview.recognition.model_card import ModelCard, bundled_cards
 
 USE = {
     "recogniser": "Names the object in the depth image of a view; the evidence of several is fused into a belief.",
+    "features": "Turns a view into 256 numbers that alike views share; taught things are remembered by them.",
     "lem": "Predicts the depth entropy of the views around the current one (local-depth-entropy map).",
     "lcm": "Predicts the recogniser's confidence in the views around the current one (local confidence map).",
     "gain": "Values every candidate view by what it is expected to add to the belief, less its weighted travel.",
@@ -60,11 +61,14 @@ def _model_page(card: ModelCard) -> str:
             "temperature of one view": f"{card.calibration.temperature:g}",
             "correlation of two views": f"{card.calibration.correlation:g}",
         }
-    else:
+    elif card.kind != "features":
         facts |= {"output": card.output, "valley classes": ", ".join(card.valley_classes) or "none"}
     parts = [f"# {card.name}", USE[card.kind], card.note, _table(facts)]
     parts += ["## Scores", _table(dict(_scores(card.scores)), ("measured on", ""))]
-    parts += ["## Limits", LIMITS, "## How it was made", _shell(card.training.commands)]
+    if card.memory is not None:
+        parts += ["## Attribution", card.memory.attribution]
+    limits = ["## Limits", LIMITS] if card.memory is None and card.kind != "features" else []
+    parts += [*limits, "## How it was made", _shell(card.training.commands)]
     for k, recipe in enumerate(card.training.recipes, 1):
         parts += [f"Recipe {k}:", _table(recipe, ("option", "value"))]
     return "\n\n".join(filter(None, parts)) + "\n"
