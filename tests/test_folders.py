@@ -66,4 +66,6 @@ def test_meshes_of_one_name_in_one_place_are_refused(tmp_path):
     with pytest.raises(DatasetError, match="no such folder"):
         list_dataset(tmp_path / "nowhere")
     with pytest.raises(DatasetError, match="no meshes in CLASS/NAME"):
-        list_dataset(meshes(tmp_path / "flat", "a.off"))
+        list_dataset(meshes(tmp_path / "empty", "notes.txt"))
+    flat = list_dataset(meshes(tmp_path / "flat", "a.off", "b.off"))  # each is a class of its own
+    assert [(entry.label, entry.name) for entry in flat] == [("a", "a"), ("b", "b")]

@@ -21,9 +21,10 @@ CLASSES = [f"class{k}" for k in range(10)]
 
 def test_cards_are_read_as_they_were_written(tmp_path):
     (tmp_path / "card.onnx").touch()
+    (tmp_path / "card.safetensors").touch()
     for card in bundled_cards().values():
         write_card(tmp_path / "card.json", card)
-        assert read_card(tmp_path / "card.json") == replace(card, path=tmp_path / "card.onnx")
+        assert read_card(tmp_path / "card.json") == replace(card, path=tmp_path / f"card{card.path.suffix}")
 
 
 def change(path, **values):
@@ -31,7 +32,7 @@ def change(path, **values):
 
 
 def test_a_model_that_is_not_there():
-    with pytest.raises(ModelError, match="no bundled model is called 'resnet'; there are lcm-"):
+    with pytest.raises(ModelError, match="no bundled model is called 'resnet'; there are features, lcm-"):
         find_card("resnet")
     with pytest.raises(ModelError, match=r"gone\.json: no such file"):
         find_card("gone.json")

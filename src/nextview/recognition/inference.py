@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import onnxruntime as ort
@@ -142,7 +142,7 @@ class Recogniser:
         """
         names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins) + [FEATURES_OUTPUT] * (self.novelty is not None)
         outputs = dict(zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True))
-        novelty = self.novelty.scores(outputs[FEATURES_OUTPUT]) if isinstance(self.novelty, Novelty) else None
+        novelty = None if self.novelty is None else cast(Novelty, self.novelty).scores(outputs[FEATURES_OUTPUT])
         return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT), novelty=novelty)
 
     def features(self, inputs: NDArray[Any]) -> NDArray[np.float32]:

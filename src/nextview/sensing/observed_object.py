@@ -221,8 +221,8 @@ class ObservedObject:
             mask = frame.mask
             if self.known is None:  # else its size does not hang on pixels at the edge
                 mask = trimmed(frame.depth, mask)
-                if plane is not None:
-                    mask &= segmentation.above_plane(frame, plane, noise)
+                above = mask if plane is None else mask & segmentation.above_plane(frame, plane, noise)
+                mask = above if 2 * above.sum() > mask.sum() else mask  # a plane may lie above what is hidden or flat
         elif self.known is not None:
             if self.box is not None:
                 mask = segmentation.inside_box(frame, self.box)
