@@ -142,11 +142,7 @@ def fit_facets(
     noise, grain, wanted = 0.0, 1, usable
     if denoise:
         if usable.any():
-            few, typical = slice(None, None, max(1, h // ROWS)), float(np.median(depth[usable]))
-            measured = estimate_noise(depth[few], usable[few])
-            if frame_noise is not None and measured.at(typical) >= frame_noise.at(typical):
-                measured = frame_noise
-            noise, grain = float(measured.at(typical)), measured.grain
+            noise, grain = _typical_noise(depth, usable, frame_noise)
         usable = drop_flying(depth, usable, noise, 1 / focal.mean())
         near = ndimage.maximum_filter(usable, 5, mode="constant")
         closed = ~ndimage.maximum_filter(~near, 5, mode="constant", cval=0)
@@ -184,6 +180,15 @@ def fit_facets(
     half = (coarse - 1) // 2
     rows, columns = corner[0] + coarse * rows + half, corner[1] + coarse * columns + half
     return Facets(planes[good], rays[good], rows[good], columns[good], pitch)
+
+
+def _typical_noise(depth: NDArray[np.float32], usable: Mask, frame_noise: Noise | None) -> tuple[float, int]:
+    """The noise at the object's median depth, and its grain: its own, or the frame's where that is smaller."""
+    few, typical = slice(None, None, max(1, len(depth) // ROWS)), float(np.median(depth[usable]))
+    measured = estimate_noise(depth[few], usable[few])
+    if frame_noise is not None and measured.at(typical) >= frame_noise.at(typical):
+        measured = frame_noise
+    return float(measured.at(typical)), measured.grain
 
 
 def _moments(weight: Float, x: Float, y: Float, q: Float) -> Float:
