@@ -31,7 +31,7 @@ COMMANDS = {
     "capture": Command(f"{CLI}.recognise:capture", "write depth images of a mesh, as a camera would take them"),
     "list": Command(f"{CLI}.listing:show", "list the bundled models, or the view measures"),
     "download": Command(f"{CLI}.listing:download", "download ModelNet10 or ModelNet40"),
-    "scenes": Command(f"{CLI}.stores:scenes", "draw cluttered scenes, a target half hidden in each"),
+    "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes, a target half hidden in each"),
     "render": Command(f"{CLI}.stores:render", "render every view of a dataset into a view store"),
     "check": Command(f"{CLI}.stores:check", "check that a view store is sound"),
     "measure": Command(f"{CLI}.stores:measure", "compute view measures, into the store"),

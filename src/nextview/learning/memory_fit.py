@@ -121,9 +121,8 @@ def _heads(
     x, y = views[:, :, ::4].reshape(len(thing), -1, f), label[thing]
     found = np.zeros((len(judged), held_out.shape[1], classes), np.float32)
     for k in range(FOLDS):
-        weights, bias = _ridge(
-            x[(fold[thing] != k) | ~several[thing]], y[(fold[thing] != k) | ~several[thing]], classes
-        )
+        others = (fold[thing] != k) | ~several[thing]
+        weights, bias = _ridge(x[others], y[others], classes)
         own = fold[judged] == k
         found[own] = held_out[judged][own] @ weights + bias
     return found, _ridge(x, y, classes)

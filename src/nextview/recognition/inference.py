@@ -15,6 +15,7 @@ from nextview.checks import one_line
 from nextview.errors import ModelError
 from nextview.files import checked_bytes
 from nextview.geometry.observation import Observation
+from nextview.geometry.viewsphere import direction_of, elevation_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.map_names import SPHERE, maps_among
 from nextview.recognition.model_card import FEATURES, MAPS, RECOGNISER, ModelCard, find_card
@@ -129,7 +130,8 @@ class Recogniser:
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
         """Evidence of B views from one camera; views in which nothing is seen are marked, see ``Evidence.seen``."""
         inputs = from_observations(self.card.input, observations)
-        evidence = replace(self.from_inputs(inputs), seen=np.array([o.seen for o in observations]))
+        elevations = np.array([elevation_of(direction_of(o.pose)) for o in observations])
+        evidence = replace(self.from_inputs(inputs, elevations), seen=np.array([o.seen for o in observations]))
         if self.card.size is None:
             return evidence
         radii = np.array([np.nan if o.radius is None else o.radius for o in observations])

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,9 @@ from safetensors.numpy import load, save
 
 from nextview.errors import ModelError
 from nextview.files import checked_bytes, new_file
-from nextview.geometry.observation import Observation
-from nextview.geometry.viewsphere import direction_of, elevation_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Features, Recogniser
 from nextview.recognition.model_card import MEMORY_SUFFIX, find_card
-from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import Quantiles, unit
 
 RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)
@@ -101,10 +97,9 @@ def similarities(views: Float, embeddings: Float, elevations: Float) -> NDArray[
         elevations: from which they were taken, radians, (B,).
     """
     place = np.interp(elevations, np.radians(RINGS), np.arange(len(RINGS)))
-    low = np.minimum(place.astype(np.int64), len(RINGS) - 2)
     found = np.zeros((len(embeddings), views.shape[1]), np.float32)
     for ring in range(len(RINGS)):
-        share = np.maximum(1 - np.abs(place - ring), 0) * ((ring == low) | (ring == low + 1))
+        share = np.maximum(1 - np.abs(place - ring), 0)
         rows = np.flatnonzero(share > 1e-6)
         if len(rows):
             found[rows] += share[rows, None].astype(np.float32) * (embeddings[rows] @ views[ring].T)
@@ -130,16 +125,6 @@ class TaughtRecogniser(Recogniser):
             raise ModelError(f"{self.card.path}: holds {h} resting poses, and its card is of others")
         self._views = by_ring(self.memory.views)
         self.novelty = Quantiles(self.memory.quantiles, np.array([self.memory.held_out[..., 0].size]))
-
-    def __call__(self, observations: Sequence[Observation]) -> Evidence:
-        """Evidence of B views from one camera, see ``Recogniser``."""
-        inputs = from_observations(self.card.input, observations)
-        elevations = np.array([elevation_of(direction_of(o.pose)) for o in observations])
-        evidence = replace(self.from_inputs(inputs, elevations), seen=np.array([o.seen for o in observations]))
-        if self.card.size is None:
-            return evidence
-        radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
-        return replace(evidence, logits=evidence.logits + self.card.size.logits(radii))
 
     def from_inputs(self, inputs: NDArray[Any], elevations: Float | None = None) -> Evidence:
         """Evidence by shape alone, from what the network takes and the elevations of the cameras, radians, (B,)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere, great_circle
+from nextview.recognition.belief import Stopping
 from nextview.session.style import ACCENT, FAINT, INK, PlainFigure
 from nextview.session.view import View
-
-if TYPE_CHECKING:
-    from nextview.session.recognition import Recognition
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -30,21 +28,22 @@ def save_figure(figure: Figure, path: Path) -> None:
         raise UsageError(f"{path}: the figure cannot be written ({error})") from None
 
 
-def draw_episode(result: Recognition, heading: str) -> Figure:
+def draw_episode(
+    views: Sequence[View], classes: Sequence[str], sphere: Viewpoints, stopping: Stopping, heading: str
+) -> Figure:
     """One column for each view (image, what the policy valued the views at, belief), and the sphere beside them."""
-    views, sphere = result.views, result.sphere
     valued = any(view.values is not None for view in views)
     heights = [2.7, 2.6, 2.9] if valued else [2.7, 2.9]
     figure = PlainFigure(figsize=(2.5 * len(views) + 5.2, sum(heights)), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.5 * len(views), 5.2])[0]
     axes = left.subplots(len(heights), len(views), squeeze=False, gridspec_kw={"height_ratios": heights})
     shown = np.argsort(-np.max([view.belief for view in views], axis=0))[:5]
-    names = [name.replace("_", " ") for name in result.classes]
+    names = [name.replace("_", " ") for name in classes]
     for k, view in enumerate(views):
         _draw_image(axes[0, k], view, k + 1)
         if valued:
             _draw_values(axes[1, k], view, sphere, [v.index for v in views[:k]], first=k == 0)
-        _draw_belief(axes[-1, k], view, k + 1, float(result.stopping.threshold_at(k + 1)), names, shown)
+        _draw_belief(axes[-1, k], view, k + 1, float(stopping.threshold_at(k + 1)), names, shown)
     _draw_path(right.add_subplot(projection="3d"), views, sphere)
     figure.suptitle(heading, color=INK, fontsize=13)
     return figure

@@ -88,7 +88,8 @@ class Recognition:
         """
         from nextview.session.episode_figure import draw_episode, save_figure
 
-        figure = draw_episode(self, f"{title}: {self!r}" if title else repr(self))
+        heading = f"{title}: {self!r}" if title else repr(self)
+        figure = draw_episode(self.views, self.classes, self.sphere, self.stopping, heading)
         if path is not None:
             save_figure(figure, Path(path))
         return figure
