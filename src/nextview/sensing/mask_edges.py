@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion, minimum_filter
+from scipy.ndimage import binary_erosion, binary_fill_holes, minimum_filter
 
 EDGE = 6
 """A segmenter's edge may be off by so many pixels."""
@@ -32,7 +32,7 @@ def trimmed(depth: NDArray[np.float32], mask: Mask) -> Mask:
         return mask
     part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     own, z = measured[part], depth[part].astype(np.float64)
-    whole = np.pad(mask[part], 1)
+    whole = np.pad(mask[part] | binary_fill_holes(own) & (z == 0), 1)
     for width in range(EDGE, 0, -1):
         inside = binary_erosion(whole, np.ones((3, 3), bool), width)[1:-1, 1:-1] & own
         if 3 * inside.sum() >= own.sum():

@@ -15,13 +15,15 @@ from nextview.checks import one_line
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.observation import Observation, SceneView, pinhole
 from nextview.geometry.viewsphere import DISTANCE
-from nextview.sensing import segmentation
+from nextview.sensing import clusters, segmentation
+from nextview.sensing.clusters import Footprint
 from nextview.sensing.facets import ROWS, Facets, Noise, estimate_noise, fit_facets, look_again, virtual_pose
 from nextview.sensing.frame import Frame
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
+from nextview.sensing.pieces import cut
 from nextview.sensing.plausibility import ViewWarning, check_frame, check_observation, check_views, refuse_far
-from nextview.sensing.segmentation import Footprint, Plane, Samples, find_plane, mistake_in_pose, refine_plane, sample
+from nextview.sensing.segmentation import Plane, Samples, find_plane, mistake_in_pose, refine_plane, sample
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,6 +40,10 @@ FINEST = 1 / 32
 """Object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``."""
 SAME = 0.01
 """Change of the centre or the radius, in object radii, below which the object frame is left as it is."""
+
+MAY_BE_TWO = ViewWarning(
+    "outline", "the object may be two things that touch: name it by a mask or a box, or move them apart"
+)
 
 
 @dataclass(frozen=True)
@@ -179,7 +185,7 @@ class ObservedObject:
         ahead, down = frame.camera_to_world[:3, 2], frame.camera_to_world[:3, 1]
         front = -ahead if abs(ahead @ up) < 0.99 else down  # from above the bottom of the image
         axes = upright_axes(up, front) if before.frame is None else before.frame.axes
-        sightings, cell = self._find(frame, upright_axes(up), plane, samples, noise)
+        sightings, cell, two = self._find(frame, upright_axes(up), plane, samples, noise)
         latest = self._estimate(sightings, axes)
         if before.frame is not None and _same(latest, before.frame):
             latest = before.frame
@@ -189,7 +195,7 @@ class ObservedObject:
                 made[i] = self._observe(sighting, latest)
         revision = before.revision + any(new is not old for new, old in zip(made, before.observations, strict=True))
         made.append(self._observe(sightings[-1], latest))
-        warnings = check_frame(frame) + check_observation(made[-1])
+        warnings = check_frame(frame) + check_observation(made[-1]) + [MAY_BE_TWO] * two
         for view in made[-4:-1]:
             warnings = warnings or check_views(view, made[-1])
         return ObjectState(rng, latest, tuple(sightings), tuple(made), tuple(warnings), revision, cell)
@@ -215,8 +221,11 @@ class ObservedObject:
 
     def _find(
         self, frame: Frame, axes: Float, plane: Plane | None, samples: Samples, noise: Noise
-    ) -> tuple[list[Sighting], float]:
-        """The sightings so far, mended where a cluster has grown, and that of a new frame; and the side of a cell."""
+    ) -> tuple[list[Sighting], float, bool]:
+        """The sightings so far, mended where a cluster has changed, and that of a new frame.
+
+        And the side of a cell, and whether the object may be two things.
+        """
         if frame.mask is not None:
             mask = frame.mask
             if self.known is None:  # else its size does not hang on pixels at the edge
@@ -239,11 +248,11 @@ class ObservedObject:
                 "no support plane is seen below the camera: give a mask or a box, or check the pose (inverse? OpenGL "
                 "axes?) and which way is up"
             )
-        return [*self.state.sightings, self._sighting(frame, mask, plane, noise)], self.state.cell
+        return [*self.state.sightings, self._sighting(frame, mask, plane, noise)], self.state.cell, False
 
     def _on_the_plane(
         self, frame: Frame, axes: Float, plane: Plane, samples: Samples, noise: Noise
-    ) -> tuple[list[Sighting], float]:
+    ) -> tuple[list[Sighting], float, bool]:
         earlier, cell = self.state.sightings, self.state.cell
         above = segmentation.above_plane(frame, plane, noise)
         ground = plane.extent(samples) @ axes[:2].T
@@ -255,14 +264,16 @@ class ObservedObject:
                     raise ObservationError(f"the object's point is {distance:.2g} m from the camera: of the world?")
             else:
                 points = sample(frame, above, noise).points
-                points = points[segmentation.on_ground(points @ axes[:2].T, ground)]
+                points = points[clusters.on_ground(points @ axes[:2].T, ground)]
                 distance = float(np.median(np.linalg.norm(points - camera, axis=1))) if len(points) else 1.0
-            cell = segmentation.CELL * distance
-        foot = segmentation.footprint(frame, above, axes, cell)
-        labels = segmentation.clusters([*(s.footprint for s in earlier if s.footprint is not None), foot])
-        target = self._target(labels, foot, ground / cell, axes[:2] / cell)
+            cell = clusters.CELL * distance
+        pieces = cut(frame.depth, above, frame.along(plane.normal, plane.offset), noise)
+        foot = clusters.footprint(frame, pieces, axes, cell)
+        footprints = [*(s.footprint for s in earlier if s.footprint is not None), foot]
+        labels, two = clusters.clusters(footprints)
+        target = self._target(labels, footprints, ground / cell, axes[:2] / cell)
         chosen = labels[-1] == target
-        mask = foot.pixels_over(chosen)
+        mask = trimmed(frame.depth, foot.pixels_over(chosen))
         if target == 0 or mask.sum() < FEWEST:
             where = "of the object known so far" if earlier else "on the support plane"
             raise ObservationError(f"this frame shows nothing {where}: check its pose, or aim the camera at the object")
@@ -276,20 +287,27 @@ class ObservedObject:
                     mended = self._sighting(s.frame, s.footprint.pixels_over(now), s.plane, s.noise)
                     s = replace(mended, footprint=s.footprint, chosen=now)
             sightings.append(s)
-        return [*sightings, replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)], cell
+        return (
+            [*sightings, replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)],
+            cell,
+            bool(two[target]),
+        )
 
-    def _target(self, labels: list[NDArray[np.int64]], foot: Footprint, ground: Float, to_cells: Float) -> int:
-        """The object's label: that of most cells that were the object's before; else by the point; else the largest."""
+    def _target(
+        self, labels: list[NDArray[np.int64]], footprints: list[Footprint], ground: Float, to_cells: Float
+    ) -> int:
+        """The object's label: by the point; else that of most cells that were the object's before; else the largest."""
+        if self.point is not None:
+            return clusters.nearest(footprints, labels, to_cells @ self.point)
         before = [s.chosen for s in self.sightings if s.chosen is not None]
         votes = np.concatenate([[0], *(now[then] for now, then in zip(labels[:-1], before, strict=True))]).astype(int)
         count = np.bincount(votes)
         count[0] = 0
         if count.any():
             return int(count.argmax())
-        point = self.object_frame.centre if self.sightings else self.point
-        if point is not None:
-            return segmentation.nearest(foot, labels[-1], to_cells @ point)
-        return segmentation.largest(foot, labels[-1], ground)
+        if self.sightings:
+            return clusters.nearest(footprints[-1:], labels[-1:], to_cells @ self.object_frame.centre)
+        return clusters.largest(footprints[-1], labels[-1], ground)
 
     def _sighting(self, frame: Frame, mask: Mask, plane: Plane | None, noise: Noise) -> Sighting:
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))

@@ -38,7 +38,7 @@ class ViewWarning:
     """Something that is likely to be wrong, in a sentence.
 
     Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside" and "contradiction"; of a
-    frame "intrinsics", "unit" and "far origin".
+    frame "intrinsics", "unit", "far origin" and "outline".
     """
 
     name: str

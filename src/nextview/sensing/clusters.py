@@ -1,0 +1,191 @@
+"""Which pieces of what stands on a plane are one object, seen from above and in several frames.
+
+From above the parts of one object lie over each other even where it hides itself, such as the far legs of a table
+under its top; things that stand side by side lie apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import block_diag
+from scipy.spatial import ConvexHull, QhullError
+
+from nextview.sensing.frame import Frame
+from nextview.sensing.pieces import Pieces
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+CELL = 0.01
+"""Side of a cell of the footprint, in distances of the camera from the object."""
+OVERLAP = 0.25
+"""Share of the cells of a piece that lie over another one of the same frame, from which they are one thing."""
+LIES_OVER = 0.5
+"""Share of the cells of a piece that lie over, or beside, one of another frame, from which they are one thing."""
+BESIDE = 2
+"""Cells up to which two pieces stand side by side."""
+TWO = 0.1
+"""Share of the cells of an object that a part of it has which may be another thing."""
+REACH, FAR = 250, 1000
+"""Cells to each side of the middle of what is seen above the plane: farther things are left out. And cells from those
+of the first frame beyond which nothing can be a part of the same object."""
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """The cells, seen from above, over which the pieces of a frame lie: K pairs of a cell and a piece, each once.
+
+    ``cells`` are the indices of the cells, (K, 2), ``piece`` the labels of the pieces, (K,). ``area`` is that of the
+    surface of each pair, square metres, ``pixels`` how many show it, ``pair_of`` the pair of each pixel of the frame,
+    (H, W) int32, -1 for none. For the rest see ``Pieces``.
+    """
+
+    cells: NDArray[np.int64]
+    piece: NDArray[np.int64]
+    stands: Mask
+    touch: Mask
+    inside: Mask
+    area: Float
+    pixels: NDArray[np.int64]
+    pair_of: NDArray[np.int32]
+
+    def pixels_over(self, chosen: Mask) -> Mask:
+        """Pixels of the chosen pairs, (H, W) bool."""
+        return np.append(chosen, False)[self.pair_of]  # the last is that of -1
+
+
+def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float) -> Footprint:
+    """The footprint of the pieces of a frame along upright axes, (3, 3), in cells of a side in metres."""
+    rows, columns = np.divmod(np.flatnonzero(pieces.label), pieces.label.shape[1])
+    z = frame.depth[rows, columns]
+    pose, (x, y) = frame.camera_to_world, frame.rays
+    ij = []
+    for axis in axes[:2]:
+        a, b, c = (pose[:3, :3].T @ axis / cell).astype(np.float32)
+        position = z * (a * x[columns] + b * y[rows] + c) + np.float32(axis @ pose[:3, 3] / cell)
+        ij.append(np.floor(position).astype(np.int64))
+    low = np.array([np.median(v[::50]) if len(v) else 0 for v in ij]).astype(np.int64) - REACH
+    side = 2 * REACH + 1
+    i, j = ij[0] - low[0], ij[1] - low[1]
+    within = (i >= 0) & (i < side) & (j >= 0) & (j < side)
+    rows, columns, z = rows[within], columns[within], z[within]
+    keys = (pieces.label[rows, columns].astype(np.int64) * side + i[within]) * side + j[within]
+    used, pair, pixels = np.unique(keys, return_inverse=True, return_counts=True)
+    area = np.bincount(pair, z * z, len(used)) / (frame.intrinsics[0, 0] * frame.intrinsics[1, 1])
+    pair_of = np.full(frame.shape, -1, np.int32)
+    pair_of[rows, columns] = pair
+    piece, place = np.divmod(used, side**2)
+    cells = np.stack(np.divmod(place, side), 1) + low
+    return Footprint(cells, piece, pieces.stands, pieces.touch, pieces.inside, area, pixels, pair_of)
+
+
+def clusters(footprints: Sequence[Footprint]) -> tuple[list[NDArray[np.int64]], Mask]:
+    """Which pieces of some frames are of one object.
+
+    Pieces of one frame are joined where they overlap seen from above; and where they lie side by side and one does not
+    reach the plane: a handle, the back of a chair. Things that stand side by side stay apart. Pieces of two frames are
+    joined where half of the smaller one lies over the other, unless a frame shows both side by side.
+
+    Returns:
+        The label of each pair in each footprint, (K,) int64 each: 1, 2, ... for the clusters; 0 for what lies far from
+        all that the first footprint shows. And for each label, (labels + 1,) bool, whether one frame joins to the
+        cluster what stands beside it in another one: it may be two things.
+    """
+    sizes = [len(f.cells) for f in footprints]
+    if not sum(sizes):
+        return [np.zeros(n, np.int64) for n in sizes], np.zeros(1, bool)
+    first = np.cumsum([0, *(len(f.stands) for f in footprints)])
+    node = np.concatenate([f.piece + start for f, start in zip(footprints, first, strict=False)])
+    cells = np.concatenate([f.cells for f in footprints])
+    near = np.abs(cells - cells[0]).max(1) <= FAR
+    here, around = (_cells_over(cells[near], node[near], int(first[-1]), reach) for reach in (0, BESIDE))
+    size = np.maximum(np.asarray(here.sum(1)).ravel(), 1)
+    shared = (here @ here.T).toarray() / np.minimum.outer(size, size)
+    beside = (around @ here.T).toarray() > 0
+    cluster, refused = _joined(*_links(footprints, shared, beside | beside.T))
+    two = np.zeros(cluster.max() + 2, bool)
+    whole = np.bincount(cluster, size)
+    for a, b in refused:
+        if min(size[a], size[b]) > TWO * max(whole[cluster[a]], whole[cluster[b]]):
+            two[[cluster[a] + 1, cluster[b] + 1]] = True
+    return np.split(np.where(near, cluster[node] + 1, 0), np.cumsum(sizes)[:-1]), two
+
+
+def _cells_over(cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int, reach: int) -> sparse.csr_matrix:
+    """Which cells lie over each node, or up to ``reach`` from it, (nodes, cells), 0 or 1."""
+    at = cells - cells.min(0) + BESIDE
+    width = int(at[:, 1].max()) + 1 + BESIDE
+    steps = [(i, j) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1)]
+    places = np.concatenate([(at[:, 0] + i) * width + at[:, 1] + j for i, j in steps])
+    shape = nodes, (int(at[:, 0].max()) + 1 + BESIDE) * width
+    found = sparse.csr_matrix((np.ones(len(places)), (np.tile(node, len(steps)), places)), shape)
+    found.data[:] = 1
+    return found
+
+
+def _links(footprints: Sequence[Footprint], shared: Float, beside: Mask) -> tuple[Float, Mask]:
+    """How strongly each two pieces are linked, 0 for not, and which stand apart, both (N, N), by what both share."""
+    frame = np.repeat(np.arange(len(footprints)), [len(f.stands) for f in footprints])
+    same = np.equal.outer(frame, frame)
+    stands = np.concatenate([f.stands for f in footprints])
+    touch, inside = (block_diag(*(getattr(f, name) for f in footprints)) > 0 for name in ("touch", "inside"))
+    inside |= inside.T
+    both, neither = np.logical_and.outer(stands, stands), ~np.logical_or.outer(stands, stands)
+    strength = np.where(shared >= np.where(same, OVERLAP, LIES_OVER), shared, 0)
+    strength[same & beside & neither] = OVERLAP
+    strength[touch & ~both | inside] = 1
+    return strength, same & beside & both & (shared < OVERLAP) & ~inside
+
+
+def _joined(strength: Float, apart: Mask) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+    """Cluster of each of N pieces by links of a strength, (N, N), 0 for none, strong ones first.
+
+    A link that would join two pieces that stand apart is refused; these links are given too.
+    """
+    cluster, refused = np.arange(len(strength)), []
+    a, b = np.nonzero(np.triu(strength, 1))
+    for k in np.argsort(-strength[a, b], kind="stable"):
+        one, other = cluster[a[k]], cluster[b[k]]
+        if one == other:
+            continue
+        if apart[np.ix_(cluster == one, cluster == other)].any():
+            refused.append((int(a[k]), int(b[k])))
+        else:
+            cluster[cluster == other] = one
+    return cluster, refused
+
+
+def on_ground(points: Float, plane: Float) -> Mask:
+    """Which points, (N, 2), lie within the hull of what was seen of the plane, (M, 2), (N,) bool."""
+    if len(plane) < 3:
+        return np.ones(len(points), bool)
+    try:
+        sides = ConvexHull(plane).equations
+    except QhullError:  # a plane of which only a line is seen
+        return np.ones(len(points), bool)
+    return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(1))
+
+
+def largest(foot: Footprint, labels: NDArray[np.int64], plane: Float) -> int:
+    """The cluster with most surface in view on the plane, whose points are given in cells, (M, 2); or 0."""
+    if not labels.any():
+        return 0
+    area = np.bincount(labels, foot.area)
+    middles = np.stack([np.bincount(labels, foot.area * x) for x in foot.cells.T], 1) / np.maximum(area, 1e-30)[:, None]
+    area[~on_ground(middles, plane)] = 0
+    area[0] = 0
+    return int(area.argmax()) if area.max() > 0 else 0
+
+
+def nearest(footprints: Sequence[Footprint], labels: Sequence[NDArray[np.int64]], point: Float) -> int:
+    """The cluster nearest to a point, in cells, (2,), seen from above, in most frames; 0 if there is none."""
+    cells, label = np.concatenate([f.cells for f in footprints]), np.concatenate(labels)
+    if not label.any():
+        return 0
+    distance = np.where(label > 0, np.linalg.norm(cells + 0.5 - point, axis=1), np.inf)
+    return int(np.bincount(label[distance < distance.min() + BESIDE]).argmax())

@@ -1,0 +1,165 @@
+"""Cut what stands on a plane into pieces along concave edges and jumps in depth: neighbours meet in such edges.
+
+After the convexity rule of LCCP (Stein et al., "Object Partitioning Using Local Convexity", CVPR 2014), on the image.
+Objects have concave edges too: ``clusters`` joins the pieces of one object again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from nextview.sensing.facets import Noise
+
+Mask = NDArray[np.bool_]
+Inverse = NDArray[np.float32]
+
+WIDTH = 320
+"""Columns in which edges are searched: a wider image is taken in steps."""
+LAG = 4
+"""Pixels from an edge at which the surfaces to both sides of it are looked at."""
+VALLEY = 0.004
+"""Depth of a concave edge, as a part of the distance, from which it cuts."""
+LEAST = 12
+"""Pixels of a piece."""
+STANDS = 0.02
+"""Height over the plane, as a part of the distance, down to which a piece is seen if it stands there."""
+BOTTOM = 0.002
+"""Height of a bottom over the plane, as a part of the distance, from which it is no hole."""
+CONTACT = 0.3
+"""Pixels in which two pieces touch, as a part of the root of those of the smaller one: fewer are a corner."""
+ENCLOSED = 0.7
+"""Share of the border of a piece that it has to one other, from which it lies inside it: the bottom of a bathtub."""
+NEXT: Any = ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))
+"""All pairs of pixels side by side: the first of each, and the second."""
+LOWEST = 5
+"""This pixel of a piece from below counts: fewer may be noise."""
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Pieces of what stands on a plane.
+
+    ``label`` is that of each pixel, (H, W) int32, 0 for none, ``stands`` tells which pieces reach down to the plane,
+    (pieces + 1,) bool, by label. Of each two pieces ``touch`` tells whether they touch in space, and ``inside`` whether
+    the first lies inside the outline of the second, (pieces + 1, pieces + 1) bool.
+    """
+
+    label: NDArray[np.int32]
+    stands: Mask
+    touch: Mask
+    inside: Mask
+
+
+def cut(depth: NDArray[np.float32], above: Mask, height: NDArray[np.float32], noise: Noise) -> Pieces:
+    """Cut the pixels ``above`` a plane, (H, W) bool, of a depth image, metres, with their heights over it, metres."""
+    label = np.zeros(depth.shape, np.int32)
+    rows, columns = np.flatnonzero(above.any(1)), np.flatnonzero(above.any(0))
+    if not len(rows):
+        return Pieces(label, np.zeros(1, bool), *np.zeros((2, 1, 1), bool))
+    part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    step = max(1, round(depth.shape[1] / WIDTH))
+    few = (slice(None, None, step),) * 2
+    z, mask, high = depth[part][few], above[part][few], height[part][few]
+    bottom = _bottoms(z, mask, high)
+    mask = mask | bottom
+    inverse, usual = _smooth(z, mask), np.where(mask, z, 1).astype(np.float32)
+    error = (2 * noise.at(usual) * usual).astype(np.float32)  # as a part of the distance
+    tolerance = (VALLEY + error) / usual
+    found: Any
+    found, count = ndimage.label(mask & ~_concave(inverse, tolerance))
+    kept = np.bincount(found.ravel(), minlength=count + 1) >= LEAST
+    kept[0] = False
+    found = np.asarray(np.cumsum(kept) * kept)[found]
+    # A pixel of an edge goes to the nearest piece that is as near to the camera.
+    away, nearest = ndimage.distance_transform_edt(found == 0, return_indices=True)
+    close, found_near = away <= 2 * LAG, found[tuple(nearest)]
+    around = np.where((mask | (z == 0)) & close, found_near, found)
+    with np.errstate(invalid="ignore"):
+        joins = mask & close & (np.abs(inverse[tuple(nearest)] - inverse) < 4 * tolerance)
+    found = np.where(joins, found_near, 0)
+    heights = high / usual - 2 * error
+    lowest: Any = ndimage.labeled_comprehension(heights, found, range(1, kept.sum() + 1), _lowest, np.float64, 1.0)  # type: ignore[arg-type]
+    label[part] = np.where(
+        above[part] | _enlarged(bottom, step, above[part].shape), _enlarged(found, step, above[part].shape), 0
+    )
+    return Pieces(label, np.append(False, lowest < STANDS), _touching(found, inverse, tolerance), _enclosed(around))
+
+
+def _enlarged(small: NDArray[Any], step: int, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Every pixel ``step`` times as wide and as high, cut off to a shape."""
+    return np.repeat(np.repeat(small, step, 0), step, 1)[: shape[0], : shape[1]]
+
+
+def _bottoms(depth: NDArray[np.float32], mask: Mask, height: NDArray[np.float32]) -> Mask:
+    """Pixels of holes of the mask that lie over the plane as a whole, (H, W) bool: the bottom of a bowl."""
+    holes = ndimage.binary_fill_holes(mask) & ~mask & (depth > 0)
+    label, count = ndimage.label(holes)
+    if not count:
+        return holes
+    middle = ndimage.median(height / np.where(holes, depth, 1), label, np.arange(1, count + 1))
+    return np.append(False, np.asarray(middle) > BOTTOM)[label]
+
+
+def _smooth(depth: NDArray[np.float32], mask: Mask) -> Inverse:
+    """Mean inverse depth of those of 3 x 3 pixels that are in the mask, (H, W), 1/metres; NaN outside of it."""
+    weight = ndimage.uniform_filter(mask.astype(np.float32), 3, mode="constant")
+    total = ndimage.uniform_filter(
+        np.where(mask, 1 / np.where(mask, depth, 1), 0).astype(np.float32), 3, mode="constant"
+    )
+    return np.where(mask, total / np.maximum(weight, np.float32(1e-6)), np.float32(np.nan))
+
+
+def _concave(inverse: Inverse, tolerance: Inverse) -> Mask:
+    """Pixels in a concave edge, (H, W) bool: farther than the line between two others to both sides of them.
+
+    Inverse depth is linear over the image of a plane; ``tolerance`` is of its unit, (H, W).
+    """
+    found = np.zeros(inverse.shape, bool)
+    padded = np.pad(inverse, LAG, constant_values=np.nan)
+    height, width = inverse.shape
+    limit = 2 * (inverse + tolerance)
+    with np.errstate(invalid="ignore"):
+        for dy, dx in ((0, LAG), (LAG, 0), (LAG, LAG), (LAG, -LAG)):
+            one = padded[LAG + dy : LAG + dy + height, LAG + dx : LAG + dx + width]
+            other = padded[LAG - dy : LAG - dy + height, LAG - dx : LAG - dx + width]
+            found |= one + other > limit
+    return found
+
+
+def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) -> Mask:
+    """Which two pieces have pixels side by side that are as near to the camera, (pieces + 1, pieces + 1) bool."""
+    with np.errstate(invalid="ignore"):
+        count = _borders(label, [np.abs(inverse[a] - inverse[b]) < tolerance[a] for a, b in NEXT])
+    size = np.sqrt(np.bincount(label.ravel(), minlength=len(count)))
+    touch = count > np.maximum(CONTACT * np.minimum.outer(size, size), 2)
+    touch[0] = touch[:, 0] = False
+    return touch
+
+
+def _enclosed(label: NDArray[np.int64]) -> Mask:
+    """Which pieces have most of their border to which other one, (pieces + 1, pieces + 1) bool."""
+    count = _borders(label, [np.ones(label[a].shape, bool) for a, _ in NEXT])
+    inside = count > ENCLOSED * count.sum(1, keepdims=True)
+    inside[0] = inside[:, 0] = False
+    return inside
+
+
+def _borders(label: NDArray[np.int64], counted: list[Mask]) -> NDArray[np.int64]:
+    """How many pairs of pixels side by side, of those ``counted``, each two pieces share, (pieces + 1, pieces + 1)."""
+    n = int(label.max()) + 1
+    count = np.zeros((n, n), np.int64)
+    for (one, other), wanted in zip(NEXT, counted, strict=True):
+        a, b = label[one], label[other]
+        use = wanted & (a != b)
+        count += np.bincount(a[use] * n + b[use], minlength=n * n).reshape(n, n)
+    return count + count.T
+
+
+def _lowest(heights: NDArray[np.float32]) -> float:
+    place = min(LOWEST, len(heights) - 1)
+    return float(np.partition(heights, place)[place])
