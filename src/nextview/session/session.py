@@ -26,12 +26,15 @@ from nextview.sensing.plausibility import ViewWarning, check_observation, check_
 from nextview.session.episode import Episodes, Step
 from nextview.session.reach import Reach, Reachable, TravelCost, as_reachable, as_travel_cost
 from nextview.session.recognition import Recognition
+from nextview.session.repeated import REPEATED, after_repeated, is_repeated
 from nextview.session.view import View
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
 Float = NDArray[np.float64]
+FARTHEST_TARGET = 20.0
+"""Object radii: a depth camera measures from some 0.25 m on, and few objects have a radius below 0.02 m."""
 CONTRADICTABLE = 3
 """Views before the last with whose geometry it is compared."""
 
@@ -249,6 +252,7 @@ class Session:
         Raises:
             SessionError: the episode has ended, or a session mixes frames and observations.
             ObservationError: the object is not found in the frame, or the image does not suit the networks.
+            UsageError: the session's ``distance`` is inside the object, or more than 20 object radii.
             PolicyError: the policy failed.
         """
         if self.done:
@@ -267,7 +271,9 @@ class Session:
         warnings = check_observation(seen)
         for view in self.views[-CONTRADICTABLE:]:
             warnings = warnings or check_views(view.observation, seen)
-        return self._take([*(view.observation for view in self.views), seen], warnings, seen.pose, None)
+        earlier = [view.observation for view in self.views]
+        warnings = [REPEATED] if is_repeated(seen, earlier) else warnings
+        return self._take([*earlier, seen], warnings, seen.pose, None)
 
     def _add_frame(self, frame: Frame) -> View:
         if self.object is None and self.views:
@@ -277,12 +283,25 @@ class Session:
             raise SessionError("frames were added to this object outside of the session; begin another one")
         before = object.state
         try:
-            object.add(frame)
+            if (repeated := after_repeated(before, frame, self._before)) is not None:
+                object.state = repeated
+            else:
+                object.add(frame)
+            self._check_distance(object.object_frame.radius)
             observations = object.observations[self._before :]
             return self._take(observations, object.warnings, frame.camera_to_world, object)
         except BaseException:
             object.state = before
             raise
+
+    def _check_distance(self, radius: float) -> None:
+        """Refuse targets inside the object or far from it, as soon as its radius is known."""
+        if self.distance is None or radius < self.distance <= FARTHEST_TARGET * radius:
+            return
+        why = f"within {FARTHEST_TARGET:g} radii: is it in millimetres?" if self.distance > radius else "outside of it"
+        raise UsageError(
+            f"the distance of {self.distance:g} m from the centre of an object of {radius:.2g} m radius has to be {why}"
+        )
 
     def _take(
         self,
@@ -295,6 +314,8 @@ class Session:
         last = len(observations) - 1
         changed = [k for k, seen in enumerate(observations) if k == last or seen is not self.views[k].observation]
         found = self.models.evidence([observations[k] for k in changed])
+        once = np.array([REPEATED not in (warnings if k == last else self.views[k].warnings) for k in changed])
+        found = replace(found, seen=once if found.seen is None else found.seen & once)
         evidence = {k: found.select([row]) for row, k in enumerate(changed)}
         at = [
             (direction, *self.sphere.nearest(direction)) for direction in (direction_of(o.pose) for o in observations)
@@ -336,7 +357,7 @@ class Session:
         classes, evidence = len(self.models.classes), step.evidence
         bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), classes, azimuth)
         alone = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth)
-        novelty = evidence.novelty
+        novelty = evidence.novelty if evidence.seen is None or evidence.seen[0] else None
         return View(
             int(step.views[0]),
             observation,
