@@ -2,6 +2,8 @@
 
 import itertools
 import pickle
+from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -100,3 +102,27 @@ def test_the_two_sides_of_a_symmetric_object_are_two_views(system, tmp_path):
     first, second = map(session.update, sides)
     assert not second.warnings
     assert (first.belief != second.belief).any()
+
+
+@pytest.mark.parametrize("again", [deepcopy, lambda session: pickle.loads(pickle.dumps(session))])
+@pytest.mark.parametrize("policy", ["gain", "lem", "visible-gain"])
+def test_a_copy_of_a_session_goes_on_alike_and_apart(camera, policy, again):
+    session = nextview.load(policy=policy, threshold=1, max_views=3).session(start=20)
+    session.update(camera.observe(session.pose))
+    copied = again(session)
+    result = copied.run(camera)
+    assert len(session.views) == 1
+    assert repr(session.run(camera)) == repr(result)
+
+
+def test_threads_that_share_a_session_wait_for_each_other(system, camera):
+    """What is taken in is a session of its own; who comes too late is told so."""
+    session = Session(system.models, system.policy, system.sphere, 20, Stopping(1.0, 5))
+    seen = [camera.observe(pose) for pose in system.sphere.poses[8:24]]
+    with ThreadPoolExecutor(4) as pool:
+        ended = [done.exception() for done in [pool.submit(session.update, one) for one in seen]]
+    assert sorted(map(str, filter(None, ended))) == ["this session has ended; begin another one"] * (len(seen) - 5)
+    alone = Session(system.models, system.policy, system.sphere, 20, Stopping(1.0, 5))
+    for view in session.views:
+        alone.update(view.observation)
+    np.testing.assert_array_equal([v.belief for v in session.views], [v.belief for v in alone.views])

@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from threading import RLock
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,7 +67,8 @@ def _blas() -> ThreadpoolController:
 class Session:
     """One object under way; the caller moves the camera.
 
-    A camera that goes where it is told, in the object frame and object radii:
+    Threads that share one wait for each other. A camera that goes where it is told, in the object frame and object
+    radii:
 
     >>> session = nextview.load().session()                                     # doctest: +SKIP
     >>> while not session.done:                                                 # doctest: +SKIP
@@ -124,7 +126,15 @@ class Session:
         self._before = 0 if object is None else len(object.sightings)
         self._chooser, self._rng = anywhere(policy, sphere), rng or np.random.default_rng(0)
         self._reach = Reach(np.zeros(len(sphere), bool))
+        self._lock = RLock()
         self._episodes = self._begin(whole(start, "the first view", 0, len(sphere) - 1))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the lock: a session can be copied and pickled, its networks are opened again."""
+        return {name: value for name, value in vars(self).items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _lock=RLock())
 
     def _begin(self, start: int) -> Episodes:
         calibration = self.models.recogniser.calibration
@@ -181,7 +191,8 @@ class Session:
 
     @reachable.setter
     def reachable(self, given: ArrayLike | Callable[[Float], bool] | None) -> None:
-        self._set_reach(replace(self._reach, reachable=as_reachable(given, len(self.sphere))))
+        with self._lock:
+            self._set_reach(replace(self._reach, reachable=as_reachable(given, len(self.sphere))))
 
     @property
     def travel_cost(self) -> TravelCost | None:
@@ -194,17 +205,19 @@ class Session:
 
     @travel_cost.setter
     def travel_cost(self, given: ArrayLike | Callable[[Float, Float], float] | None) -> None:
-        self._reach = replace(self._reach, cost=as_travel_cost(given, len(self.sphere)))
+        with self._lock:
+            self._reach = replace(self._reach, cost=as_travel_cost(given, len(self.sphere)))
 
     def failed(self, view: int | None = None) -> None:
         """The camera could not be brought to a view, by default the one that was asked for: it is offered no more.
 
         Where no reachable view is left the session ends, not confident: ``Recognition.stranded``.
         """
-        if self.done:
-            raise SessionError("this session has ended; begin another one")
-        view = self.view if view is None else whole(view, "a view", 0, len(self.sphere) - 1)
-        self._set_reach(replace(self._reach, failed=self._reach.failed | (np.arange(len(self.sphere)) == view)))
+        with self._lock:
+            if self.done:
+                raise SessionError("this session has ended; begin another one")
+            view = self.view if view is None else whole(view, "a view", 0, len(self.sphere) - 1)
+            self._set_reach(replace(self._reach, failed=self._reach.failed | (np.arange(len(self.sphere)) == view)))
 
     def _set_reach(self, reach: Reach) -> None:
         """Choose another view if the one that was chosen can no longer be reached."""
@@ -255,12 +268,13 @@ class Session:
             UsageError: the session's ``distance`` is inside the object, or more than 20 object radii.
             PolicyError: the policy failed.
         """
-        if self.done:
-            raise SessionError("this session has ended; begin another one")
-        with _blas().limit(limits=1):
-            view = self._add_frame(seen) if isinstance(seen, Frame) else self._add_observation(seen)
-        for observer in self.observers:
-            observer(self)
+        with self._lock:
+            if self.done:
+                raise SessionError("this session has ended; begin another one")
+            with _blas().limit(limits=1):
+                view = self._add_frame(seen) if isinstance(seen, Frame) else self._add_observation(seen)
+            for observer in self.observers:
+                observer(self)
         return view
 
     def _add_observation(self, seen: Observation) -> View:
