@@ -19,6 +19,7 @@ from nextview.cli.main import main
 from nextview.data.metrics import calibration_error
 from nextview.data.predictions import Predictions
 from nextview.recognition.belief import Calibration, RiskBounds, Stopping
+from nextview.recognition.own_stopping import own_stopping
 
 TEN = tuple(read_table(ACCURACY[10]))
 
@@ -97,6 +98,21 @@ def test_python_and_the_command_give_the_same_numbers(predictions, tmp_path):
             np.testing.assert_array_equal(getattr(ends, column), rows[column])
         np.testing.assert_array_equal(np.array(p.classes)[ends.answer], rows["answer"].astype(str))
         assert truncate(paths, Stopping(0.7)).n_views.mean() > ends.n_views.mean()  # a threshold that stays
+
+
+def test_a_stopping_rule_of_ones_own_decides_in_the_command(predictions, tmp_path, capsys):
+    predictions.save(tmp_path / "p.npz")
+    main(["benchmark", str(tmp_path / "p.npz"), str(tmp_path / "out"), "--policies", "lem", "--runs", "2",
+          "--samples", "20", "--thresholds", "0.6", "--stopping", "test_replay:uncertain"])  # fmt: skip
+    ends = truncate(
+        replay("lem", make_specs(predictions, runs=2, seed=0), 5, 0, beliefs=True),
+        own_stopping("test_replay:uncertain", 0.6, 5),
+    )
+    rows = load(tmp_path / "out").episodes("lem", 0.6)
+    np.testing.assert_array_equal(ends.n_views, rows["n_views"])
+    assert len(set(ends.n_views)) > 1
+    wrong = ("benchmark", tmp_path / "p.npz", tmp_path / "no", "--stopping", "test_replay:nothing")
+    assert "stopping rule test_replay:nothing cannot be made" in refused(capsys, *wrong)
 
 
 def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes_nothing_from_it(

@@ -12,6 +12,7 @@ import pytest
 from pipeline import refused, some_predictions
 
 from nextview.cli.main import main
+from nextview.data.predictions import Predictions
 from nextview.files import sha256_of
 from nextview.recognition.model_card import ModelCard, write_card
 from nextview.recognition.network_input import InputSpec
@@ -52,6 +53,12 @@ def test_the_page_shows_the_numbers_of_the_tables(made):
     mse = next(float(row["value"]) for row in table(made, "maps") if (row["map"], row["label"]) == ("lem", "box"))
     section = text[text.index('id="lem"') : text.index('id="lcm"')]
     assert f"<td>{mse:.4f}" in re.search(r'<tr><th scope="row">box</th>.*?</tr>', section)[0]
+
+
+def test_predictions_that_name_no_model_are_judged_alike(made, tmp_path, capsys):
+    replace(Predictions.load(made / "p.npz"), models={}).save(tmp_path / "p.npz")
+    main(["evaluate", str(tmp_path / "p.npz"), str(tmp_path / "out"), "--samples", "50"])
+    assert table(tmp_path, "accuracy") == table(made, "accuracy")
 
 
 def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(tmp_path, capsys):

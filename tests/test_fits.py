@@ -237,6 +237,17 @@ def test_a_calibration_goes_into_the_card_and_is_used(training_predictions, monk
     assert [p.name for p in card.parent.iterdir() if p.name.startswith(".")] == []  # no lock, no part is left
 
 
+def test_logits_of_ones_own_are_fitted_to_where_they_name_no_model(training_predictions):
+    card, path = training_predictions
+    named = fit_calibration(path, card, validation=0.5).calibration
+    unnamed = replace(Predictions.load(path), models={})
+    unnamed.save(path, overwrite=True)
+    assert fit_calibration(path, card, validation=0.5).calibration == named
+    replace(unnamed, classes=("ball", "box", "cone")).save(path, overwrite=True)
+    with pytest.raises(PredictionsError, match="another recogniser"):
+        fit_calibration(path, card, validation=0.5)
+
+
 def test_a_calibration_by_a_bad_sensor_trusts_views_less(training_predictions, tmp_path):
     card, path = training_predictions
     p = Predictions.load(path)

@@ -137,3 +137,14 @@ def test_any_depth_is_an_object_or_nothing_or_refused(depth):
     np.testing.assert_array_equal(view.depth[kept], depth[kept].astype(np.float32))
     assert np.isfinite(view.points).all()
     np.testing.assert_array_equal(view.picture > 0, kept)
+
+
+def test_what_is_written_into_the_callers_arrays_later_changes_no_observation():
+    depth, pose, intrinsics = np.full((9, 9), 3, np.float32), np.eye(4), pinhole(9, 3.0)
+    image = np.full((9, 9), 7, np.uint8)
+    seen = Observation(depth, pose, intrinsics, image=image)
+    for array in (depth, pose, intrinsics, image):
+        array[:] = 1
+    assert (seen.depth[0, 0], seen.pose[0, 1], seen.intrinsics[0, 1], seen.image[0, 0]) == (3, 0, 0, 7)
+    with pytest.raises(ValueError, match="read-only"):
+        seen.depth[0] = 0

@@ -27,7 +27,7 @@ def there(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("page", ["add_a_measure", "add_a_policy"])
+@pytest.mark.parametrize("page", ["add_a_measure", "add_a_policy", "add_a_recogniser"])
 def test_a_page_does_what_it_says(page):
     try:
         failed, tried = doctest.testfile(str(ROOT / f"docs/{page}.md"), module_relative=False)

@@ -18,12 +18,15 @@ from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import render
 from nextview.data.store import ViewStore
-from nextview.errors import PredictionsError, ResultsError
+from nextview.errors import DatasetError, PredictionsError, ResultsError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration, RiskBounds
 from nextview.recognition.inference import MapNetwork, Recogniser
 from nextview.recognition.model_card import read_card
+from nextview.recognition.network_input import InputSpec, from_store
+
+SPEC = InputSpec("geometry", 32)
 
 
 def test_what_is_saved_is_what_is_loaded(tmp_path):
@@ -124,6 +127,26 @@ def test_predictions_are_what_the_networks_say_of_each_look(views, models, predi
     # Here the points come from the stored depth, which is rounded; those in the store are from the depth as rendered.
     lem = MapNetwork(models / "tiny-lem.json")([observation])["lem"][0]
     np.testing.assert_allclose(found.maps["lem"][i, v], lem, atol=5e-4)
+
+
+def test_logits_of_ones_own_make_the_predictions_that_the_networks_make(views, models, predictions):
+    made, store = Predictions.load(predictions).by_shape(), ViewStore.open(views)
+    logits = np.stack(
+        [Recogniser(models / "tiny.json").from_inputs(from_store(SPEC, store, i)).logits for i in range(18)]
+    )
+    own = Predictions.from_logits(views, logits, made.classes)
+    np.testing.assert_allclose(own.logits, made.logits, atol=1e-5)
+    assert own.models == {}
+    for name in ("names", "classes", "sphere", "store"):
+        assert getattr(own, name) == getattr(made, name)
+    for name in ("labels", "splits", "conflicting", "depth_entropy"):
+        np.testing.assert_array_equal(getattr(own, name), getattr(made, name))
+    tested = Predictions.from_logits(store, logits[made.splits == "test"], made.classes, "test")
+    assert tested.names == made.of_split("test").names
+    with pytest.raises(PredictionsError, match="logits of these predictions has the shape"):
+        Predictions.from_logits(views, logits, made.classes, "test")
+    with pytest.raises(DatasetError, match="does not know the class"):
+        Predictions.from_logits(views, logits, ("a", "b", "c"))
 
 
 def test_the_same_mesh_under_two_labels_is_marked_across_splits(furniture, models, tmp_path):

@@ -11,14 +11,15 @@ from scipy.special import log_softmax, softmax
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.replay import Grid, make_specs, replay, run_grid, truncate
 from nextview.data.predictions import Predictions
-from nextview.errors import EntryError
+from nextview.errors import EntryError, UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import Calibration, Stopping
 from nextview.recognition.inference import MapNetwork, Models, Recogniser
-from nextview.session.episode import run_episodes
+from nextview.recognition.own_stopping import own_stopping
+from nextview.session.episode import Episodes, run_episodes
 from nextview.session.session import Session
 from nextview.simulation.simulated import SimulatedCamera
 
@@ -51,6 +52,64 @@ def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(specs, na
     taken = np.arange(5) < ends.n_views[:, None]
     width = episodes.views.shape[1]
     np.testing.assert_array_equal(np.where(taken, paths.views, -1)[:, :width], episodes.views)
+
+
+def uncertain(seen, threshold):
+    """A user's stopping rule."""
+    return (seen.entropy < threshold) | (seen.n_views > 3) & (seen.margin > 0.2)
+
+
+@pytest.mark.parametrize("threshold", [0.2, 0.6])
+def test_a_stopping_rule_of_ones_own_ends_a_path_as_it_ends_the_episode(specs, threshold):
+    p, rule = specs.predictions, own_stopping("test_replay:uncertain", threshold, 5)
+    policy, paths = make_policy("lem", p.sphere, specs.valley_classes("lem")), replay("lem", specs, 5, 0, beliefs=True)
+    episodes = Episodes(p.sphere, policy, specs.starts, rule, np.random.default_rng(0))
+    observe, stopped = evidence_of(p, specs.objects), np.zeros(len(specs.starts), int)
+    while len(episodes.running):
+        step = episodes.update(observe(episodes.running, episodes.current[episodes.running]))
+        entropy = -(step.belief * np.log2(step.belief)).sum(1)
+        lead = np.subtract(*np.sort(step.belief, 1)[:, [-1, -2]].T)
+        k = len(episodes.steps)
+        np.testing.assert_array_equal(step.stopped, (entropy < threshold) | ((k > 3) & (lead > 0.2)) | (k == 5))
+        stopped[step.episodes] = k
+    ends = truncate(paths, rule)
+    np.testing.assert_array_equal(ends.n_views, stopped)
+    for field in ("answer", "confidence", "confident", "travel"):
+        np.testing.assert_allclose(getattr(ends, field), getattr(episodes.outcome, field), atol=1e-12, err_msg=field)
+    with pytest.raises(UsageError, match="beliefs=True"):
+        truncate(replay("lem", specs, 5, 0), rule)
+
+
+def test_what_a_stopping_rule_does_wrong_is_one_sentence():
+    belief = np.full((4, 3), 1 / 3)
+    for rule, words in [
+        ("test_replay:nothing", "cannot be made"),
+        ("entropy", "MODULE:NAME"),
+        (lambda seen, threshold: seen.belief > threshold, r"bool of the shape \(4,\), not bool of \(4, 3\)"),
+        (lambda seen, threshold: 1 / 0, "raised ZeroDivisionError"),
+    ]:
+        with pytest.raises(UsageError, match=words):
+            own_stopping(rule, 0.5, 5).reached(belief, 1)
+
+
+def test_nothing_seen_stops_no_path(specs):
+    """As in live use: a view in which nothing is seen counts neither for the decay nor as the end."""
+    p = specs.predictions
+    logits = p.logits.copy()
+    logits[:, ::2] = 0
+    specs = replace(specs, predictions=replace(p, logits=logits))
+    policy, stopping = make_policy("unidirectional", p.sphere), Stopping(0.9, 5, 1.0)
+    live = run_episodes(
+        lambda e, v: specs.predictions.evidence(specs.objects[e], v),
+        p.sphere,
+        policy,
+        specs.starts,
+        stopping,
+        np.random.default_rng(0),
+    ).outcome
+    ends = truncate(replay("unidirectional", specs, 5, 0), stopping)
+    np.testing.assert_array_equal(ends.n_views, live.n_views)
+    np.testing.assert_array_equal(ends.confident, live.confident)
 
 
 @pytest.mark.parametrize("knows_bins", [False, True])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import nextview
 from nextview import Observation, SessionError, SimulatedCamera, Stopping, ViewSphere
 from nextview.data.samples import sample_mesh
-from nextview.errors import ObservationError
+from nextview.errors import ObservationError, UsageError
 from nextview.geometry.viewsphere import viewpoints_of
 from nextview.policies.maps import MapPeak
 from nextview.policies.registry import make_policy
@@ -136,7 +136,7 @@ def test_moving_the_world_and_the_poses_together_changes_nothing(tiny, elevation
 
 
 def mistakes():
-    good = frame(pose_at(35, 0, 0.7, (0, 0, 0.08)))
+    good = frame(pose_at(35, 60, 0.7, (0, 0, 0.08)))
     away = frame(pose_at(35, 0, 0.7, (0, 0, 0.08)), meshes=(TABLE,))
     yield "the empty table", lambda: away, ObservationError
     yield "an inverse pose", lambda: replace(good, pose=np.linalg.inv(good.pose)), ObservationError
@@ -290,3 +290,26 @@ def test_reach_and_cost_are_asked_in_the_world(tiny):
     assert session.target[2, 3] > 0.3
     for pose in starts:
         np.testing.assert_allclose(pose, first, atol=1e-12)
+
+
+@pytest.mark.parametrize(("distance", "words"), [(0.15, "outside of it"), (700, "in millimetres")])
+def test_a_distance_that_cannot_be_is_refused_once_the_radius_is_known(tiny, distance, words):
+    session = begin(tiny, distance=distance)
+    before = snapshot(session)
+    with pytest.raises(UsageError, match=f"{distance} m from the centre of an object of 0.16 m radius .*{words}"):
+        session.update(frame(pose_at(20, 30, 0.7, (0, 0, 0.08))))
+    assert snapshot(session) == before
+
+
+def test_a_frame_that_comes_again_counts_once_and_moves_no_object(tiny):
+    """Whatever pose is told with it. The camera is asked for the same view still, as nobody knows where it was."""
+    first = frame(pose_at(20, 30, 0.7, (0, 0, 0.08)))
+    session = begin(tiny)
+    session.update(first)
+    where = session.object.object_frame
+    while not session.done:
+        session.update(replace(first, pose=session.target, pixel_centre=0.5))
+    assert [[w.name for w in view.warnings] for view in session.views] == [[], *[["repeated"]] * 3]
+    for view in session.views:
+        np.testing.assert_array_equal(view.belief, session.views[0].belief)
+    assert session.object.object_frame == where

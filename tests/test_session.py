@@ -2,10 +2,13 @@
 
 import itertools
 import pickle
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import trimesh
 
 import nextview
 from nextview import Session, SimulatedCamera, Stopping
@@ -74,3 +77,52 @@ def test_a_stopping_rule_of_ones_own(camera):
         leads = [np.ptp(np.sort(view.belief)[-2:]) for view in result.views]
         assert (leads[-1] >= 0.95) == result.confident
         assert max(leads[:-1], default=0) < 0.95
+
+
+def test_a_picture_that_is_handed_in_again_counts_once(system, camera):
+    """A camera that hangs, whatever pose is told with it: the belief stays what the first view made it."""
+    for move in (True, False):
+        session = Session(system.models, system.policy, system.sphere, 20, Stopping(0.99, 5))
+        first = camera.observe(session.pose)
+        while not session.done:
+            session.update(replace(first, depth=first.depth.copy(), pose=session.pose if move else first.pose))
+        beliefs = np.array([view.belief for view in session.views])
+        assert len(beliefs) == 5
+        np.testing.assert_array_equal(beliefs, beliefs[[0] * 5])
+        assert [[w.name for w in view.warnings] for view in session.views] == [[], *[["repeated"]] * 4]
+        assert not session.result.confident
+
+
+def test_the_two_sides_of_a_symmetric_object_are_two_views(system, tmp_path):
+    trimesh.creation.box((0.4, 0.2, 0.3)).export(tmp_path / "box.off")
+    camera = SimulatedCamera(nextview.load_mesh(tmp_path / "box.off"))
+    session = Session(system.models, system.policy, system.sphere, 16, Stopping(1.0, 2))
+    sides = [camera.observe(system.sphere.poses[view]) for view in (16, 20)]
+    np.testing.assert_array_equal(sides[0].depth, sides[1].depth)
+    first, second = map(session.update, sides)
+    assert not second.warnings
+    assert (first.belief != second.belief).any()
+
+
+@pytest.mark.parametrize("again", [deepcopy, lambda session: pickle.loads(pickle.dumps(session))])
+@pytest.mark.parametrize("policy", ["gain", "lem", "visible-gain"])
+def test_a_copy_of_a_session_goes_on_alike_and_apart(camera, policy, again):
+    session = nextview.load(policy=policy, threshold=1, max_views=3).session(start=20)
+    session.update(camera.observe(session.pose))
+    copied = again(session)
+    result = copied.run(camera)
+    assert len(session.views) == 1
+    assert repr(session.run(camera)) == repr(result)
+
+
+def test_threads_that_share_a_session_wait_for_each_other(system, camera):
+    """What is taken in is a session of its own; who comes too late is told so."""
+    session = Session(system.models, system.policy, system.sphere, 20, Stopping(1.0, 5))
+    seen = [camera.observe(pose) for pose in system.sphere.poses[8:24]]
+    with ThreadPoolExecutor(4) as pool:
+        ended = [done.exception() for done in [pool.submit(session.update, one) for one in seen]]
+    assert sorted(map(str, filter(None, ended))) == ["this session has ended; begin another one"] * (len(seen) - 5)
+    alone = Session(system.models, system.policy, system.sphere, 20, Stopping(1.0, 5))
+    for view in session.views:
+        alone.update(view.observation)
+    np.testing.assert_array_equal([v.belief for v in session.views], [v.belief for v in alone.views])

@@ -24,6 +24,7 @@ from nextview.policies.base import Evidence, Policy
 from nextview.policies.baselines import ViewList
 from nextview.recognition.belief import FixedLength, Stopping
 from nextview.recognition.map_names import maps_among
+from nextview.recognition.own_stopping import Rule, own_stopping
 from nextview.session.episode import run_episodes
 
 THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)
@@ -34,14 +35,19 @@ PART = 4096
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Where E episodes went, up to K views, and what was believed after each."""
+    """Where E episodes went, up to K views, and what was believed after each; ``seen``: views that showed anything.
+
+    ``beliefs`` are in all classes, (E, K, classes), for rules that look at more than the highest; kept if asked for.
+    """
 
     views: NDArray[np.int64]
     answers: NDArray[np.int64]
     confidences: NDArray[np.float64]
     travel: NDArray[np.float64]
     arc: NDArray[np.float64]
+    seen: NDArray[np.int64]
     fixed: bool
+    beliefs: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -79,24 +85,32 @@ def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
     return EpisodeSpecs(predictions, objects, starts, scenes)
 
 
-def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int) -> Trajectories:
-    """Run one entry through all episodes, to the last view."""
+def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int, beliefs: bool = False) -> Trajectories:
+    """Run one entry through all episodes, to the last view; keep whole ``beliefs`` for a stopping rule of your own."""
     rng = np.random.default_rng([seed, *name.encode()])
     views = fixed_views(name, specs, rng)
     if views is None:
-        return _run(name, entry_policy(name, specs), specs, Stopping(1.0, max_views), rng)
+        to_the_end = FixedLength(max_views=max_views) if beliefs else Stopping(1.0, max_views)
+        return _run(name, entry_policy(name, specs), specs, to_the_end, rng, beliefs)
     # Fixed views draw nothing more and may be long: in parts, whose steps are not all held at once.
     parts = []
     for start in range(0, len(views), PART):
         part = slice(start, start + PART)
         here = replace(specs, objects=specs.objects[part], starts=views[part, 0])
         parts.append(_run(name, ViewList(views[part]), here, FixedLength(max_views=views.shape[1]), rng))
-    names = [f.name for f in fields(Trajectories) if f.name != "fixed"]
+    names = [f.name for f in fields(Trajectories) if f.name not in ("fixed", "beliefs")]
     whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     return replace(parts[0], **whole, fixed=True)
 
 
-def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng: np.random.Generator) -> Trajectories:
+def _run(
+    name: str,
+    policy: Policy,
+    specs: EpisodeSpecs,
+    stopping: Stopping,
+    rng: np.random.Generator,
+    beliefs: bool = False,
+) -> Trajectories:
     p, objects = specs.predictions, specs.objects
     maps = {
         name: true_map(p, name.removeprefix(TRUE)) if name.startswith(TRUE) else p.maps[name]
@@ -114,12 +128,16 @@ def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng
         where = "" if error.episode is None else f" (object {p.names[objects[error.episode]]})"
         raise EntryError(f"{name}: {error}{where}") from error
     shape = (len(objects), len(done.steps))
-    answers, confidences = np.zeros(shape, np.int64), np.full(shape, -1.0)
+    answers, confidences, seen = np.zeros(shape, np.int64), np.full(shape, -1.0), np.zeros(shape, np.int64)
+    kept = np.zeros((*shape, len(p.classes))) if beliefs else None
     for k, step in enumerate(done.steps):
         answers[step.episodes, k] = step.belief.argmax(1)
         confidences[step.episodes, k] = step.belief.max(1)
+        seen[step.episodes, k] = step.seen
+        if kept is not None:
+            kept[step.episodes, k] = step.belief
     views = done.outcome.views
-    return Trajectories(views, answers, confidences, *_moved(p.sphere, views), fixed=False)
+    return Trajectories(views, answers, confidences, *_moved(p.sphere, views), seen, fixed=False, beliefs=kept)
 
 
 def _moved(sphere: ViewSphere, views: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -131,15 +149,21 @@ def _moved(sphere: ViewSphere, views: NDArray[np.int64]) -> tuple[NDArray[np.flo
 
 
 def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcomes:
-    """The episodes as a rule ends them."""
+    """The episodes as a rule ends them, as it would in live use: never after a view in which nothing is seen."""
     e, count = np.arange(len(paths.views)), (paths.views >= 0).sum(1)
     if stopping is None or paths.fixed:
         confident, at = np.zeros(len(e), bool), count - 1
     else:
-        n_views = np.arange(1, min(paths.views.shape[1], stopping.max_views) + 1)
-        reached = paths.confidences[:, : len(n_views)] >= stopping.threshold_at(n_views)
+        last = min(paths.views.shape[1], stopping.max_views)
+        seen, beliefs = paths.seen[:, :last], paths.beliefs
+        if beliefs is None:
+            if type(stopping).reached is not Stopping.reached:
+                raise UsageError("a stopping rule of your own needs whole beliefs: replay with beliefs=True")
+            beliefs = paths.confidences[:, :, None]
+        there = (np.diff(seen, prepend=0) > 0) & (paths.views[:, :last] >= 0)
+        reached = stopping.reached(beliefs[:, :last], np.maximum(seen, 1)) & there
         confident = np.asarray(reached.any(1))
-        at = np.where(confident, reached.argmax(1), np.minimum(count, len(n_views)) - 1)
+        at = np.where(confident, reached.argmax(1), np.minimum(count, last) - 1)
     return Outcomes(
         paths.answers[e, at], paths.confidences[e, at], at + 1, confident, paths.travel[e, at], paths.arc[e, at]
     )
@@ -155,11 +179,14 @@ class Grid:
     max_views: int
     seed: int
     threshold_decay: float | None = None
+    rule: Rule | str | None = None
     paths: dict[str, Trajectories] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
 
     def stopping(self, threshold: float) -> Stopping:
         """The rule of a threshold."""
+        if self.rule is not None:
+            return own_stopping(self.rule, threshold, self.max_views)
         rule = Stopping.of(self.specs.predictions.calibration, threshold, max_views=self.max_views)
         return rule if self.threshold_decay is None else replace(rule, threshold_decay=self.threshold_decay)
 
@@ -182,7 +209,7 @@ def run_grid(grid: Grid, names: Sequence[str]) -> Iterator[int]:
     """Run the entries one after the other; one that fails leaves its sentence and takes nothing from the others."""
     for n, name in enumerate(names, 1):
         try:
-            grid.paths[name] = replay(name, grid.specs, grid.max_views, grid.seed)
+            grid.paths[name] = replay(name, grid.specs, grid.max_views, grid.seed, beliefs=grid.rule is not None)
         except NextviewError as error:
             grid.failures[name] = str(error)
         yield n

@@ -24,6 +24,7 @@ from nextview.policies.registry import with_cards
 from nextview.recognition.belief import PLAIN_SUM, Stopping
 from nextview.recognition.map_names import LEM
 from nextview.recognition.model_card import find_models
+from nextview.recognition.own_stopping import own_stopping
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class BenchmarkSettings:
         thresholds: of the belief.
         risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too. With them
             thresholds stay; else they come down with the views, by the recogniser's correlation.
+        stopping: MODULE:NAME of a stopping rule of your own, asked with each threshold; see docs/add_a_policy.md.
         uncalibrated: believe the plain sum of the logits, as published, whatever the recogniser's card says.
         split: take only the objects of this one; needed where the predictions hold several.
         runs: random first views of each object.
@@ -49,6 +51,7 @@ class BenchmarkSettings:
     models: str = "modelnet10"
     thresholds: tuple[float, ...] = THRESHOLDS
     risks: tuple[float, ...] = ()
+    stopping: str | None = None
     uncalibrated: bool = False
     split: Literal["train", "test", "val"] | None = None
     runs: int = 10
@@ -138,13 +141,17 @@ def _prepare(predictions: Path, s: BenchmarkSettings) -> tuple[Grid, list[str], 
     decay = 0.0 if s.risks else table.calibration.correlation
     for threshold in s.thresholds:
         Stopping(threshold, s.max_views, decay)  # says what is wrong with it
+    if s.stopping and s.risks:
+        raise UsageError("error rates are promised for the package's own stopping rule, not for yours")
+    if s.stopping:
+        own_stopping(s.stopping, s.thresholds[0], s.max_views)  # likewise
     promised = {risk: table.calibration.threshold(risk, s.max_views) for risk in s.risks}
     table = chosen_split(table, predictions, s.split)
     specs, cards = make_specs(table, s.runs, s.seed), find_models(s.models).policies
     names = [with_cards(name, cards) for name in s.policies] or [*default_entries(specs), *map(str, cards.values())]
     names = list(dict.fromkeys([*([s.reference] if s.policies else []), *names]))
     thresholds = tuple(sorted({*s.thresholds, *promised.values()}))
-    return Grid(specs, s.runs, thresholds, s.max_views, s.seed, decay), names, promised
+    return Grid(specs, s.runs, thresholds, s.max_views, s.seed, decay, s.stopping), names, promised
 
 
 def chosen_split(table: Predictions, path: Path, split: str | None) -> Predictions:

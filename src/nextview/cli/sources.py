@@ -34,6 +34,7 @@ class Looking:
     # instead, stop at the lowest threshold at which at most this share of those who stop early is wrong
     risk: float | None = None
     max_views: int = 5  # stop after so many views
+    stopping: str | None = None  # MODULE:NAME of a stopping rule of your own, docs/add_a_policy.md
     # where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in degrees by views on each ring), or
     # fibonacci:60 (spread evenly over the upper half)
     viewpoints: str = "40"

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from nextview.data.pool import counted
 from nextview.data.predictions import Predictions
-from nextview.data.splits import duplicate_groups, some_objects
+from nextview.data.splits import some_objects
 from nextview.data.store import ViewStore, writing
-from nextview.errors import DatasetError, PredictionsError
+from nextview.errors import PredictionsError
 from nextview.files import check_new, command
 from nextview.geometry.observation import enough_shows
 from nextview.recognition.inference import MapNetwork, Recogniser
@@ -67,7 +67,7 @@ def predict(
     path, out = Path(path), Path(out)
     check_new(out, overwrite)
     store = ViewStore.open(path)
-    objects = _asked(store, recogniser, split, held_out)
+    objects = some_objects(store, split, recogniser if held_out else None)
     plan, radii, of_size = _plan(store, objects, recogniser, maps), store.radii[objects], None
     if size and recogniser.size is not None and not np.isnan(radii).all():
         of_size = recogniser.size.logits(radii).astype(np.float32)
@@ -89,46 +89,19 @@ def predict(
         shutil.rmtree(place)
 
 
-def _asked(store: ViewStore, recogniser: ModelCard, split: str | None, held_out: bool) -> NDArray[np.int64]:
-    """The objects to predict, rows of the store."""
-    objects = some_objects(store, split, recogniser if held_out else None)
-    unknown = sorted({store.classes[label] for label in store.labels[objects]} - set(recogniser.classes))
-    if unknown:
-        raise DatasetError(f"{store.path}: recogniser {recogniser.name} does not know the class {unknown[0]!r}")
-    return objects
-
-
 def _plan(
     store: ViewStore, objects: NDArray[np.int64], recogniser: ModelCard, maps: dict[str, ModelCard]
 ) -> Predictions:
     """What store and cards say of the objects; what the networks say is still to come."""
-    classes = recogniser.classes
     own = [card for card in (recogniser, *maps.values()) if card.path.parent != BUNDLED]
     made_by = [*store.commands, *(line for card in own for line in card.training.commands), command()]
-    return Predictions(
-        logits=np.zeros((len(objects), len(store.sphere), len(classes)), np.float32),
-        maps={},
-        depth_entropy=store.measure()[objects],
-        names=tuple(store.names[i] for i in objects),
-        labels=np.array([classes.index(store.classes[label]) for label in store.labels[objects]]),
-        classes=classes,
-        splits=store.splits[objects],
-        conflicting=conflicting_objects(store)[objects],
-        sphere=store.sphere,
+    return replace(
+        Predictions.of_objects_in(store, objects, recogniser.classes),
         models={name: (card.name, card.sha256) for name, card in ({"recogniser": recogniser} | maps).items()},
-        valley_classes={name: card.valleys(classes) for name, card in maps.items()},
+        valley_classes={name: card.valleys(recogniser.classes) for name, card in maps.items()},
         calibration=recogniser.calibration,
-        store=str(store.path.resolve()),
         commands=tuple(dict.fromkeys(made_by)),
     )
-
-
-def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
-    """Objects that look exactly like one with another label, in any split of the store, (N,) bool."""
-    group = duplicate_groups(store.measure())
-    several = np.zeros((group.max() + 1, len(store.classes)), bool)
-    several[group, store.labels] = True
-    return (several.sum(1) > 1)[group] & store.done
 
 
 def _card_file(card: ModelCard) -> str:

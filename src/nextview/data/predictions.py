@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,11 +12,13 @@ from typing import Any
 import msgspec
 import numpy as np
 from numpy.lib import format as npy
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from nextview.data.splits import deduplicated
-from nextview.errors import PredictionsError
+from nextview.data.splits import deduplicated, duplicate_groups, some_objects
+from nextview.data.store import ViewStore
+from nextview.errors import DatasetError, PredictionsError
 from nextview.files import decode_record, new_file, regular_file
+from nextview.geometry.observation import enough_shows
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
 from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
@@ -153,6 +156,59 @@ class Predictions:
     def with_size(self, of_size: NDArray[np.float32] | None) -> Predictions:
         """The inverse of ``by_shape``: logits by size, (N, C), are added."""
         return self if of_size is None else replace(self, logits=self.logits + of_size[:, None], of_size=of_size)
+
+    @classmethod
+    def from_logits(
+        cls,
+        store: ViewStore | str | Path,
+        logits: ArrayLike,
+        classes: Sequence[str] | None = None,
+        split: str | None = None,
+    ) -> Predictions:
+        """Predictions by a recogniser of your own, of no maps; they name no model.
+
+        Args:
+            store: view store, or its path.
+            logits: of each view of the rendered objects of the split, in the store's order, (N, V, C). Those of views
+                in which nothing is seen are set to 0: no evidence.
+            classes: their names; those of the store by default.
+            split: "train", "test" or "val"; all objects by default.
+
+        Raises:
+            DatasetError, PredictionsError: store, classes and logits do not fit together.
+        """
+        store = store if isinstance(store, ViewStore) else ViewStore.open(store)
+        objects = some_objects(store, split)
+        logits = np.array(logits, np.float32)
+        made = replace(cls.of_objects_in(store, objects, classes or store.classes), logits=logits)
+        for row, i in enumerate(objects):
+            logits[row, [not enough_shows(depth > 0) for depth in store.read("depth", i)]] = 0
+        return made
+
+    @classmethod
+    def of_objects_in(cls, store: ViewStore, objects: NDArray[np.int64], classes: Sequence[str]) -> Predictions:
+        """What a store says of objects, by index; all logits are 0."""
+        labels = [store.classes[label] for label in store.labels[objects]]
+        if unknown := sorted(set(labels) - set(classes)):
+            raise DatasetError(f"{store.path}: the recogniser does not know the class {unknown[0]!r}")
+        group = duplicate_groups(store.measure())
+        several = np.zeros((group.max() + 1, len(store.classes)), bool)
+        several[group, store.labels] = True
+        return cls(
+            logits=np.zeros((len(objects), len(store.sphere), len(classes)), np.float32),
+            maps={},
+            depth_entropy=store.measure()[objects],
+            names=tuple(store.names[i] for i in objects),
+            labels=np.array([classes.index(label) for label in labels]),
+            classes=tuple(classes),
+            splits=store.splits[objects],
+            conflicting=((several.sum(1) > 1)[group] & store.done)[objects],
+            sphere=store.sphere,
+            models={},
+            valley_classes={},
+            store=str(store.path.resolve()),
+            commands=store.commands,
+        )
 
     def save(self, path: Path, overwrite: bool = False) -> None:
         """Write one .npz file, whole or not at all; ResultsError if that cannot be."""

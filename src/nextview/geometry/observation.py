@@ -61,7 +61,7 @@ class SceneView:
 
 @dataclass(frozen=True, eq=False)  # each is itself, and can be the key of what is made of it
 class Observation:
-    """One view of an object. Lists are converted; arrays of the right type are not copied.
+    """One view of an object. It keeps copies of the arrays, which nobody can write to.
 
     Attributes:
         depth: distance along the optical axis, (H, W) float32, object radii, 0 where there is no object. What a sensor
@@ -97,7 +97,7 @@ class Observation:
             "image": None if self.image is None else _image(self.image, depth.shape),
         }
         for name, value in checked.items():
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, None if value is None else _own(value))
         if self.radius is not None:
             if not (isinstance(self.radius, Real) and 0 < self.radius < LARGEST):
                 shown = one_line(repr(self.radius))
@@ -123,6 +123,14 @@ class Observation:
     def picture(self) -> NDArray[np.uint8]:
         """The image; where the camera has none, the depth as a headlight would show it. (H, W) uint8."""
         return headlight(self.depth, self.intrinsics) if self.image is None else self.image
+
+
+def _own(values: NDArray[Any]) -> NDArray[Any]:
+    """The values in an array that nobody can write to: a copy where somebody could."""
+    if values.flags.writeable or values.base is not None:
+        values = values.copy()
+        values.flags.writeable = False
+    return values
 
 
 def enough_shows(mask: NDArray[np.bool_]) -> bool:

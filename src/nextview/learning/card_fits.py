@@ -321,14 +321,15 @@ def fit_valleys(predictions: Path, card: Path) -> FittedValleys:
     """
     table = Predictions.load(predictions)
     with card_to_fit(card, recogniser=False) as (model, write):
-        if model.kind not in table.maps or table.models[model.kind] != (model.name, model.sha256):
+        if model.kind not in table.maps or table.models.get(model.kind) != (model.name, model.sha256):
             raise PredictionsError(f"{predictions}: holds no maps by {card}")
         FittingSet.of_all(table)  # refuses the test split
         kept = _held_out(predictions, table, card, model)
         by_class = valley_gains(kept.sphere, kept.logits, kept.maps[model.kind], kept.labels)
         classes = tuple(table.classes[c] for c, gain in by_class.items() if gain > 0)
         gains = {table.classes[c]: round(gain, 4) for c, gain in by_class.items()}
-        about = f"{len(kept)} objects of the training split, judged by {table.models['recogniser'][0]}"
+        judge = table.models.get("recogniser", ("a recogniser without a card", ""))[0]
+        about = f"{len(kept)} objects of the training split, judged by {judge}"
         write("valleys", about, [table], valley_classes=classes, valley_gain=gains)
     return FittedValleys(classes, gains, len(kept))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -28,7 +29,7 @@ from nextview.policies.base import (
     visibility_of,
 )  # fmt: skip
 from nextview.policies.learned_tables import cells_from, cells_to
-from nextview.recognition.inference import check_end, open_onnx, run_onnx
+from nextview.recognition.inference import OnnxFile, check_end, open_onnx, run_onnx
 from nextview.recognition.map_names import SPHERE, in_order, maps_among
 
 Float = NDArray[np.float64]
@@ -262,13 +263,14 @@ class GainTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     frame: Frame
 
 
+def _cells(weights: Path, session: OnnxFile, features: NDArray[np.float32]) -> NDArray[np.float32]:
+    return run_onnx(weights, session, ["cells"], features)[0]
+
+
 def read_gain(sphere: ViewSphere, table: GainTable, scope: Scope, weights: Path, sha256: str) -> Gain:
     """The policy that a card describes."""
     session = open_onnx(weights, sha256, threads=1)
-
-    def score(features: NDArray[np.float32]) -> NDArray[np.float32]:
-        return run_onnx(weights, session, ["cells"], features)[0]
-
+    score = partial(_cells, weights, session)
     policy = Gain(sphere, table.classes, score, table.inputs, table.travel_weight, scope, table.frame)
     width = len(mirrored_features(sphere, policy.classes, policy.inputs, policy.frame))
     ends = [*session.get_inputs(), *session.get_outputs()]

@@ -33,7 +33,21 @@ Shape = tuple[int | None, ...]
 """Without the batch; None for a size that is free."""
 
 
-def open_onnx(path: Path, sha256: str, threads: int = 0) -> ort.InferenceSession:
+class OnnxFile(ort.InferenceSession):
+    """A network that ``open_onnx`` opened; pickled as its file, which is opened again. It never changes."""
+
+    def __init__(self, content: bytes, options: ort.SessionOptions, opened: tuple[Path, str, int]) -> None:
+        super().__init__(content, options, providers=["CPUExecutionProvider"])
+        self._opened = opened
+
+    def __reduce__(self) -> tuple[Any, tuple[Path, str, int]]:
+        return open_onnx, self._opened
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> OnnxFile:
+        return self
+
+
+def open_onnx(path: Path, sha256: str, threads: int = 0) -> OnnxFile:
     """Check the hash of an ONNX file, which holds all its weights, and hand it to ONNX Runtime."""
     content = checked_bytes(path, sha256)
     options = ort.SessionOptions()
@@ -44,7 +58,7 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> ort.InferenceSession
     # The hash is of this file alone: weights that it refers to in others, of the working folder say, are not found.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(path))
     try:
-        return ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        return OnnxFile(content, options, (Path(path).absolute(), sha256, threads))
     except Exception as error:  # the runtime has a class of exception for every reason
         raise ModelError(f"{path}: not a usable ONNX model ({one_line(str(error), LONGEST)})") from None
 

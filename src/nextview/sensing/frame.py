@@ -75,7 +75,7 @@ class Frame:
                 )
             if not (mask & (depth > 0)).any():
                 raise ObservationError("no pixel of the mask has a depth: a mask of another image, or empty")
-            object.__setattr__(self, "mask", mask)
+            object.__setattr__(self, "mask", mask.copy())
         if self.image is not None:
             image = array_of(self.image, "the image")
             if image.dtype != np.uint8 or image.shape not in (depth.shape, (*depth.shape, 3)):

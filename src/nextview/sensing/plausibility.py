@@ -37,8 +37,8 @@ FAR_ORIGIN = 30.0
 class ViewWarning:
     """Something that is likely to be wrong, in a sentence.
 
-    Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside" and "contradiction"; of a
-    frame "intrinsics", "unit", "far origin" and "outline".
+    Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside", "contradiction" and
+    "repeated"; of a frame "intrinsics", "unit", "far origin" and "outline".
     """
 
     name: str

@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from threading import RLock
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,12 +27,15 @@ from nextview.sensing.plausibility import ViewWarning, check_observation, check_
 from nextview.session.episode import Episodes, Step
 from nextview.session.reach import Reach, Reachable, TravelCost, as_reachable, as_travel_cost
 from nextview.session.recognition import Recognition
+from nextview.session.repeated import REPEATED, after_repeated, is_repeated
 from nextview.session.view import View
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
 Float = NDArray[np.float64]
+FARTHEST_TARGET = 20.0
+"""Object radii: a depth camera measures from some 0.25 m on, and few objects have a radius below 0.02 m."""
 CONTRADICTABLE = 3
 """Views before the last with whose geometry it is compared."""
 
@@ -63,7 +67,8 @@ def _blas() -> ThreadpoolController:
 class Session:
     """One object under way; the caller moves the camera.
 
-    A camera that goes where it is told, in the object frame and object radii:
+    Threads that share one wait for each other. A camera that goes where it is told, in the object frame and object
+    radii:
 
     >>> session = nextview.load().session()                                     # doctest: +SKIP
     >>> while not session.done:                                                 # doctest: +SKIP
@@ -121,7 +126,15 @@ class Session:
         self._before = 0 if object is None else len(object.sightings)
         self._chooser, self._rng = anywhere(policy, sphere), rng or np.random.default_rng(0)
         self._reach = Reach(np.zeros(len(sphere), bool))
+        self._lock = RLock()
         self._episodes = self._begin(whole(start, "the first view", 0, len(sphere) - 1))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the lock: a session can be copied and pickled, its networks are opened again."""
+        return {name: value for name, value in vars(self).items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _lock=RLock())
 
     def _begin(self, start: int) -> Episodes:
         calibration = self.models.recogniser.calibration
@@ -178,7 +191,8 @@ class Session:
 
     @reachable.setter
     def reachable(self, given: ArrayLike | Callable[[Float], bool] | None) -> None:
-        self._set_reach(replace(self._reach, reachable=as_reachable(given, len(self.sphere))))
+        with self._lock:
+            self._set_reach(replace(self._reach, reachable=as_reachable(given, len(self.sphere))))
 
     @property
     def travel_cost(self) -> TravelCost | None:
@@ -191,17 +205,19 @@ class Session:
 
     @travel_cost.setter
     def travel_cost(self, given: ArrayLike | Callable[[Float, Float], float] | None) -> None:
-        self._reach = replace(self._reach, cost=as_travel_cost(given, len(self.sphere)))
+        with self._lock:
+            self._reach = replace(self._reach, cost=as_travel_cost(given, len(self.sphere)))
 
     def failed(self, view: int | None = None) -> None:
         """The camera could not be brought to a view, by default the one that was asked for: it is offered no more.
 
         Where no reachable view is left the session ends, not confident: ``Recognition.stranded``.
         """
-        if self.done:
-            raise SessionError("this session has ended; begin another one")
-        view = self.view if view is None else whole(view, "a view", 0, len(self.sphere) - 1)
-        self._set_reach(replace(self._reach, failed=self._reach.failed | (np.arange(len(self.sphere)) == view)))
+        with self._lock:
+            if self.done:
+                raise SessionError("this session has ended; begin another one")
+            view = self.view if view is None else whole(view, "a view", 0, len(self.sphere) - 1)
+            self._set_reach(replace(self._reach, failed=self._reach.failed | (np.arange(len(self.sphere)) == view)))
 
     def _set_reach(self, reach: Reach) -> None:
         """Choose another view if the one that was chosen can no longer be reached."""
@@ -249,14 +265,16 @@ class Session:
         Raises:
             SessionError: the episode has ended, or a session mixes frames and observations.
             ObservationError: the object is not found in the frame, or the image does not suit the networks.
+            UsageError: the session's ``distance`` is inside the object, or more than 20 object radii.
             PolicyError: the policy failed.
         """
-        if self.done:
-            raise SessionError("this session has ended; begin another one")
-        with _blas().limit(limits=1):
-            view = self._add_frame(seen) if isinstance(seen, Frame) else self._add_observation(seen)
-        for observer in self.observers:
-            observer(self)
+        with self._lock:
+            if self.done:
+                raise SessionError("this session has ended; begin another one")
+            with _blas().limit(limits=1):
+                view = self._add_frame(seen) if isinstance(seen, Frame) else self._add_observation(seen)
+            for observer in self.observers:
+                observer(self)
         return view
 
     def _add_observation(self, seen: Observation) -> View:
@@ -267,7 +285,9 @@ class Session:
         warnings = check_observation(seen)
         for view in self.views[-CONTRADICTABLE:]:
             warnings = warnings or check_views(view.observation, seen)
-        return self._take([*(view.observation for view in self.views), seen], warnings, seen.pose, None)
+        earlier = [view.observation for view in self.views]
+        warnings = [REPEATED] if is_repeated(seen, earlier) else warnings
+        return self._take([*earlier, seen], warnings, seen.pose, None)
 
     def _add_frame(self, frame: Frame) -> View:
         if self.object is None and self.views:
@@ -277,12 +297,25 @@ class Session:
             raise SessionError("frames were added to this object outside of the session; begin another one")
         before = object.state
         try:
-            object.add(frame)
+            if (repeated := after_repeated(before, frame, self._before)) is not None:
+                object.state = repeated
+            else:
+                object.add(frame)
+            self._check_distance(object.object_frame.radius)
             observations = object.observations[self._before :]
             return self._take(observations, object.warnings, frame.camera_to_world, object)
         except BaseException:
             object.state = before
             raise
+
+    def _check_distance(self, radius: float) -> None:
+        """Refuse targets inside the object or far from it, as soon as its radius is known."""
+        if self.distance is None or radius < self.distance <= FARTHEST_TARGET * radius:
+            return
+        why = f"within {FARTHEST_TARGET:g} radii: is it in millimetres?" if self.distance > radius else "outside of it"
+        raise UsageError(
+            f"the distance of {self.distance:g} m from the centre of an object of {radius:.2g} m radius has to be {why}"
+        )
 
     def _take(
         self,
@@ -295,6 +328,8 @@ class Session:
         last = len(observations) - 1
         changed = [k for k, seen in enumerate(observations) if k == last or seen is not self.views[k].observation]
         found = self.models.evidence([observations[k] for k in changed])
+        once = np.array([REPEATED not in (warnings if k == last else self.views[k].warnings) for k in changed])
+        found = replace(found, seen=once if found.seen is None else found.seen & once)
         evidence = {k: found.select([row]) for row, k in enumerate(changed)}
         at = [
             (direction, *self.sphere.nearest(direction)) for direction in (direction_of(o.pose) for o in observations)
@@ -336,7 +371,7 @@ class Session:
         classes, evidence = len(self.models.classes), step.evidence
         bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), classes, azimuth)
         alone = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth)
-        novelty = evidence.novelty
+        novelty = evidence.novelty if evidence.seen is None or evidence.seen[0] else None
         return View(
             int(step.views[0]),
             observation,

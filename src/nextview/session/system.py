@@ -29,6 +29,7 @@ from nextview.recognition.inference import MapNetwork, Models, Recogniser, open_
 from nextview.recognition.map_names import SPHERE
 from nextview.recognition.memory import open_recogniser
 from nextview.recognition.model_card import DISCRIMINATE, find_models
+from nextview.recognition.own_stopping import Rule, own_stopping
 from nextview.session.recognition import Recognition
 from nextview.session.session import FrameCamera, Session
 
@@ -154,7 +155,7 @@ def load(
     viewpoints: str | Viewpoints | ArrayLike = "40",
     threads: int = 0,
     unknown: float = 0.0,
-    stopping: Stopping | None = None,
+    stopping: Stopping | Rule | str | None = None,
 ) -> System:
     """Open models, and what belongs to them.
 
@@ -171,8 +172,8 @@ def load(
         threads: of ONNX Runtime, 0 for one on each core.
         unknown: answer None where an object is as novel as at most this share of the objects of known classes: so
             often one of these is called unknown. 0 always names a class.
-        stopping: a rule of your own instead of ``threshold``, ``risk`` and ``max_views``: a ``Stopping`` with another
-            ``reached``.
+        stopping: a rule of your own: "MODULE:NAME" or a function, which is asked with what is believed and the
+            threshold, see ``recognition.own_stopping``; or a ``Stopping``, instead of threshold, risk and views.
 
     Raises:
         ModelError: there are no such models, one cannot be used, or the recogniser has no novelty score.
@@ -200,7 +201,12 @@ def load(
         made = make_policy_anywhere(policy, sphere, opened.valley_classes(policy), recogniser.classes, found.maps)
     if isinstance(made, MapPeak | SpherePeak):
         made = replace(made, sphere=_grid_of(opened.maps[made.map_name.removesuffix(SPHERE)], made.sphere))
-    rule = stopping or Stopping.of(recogniser.calibration, threshold, risk, max_views)
+    if isinstance(stopping, Stopping) or stopping is None:
+        rule = stopping or Stopping.of(recogniser.calibration, threshold, risk, max_views)
+    elif risk is not None:
+        raise UsageError("error rates are promised for the package's own stopping rule, not for yours")
+    else:
+        rule = own_stopping(stopping, threshold, max_views)
     return System(opened, made, policy, sphere, rule, unknown, given)
 
 

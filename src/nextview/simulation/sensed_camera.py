@@ -119,7 +119,7 @@ class SensedCamera:
     def _scene(self, pose: Float) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """True depth of object, boxes and table, metres, and what each pixel shows."""
         inside = self._truth.pose_in_object(pose)
-        depth = self._camera.observe(inside).depth
+        depth = self._camera.observe(inside).depth.copy()
         whose = np.full(depth.shape, OBJECT, np.uint8)
         table = self._table(inside)
         shown = np.isfinite(table) & (depth == 0)

@@ -97,7 +97,7 @@ class Walk:
         counted = 0
         for view in self.views:
             counted += view.observation.seen
-            if view.observation.seen and view.belief.max() >= self.stopping.threshold_at(counted):
+            if view.observation.seen and self.stopping.reached(view.belief, counted):
                 return True
         return len(self.views) >= self.stopping.max_views
 

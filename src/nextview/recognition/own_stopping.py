@@ -1,0 +1,81 @@
+"""A stopping rule of your own: a function of what is believed, in live use and in the benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.checks import one_line, plugin, plugin_errors
+from nextview.errors import UsageError
+from nextview.recognition.belief import Floating, Stopping
+
+
+@dataclass(frozen=True)
+class Believed:
+    """What is believed in some episodes, (...): all that a stopping rule may look at."""
+
+    belief: Floating  # in each class, (..., classes)
+    n_views: NDArray | int  # so far, in which anything was seen, (...)
+
+    @property
+    def highest(self) -> NDArray[np.float64]:
+        """The belief in the class believed most, (...)."""
+        return np.asarray(self.belief.max(-1), np.float64)
+
+    @property
+    def margin(self) -> NDArray[np.float64]:
+        """By how much it leads, (...)."""
+        if self.belief.shape[-1] == 1:
+            return self.highest
+        top = np.sort(self.belief, -1)
+        return np.asarray(top[..., -1] - top[..., -2], np.float64)
+
+    @property
+    def entropy(self) -> NDArray[np.float64]:
+        """Of the belief, bits, (...)."""
+        return -np.asarray((self.belief * np.log2(np.maximum(self.belief, 1e-300))).sum(-1), np.float64)
+
+
+Rule = Callable[[Believed, float], NDArray[np.bool_]]
+"""Whether to stop, (...) bool, by what is believed and by the threshold that was asked for."""
+
+
+@dataclass(frozen=True)
+class OwnStopping(Stopping):
+    """Stop where a rule says so, or after ``max_views`` views. UsageError where the rule fails."""
+
+    rule: Rule | None = None
+    name: str = "a rule of your own"
+
+    def reached(self, belief: Floating, n_views: NDArray | int) -> NDArray[np.bool_]:
+        """What the rule says, (...)."""
+        assert self.rule is not None
+        with plugin_errors(lambda said: UsageError(f"the stopping rule {self.name} raised {said}")):
+            said = np.asarray(self.rule(Believed(belief, n_views), self.threshold))
+        if said.dtype != bool or said.shape != belief.shape[:-1]:
+            wanted = f"bool of the shape {belief.shape[:-1]}, not {said.dtype} of {said.shape}"
+            raise UsageError(f"the stopping rule {self.name} has to return {wanted}")
+        return said
+
+    def __str__(self) -> str:
+        return f"{self.name} at {self.threshold:.3g}"
+
+
+def own_stopping(rule: Rule | str, threshold: float, max_views: int) -> Stopping:
+    """The rule of a function, or of MODULE:NAME: a function, or a kind of ``Stopping``."""
+    found: Any = rule
+    name = rule if isinstance(rule, str) else getattr(rule, "__name__", "a rule of your own")
+    if isinstance(rule, str):
+        if ":" not in rule:
+            raise UsageError(f"a stopping rule of your own is named MODULE:NAME, not {one_line(repr(rule))}")
+        with plugin_errors(lambda said: UsageError(f"the stopping rule {rule} cannot be made ({said})")):
+            found = plugin(rule)
+    if isinstance(found, type) and issubclass(found, Stopping):
+        return found(threshold, max_views)
+    if not callable(found):
+        raise UsageError(f"the stopping rule {name} is no function")
+    return OwnStopping(threshold, max_views, rule=found, name=name)
