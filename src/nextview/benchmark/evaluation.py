@@ -1,7 +1,5 @@
 """How good the models under the policies are: every view of every object judged, no policy asked."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

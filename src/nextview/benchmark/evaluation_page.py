@@ -1,7 +1,5 @@
 """The stage that judges the models behind some predictions: a folder of tables and one HTML page."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The figures of a benchmark, from its tables, and of an evaluation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Who leads under one threshold, which differences can be told from chance, and when there are too few objects."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

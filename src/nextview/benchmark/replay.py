@@ -6,8 +6,6 @@ draws once for all thresholds in this way, which also pairs its episodes. A path
 exactly 1 in double precision: no threshold can want more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 

@@ -1,7 +1,5 @@
 """The report: one self-contained HTML page from a folder of benchmark results."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from io import BytesIO

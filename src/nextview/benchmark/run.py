@@ -1,7 +1,5 @@
 """The benchmark: from predictions to a folder of results, and back from the folder."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From episodes to tables: every number with its interval, its test and the published value."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product

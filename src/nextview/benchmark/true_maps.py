@@ -1,7 +1,5 @@
 """What no model predicts: true measures and maps of every view, and plans, from predictions and their view store."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How a command ends, whatever happens: a mistake of the user's in one sentence, a bug with its traceback."""
 
-from __future__ import annotations
-
 import os
 import sys
 import warnings

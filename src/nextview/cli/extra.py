@@ -1,7 +1,5 @@
 """Packages that an optional part of nextview needs."""
 
-from __future__ import annotations
-
 import sys
 from importlib.util import find_spec
 

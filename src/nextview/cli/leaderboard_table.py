@@ -1,7 +1,5 @@
 """The results of a benchmark and of an evaluation as tables in the terminal."""
 
-from __future__ import annotations
-
 from math import isfinite
 from typing import Any
 

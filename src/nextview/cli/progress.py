@@ -1,7 +1,5 @@
 """Progress on standard error: a bar in a terminal, else a line now and then."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Iterator
 from typing import Any

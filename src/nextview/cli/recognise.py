@@ -1,7 +1,5 @@
 """``nextview recognise`` and ``demo``: look at one object until it is clear what it is; ``capture`` for the former."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Download a published dataset: verified, and unpacked whole or not at all."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from dataclasses import dataclass

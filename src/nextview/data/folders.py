@@ -5,8 +5,6 @@ the mesh (CLASS/ID/models/MESH). Where all meshes lie in the folder itself, each
 own. Links are followed.
 """
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """View measures: what they are handed; depth entropy and the recogniser's confidence; users' own by import path."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

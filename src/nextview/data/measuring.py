@@ -1,7 +1,5 @@
 """Compute something of every rendered object of a store, into the store; resumable by object."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial

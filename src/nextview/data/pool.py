@@ -1,7 +1,5 @@
 """Run one function on many items: on this machine's cores, or on a cluster through dask.distributed."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

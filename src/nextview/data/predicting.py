@@ -1,7 +1,5 @@
 """Run the models over every view of a store, once; resumable by object."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Render a dataset into a view store, on all cores, resumable."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress

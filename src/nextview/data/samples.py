@@ -1,7 +1,5 @@
 """Sample objects of our own, made of boxes: something to look at before any dataset is there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

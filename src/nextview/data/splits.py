@@ -1,7 +1,5 @@
 """Which objects train and which validate: by object, stratified by class, identical meshes together. And samples."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Depth images in object radii, 0 where there is no object: their points, and how they look under a headlight."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

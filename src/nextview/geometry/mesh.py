@@ -1,7 +1,5 @@
 """Read a mesh file and bring it into the object frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

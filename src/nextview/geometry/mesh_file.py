@@ -4,8 +4,6 @@ OFF and OBJ are read here. ModelNet's OFF files break the standard (``OFF490926 
 takes a truncated one for whole; its OBJ reader counts relative indices from the end of the file.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re

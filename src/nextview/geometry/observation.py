@@ -1,7 +1,5 @@
 """What one view yields, and what can take a view."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real

@@ -1,7 +1,5 @@
 """Several things in one Embree scene: how far rays go, and which thing they end on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The ways in which an object is likely to lie on a plane."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """From finished training runs to a model that ships: an ONNX file with half-precision weights, and its card."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence

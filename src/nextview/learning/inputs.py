@@ -1,7 +1,5 @@
 """The networks' inputs of a whole store: computed once and kept beside the store, each view packed for itself."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The training run that all networks share: devices, checkpoints, early stopping, logs, exact epochs after a resume."""
 
-from __future__ import annotations
-
 import csv
 import io
 import logging

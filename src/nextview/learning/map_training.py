@@ -1,7 +1,5 @@
 """The stage from a view store to a trained map network: it learns one value for every view of an object."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

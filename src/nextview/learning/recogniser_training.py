@@ -1,7 +1,5 @@
 """The stage from a view store to a trained recogniser."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """The folder of a training run, and networks that begin from one or from a published checkpoint."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext

@@ -5,8 +5,6 @@ the absolute azimuth: all views are written as cells (see ``policies.learned_tab
 stands, or from where the recogniser believes the object's own zero to be. An object and its mirror image are alike.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ So every place is written as a *cell*: its ring, and how many azimuth steps it l
 view farthest from all visited.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """The card of a policy that was learned from predictions: one JSON file, table and all; weights are ONNX beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal

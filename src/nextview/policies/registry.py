@@ -1,7 +1,5 @@
 """Policies by name, or by the import path of a user's own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

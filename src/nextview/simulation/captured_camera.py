@@ -1,7 +1,5 @@
 """A camera that has been everywhere already: the nearest captured view answers a request."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

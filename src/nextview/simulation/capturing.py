@@ -1,7 +1,5 @@
 """Write captured views of a mesh in BOP's layout, from a camera that casts rays: what ``captured`` reads."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A robot's camera in a scene: frames in metres, through a sensor, of a target that is named as a user would."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal, get_args
 

@@ -1,7 +1,5 @@
 """A scene as geometry: upright things on a table, in the target's object frame, and where a camera can be."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A simulated camera behind a sensor: true depth in metres, the sensor's errors, then the product's own way in."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

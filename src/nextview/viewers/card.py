@@ -1,7 +1,5 @@
 """What the last view of a walk showed and changed, as a piece of HTML."""
 
-from __future__ import annotations
-
 from base64 import b64encode
 from collections.abc import Iterable
 from html import escape

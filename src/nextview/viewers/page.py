@@ -1,7 +1,5 @@
 """The explorer's page: what is clicked and dragged goes to an ``Exploration``, and what follows is drawn."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator

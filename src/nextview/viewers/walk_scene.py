@@ -1,7 +1,5 @@
 """A walk in 3D: the object, the candidate views in the colours of their values, the path and the camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
