@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -117,6 +118,12 @@ class Predictions:
         seen = np.ptp(self.by_shape().logits, axis=2) > (SAME if len(self.classes) > 1 else -1)
         return seen if self.azimuth_bins is None else seen | (np.ptp(self.azimuth_bins, axis=(2, 3)) > SAME)
 
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Of the objects, (N,), sum N: all classes that occur count the same."""
+        count = np.bincount(self.labels, minlength=len(self.classes))
+        return len(self) / ((count > 0).sum() * count[self.labels])
+
     def evidence(self, objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
         """What the models say of objects (rows), (B,), each seen from one view, (B,)."""
         return Evidence(
@@ -143,6 +150,18 @@ class Predictions:
         arrays: dict[str, Any] = {name: values[kept] for name, values in self._arrays().items()}
         maps = {name: values[kept] for name, values in self.maps.items()}
         return replace(self, **arrays, maps=maps, names=tuple(self.names[i] for i in kept))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Predictions]) -> Predictions:
+        """All objects of predictions by the same models, one after the other: in part K their names end in #K."""
+        found = [part._arrays() for part in parts]
+        arrays: dict[str, Any] = {
+            name: np.concatenate([own[name] for own in found]) if all(name in own for own in found) else None
+            for name in found[0]
+        }
+        maps = {name: np.concatenate([part.maps[name] for part in parts]) for name in parts[0].maps}
+        names = (f"{name}#{k}" if k else name for k, part in enumerate(parts) for name in part.names)
+        return replace(parts[0], **arrays, maps=maps, names=tuple(names))
 
     def by_shape(self) -> Predictions:
         """What the recogniser says to those who do not know how large the objects are."""

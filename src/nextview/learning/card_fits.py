@@ -17,12 +17,12 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, PredictionsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.fitting_set import (
-    FittingSet,
     blind_walks,
     card_to_fit,
     check_recogniser,
     described,
     fitting_set,
+    for_fitting,
     held_out_by,
     load_sensed,
 )
@@ -83,9 +83,9 @@ def fit_calibration(
         if validation != 1:
             check_recogniser(card, model, predictions, table)
         if validation is None:
-            FittingSet.of_all(table)  # refuses the test split
+            for_fitting(table)
             table = _held_out(predictions, table, card, model)
-            data = FittingSet.joined([FittingSet.of_all(part) for part in (table, *load_sensed(sensed, table))])
+            data = Predictions.joined([table, *load_sensed(sensed, table)])
         else:
             data = fitting_set(table, validation, split_seed)
         walks = 1 + 8000 // len(data)  # few objects are walked over more often
@@ -109,12 +109,12 @@ def _held_out(path: Path, table: Predictions, card: Path, model: ModelCard) -> P
 class Walks:
     """Walks over all objects of a set: as many in the local window as over the sphere, those last."""
 
-    data: FittingSet
+    data: Predictions
     objects: NDArray[np.int64]  # (walks,)
     totals: Float  # log-evidence summed over the views so far, (walks, views, D)
 
     @classmethod
-    def draw(cls, data: FittingSet, rng: np.random.Generator, n_views: int, walks: int) -> Walks:
+    def draw(cls, data: Predictions, rng: np.random.Generator, n_views: int, walks: int) -> Walks:
         """So many walks of each kind over every object."""
         objects, views, n_views = np.tile(np.arange(len(data)), 2 * walks), [], min(n_views, len(data.sphere))
         for policy in (Random(data.sphere), RandomAll(data.sphere)):
@@ -136,7 +136,7 @@ class Walks:
         return -float((weights / weights.sum() / len(self.numbers)) @ of_truth.sum(1))
 
 
-def fit_temperature(data: FittingSet, rng: np.random.Generator, n_views: int = 5, walks: int = 4) -> Calibration:
+def fit_temperature(data: Predictions, rng: np.random.Generator, n_views: int = 5, walks: int = 4) -> Calibration:
     """Temperature of one view and correlations of several, by maximum likelihood over 1 to ``n_views`` views."""
     walked = Walks.draw(data, rng, n_views, walks)
 
@@ -153,21 +153,20 @@ def fit_temperature(data: FittingSet, rng: np.random.Generator, n_views: int = 5
     return calibration(np.round(fitted.x, 4))
 
 
-def calibration_of(predictions: Predictions, data: FittingSet, rng: np.random.Generator, walks: int = 4) -> Calibration:
-    """The calibration of predictions; fitted to some of them where their recogniser was not calibrated."""
-    known = predictions.calibration != PLAIN_SUM
-    return predictions.calibration if known else fit_temperature(data, rng, walks=walks)
+def calibration_of(data: Predictions, rng: np.random.Generator, walks: int = 4) -> Calibration:
+    """The calibration of predictions; fitted to them where their recogniser was not calibrated."""
+    return data.calibration if data.calibration != PLAIN_SUM else fit_temperature(data, rng, walks=walks)
 
 
 def loss(
-    data: FittingSet, calibration: Calibration, rng: np.random.Generator, n_views: int = 5, walks: int = 4
+    data: Predictions, calibration: Calibration, rng: np.random.Generator, n_views: int = 5, walks: int = 4
 ) -> float:
     """Mean negative log-likelihood of the true class over 1 to ``n_views`` views; see ``fit_temperature``."""
     return Walks.draw(data, rng, n_views, walks).loss(calibration)
 
 
 def fit_risk(
-    data: FittingSet,
+    data: Predictions,
     calibration: Calibration,
     rng: np.random.Generator,
     delta: float = 0.1,
@@ -256,7 +255,7 @@ def fit_size(store: Path, predictions: Path, card: Path) -> FittedSize:
         raise PredictionsError(f"{predictions}: holds {unknown[0]!r}, which {store} does not")
     with card_to_fit(card) as (model, write):
         check_recogniser(card, model, predictions, table)
-        data, judged = FittingSet.of_all(table), [row[name] for name in table.names]
+        data, judged = for_fitting(table), [row[name] for name in table.names]
         of_training = views.done & (views.splits == "train") & np.isin(views.attributes.labels, table.classes)
         taught = np.setdiff1d(np.flatnonzero(of_training), [row[name] for name in predicted.names])
         classes = np.array([table.classes.index(name) if name in table.classes else -1 for name in views.classes])
@@ -282,7 +281,7 @@ def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
     return density
 
 
-def fit_weight(data: FittingSet, radii: Float, log_density: Float) -> tuple[SizeEvidence, float, float]:
+def fit_weight(data: Predictions, radii: Float, log_density: Float) -> tuple[SizeEvidence, float, float]:
     """The most likely weight beside the logits, over single views, at the temperature most likely with it."""
     of_size = SizeEvidence.from_arrays(RADII, log_density, 1.0).logits(radii)[:, None]
 
@@ -323,7 +322,7 @@ def fit_valleys(predictions: Path, card: Path) -> FittedValleys:
     with card_to_fit(card, recogniser=False) as (model, write):
         if model.kind not in table.maps or table.models[model.kind] != (model.name, model.sha256):
             raise PredictionsError(f"{predictions}: holds no maps by {card}")
-        FittingSet.of_all(table)  # refuses the test split
+        for_fitting(table)
         kept = _held_out(predictions, table, card, model)
         by_class = valley_gains(kept.sphere, kept.logits, kept.maps[model.kind], kept.labels)
         classes = tuple(table.classes[c] for c, gain in by_class.items() if gain > 0)

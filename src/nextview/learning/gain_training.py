@@ -317,7 +317,7 @@ class _Data:
             {},
             f"{self.learned_from}, classes weighted evenly; epoch and travel weight chosen on {self.validated_on}",
             tuple(LearnedFrom(sha256_of(path), p.models) for path, p in self.sources),
-            tuple((part.calibration.temperature, part.calibration.correlation) for part in self.learned),
+            tuple((part.data.calibration.temperature, part.data.calibration.correlation) for part in self.learned),
             asdict(recipe),
             tuple(dict.fromkeys((*(line for _, p in self.sources for line in p.commands), command()))),
         )
