@@ -29,9 +29,9 @@ from nextview.errors import ResultsError, UsageError
 from nextview.files import new_file
 from nextview.learning.export import run_network
 from nextview.learning.inputs import PackedViews, load_inputs
-from nextview.learning.loop import is_first
 from nextview.learning.recipes import THESIS_RECOGNISER, Hardware, RecogniserRecipe
 from nextview.learning.recogniser_training import train_recogniser
+from nextview.learning.runs import is_first
 from nextview.session.style import ACCENT, BLUE, legend, new_figure, percent_axis, to_png
 from research.training_curves import draw_curves
 

@@ -20,9 +20,8 @@ from nextview.errors import ModelError, PredictionsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.architectures import map_columns, map_network, orthogonality
 from nextview.learning.inputs import PackedViews, ready_inputs
-from nextview.learning.loop import OwnBatches, fit, optimiser
 from nextview.learning.recipes import Hardware, MapRecipe
-from nextview.learning.runs import new_run, read_run, refuse_seen, start_from, train_once
+from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, read_run, refuse_seen, start_from, train_once
 from nextview.recognition.map_names import CONFIDENCE
 from nextview.recognition.network_input import cloud_input
 

@@ -20,9 +20,8 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.learning.architectures import recogniser_network
 from nextview.learning.inputs import PackedViews, ready_inputs
-from nextview.learning.loop import OwnBatches, fit, optimiser
 from nextview.learning.recipes import Hardware, RecogniserRecipe
-from nextview.learning.runs import new_run, refuse_seen, start_from, train_once
+from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, refuse_seen, start_from, train_once
 
 Indices = NDArray[np.int64]
 
