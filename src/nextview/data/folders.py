@@ -1,8 +1,7 @@
 """Folders of meshes: which files are objects, of which class and split, and what is left out.
 
-Understood are CLASS/MESH, CLASS/SPLIT/MESH and SPLIT/CLASS/MESH, each also with folders between the last of these and
-the mesh (CLASS/ID/models/MESH). Where all meshes lie in the folder itself, each is a class of its
-own. Links are followed.
+Understood are CLASS/MESH, CLASS/SPLIT/MESH and SPLIT/CLASS/MESH, each also with folders before the mesh
+(CLASS/ID/models/MESH). Where all meshes lie in the folder itself, each is a class of its own. Links are followed.
 """
 
 import os
@@ -60,8 +59,7 @@ def list_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> list[
 def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> Listing:
     """All meshes of a dataset folder, or other files in its layout, and those that were left out.
 
-    Raises:
-        DatasetError: there is no such folder, it holds none, or two of them would have one name.
+    DatasetError if there is no such folder, it holds none, or two of them would have one name.
     """
     root = Path(root)
     if not root.is_dir():

@@ -42,25 +42,12 @@ def predict(
     scheduler: str | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """Write the predictions of a store's rendered objects.
+    """Write the predictions of a store's rendered objects into an .npz file; options as of ``nextview predict``.
 
-    What is done is kept in a folder beside ``out``, so that a run that was killed goes on from there.
-
-    Args:
-        path, out: the view store, and the .npz file to make.
-        recogniser: its card.
-        maps: card of the network for each map.
-        size: let the recogniser know how large the objects are, where store and card tell.
-        split, held_out, overwrite: as of ``nextview predict``.
-        workers, scheduler: see ``pool.each``; a scheduler's workers see the same files.
-
-    Yields:
-        Objects done so far, and how many there are.
-
-    Raises:
-        DatasetError: the store holds no such objects, or a class that the recogniser does not know; or one of them
-            kills its process.
-        ResultsError: ``out`` exists, or cannot be written.
+    ``size`` lets the recogniser know how large the objects are, where store and card tell. What is done is kept beside
+    ``out``: a run that was killed goes on from there. Yields objects done so far, and how many there are.
+    DatasetError: no such objects, a class that the recogniser does not know, or an object that kills its process.
+    ResultsError: ``out`` exists, or cannot be written.
     """
     path, out = Path(path), Path(out)
     check_new(out, overwrite)

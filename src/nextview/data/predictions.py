@@ -32,44 +32,26 @@ KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}
 
 @dataclass(frozen=True)
 class Predictions:
-    """What the models say of N objects from the V views of a sphere; C classes, R rings.
+    """What the models say of N objects from the V views of a sphere; C classes, R rings."""
 
-    Attributes:
-        logits: of the recogniser for each view alone, (N, V, C) float32.
-        maps: predicted local maps around each view by name ("lem"), each (N, V, R, 3) float32; those of the whole
-            sphere ("lem-sphere") are (N, V, R, azimuths), once round from the view.
-        depth_entropy: the true measure, bits, (N, V) float32.
-        names: of the objects, unique.
-        labels: true class of each as an index into ``classes``, (N,) int64.
-        classes: their names, in the order of the logits.
-        splits: "train", "test" or "" for each object, (N,).
-        conflicting: objects that are the very mesh of another one with another label, (N,) bool.
-        sphere: the viewpoints.
-        models: name and SHA-256 of the recogniser ("recogniser") and of each map network ("lem").
-        valley_classes: for each map, the classes for which its card says that the valley is the better view.
-        calibration: how far a sum of the recogniser's logits is to be trusted.
-        azimuth_bins: see ``Evidence``, (N, V, hypotheses, azimuth bins) float32; None if the recogniser cannot tell.
-        of_size: what the object's size added to the logits, (N, C) float32; None if sizes are not known.
-        store: absolute path of the view store they were made from; empty if it is not known.
-        commands: all that made them, in order, from the meshes on; () if that is not known.
-    """
-
-    logits: NDArray[np.float32]
+    logits: NDArray[np.float32]  # of the recogniser for each view alone, (N, V, C)
+    # predicted local maps around each view by name ("lem"), each (N, V, R, 3); those of the whole sphere ("lem-sphere")
+    # are (N, V, R, azimuths), once round from the view
     maps: dict[str, NDArray[np.float32]]
-    depth_entropy: NDArray[np.float32]
-    names: tuple[str, ...]
-    labels: NDArray[np.int64]
-    classes: tuple[str, ...]
-    splits: NDArray[np.str_]
-    conflicting: NDArray[np.bool_]
+    depth_entropy: NDArray[np.float32]  # the true measure, bits, (N, V)
+    names: tuple[str, ...]  # of the objects, unique
+    labels: NDArray[np.int64]  # true class of each as an index into ``classes``, (N,)
+    classes: tuple[str, ...]  # their names, in the order of the logits
+    splits: NDArray[np.str_]  # "train", "test" or "" for each object, (N,)
+    conflicting: NDArray[np.bool_]  # objects that are the very mesh of another one with another label, (N,)
     sphere: ViewSphere
-    models: dict[str, tuple[str, str]]
-    valley_classes: dict[str, tuple[str, ...]]
-    calibration: Calibration = PLAIN_SUM
-    azimuth_bins: NDArray[np.float32] | None = None
-    of_size: NDArray[np.float32] | None = None
-    store: str = ""
-    commands: tuple[str, ...] = ()
+    models: dict[str, tuple[str, str]]  # name and SHA-256 of the "recogniser" and of each map network ("lem")
+    valley_classes: dict[str, tuple[str, ...]]  # of each map: those for which the valley is the better view
+    calibration: Calibration = PLAIN_SUM  # how far a sum of the recogniser's logits is to be trusted
+    azimuth_bins: NDArray[np.float32] | None = None  # see ``Evidence``, (N, V, hypotheses, bins); None if not known
+    of_size: NDArray[np.float32] | None = None  # what the size added to the logits, (N, C); None if not known
+    store: str = ""  # absolute path of the view store they were made from; empty if it is not known
+    commands: tuple[str, ...] = ()  # all that made them, in order, from the meshes on; () if that is not known
 
     def __post_init__(self) -> None:
         n, v, c = len(self.names), len(self.sphere), len(self.classes)

@@ -84,15 +84,8 @@ def draw_scenes(
 
     The objects of each split are taken in an order that the seed draws, each once before any is taken again, the same
     at all levels. What stands around an object is of its own split. Files are CLASS/SPLIT/NAME@LEVEL-NUMBER.json, or
-    CLASS/NAME@LEVEL-NUMBER.json where the dataset has no splits.
-
-    Args:
-        dataset, out: folder of meshes, and of scenes.
-        levels, scenes, seed, split, held_out: as of ``nextview scenes``.
-        workers, scheduler: see ``pool.each``; a scheduler's workers see the same files.
-
-    Yields:
-        (name, None) for each scene that is there, (name, reason) for one that cannot be drawn.
+    CLASS/NAME@LEVEL-NUMBER.json where the dataset has no splits. Options as of ``nextview scenes`` and ``pool.each``.
+    Yields (name, None) for each scene that is there, (name, reason) for one that cannot be drawn.
     """
     dataset, out = Path(dataset), Path(out)
     wanted = tasks(dataset, out, levels, scenes, seed, split, held_out)
@@ -167,9 +160,7 @@ class Meshes:
 def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) -> SceneLayout:
     """A scene of some level around a target, a mesh file of the folder; seed and name decide all that is random.
 
-    Raises:
-        MeshError: the target cannot be used.
-        DatasetError: no layout shows as much of it as the level wants; or a file cannot be read.
+    MeshError if the target cannot be used; DatasetError if no layout shows as much of it as the level wants.
     """
     rng = np.random.default_rng([seed, *name.encode()])
     mesh = cached_mesh(meshes.folder / target)

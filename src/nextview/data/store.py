@@ -362,11 +362,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def check(path: Path, workers: int | None = None, scheduler: str | None = None) -> Iterator[tuple[str, str | None]]:
-    """Read every array of every rendered object: every chunk is there and has its checksum.
-
-    Yields:
-        (name, None) for each sound object, (name, what is wrong with it) for a damaged one.
-    """
+    """Read all arrays of all rendered objects, by their checksums; yields (name, None) or (name, what is wrong)."""
     store = ViewStore.open(path)
     for name in store.rendered:
         store.array(name)  # says what is wrong
