@@ -51,20 +51,11 @@ class Mesh:
 def make_mesh(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], name: str = "mesh", unit: str | None = None
 ) -> Mesh:
-    """Check raw arrays and normalise them.
+    """Check raw vertices, (V, 3), any unit, and faces, (F, 3), and normalise them.
 
-    Args:
-        vertices: (V, 3), any unit.
-        faces: (F, 3), indices into the vertices.
-        name: used in messages.
-        unit: of the positions, one of UNITS; None if it is not known.
-
-    Returns:
-        The mesh in the object frame, without the vertices that no face uses, and each triangle once: copies in the same
-        place show nothing new, and a great many of them take a minute a view.
-
-    Raises:
-        MeshError: no faces, not triangles, an index out of range, a position that is not finite, no extent, or no area.
+    Returns the mesh in the object frame, without the vertices that no face uses, and each triangle once: copies in the
+    same place show nothing new, and a great many of them take a minute a view. MeshError: no faces, not triangles, an
+    index out of range, a position that is not finite, no extent, or no area.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     for array, what in ((vertices, "vertices"), (faces, "faces")):
@@ -119,19 +110,11 @@ def _first_of_equals(rows: NDArray) -> NDArray[np.int64]:
 
 
 def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None, max_faces: int = MAX_FACES) -> Mesh:
-    """Read an OFF, OBJ, PLY, STL or GLB file; the parts of a scene are joined.
+    """Read an OFF, OBJ, PLY, STL or GLB file, by its suffix, into the object frame; the parts of a scene are joined.
 
-    Args:
-        path: the file; its suffix tells the format.
-        up: the file's up axis, "y" or "z". By default z, but y for GLB, whose standard says so.
-        unit: the file's unit of length, one of UNITS; None if it is not known.
-        max_faces: refuse a mesh of more triangles, or in a file of more than BYTES_PER_FACE bytes for each.
-
-    Returns:
-        The mesh in the object frame.
-
-    Raises:
-        MeshError: what is wrong with the file, in one sentence.
+    The ``up`` axis is "y" or "z"; by default z, but y for GLB, whose standard says so. The ``unit`` of length is one of
+    UNITS; None if it is not known. A mesh of more triangles than ``max_faces``, or in a file of more than
+    BYTES_PER_FACE bytes for each, is refused. MeshError: what is wrong with the file, in one sentence.
     """
     path = Path(path)
     suffix = path.suffix.lower()

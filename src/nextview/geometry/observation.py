@@ -143,10 +143,9 @@ class Camera(Protocol):
 
 
 def checked_pose(pose: Any) -> NDArray[np.float64]:
-    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii, if it is one.
+    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii.
 
-    Raises:
-        ObservationError: not a rigid motion, or one to a place from which no object can be seen.
+    ObservationError if it is no rigid motion, or leads to a place from which no object can be seen.
     """
     pose = numbers(pose, "the pose").astype(np.float64, copy=False)
     if pose.shape != (4, 4):
@@ -170,11 +169,7 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
 
 
 def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """A pinhole matrix, (3, 3) float64, pixels, of an image of some shape, if it is one.
-
-    Raises:
-        ObservationError: another shape, or numbers that no camera has.
-    """
+    """A pinhole matrix, (3, 3) float64, pixels, of an image of some shape; ObservationError if no camera has it."""
     intrinsics = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64, copy=False)
     if intrinsics.shape != (3, 3):
         raise ObservationError(f"the intrinsics are a pinhole matrix of the shape (3, 3), not {intrinsics.shape}")
@@ -194,11 +189,7 @@ def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.fl
 
 
 def numbers(values: Any, what: str) -> NDArray[Any]:
-    """An array of real numbers; ``what`` says in the message what it should be.
-
-    Raises:
-        ObservationError: it is none.
-    """
+    """An array of real numbers; ObservationError if it is none: ``what`` names it there."""
     array = array_of(values, what)
     if array.dtype.kind not in "fiu":
         raise ObservationError(f"{what} is an array of numbers, not of {array.dtype}")
@@ -206,11 +197,7 @@ def numbers(values: Any, what: str) -> NDArray[Any]:
 
 
 def array_of(values: Any, what: str) -> NDArray[Any]:
-    """An array of anything.
-
-    Raises:
-        ObservationError: it cannot become one.
-    """
+    """An array of anything; ObservationError if it cannot become one."""
     try:
         return np.asarray(values)
     except (ValueError, TypeError) as error:  # rows of different lengths, or what cannot become an array at all
@@ -218,11 +205,7 @@ def array_of(values: Any, what: str) -> NDArray[Any]:
 
 
 def depth_image(depth: Any) -> NDArray[Any]:
-    """A depth image, (H, W), of numbers in any unit.
-
-    Raises:
-        ObservationError: it is none.
-    """
+    """A depth image, (H, W), of numbers in any unit; ObservationError if it is none."""
     depth = numbers(depth, "the depth")
     if depth.ndim != 2 or depth.size == 0:
         raise ObservationError(f"the depth is one image of the shape (H, W), not {depth.shape}")
@@ -258,17 +241,9 @@ def _image(image: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
 
 
 def pinhole(size: int, distance: float) -> NDArray[np.float64]:
-    """Intrinsics of a square image that just holds the unit sphere seen from a distance.
+    """Pinhole matrix, (3, 3) float64, of a square image that just holds the unit sphere seen from a distance.
 
-    Args:
-        size: side of the image, pixels.
-        distance: from the sphere's centre, object radii, greater than 1.
-
-    Returns:
-        (3, 3) float64.
-
-    Raises:
-        ObservationError: the camera stands inside the sphere.
+    ``size`` is its side, pixels; the distance is from the centre, object radii. ObservationError if that is inside.
     """
     distance = number(distance, "the distance")
     if not 1 < distance < LARGEST:

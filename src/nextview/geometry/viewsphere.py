@@ -32,15 +32,10 @@ SNAP = 1e-6
 
 
 def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = DISTANCE) -> Float:
-    """Camera-to-world poses of cameras that look at the origin with the horizon level.
+    """Camera-to-world poses, (..., 4, 4) float64, of cameras that look at the origin with the horizon level.
 
-    Args:
-        elevation: angle above the horizontal plane, radians, (...).
-        azimuth: angle about +z, counter-clockwise from +x, radians, (...).
-        distance: from the origin, object radii.
-
-    Returns:
-        (..., 4, 4) float64, in OpenCV's camera axes: x right, y down, z forward.
+    Camera axes are OpenCV's: x right, y down, z forward. Elevation above the horizontal plane and azimuth about +z,
+    counter-clockwise from +x, are radians, (...); the distance is from the origin, object radii.
     """
     elevation, azimuth = np.broadcast_arrays(np.asarray(elevation, float), np.asarray(azimuth, float))
     ce, se, ca, sa = np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth)

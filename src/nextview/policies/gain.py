@@ -153,25 +153,17 @@ class Gain:
     view (``nextview train gain``): fitted one-step lookahead, as in the value functions for sensor planning of Denzler
     and Brown, "Information theoretic sensor data selection for active object recognition", PAMI 24 (2002), but
     regressed from the decision state instead of simulated. They decide by ``features`` alone.
-
-    Attributes:
-        sphere: the viewpoints.
-        classes: how many, C.
-        score: from the features, (B, D) float32, to the value of each cell, (B, V) float32: the mean over some
-            networks and over the object and its mirror image. Each row by itself, to the last bit.
-        inputs: of which the features are made.
-        travel_weight: of a grid cell of travel, in the unit of the values: log-belief for the bundled one.
-        scope: where it may go.
-        frame: in which cells are counted.
     """
 
     sphere: ViewSphere
-    classes: int
+    classes: int  # how many, C
+    # from features, (B, D) float32, to the value of each cell, (B, V): the mean over some networks and over the object
+    # and its mirror image; each row by itself, to the last bit
     score: Callable[[NDArray[np.float32]], NDArray[np.floating]]
-    inputs: tuple[str, ...]
-    travel_weight: float = 0.0
-    scope: Scope = "global"
-    frame: Frame = "camera"
+    inputs: tuple[str, ...]  # of which the features are made
+    travel_weight: float = 0.0  # of a grid cell, in the unit of the values: log-belief for the bundled one
+    scope: Scope = "global"  # where it may go
+    frame: Frame = "camera"  # in which cells are counted
 
     def __post_init__(self) -> None:
         maps = maps_of(self.inputs)

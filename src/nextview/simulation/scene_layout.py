@@ -64,10 +64,7 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
-    """A target at rest on a table, and what stands around it.
-
-    Its frame is the target's object frame. The table is as high as the target's lowest point.
-    """
+    """A target at rest on a table as high as its lowest point, in its object frame, and what stands around it."""
 
     name: str  # unique in its folder, "chair_0890@medium-1"
     level: str  # one of LEVELS, or another word for scenes of one's own

@@ -31,10 +31,7 @@ class Sensor:
 
     The simulated object is ``radius`` metres large and ``distance`` metres away. ``scaled`` multiplies every strength,
     that is all but what the sensor is (height to radius). Deviations are standard deviations; those of the setup are
-    drawn for each axis.
-
-    Raises:
-        UsageError: numbers that no sensor has.
+    drawn for each axis. UsageError: numbers that no sensor has.
     """
 
     name: str = "none"
