@@ -52,26 +52,17 @@ FAR = 100.0
 
 @dataclass(frozen=True)
 class Rules:
-    """What the agent sees, what it is paid for, and when an episode ends.
+    """What the agent sees, what it is paid for, and when an episode ends."""
 
-    Attributes:
-        inputs: of an observation: "belief", "view" (what the last one alone says), "place" (the ring and which views
-            were taken), "azimuth_bin", and predicted maps by name ("lem", "view_area-sphere").
-        frame: where azimuths are counted from: the "camera", or the "object" as it is believed to be turned.
-        objective: paid is by how much a view changes "right", the "belief" in the true class, or its "log-belief".
-        max_views: views at most, at least 2; the first is not the agent's.
-        threshold: belief that ends an episode after the second view or later; None always takes ``max_views``.
-        view_price: taken from the reward for each view.
-        travel_price: taken from it for each grid cell of travel.
-    """
-
+    # of an observation: "belief", "view" (what the last one alone says), "place" (the ring and which views were taken),
+    # "azimuth_bin", and predicted maps by name ("lem", "view_area-sphere")
     inputs: tuple[str, ...] = ("belief", "view", "place")
-    frame: Frame = "camera"
-    objective: str = "right"
-    max_views: int = 5
-    threshold: float | None = None
-    view_price: float = 0.0
-    travel_price: float = 0.0
+    frame: Frame = "camera"  # where azimuths are counted from: or the "object" as it is believed to be turned
+    objective: str = "right"  # or "belief" in the true class, or its "log-belief": what is paid is the change by a view
+    max_views: int = 5  # at most, at least 2; the first is not the agent's
+    threshold: float | None = None  # belief that ends an episode after the second view or later; None takes all views
+    view_price: float = 0.0  # taken from the reward for each view
+    travel_price: float = 0.0  # taken from it for each grid cell of travel
 
     def __post_init__(self) -> None:
         if not self.inputs or VISIBILITY in self.inputs:
@@ -154,16 +145,11 @@ class Task:
 def replayed(
     predictions: Source, split: Split | None = "train", balanced: bool = False, rules: Rules = Rules()
 ) -> Task:
-    """The task of recognising the objects of one split.
+    """The task of recognising the objects of one split, each shape once for "train"; None takes all objects.
 
-    Args:
-        predictions: to learn from, of objects that the recogniser was not trained on (``nextview predict --held-out``).
-        split: "train" to learn from, each shape once; "test" to judge by; None for all.
-        balanced: draw every class equally often.
-        rules: see ``Rules``.
-
-    Raises:
-        PredictionsError: there are no objects of that split, or no such map or azimuth bins.
+    ``predictions`` to learn from are of objects that the recogniser was not trained on (``nextview predict
+    --held-out``); ``balanced`` draws every class equally often. PredictionsError: no objects of that split, no such map
+    or azimuth bins.
     """
     p = predictions if isinstance(predictions, Predictions) else Predictions.load(Path(predictions))
     p = p if split is None else p.of_split(split)
@@ -377,19 +363,12 @@ class RecogniseVectorEnv(TaskVectorEnv):
 class RecogniseMeshEnv(TaskEnv):
     """Recognise an object by few views of its mesh.
 
-    Args:
-        meshes: a folder, CLASS/train|test/MESH or CLASS/MESH; the bundled samples by default, which have no splits.
-        split: "train", "test", or None for a folder without splits.
-        models: the name of bundled models, or a folder of your own.
-        viewpoints: a layout of ``ViewSphere.named``.
-        depth: add the depth image: the observation is then {"state": (D,), "depth": (size, size) float32, object radii,
-            0 where there is no object}.
-        size: side of the image, pixels; a multiple of what the networks take, 112 for the bundled ones.
-        balanced: draw every class equally often.
-        rules: options of ``Rules``, by name.
-
-    Raises:
-        DatasetError: there are no such meshes, or one is of a class that the recogniser does not know.
+    ``meshes`` are a folder, CLASS/train|test/MESH or CLASS/MESH; ``split`` None is for one without splits, as are the
+    samples, the default. ``models`` are bundled ones by name, or a folder; ``viewpoints`` a layout of
+    ``ViewSphere.named``. With ``depth`` the observation is {"state": (D,), "depth": (size, size) float32, object radii,
+    0 where there is no object}; ``size`` is a multiple of what the networks take, 112 for the bundled ones.
+    ``balanced`` draws every class equally often; ``rules`` are options of ``Rules``. DatasetError: no such meshes, or a
+    class that the recogniser does not know.
     """
 
     def __init__(

@@ -21,22 +21,16 @@ from nextview.recognition.model_card import find_card, write_card
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """What is judged.
+    """What is judged."""
 
-    Attributes:
-        split: take only the objects of this one; needed where the predictions hold several.
-        deduplicate: of objects with the same label that look the same from every view, copies of one mesh, judge
-            only the first; the published numbers count them all.
-        cards: of the models that made the predictions; their scores are noted on these.
-        samples: of the bootstrap.
-        seed: decides the bootstrap and the orders of views.
-    """
-
+    # take only the objects of this one; needed where the predictions hold several
     split: Literal["train", "test", "val"] | None = None
+    # of objects with the same label that look the same from every view, copies of one mesh, judge only the first; the
+    # published numbers count them all
     deduplicate: bool = False
-    cards: tuple[str, ...] = ()
-    samples: int = 2000
-    seed: int = 0
+    cards: tuple[str, ...] = ()  # of the models that made the predictions; their scores are noted on these
+    samples: int = 2000  # of the bootstrap
+    seed: int = 0  # decides the bootstrap and the orders of views
 
 
 def write_evaluation(

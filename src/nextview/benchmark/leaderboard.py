@@ -22,10 +22,9 @@ def headline_threshold(thresholds: Sequence[float]) -> float:
 def leaderboard(tables: Tables, threshold: float) -> list[Any]:
     """The policies under one threshold, the most accurate first and those that no robot could follow last.
 
-    Returns:
-        Rows with policy, accuracy, its 95 % interval low to high, class_accuracy, n_views, travel (grid cells, over all
-        episodes), difference and p_holm to the reference (NaN for the reference itself), and differs: whether that is
-        significant.
+    Rows with policy, accuracy, its 95 % interval low to high, class_accuracy, n_views, travel (grid cells, over all
+    episodes), difference and p_holm to the reference (NaN for the reference itself), and differs: whether that is
+    significant.
     """
     rows = tables.summary[tables.summary["threshold"] == threshold]
     table = rows.pivot(index="policy", columns="measure", values="value")

@@ -57,14 +57,8 @@ class Outcomes:
 def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
     """Every object from ``runs`` random first views: episode = run * objects + object.
 
-    Args:
-        predictions: what the models say.
-        runs: first views of each object.
-        seed: decides the first views: they are the same for every policy and threshold. In scenes they are drawn among
-            those that can be reached.
-
-    Raises:
-        UsageError: fewer than one run.
+    The seed decides the first views, the same for every policy and threshold; in scenes among those that can be
+    reached.
     """
     if runs < 1:
         raise UsageError(f"at least one run is needed, not {runs}")

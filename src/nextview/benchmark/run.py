@@ -26,34 +26,22 @@ from nextview.recognition.model_card import find_models
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """What is run.
+    """What is run."""
 
-    Attributes:
-        policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
-        models: a folder with models of your own: the policies learned for them take part, by their names.
-        thresholds: of the belief.
-        risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too. With them
-            thresholds stay; else they come down with the views, by the recogniser's correlation.
-        uncalibrated: believe the plain sum of the logits, as published, whatever the recogniser's card says.
-        split: take only the objects of this one; needed where the predictions hold several.
-        runs: random first views of each object.
-        max_views: views at most.
-        reference: the policy that the others are compared with.
-        samples: of the bootstrap.
-        seed: decides first views, random policies and the bootstrap.
-    """
-
-    policies: tuple[str, ...] = ()
-    models: str = "modelnet10"
-    thresholds: tuple[float, ...] = THRESHOLDS
+    policies: tuple[str, ...] = ()  # names, or MODULE:CLASS for your own; all that the predictions allow by default
+    models: str = "modelnet10"  # a folder with models of your own: the policies learned for them take part, by name
+    thresholds: tuple[float, ...] = THRESHOLDS  # of the belief
+    # error rates; the thresholds that promise them, by the recogniser's calibration, are run too. With them thresholds
+    # stay; else they come down with the views, by the recogniser's correlation
     risks: tuple[float, ...] = ()
-    uncalibrated: bool = False
+    uncalibrated: bool = False  # believe the plain sum of the logits, as published, whatever the recogniser's card says
+    # take only the objects of this one; needed where the predictions hold several
     split: Literal["train", "test", "val"] | None = None
-    runs: int = 10
-    max_views: int = 5
-    reference: str = "random"
-    samples: int = 2000
-    seed: int = 0
+    runs: int = 10  # random first views of each object
+    max_views: int = 5  # views at most
+    reference: str = "random"  # the policy that the others are compared with
+    samples: int = 2000  # of the bootstrap
+    seed: int = 0  # decides first views, random policies and the bootstrap
 
 
 @dataclass(frozen=True)
@@ -92,9 +80,7 @@ def run_benchmark(
         track: shows how far it is.
 
     Raises:
-        UsageError: settings that make no sense.
-        RiskError: the recogniser's calibration does not promise such an error rate.
-        EntryError: not one policy came to its end.
+        UsageError, RiskError, EntryError: settings make no sense, nothing promises a risk, or no policy ends.
     """
     check_new(out, overwrite, folder=True)
     grid, names, promised = _prepare(predictions, settings)

@@ -141,14 +141,9 @@ def train_map(
         hardware: on what.
         track: follows the preparation of the inputs.
 
-    Returns:
-        The folder of the finished run.
-
     Raises:
-        DatasetError: the store cannot be used, lacks the measure or has nothing to train on, or another process trains
-            in the same folder.
-        PredictionsError: the predictions are of other views.
-        ModelError: the weights cannot be used, or have seen what validates; or ``out`` holds another run.
+        DatasetError: the store lacks what it takes, or another process trains in the same folder.
+        ModelError, PredictionsError: weights or predictions cannot be used; or ``out`` holds another run.
     """
     views = ViewStore.open(store)
     predicted = None if predictions is None else Predictions.load(predictions)

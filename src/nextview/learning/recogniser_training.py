@@ -236,9 +236,6 @@ def train_recogniser(
         hardware: on what.
         track: follows the preparation of the inputs.
 
-    Returns:
-        The folder of the finished run.
-
     Raises:
         DatasetError: a store cannot be used, or another process trains in the same folder.
         ModelError: the weights cannot be used, or have seen what is held out; or ``out`` holds another run.
