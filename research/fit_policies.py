@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from nextview.cli.ending import orderly_end
 from nextview.data.predictions import Predictions
-from nextview.errors import UsageError
+from nextview.data.splits import divide
+from nextview.errors import PredictionsError, UsageError
 from nextview.files import check_new, command, sha256_of
 from nextview.learning.card_fits import calibration_of
-from nextview.learning.fitting_set import blind_walks, described, fitting_set
+from nextview.learning.fitting_set import blind_walks, for_fitting
 from nextview.policies.base import Scope
 from nextview.policies.learned_tables import FixedRing, cells_from, cells_to
 from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
@@ -89,7 +90,7 @@ def fit_policies(
             table.sphere.azimuths,
             table.classes,
             {},
-            described(len(data)),
+            f"{len(data)} objects of the training split, classes weighted evenly",
             (LearnedFrom(sha256_of(predictions), table.models),),
             ((calibration.temperature, calibration.correlation),),
             settings,
@@ -99,6 +100,17 @@ def fit_policies(
             if (name := f"{kind}{suffix}") in cards:
                 write_policy_card(cards[name], msgspec.structs.replace(card, kind=kind, table=entries), overwrite=True)
     return FittedPolicies(tuple(cards.values()), len(data))
+
+
+def fitting_set(predictions: Predictions, validation: float, seed: int) -> Predictions:
+    """The objects of the training split that the recogniser was not trained on, duplicates left out."""
+    for_fitting(predictions)
+    if not 0 < validation <= 1:
+        raise PredictionsError(f"the validation part lies between 0 and 1, not {validation}")
+    _, kept = divide(predictions.labels, predictions.depth_entropy, validation, seed)
+    if len(kept) == 0:
+        raise PredictionsError("no object is left to fit to")
+    return predictions.of_objects(kept).deduplicate()
 
 
 def _tables(data: Predictions, calibration: Calibration, card: PolicyCard, values: Float) -> dict[str, dict[str, Any]]:

@@ -23,7 +23,6 @@ from nextview.benchmark.published import published_recognisers, read_rows
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track as progress
 from nextview.data.progress import Track, silently
-from nextview.data.splits import test_objects
 from nextview.data.store import ViewStore
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_file
@@ -156,7 +155,7 @@ def _scores(run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe, 
     if kept.exists():
         return json.loads(kept.read_text())
     network = run_network(run, recipe, views)
-    objects, labels = test_objects(views), views.labels
+    objects, labels = np.flatnonzero(views.done & (views.splits == "test")), views.labels
     right: list[int] = []
 
     def judged() -> Iterator[int]:

@@ -19,7 +19,7 @@ from nextview.errors import DatasetError, ModelError, PredictionsError, ResultsE
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning import card_fits as calibration
 from nextview.learning.card_fits import error_bound, fit_calibration, fit_risk, fit_temperature, loss, valley_gains
-from nextview.learning.fitting_set import blind_walks, card_to_fit, fitting_set
+from nextview.learning.fitting_set import blind_walks, card_to_fit
 from nextview.learning.unknown import FAMILIES, fit_novelty, fit_unknown, synthetic_outlier
 from nextview.policies.baselines import Random
 from nextview.policies.learned_tables import ClassTable, cells_from, cells_to
@@ -27,7 +27,7 @@ from nextview.policies.registry import make_policy
 from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.inference import Recogniser
 from nextview.recognition.model_card import read_card
-from research.fit_policies import fit_class_table, fit_policies, fit_ring, fit_sequence
+from research.fit_policies import fit_class_table, fit_policies, fit_ring, fit_sequence, fitting_set
 
 SPHERE = ViewSphere.named("40")
 SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
@@ -218,7 +218,9 @@ def training_predictions(tmp_path):
     p = some_predictions(90)
     logits = p.logits.copy()
     logits[np.arange(90), :, p.labels] += np.random.default_rng(0).normal(0.6, 0.8, (90, 1))
-    recogniser = ("tiny", json.loads(card.read_text())["sha256"])
+    about = json.loads(card.read_text())
+    card.write_text(json.dumps(about | {"held_out": list(p.names[:45])}))
+    recogniser = ("tiny", about["sha256"])
     models = {**p.models, "recogniser": recogniser}
     path = tmp_path / "training.npz"
     replace(p, logits=logits.astype(np.float32), splits=np.array(["train"] * 90), models=models).save(path)
@@ -229,7 +231,7 @@ def test_a_calibration_goes_into_the_card_and_is_used(training_predictions, monk
     card, path = training_predictions
     before = json.loads(card.read_text())
     monkeypatch.setattr("sys.argv", ["/bin/nextview", "fit", "calibration", "a b"])
-    fitted = fit_calibration(path, card, validation=0.5)
+    fitted = fit_calibration(path, card)
     after = json.loads(card.read_text())
     assert {name: after[name] for name in before} == before | {"schema": 2}  # written anew
     assert after["training"]["commands"] == ["nextview fit calibration 'a b'"]
@@ -268,7 +270,7 @@ def test_a_card_that_was_changed_meanwhile_or_does_not_fit_is_left_alone(trainin
 
     monkeypatch.setattr(calibration, "fit_temperature", fit_slowly)
     with pytest.raises(ModelError, match="was changed while this ran"):
-        fit_calibration(path, card, validation=0.5)
+        fit_calibration(path, card)
     for spoilt, sentence in [
         (replace(p, splits=np.array(["test"] * 90)), "test split"),
         (replace(p, models={"recogniser": ("other", "f" * 64)}), "another recogniser"),

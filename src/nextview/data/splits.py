@@ -60,11 +60,6 @@ def deduplicate(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.int6
     return objects[deduplicated(store.labels[objects], store.measure()[objects])]
 
 
-def test_objects(store: ViewStore) -> NDArray[np.int64]:
-    """Indices of the rendered objects of the test split."""
-    return np.flatnonzero(store.done & (store.splits == "test"))
-
-
 def sample(objects: NDArray[np.int64], count: int | None = None) -> NDArray[np.int64]:
     """So many of some objects, in even steps from the first; all if there are no more."""
     if count is not None:

@@ -13,19 +13,11 @@ from scipy.stats import beta, gaussian_kde
 
 from nextview.checks import number
 from nextview.data.predictions import Predictions
+from nextview.data.splits import deduplicated
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, PredictionsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning.fitting_set import (
-    blind_walks,
-    card_to_fit,
-    check_recogniser,
-    described,
-    fitting_set,
-    for_fitting,
-    held_out_by,
-    load_sensed,
-)
+from nextview.learning.fitting_set import blind_walks, card_to_fit, for_fitting, load_sensed
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.maps import MapPeak
@@ -51,8 +43,6 @@ class FittedCalibration:
 def fit_calibration(
     predictions: Path,
     card: Path,
-    validation: float | None = None,
-    split_seed: int = 0,
     sensed: tuple[Path, ...] = (),
     delta: float = 0.1,
     seed: int = 0,
@@ -65,8 +55,6 @@ def fit_calibration(
     Args:
         predictions: of the training split (nextview predict --held-out, or --split train).
         card: of the recogniser; "calibration" is written into it. Fitted to the objects that it calls held out.
-        validation: take this part of every class instead, as training kept it out; 1 for out-of-fold predictions.
-        split_seed: the recogniser's seed, which decided that part.
         sensed: predictions of the same objects through sensors (nextview render --sensor mix), fitted to as well.
         delta: how often a promised error rate may not hold.
         seed: decides the walks over which is fitted.
@@ -76,33 +64,34 @@ def fit_calibration(
     """
     if not 0 < number(delta, "--delta") < 1:
         raise UsageError(f"delta is a probability between 0 and 1, not {delta}")
-    if sensed and validation is not None:
-        raise UsageError("predictions through sensors are of the objects that the card calls held out: no --validation")
     table = Predictions.load(predictions).by_shape()
     with card_to_fit(card) as (model, write):
-        if validation != 1:
-            check_recogniser(card, model, predictions, table)
-        if validation is None:
-            for_fitting(table)
-            table = _held_out(predictions, table, card, model)
-            data = Predictions.joined([table, *load_sensed(sensed, table)])
-        else:
-            data = fitting_set(table, validation, split_seed)
+        _check_recogniser(card, model, predictions, table)
+        table = _held_out(predictions, table, card, model)
+        data = Predictions.joined([table, *load_sensed(sensed, table)])
         walks = 1 + 8000 // len(data)  # few objects are walked over more often
         calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=walks)
         risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
         calibration = replace(calibration, risk=risk)
-        about = described(len(data) // (1 + len(sensed))) + ", clean and through sensors" * bool(sensed)
+        about = f"{len(table)} objects of the training split, classes weighted evenly"
+        about += ", clean and through sensors" * bool(sensed)
         write("calibration", about, [table], calibration=calibration)
     before, after = (loss(data, c, np.random.default_rng([seed, 2]), walks=walks) for c in (PLAIN_SUM, calibration))
     return FittedCalibration(calibration, len(data), before, after)
 
 
 def _held_out(path: Path, table: Predictions, card: Path, model: ModelCard) -> Predictions:
-    kept = held_out_by(model, table)
+    """The objects that a card calls held out of its training, without duplicates."""
+    once = deduplicated(for_fitting(table).labels, table.depth_entropy)
+    kept = once[np.isin(np.array(table.names)[once], model.held_out)]
     if len(kept) == 0:
         raise PredictionsError(f"{path}: holds no object that {card} calls held out of its training")
     return table.of_objects(kept)
+
+
+def _check_recogniser(path: Path, card: ModelCard, predictions: Path, table: Predictions) -> None:
+    if table.models["recogniser"][1] != card.sha256:
+        raise PredictionsError(f"{predictions}: comes from another recogniser than {path}")
 
 
 @dataclass(frozen=True)
@@ -254,7 +243,7 @@ def fit_size(store: Path, predictions: Path, card: Path) -> FittedSize:
     if unknown:
         raise PredictionsError(f"{predictions}: holds {unknown[0]!r}, which {store} does not")
     with card_to_fit(card) as (model, write):
-        check_recogniser(card, model, predictions, table)
+        _check_recogniser(card, model, predictions, table)
         data, judged = for_fitting(table), [row[name] for name in table.names]
         of_training = views.done & (views.splits == "train") & np.isin(views.attributes.labels, table.classes)
         taught = np.setdiff1d(np.flatnonzero(of_training), [row[name] for name in predicted.names])
@@ -322,7 +311,6 @@ def fit_valleys(predictions: Path, card: Path) -> FittedValleys:
     with card_to_fit(card, recogniser=False) as (model, write):
         if model.kind not in table.maps or table.models[model.kind] != (model.name, model.sha256):
             raise PredictionsError(f"{predictions}: holds no maps by {card}")
-        for_fitting(table)
         kept = _held_out(predictions, table, card, model)
         by_class = valley_gains(kept.sphere, kept.logits, kept.maps[model.kind], kept.labels)
         classes = tuple(table.classes[c] for c, gain in by_class.items() if gain > 0)

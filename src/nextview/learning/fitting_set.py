@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.data.predictions import Predictions
-from nextview.data.splits import deduplicated, divide, duplicate_groups
+from nextview.data.splits import duplicate_groups
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, ModelError, PredictionsError
 from nextview.files import command, only_one
@@ -41,23 +41,6 @@ def for_fitting(predictions: Predictions) -> Predictions:
     if (predictions.splits == "test").any():
         raise PredictionsError("these predictions hold objects of the test split, to which nothing may be fitted")
     return predictions
-
-
-def fitting_set(predictions: Predictions, validation: float, seed: int) -> Predictions:
-    """The objects of the training split that the recogniser was not trained on, duplicates left out."""
-    for_fitting(predictions)
-    if not 0 < validation <= 1:
-        raise PredictionsError(f"the validation part lies between 0 and 1, not {validation}")
-    _, kept = divide(predictions.labels, predictions.depth_entropy, validation, seed)
-    if len(kept) == 0:
-        raise PredictionsError("no object is left to fit to")
-    return predictions.of_objects(kept).deduplicate()
-
-
-def held_out_by(card: ModelCard, predictions: Predictions) -> Indices:
-    """Indices of the objects that a card calls held out of its training, without duplicates."""
-    once = deduplicated(predictions.labels, predictions.depth_entropy)
-    return once[np.isin(np.array(predictions.names)[once], card.held_out)]
 
 
 def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
@@ -105,14 +88,3 @@ def card_to_fit(path: Path, recogniser: bool = True) -> Iterator[tuple[ModelCard
             known = path.read_bytes()
 
         yield card, write
-
-
-def check_recogniser(path: Path, card: ModelCard, predictions: Path, table: Predictions) -> None:
-    """Refuse predictions by another recogniser than a card's."""
-    if table.models["recogniser"][1] != card.sha256:
-        raise PredictionsError(f"{predictions}: comes from another recogniser than {path}")
-
-
-def described(objects: int) -> str:
-    """Words for a card."""
-    return f"{objects} objects of the training split, classes weighted evenly"
