@@ -34,19 +34,13 @@ class EvaluationSettings:
 
 
 def write_evaluation(
-    predictions: Path,
-    out: Path,
+    predictions: Path,  # made by nextview predict
+    out: Path,  # folder for tables (.csv), settings and evaluate.html
     settings: EvaluationSettings = EvaluationSettings(),
     *,
-    overwrite: bool = False,
+    overwrite: bool = False,  # replace the files of an earlier evaluation
 ) -> Evaluation:
     """Judge recogniser and maps on every view: accuracy, confusions, calibration, map scores, beside the published.
-
-    Args:
-        predictions: made by nextview predict.
-        out: folder for tables (.csv), settings and evaluate.html.
-        settings: what is judged.
-        overwrite: replace the files of an earlier evaluation.
 
     Raises:
         UsageError: the predictions hold several splits, and none is chosen.

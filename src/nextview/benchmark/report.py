@@ -34,15 +34,16 @@ OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225
 """Colours of nothing, the target, other things and the table in a scene."""
 
 
-def report(results: Path, out: Path | None = None, /, store: Path | None = None, overwrite: bool = False) -> Path:
+def report(
+    results: Path,  # folder made by nextview benchmark
+    out: Path | None = None,  # the page; RESULTS/report.html by default
+    /,
+    # take the pictures of the objects from this view store; by default from that of the predictions, if it still is
+    # where it was
+    store: Path | None = None,
+    overwrite: bool = False,  # replace an earlier page
+) -> Path:
     """Write one self-contained HTML page: tables, curves, and the worst failures.
-
-    Args:
-        results: folder made by nextview benchmark.
-        out: the page; RESULTS/report.html by default.
-        store: take the pictures of the objects from this view store; by default from that of the predictions, if it
-            still is where it was.
-        overwrite: replace an earlier page.
 
     Raises:
         ResultsError: there are no results, or fixed views only; or the page cannot be written.

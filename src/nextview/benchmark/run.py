@@ -60,24 +60,17 @@ class Results:
 
 
 def run_benchmark(
-    predictions: Path,
-    out: Path,
+    predictions: Path,  # made by nextview predict
+    out: Path,  # folder for the results
     settings: BenchmarkSettings = BenchmarkSettings(),
     *,
-    overwrite: bool = False,
+    overwrite: bool = False,  # replace the files of earlier results
     track: Track = silently,
 ) -> Results:
     """Run every policy under every threshold from the same first views, and say which are better than the reference.
 
     Episodes, tables and tests are written; nextview report makes a page of them. Why a policy failed stands in the
     settings of the results.
-
-    Args:
-        predictions: made by nextview predict.
-        out: folder for the results.
-        settings: what is run.
-        overwrite: replace the files of earlier results.
-        track: shows how far it is.
 
     Raises:
         UsageError, RiskError, EntryError: settings make no sense, nothing promises a risk, or no policy ends.

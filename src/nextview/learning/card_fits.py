@@ -41,23 +41,17 @@ class FittedCalibration:
 
 
 def fit_calibration(
-    predictions: Path,
-    card: Path,
+    predictions: Path,  # of the training split (nextview predict --held-out, or --split train)
+    card: Path,  # of the recogniser; "calibration" is written into it. Fitted to the objects that it calls held out
+    # predictions of the same objects through sensors (nextview render --sensor mix), fitted to as well
     sensed: tuple[Path, ...] = (),
-    delta: float = 0.1,
-    seed: int = 0,
+    delta: float = 0.1,  # how often a promised error rate may not hold
+    seed: int = 0,  # decides the walks over which is fitted
 ) -> FittedCalibration:
     """Calibrate a recogniser: how far to trust the sum of several views, and which error rates can be promised.
 
     Both go into its card; nextview predict takes them into predictions made before, without predicting again. The size
     of the objects is not used.
-
-    Args:
-        predictions: of the training split (nextview predict --held-out, or --split train).
-        card: of the recogniser; "calibration" is written into it. Fitted to the objects that it calls held out.
-        sensed: predictions of the same objects through sensors (nextview render --sensor mix), fitted to as well.
-        delta: how often a promised error rate may not hold.
-        seed: decides the walks over which is fitted.
 
     Raises:
         UsageError, ModelError, PredictionsError: the arguments make no sense, or do not fit together.
@@ -218,18 +212,18 @@ class FittedSize:
     after: float
 
 
-def fit_size(store: Path, predictions: Path, card: Path) -> FittedSize:
+def fit_size(
+    # view store that knows the unit of its meshes (nextview render --unit). Its training objects teach, except those in
+    # the predictions
+    store: Path,
+    # of training objects that the recogniser has not seen (nextview predict --held-out); they decide the weight of the
+    # size beside the shape
+    predictions: Path,
+    card: Path,  # of the recogniser; "size" is written into it
+) -> FittedSize:
     """Learn how large the objects of each class are, for stores and cameras that know the scale.
 
-    It goes into the recogniser's card; nextview predict takes it into predictions made before, without predicting
-    again.
-
-    Args:
-        store: view store that knows the unit of its meshes (nextview render --unit). Its training objects teach, except
-            those in the predictions.
-        predictions: of training objects that the recogniser has not seen (nextview predict --held-out); they decide the
-            weight of the size beside the shape.
-        card: of the recogniser; "size" is written into it.
+    It goes into the card; nextview predict takes it into predictions made before, without predicting again.
 
     Raises:
         DatasetError, ModelError, PredictionsError: the arguments do not fit together.
@@ -293,16 +287,15 @@ class FittedValleys:
     objects: int
 
 
-def fit_valleys(predictions: Path, card: Path) -> FittedValleys:
+def fit_valleys(
+    # of the training split, by a recogniser that was not trained on the objects (nextview predict --held-out). Fitted
+    # to the objects that the map network was not trained on either
+    predictions: Path,
+    card: Path,  # of the map network; "valley_classes" is written into it
+) -> FittedValleys:
     """Choose the classes for which the valley of a predicted map is the better view than its peak.
 
-    They go into the map network's card; nextview predict takes them into predictions made before, without predicting
-    again.
-
-    Args:
-        predictions: of the training split, by a recogniser that was not trained on the objects (nextview predict
-            --held-out). Fitted to the objects that the map network was not trained on either.
-        card: of the map network; "valley_classes" is written into it.
+    They go into the network's card; nextview predict takes them into predictions made before, without predicting again.
 
     Raises:
         ModelError, PredictionsError: the arguments do not fit together.

@@ -235,33 +235,25 @@ class TrainedGain:
 
 
 def train_gain(
-    predictions: Path,
-    out: Path,
+    predictions: Path,  # of training objects that the recogniser has not seen (nextview predict --held-out)
+    out: Path,  # card to write (NAME.json); the networks are written beside it (NAME.onnx)
+    # predictions of other such objects, which choose the epoch and the travel weight; those among them are left out of
+    # the training. By default PREDICTIONS choose them, in folds
     validation: Path | None = None,
+    # without VALIDATION, so many policies are trained, each without its share of the objects, which validate it; the
+    # result is the mean of all
     folds: int = 20,
+    # of a grid cell of travel; by default the lowest at which the policy travels no farther than a random walk in the
+    # local window
     travel_weight: float | None = None,
-    local: bool = False,
+    local: bool = False,  # let it choose in the local window only
+    # predictions of the same objects through sensors (nextview render --sensor mix), to learn from as well
     sensed: tuple[Path, ...] = (),
     recipe: GainRecipe = GainRecipe(),
-    overwrite: bool = False,
+    overwrite: bool = False,  # replace files of these names
     track: Track = silently,
 ) -> TrainedGain:
     """Train the gain policy, which predicts what a view from each viewpoint brings. When stopped, it begins anew.
-
-    Args:
-        predictions: of objects of the training split that the recogniser has not seen (nextview predict --held-out).
-        out: card to write (NAME.json); the networks are written beside it (NAME.onnx).
-        validation: predictions of other such objects, which choose the epoch and the travel weight; those among them
-            are left out of the training. By default PREDICTIONS choose them, in folds.
-        folds: without VALIDATION, so many policies are trained, each without its share of the objects, which validate
-            it; the result is the mean of all.
-        travel_weight: of a grid cell of travel; by default the lowest at which the policy travels no farther than a
-            random walk in the local window.
-        local: let it choose in the local window only.
-        sensed: predictions of the same objects through sensors (nextview render --sensor mix), to learn from as well.
-        recipe: how to train.
-        overwrite: replace files of these names.
-        track: follows the epochs.
 
     Raises:
         UsageError, ResultsError: the card is not called NAME.json, or exists.

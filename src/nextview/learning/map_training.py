@@ -120,26 +120,18 @@ class MapModule(L.LightningModule):
 
 
 def train_map(
-    store: Path,
-    out: Path,
+    store: Path,  # view store made by nextview render, with the 40 views and the measure (nextview measure)
+    out: Path,  # folder for checkpoints, logs and network.pt, the network of the epoch with the lowest squared error
+    # for --measure confidence, of the store's training split, by the recogniser whose confidence is to be predicted
     predictions: Path | None = None,
+    # folder of a finished run of the same depth and input from which a ResNet starts: a recogniser's, or a map
+    # network's to go on with
     weights: Path | None = None,
     recipe: MapRecipe = MapRecipe(),
     hardware: Hardware = Hardware(),
     track: Track = silently,
 ) -> list[Path]:
     """Train a network that predicts a measure of the views around one. Resumes if OUT holds a run that was cut off.
-
-    Args:
-        store: view store made by nextview render, with the 40 views and the measure (nextview measure).
-        out: folder for checkpoints, logs and network.pt, the network of the epoch with the lowest squared error.
-        predictions: for --measure confidence, of the store's training split, by the recogniser whose confidence is to
-            be predicted.
-        weights: folder of a finished run of the same depth and input from which a ResNet starts: a recogniser's, or a
-            map network's to go on with.
-        recipe: how to train.
-        hardware: on what.
-        track: follows the preparation of the inputs.
 
     Raises:
         DatasetError: the store lacks what it takes, or another process trains in the same folder.

@@ -215,26 +215,19 @@ def side_loss(likely: Tensor, label: Tensor, side: Tensor) -> Tensor:
 
 
 def train_recogniser(
-    store: Path,
-    out: Path,
+    store: Path,  # view store made by nextview render
+    out: Path,  # folder for checkpoints, logs and network.pt, the network of the epoch with the best class mean
+    # stores of the same objects or some of them, stretched and rotated (nextview render --stretch .25 --rotated --seed
+    # 1 and so on) or through sensors (--sensor mix); their views may be others
     deformed: tuple[Path, ...] = (),
+    # start from a published checkpoint, torchvision's of the same depth or EfficientNet-Lite0's, or go on from the run
+    # in this folder, on other data or for longer
     weights: Path | None = None,
     recipe: RecogniserRecipe = RecogniserRecipe(),
     hardware: Hardware = Hardware(),
     track: Track = silently,
 ) -> list[Path]:
     """Train the recogniser on a store's training split. Resumes if OUT holds a run that was cut off.
-
-    Args:
-        store: view store made by nextview render.
-        out: folder for checkpoints, logs and network.pt, the network of the epoch with the best class mean.
-        deformed: stores of the same objects or some of them, stretched and rotated (nextview render --stretch .25
-            --rotated --seed 1 and so on) or through sensors (--sensor mix); their views may be others.
-        weights: start from a published checkpoint, torchvision's of the same depth or EfficientNet-Lite0's, or go on
-            from the run in this folder, on other data or for longer.
-        recipe: how to train.
-        hardware: on what.
-        track: follows the preparation of the inputs.
 
     Raises:
         DatasetError: a store cannot be used, or another process trains in the same folder.
