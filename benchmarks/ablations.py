@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from nextview.cli.extra import require
+from nextview.cli.ending import require
 
 require("train")
 require("benchmark")

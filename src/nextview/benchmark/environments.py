@@ -386,7 +386,12 @@ class RecogniseMeshEnv(TaskEnv):
         given, found, sphere = Rules(**rules), find_models(models), ViewSphere.named(viewpoints)
         self._models = Models(Recogniser(found.recogniser), open_maps(found.maps, given.maps))
         classes, calibration = self._models.classes, self._models.recogniser.calibration
-        objects = _meshes(meshes, split)
+        objects: list[tuple[str, Callable[[], Mesh]]] = [(name, partial(sample_mesh, name)) for name in SAMPLES]
+        if meshes is not None:
+            entries = [e for e in list_dataset(Path(meshes)) if split in (None, e.split)]
+            objects = [(e.label, partial(load_mesh, e.path)) for e in entries]
+        if not objects:
+            raise DatasetError(f"{meshes}: holds no meshes of the split {split!r}; split=None takes all that there are")
         for label, _ in objects:
             if label not in classes:
                 raise DatasetError(f"the recogniser knows no class {label!r}; it knows {', '.join(classes)}")
@@ -408,13 +413,3 @@ class RecogniseMeshEnv(TaskEnv):
         """The state, and the depth image if it is wanted."""
         state = super().observed(seen)
         return {"state": state, "depth": self._last.depth} if self._depth else state
-
-
-def _meshes(folder: str | Path | None, split: str | None) -> list[tuple[str, Callable[[], Mesh]]]:
-    """The class of each mesh of a folder, or of the samples, and what reads it."""
-    if folder is None:
-        return [(name, partial(sample_mesh, name)) for name in SAMPLES]
-    entries = [e for e in list_dataset(Path(folder)) if split in (None, e.split)]
-    if not entries:
-        raise DatasetError(f"{folder}: holds no meshes of the split {split!r}; split=None takes all that there are")
-    return [(e.label, partial(load_mesh, e.path)) for e in entries]

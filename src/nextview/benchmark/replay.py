@@ -17,7 +17,6 @@ from nextview.benchmark.true_maps import TRUE, true_map
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import scenes_of, sight_of
 from nextview.errors import EntryError, NextviewError, PolicyError, UsageError
-from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence, Policy
 from nextview.policies.baselines import ViewList
 from nextview.recognition.belief import FixedLength, Stopping
@@ -111,15 +110,10 @@ def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng
         answers[step.episodes, k] = step.belief.argmax(1)
         confidences[step.episodes, k] = step.belief.max(1)
     views = done.outcome.views
-    return Trajectories(views, answers, confidences, *_moved(p.sphere, views), fixed=False)
-
-
-def _moved(sphere: ViewSphere, views: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    legs = (views[:, :-1], views[:, 1:])
+    legs, going = (views[:, :-1], views[:, 1:]), views[:, 1:] >= 0
     still = np.zeros((len(views), 1))
-    going = views[:, 1:] >= 0
-    travel, arc = (np.hstack([still, np.cumsum(d[legs] * going, axis=1)]) for d in (sphere.travel, sphere.arc))
-    return travel, arc
+    travel, arc = (np.hstack([still, np.cumsum(d[legs] * going, axis=1)]) for d in (p.sphere.travel, p.sphere.arc))
+    return Trajectories(views, answers, confidences, travel, arc, fixed=False)
 
 
 def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcomes:

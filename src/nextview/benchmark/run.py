@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.replay import THRESHOLDS, Grid, make_specs, run_grid
@@ -161,6 +160,8 @@ def _write_episodes(path: Path, grid: Grid) -> None:
     writer = None
     for policy, threshold, ends in grid.cells():
         paths = grid.paths[policy]
+        taken = paths.views[np.arange(paths.views.shape[1]) < ends.n_views[:, None]].astype(np.int16)
+        begins = np.concatenate([[0], np.cumsum(ends.n_views)]).astype(np.int32)
         table = pa.table(
             {
                 "object": names,
@@ -168,7 +169,7 @@ def _write_episodes(path: Path, grid: Grid) -> None:
                 "run": run,
                 "policy": words(np.zeros(n), (policy,)),
                 "threshold": pa.array(np.full(n, np.nan if threshold is None else threshold)),
-                "views": _lists(paths.views, ends.n_views),
+                "views": pa.ListArray.from_arrays(pa.array(begins), pa.array(taken)),
                 "stop": words(np.where(paths.fixed, 2, ends.confident), STOPS),
                 "answer": words(ends.answer, p.classes),
                 "confidence": pa.array(ends.confidence),
@@ -181,9 +182,3 @@ def _write_episodes(path: Path, grid: Grid) -> None:
         writer.write_table(table)
     if writer is not None:
         writer.close()
-
-
-def _lists(views: NDArray[np.int64], n_views: NDArray[np.int64]) -> pa.ListArray:
-    taken = np.arange(views.shape[1]) < n_views[:, None]
-    offsets = np.concatenate([[0], np.cumsum(n_views)]).astype(np.int32)
-    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(views[taken].astype(np.int16)))

@@ -87,16 +87,11 @@ def make_mesh(
     if reach > np.finfo(float).max / radius:
         raise MeshError(f"{name}: the mesh is too large, its radius is not a finite number")
     normalised: NDArray[np.float64] = vertices / radius
-    if not _has_area(normalised, faces):
+    parts = (faces[first : first + 4096].T for first in range(0, len(faces), 4096))  # most often the first few tell
+    areas = (np.cross(normalised[b] - normalised[a], normalised[c] - normalised[a]) for a, b, c in parts)
+    if not any(np.abs(area).max() > FLAT for area in areas):
         raise MeshError(f"{name}: the mesh has no area, all its faces are lines or points")
     return Mesh(normalised, faces.astype(np.int32), centre, float(radius * reach), name, unit)
-
-
-def _has_area(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> bool:
-    """Whether any face is more than a line; most often the first few tell."""
-    parts = (faces[first : first + 4096].T for first in range(0, len(faces), 4096))
-    areas = (np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a]) for a, b, c in parts)
-    return any(np.abs(area).max() > FLAT for area in areas)
 
 
 def _first_of_equals(rows: NDArray) -> NDArray[np.int64]:

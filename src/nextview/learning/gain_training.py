@@ -45,8 +45,6 @@ from nextview.recognition.map_names import in_order
 BOUND = 1e-5
 """Largest difference of the file's answers from those of the networks in double precision, relative to the largest
 answer beyond 1. For gains a fiftieth of the lowest travel weight that is tried."""
-Layers = Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
-"""Weights (in, out) and biases (out,) of one perceptron, ReLU between them."""
 
 
 class Perceptrons(nn.Module):
@@ -59,14 +57,6 @@ class Perceptrons(nn.Module):
         self.weights, self.biases = nn.ParameterList(weights), nn.ParameterList(biases)
         self.register_buffer("features_flip", torch.as_tensor(features_flip))
         self.register_buffer("cells_flip", torch.as_tensor(cells_flip))
-
-    @classmethod
-    def from_layers(cls, networks: Sequence[Layers], features_flip: NDArray, cells_flip: NDArray) -> Perceptrons:
-        """Of equally shaped perceptrons, in single precision."""
-        layers = list(zip(*networks, strict=True))
-        weights = [torch.from_numpy(np.stack([w for w, _ in layer])).float() for layer in layers]
-        biases = [torch.from_numpy(np.stack([b[None] for _, b in layer])).float() for layer in layers]
-        return cls(weights, biases, features_flip, cells_flip)
 
     def each(self, x: Tensor) -> Tensor:
         """Of each perceptron, without the mirror image, (E, B, V)."""

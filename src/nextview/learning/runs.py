@@ -318,7 +318,11 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
             state[name] = value
     state = {name: value for name, value in state.items() if name in own or not name.startswith("side.")}
     if first in state and state[first].ndim == 4 and state[first].shape != own[first].shape:
-        share = _dealt(state[first].shape[1], own[first].shape[1])
+        colours, channels = state[first].shape[1], own[first].shape[1]
+        turn = torch.arange(max(colours, channels))  # each colour's kernel is dealt out to the channels in turn
+        share = torch.zeros(colours, channels)
+        share[turn % colours, turn % channels] = 1
+        share /= share.sum(1, keepdim=True)
         state[first] = torch.einsum("okhw,kc->ochw", state[first], share)
     faults = [f"it lacks {name}" for name in sorted(own.keys() - state.keys())]
     faults += [f"it holds {name}" for name in sorted(state.keys() - own.keys())]
@@ -333,14 +337,6 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
         if not torch.isfinite(value).all():
             raise ModelError(f"{path}: {name} holds numbers that are not finite; download the checkpoint again")
     network.load_state_dict(state)
-
-
-def _dealt(colours: int, channels: int) -> Tensor:
-    """The share of each colour's kernel that goes to each channel, dealt in turn, (colours, channels)."""
-    turn = torch.arange(max(colours, channels))
-    share = torch.zeros(colours, channels)
-    share[turn % colours, turn % channels] = 1
-    return share / share.sum(1, keepdim=True)
 
 
 def refuse_seen(weights: Path | None, held_out: list[str]) -> None:

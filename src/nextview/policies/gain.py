@@ -16,15 +16,7 @@ from numpy.typing import NDArray
 
 from nextview.errors import ModelError, PolicyError
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.policies.base import (
-    EpisodeState,
-    Scope,
-    best_view,
-    check_weight,
-    considered,
-    travel_from,
-    visibility_of,
-)  # fmt: skip
+from nextview.policies.base import EpisodeState, Scope, best_view, check_weight, considered, travel_from, visibility_of
 from nextview.policies.learned_tables import cells_from, cells_to
 from nextview.recognition.inference import check_end, open_onnx, run_onnx
 from nextview.recognition.map_names import SPHERE, in_order, maps_among

@@ -74,7 +74,11 @@ def make_policy(
         return Discriminate.from_card(card, sphere, None if classes is None else tuple(classes))
     if card is not None:
         policy = read_policy(card, sphere, classes)
-        return _visible(policy, name) if name.startswith(VISIBLE) else policy
+        if not name.startswith(VISIBLE):
+            return policy
+        if not isinstance(policy, Gain):
+            raise PolicyError(f"{name}: this policy values no views that could be weighed by what shows")
+        return VisibleGain(policy, policy.travel_weight)
     path = plugins(GROUP).get(name, name)
     if ":" in path:
         return _import_policy(path, sphere)
@@ -137,12 +141,6 @@ def with_cards(name: str, cards: Mapping[str, Path]) -> str:
         return f"{cards[policy]}{weighted}{travel_weight}"
     card = cards.get(policy.removeprefix(VISIBLE)) if policy.startswith(VISIBLE) else None
     return name if card is None else f"{VISIBLE}{card}{weighted}{travel_weight}"
-
-
-def _visible(policy: Policy, name: str) -> Policy:
-    if not isinstance(policy, Gain):
-        raise PolicyError(f"{name}: this policy values no views that could be weighed by what shows")
-    return VisibleGain(policy, policy.travel_weight)
 
 
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
