@@ -49,14 +49,10 @@ def some_gain(sphere=SPHERE, inputs=INPUTS, networks=2, seed=0, frame="camera", 
     """With weights at random: whatever it was trained to, these promises hold."""
     rng = np.random.default_rng(seed)
     widths = [len(mirrored_features(sphere, CLASSES, inputs, frame)), 8, 8, len(sphere)]
-    drawn = [
-        [(rng.normal(size=(a, b)) / a**0.5, rng.normal(size=(1, b))) for a, b in pairwise(widths)]
-        for _ in range(networks)
-    ]
-    parts = [zip(*layer, strict=True) for layer in zip(*drawn, strict=True)]
-    weights, biases = zip(
-        *([torch.from_numpy(np.stack(part)).float() for part in layer] for layer in parts), strict=True
-    )
+    pairs = list(pairwise(widths))
+    drawn = [[(rng.normal(size=(a, b)) / a**0.5, rng.normal(size=(1, b))) for a, b in pairs] for _ in range(networks)]
+    layers = [[np.stack(part) for part in zip(*layer, strict=True)] for layer in zip(*drawn, strict=True)]
+    weights, biases = ([torch.from_numpy(layer[k]).float() for layer in layers] for k in (0, 1))
     flips = mirrored_features(sphere, CLASSES, inputs, frame), mirrored(sphere)
     score = Score(Perceptrons(weights, biases, *flips))
     return Gain(sphere, CLASSES, score, inputs, frame=frame, **rest)
