@@ -4,8 +4,6 @@
 - ``nextview/RecogniseMesh-v0``: over meshes, rendered and shown to the networks as the agent goes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -119,7 +117,7 @@ class Task:
     def __post_init__(self) -> None:
         whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
 
-    def begin(self, n: int, rng: np.random.Generator, options: dict[str, Any] | None = None) -> Cohort:
+    def begin(self, n: int, rng: np.random.Generator, options: dict[str, Any] | None = None) -> "Cohort":
         """Begin ``n`` episodes: the options of ``reset`` may name each "object" and "start"; else they are drawn."""
         weight = 1 / np.bincount(self.labels)[self.labels]
         chance = weight / weight.sum() if self.balanced else None

@@ -1,7 +1,5 @@
 """What the models say of every view of every object: the table from which policies are replayed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -115,7 +113,7 @@ class Predictions:
             seen=self.seen[objects, views],
         )
 
-    def of_split(self, split: str) -> Predictions:
+    def of_split(self, split: str) -> "Predictions":
         """The objects of one split."""
         kept = self.splits == split
         if not kept.any():
@@ -123,18 +121,18 @@ class Predictions:
             raise PredictionsError(f"these predictions hold no objects of the split {split!r}, only of {there}")
         return self.of_objects(np.flatnonzero(kept))
 
-    def deduplicate(self) -> Predictions:
+    def deduplicate(self) -> "Predictions":
         """One object of each shape and label: without the copies that look the same from every view."""
         return self.of_objects(deduplicated(self.labels, self.depth_entropy))
 
-    def of_objects(self, kept: NDArray[np.int64]) -> Predictions:
+    def of_objects(self, kept: NDArray[np.int64]) -> "Predictions":
         """Some of the objects, by their rows, (n,)."""
         arrays: dict[str, Any] = {name: values[kept] for name, values in self._arrays().items()}
         maps = {name: values[kept] for name, values in self.maps.items()}
         return replace(self, **arrays, maps=maps, names=tuple(self.names[i] for i in kept))
 
     @classmethod
-    def joined(cls, parts: Sequence[Predictions]) -> Predictions:
+    def joined(cls, parts: Sequence["Predictions"]) -> "Predictions":
         """All objects of predictions by the same models, one after the other: in part K their names end in #K."""
         found = [part._arrays() for part in parts]
         arrays: dict[str, Any] = {
@@ -145,13 +143,13 @@ class Predictions:
         names = (f"{name}#{k}" if k else name for k, part in enumerate(parts) for name in part.names)
         return replace(parts[0], **arrays, maps=maps, names=tuple(names))
 
-    def by_shape(self) -> Predictions:
+    def by_shape(self) -> "Predictions":
         """What the recogniser says to those who do not know how large the objects are."""
         if self.of_size is None:
             return self
         return replace(self, logits=self.logits - self.of_size[:, None], of_size=None)
 
-    def with_size(self, of_size: NDArray[np.float32] | None) -> Predictions:
+    def with_size(self, of_size: NDArray[np.float32] | None) -> "Predictions":
         """The inverse of ``by_shape``: logits by size, (N, C), are added."""
         return self if of_size is None else replace(self, logits=self.logits + of_size[:, None], of_size=of_size)
 
@@ -176,7 +174,7 @@ class Predictions:
             np.savez_compressed(file, **arrays)
 
     @classmethod
-    def load(cls, path: str | Path) -> Predictions:
+    def load(cls, path: str | Path) -> "Predictions":
         """Read what ``save`` wrote; PredictionsError if it is missing or damaged. Nothing is unpickled."""
         path = Path(path)
         if not path.exists():
@@ -193,7 +191,7 @@ class Predictions:
             raise PredictionsError(f"{path}: not a predictions file ({reason})") from None
 
     @classmethod
-    def _from(cls, f: dict[str, NDArray]) -> Predictions:
+    def _from(cls, f: dict[str, NDArray]) -> "Predictions":
         def group(prefix: str) -> dict[str, NDArray]:
             return {name.removeprefix(prefix): values for name, values in f.items() if name.startswith(prefix)}
 

@@ -4,8 +4,6 @@ Things are set beside a target, where nothing stands yet, until so much of it sh
 upright on the table. Their footprints, which are convex hulls, never overlap.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -67,6 +65,14 @@ class Task:
     level: str
     name: str
     path: Path
+
+
+@dataclass(frozen=True)
+class Meshes:
+    """The mesh files that may stand around a target: a folder, and paths below it, with forward slashes, sorted."""
+
+    folder: Path
+    files: tuple[str, ...]
 
 
 def draw_scenes(
@@ -147,14 +153,6 @@ def _draw(meshes: dict[str, Meshes], seed: int, task: Task) -> str | None:
     except (MeshError, DatasetError) as error:
         return str(error)
     return None
-
-
-@dataclass(frozen=True)
-class Meshes:
-    """The mesh files that may stand around a target: a folder, and paths below it, with forward slashes, sorted."""
-
-    folder: Path
-    files: tuple[str, ...]
 
 
 def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) -> SceneLayout:

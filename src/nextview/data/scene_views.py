@@ -1,7 +1,5 @@
 """What a store keeps of scenes, and what a robot in them would expect to see from each view."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -92,7 +90,7 @@ def scene_views(store: ViewStore, i: int) -> SceneViews:
 Constrain = Callable[[EpisodeState], EpisodeState]
 
 
-def sight_of(scenes: SceneSight | None, objects: NDArray[np.int64]) -> tuple[Constrain, Visible]:
+def sight_of(scenes: "SceneSight | None", objects: NDArray[np.int64]) -> tuple[Constrain, Visible]:
     """What ``run_episodes`` needs of scenes: where cameras can be, and what is expected to show."""
     if scenes is None:
         return unconstrained, lambda state: np.ones(state.visited.shape)
@@ -102,7 +100,7 @@ def sight_of(scenes: SceneSight | None, objects: NDArray[np.int64]) -> tuple[Con
     )
 
 
-def scenes_of(p: Predictions) -> SceneSight | None:
+def scenes_of(p: Predictions) -> "SceneSight | None":
     """The scenes that predictions are of; None if they are of single objects, whose store need not be there."""
     try:
         store = ViewStore.open(p.store) if p.store else None
@@ -127,7 +125,7 @@ class SceneSight:
     _frames: dict[tuple[int, int], tuple[bytes, float]] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, store: ViewStore, names: Sequence[str]) -> SceneSight | None:
+    def of(cls, store: ViewStore, names: Sequence[str]) -> "SceneSight | None":
         """Of some of a store's objects; None if it holds no scenes."""
         if store.attributes.scene is None:
             return None
@@ -138,7 +136,7 @@ class SceneSight:
         rows = np.array([row[name] for name in names])
         return cls(store, rows, np.stack([store.read("scene/reachable", i) for i in rows]))
 
-    def of_scenes(self, kept: NDArray[np.int64]) -> SceneSight:
+    def of_scenes(self, kept: NDArray[np.int64]) -> "SceneSight":
         """Some of the scenes, by their index; also the same one several times."""
         return replace(self, rows=self.rows[kept], reachable=self.reachable[kept])
 

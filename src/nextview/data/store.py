@@ -1,7 +1,5 @@
 """The view store: every view of every object of a dataset, in one Zarr group, one chunk an object."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -96,7 +94,7 @@ class ViewStore:
     attributes: Attributes
 
     @classmethod
-    def create(cls, path: Path, attributes: Attributes, overwrite: bool = False) -> ViewStore:
+    def create(cls, path: Path, attributes: Attributes, overwrite: bool = False) -> "ViewStore":
         """Make an empty store, whole or not at all; with ``overwrite`` it replaces the store at ``path``."""
         with new_folder(path, overwrite) as part:
             store = cls(part, zarr.open_group(part, mode="w"), attributes)
@@ -110,7 +108,7 @@ class ViewStore:
         return cls.open(path)
 
     @classmethod
-    def open(cls, path: str | Path) -> ViewStore:
+    def open(cls, path: str | Path) -> "ViewStore":
         """Open a store; DatasetError if there is none, it is of another format, or damaged."""
         path = Path(path)
         if not (path / "zarr.json").is_file():

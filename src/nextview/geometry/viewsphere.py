@@ -5,8 +5,6 @@ On a ``ViewSphere`` they lie on rings of equal elevation, evenly spaced in azimu
 azimuth_index``. ``Directions`` lie anywhere.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import cached_property
@@ -182,7 +180,7 @@ class Directions(Viewpoints):
         object.__setattr__(self, "directions", _fixed(given / length))
 
     @classmethod
-    def fibonacci(cls, n: int) -> Directions:
+    def fibonacci(cls, n: int) -> "Directions":
         """n views spread evenly over the upper half (Fibonacci lattice; Swinbank and Purser, QJRMS 132, 2006)."""
         whole(n, "the number of viewpoints", 1, MOST)
         height, azimuth = (np.arange(n) + 0.5) / n, np.arange(n) * np.pi * (3 - np.sqrt(5))
@@ -217,7 +215,7 @@ class ViewSphere(Viewpoints):
         number(self.distance, "the distance", above=0)
 
     @classmethod
-    def named(cls, name: str) -> ViewSphere:
+    def named(cls, name: str) -> "ViewSphere":
         """The thesis's layouts: "40" (5 rings of 8, section 4.1.1) and "12" (one ring at 45 degrees)."""
         if name not in LAYOUTS:
             raise UsageError(f"no view sphere is called {one_line(repr(name))}; there are {', '.join(LAYOUTS)}")
@@ -231,7 +229,7 @@ class ViewSphere(Viewpoints):
         """How many rings."""
         return len(self.elevations)
 
-    def same_grid(self, other: ViewSphere) -> bool:
+    def same_grid(self, other: "ViewSphere") -> bool:
         """Whether another one has the same views, from whatever distance."""
         return (self.elevations, self.azimuths) == (other.elevations, other.azimuths)
 

@@ -1,7 +1,5 @@
 """What is fitted into a card from held-out predictions: calibration and promised error rates, sizes, valleys."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,7 +95,7 @@ class Walks:
     totals: Float  # log-evidence summed over the views so far, (walks, views, D)
 
     @classmethod
-    def draw(cls, data: Predictions, rng: np.random.Generator, n_views: int, walks: int) -> Walks:
+    def draw(cls, data: Predictions, rng: np.random.Generator, n_views: int, walks: int) -> "Walks":
         """So many walks of each kind over every object."""
         objects, views, n_views = np.tile(np.arange(len(data)), 2 * walks), [], min(n_views, len(data.sphere))
         for policy in (Random(data.sphere), RandomAll(data.sphere)):

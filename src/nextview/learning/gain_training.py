@@ -1,7 +1,5 @@
 """From predictions to the gain policy: its networks, their training, and its card with the ONNX file beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace

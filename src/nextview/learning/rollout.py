@@ -1,7 +1,5 @@
 """Decision states on the way of a policy, and the value of every next view there, by replay of predictions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -40,7 +38,7 @@ class ReplayTable:
         rng: np.random.Generator,
         sensed: Sequence[Predictions] = (),
         scenes: SceneSight | None = None,
-    ) -> ReplayTable:
+    ) -> "ReplayTable":
         """Some of the objects of predictions, by index; calibrated here where their recogniser is not."""
         if len(kept) == 0:
             raise PredictionsError("no object is left to learn from")

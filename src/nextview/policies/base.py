@@ -1,7 +1,5 @@
 """The contract of a policy: what it sees, and what it answers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -62,7 +60,7 @@ class EpisodeState:
         """The views that may be chosen: reachable and not visited, (B, V) bool."""
         return ~self.visited if self.reachable is None else ~self.visited & self.reachable
 
-    def select(self, rows: Any) -> EpisodeState:
+    def select(self, rows: Any) -> "EpisodeState":
         """Some of the episodes, by index or mask."""
         parts: dict[str, Any] = {}
         for name, value in vars(self).items():

@@ -1,7 +1,5 @@
 """What stands where on the table of a cluttered scene: one small JSON file, of which it is built to the bit."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated
@@ -87,6 +85,6 @@ class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
         write_record(path, self)
 
     @classmethod
-    def load(cls, path: str | Path) -> SceneLayout:
+    def load(cls, path: str | Path) -> "SceneLayout":
         """Read what ``save`` wrote; DatasetError if there is nothing, or something else."""
         return read_record(Path(path), cls, "a scene", DatasetError)
