@@ -37,15 +37,12 @@ from nextview.simulation.simulated import SimulatedCamera
 
 Rows = NDArray[np.int64]
 Source = str | Path | Predictions
-CAMERAS = 16
-"""Meshes that are kept ready to be looked at."""
+CAMERAS = 16  # meshes that are kept ready to be looked at
 _HERE = "nextview.benchmark.environments"
 gymnasium.register("nextview/Recognise-v0", f"{_HERE}:RecogniseEnv", vector_entry_point=f"{_HERE}:RecogniseVectorEnv")
 gymnasium.register("nextview/RecogniseMesh-v0", f"{_HERE}:RecogniseMeshEnv")
-Split = Literal["train", "test"]
-"""Objects to learn from, or objects to judge by."""
-FAR = 100.0
-"""Bound of the observation space for what a map network says; the networks of this project stay far below."""
+Split = Literal["train", "test"]  # objects to learn from, or objects to judge by
+FAR = 100.0  # bound of the observation space for what a map network says; the networks of this project stay far below
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from nextview.recognition.model_card import ModelCard
 
 Float = NDArray[np.float64]
 
-RELIABILITY_LOOKS = (1, 2, 5)
-"""Views after which confidence is compared with accuracy, beside all of them."""
+RELIABILITY_LOOKS = (1, 2, 5)  # views after which confidence is compared with accuracy, beside all of them
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,8 @@ from nextview.recognition.belief import FixedLength, Stopping
 from nextview.recognition.map_names import maps_among
 from nextview.session.episode import run_episodes
 
-THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)
-"""The thesis's (section 5.3)."""
-PART = 4096
-"""Episodes of fixed views that are run at once."""
+THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)  # the thesis's (section 5.3)
+PART = 4096  # episodes of fixed views that are run at once
 
 
 @dataclass(frozen=True)

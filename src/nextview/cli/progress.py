@@ -10,8 +10,7 @@ from rich.text import Text
 
 from nextview.cli.ending import printable
 
-EVERY = 30.0
-"""Seconds between two lines where the output is no terminal."""
+EVERY = 30.0  # seconds between two lines where the output is no terminal
 
 
 class Terminal(Console):

@@ -14,8 +14,7 @@ from nextview.geometry.mesh import FORMATS
 from nextview.recognition.model_card import read_card
 
 SPLITS = ("train", "test", "val")
-FEW = 3
-"""Files that are named of those left out for one reason."""
+FEW = 3  # files that are named of those left out for one reason
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from nextview.geometry.depth import object_depth
 from nextview.geometry.observation import depth_image
 from nextview.recognition.map_names import Good
 
-QUANTUM = 1e-3
-"""Depth values closer than this count as equal, object radii."""
+QUANTUM = 1e-3  # depth values closer than this count as equal, object radii
 
 
 @dataclass(frozen=True)

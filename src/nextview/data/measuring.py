@@ -14,8 +14,7 @@ from nextview.data.pool import counted
 from nextview.data.store import DEPTH_UNIT, ViewStore, opened, writing
 from nextview.errors import MeasureError
 
-Made = dict[str, NDArray[np.float32]]
-"""The values of one object, by the names of their arrays."""
+Made = dict[str, NDArray[np.float32]]  # the values of one object, by the names of their arrays
 
 
 def depth_views(store: ViewStore, i: int) -> Iterator[MeasuredView]:

@@ -14,10 +14,8 @@ from threadpoolctl import threadpool_limits
 from nextview.checks import whole
 from nextview.errors import DatasetError
 
-MOST = 1024
-"""Processes on one machine."""
-PATIENCE = "10s"
-"""How long a scheduler may take to answer."""
+MOST = 1024  # processes on one machine
+PATIENCE = "10s"  # how long a scheduler may take to answer
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

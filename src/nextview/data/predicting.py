@@ -24,10 +24,8 @@ from nextview.recognition.memory import open_recogniser
 from nextview.recognition.model_card import BUNDLED, ModelCard
 from nextview.recognition.network_input import from_store
 
-BATCH = 8
-"""Views a call of the networks."""
-Arrays = dict[str, NDArray[np.float32]]
-"""What the networks give: ``logits``, ``azimuth_bins`` and ``map/NAME``."""
+BATCH = 8  # views a call of the networks
+Arrays = dict[str, NDArray[np.float32]]  # what the networks give: ``logits``, ``azimuth_bins`` and ``map/NAME``
 
 
 def predict(

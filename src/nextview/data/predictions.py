@@ -20,12 +20,9 @@ from nextview.policies.base import Evidence
 from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
 
 FORMAT = 1
-PACKED, SPARE = 100, 64 * 2**20
-"""A file holds at most this many times its size, and so many bytes more."""
-SAME = 1e-5
-"""Difference between logits that are the same, but for rounding."""
-KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}
-"""Of numpy's types; all other arrays are of floats."""
+PACKED, SPARE = 100, 64 * 2**20  # a file holds at most this many times its size, and so many bytes more
+SAME = 1e-5  # difference between logits that are the same, but for rounding
+KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}  # of numpy's types; all other arrays are of floats
 
 
 @dataclass(frozen=True)

@@ -31,12 +31,9 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named
 from nextview.simulation.simulated import OccludedCamera, SimulatedCamera
 
-LARGEST_CHUNK = 2**31 - 2**20
-"""Bytes that may be compressed at once, the compressor's own included."""
-FARTHEST = np.iinfo(np.uint16).max * DEPTH_UNIT
-"""Depth that can be stored, object radii."""
-SENSING = 256
-"""Sets the draws of a sensor apart from those of a deformation: no byte of a name is as large."""
+LARGEST_CHUNK = 2**31 - 2**20  # bytes that may be compressed at once, the compressor's own included
+FARTHEST = np.iinfo(np.uint16).max * DEPTH_UNIT  # depth that can be stored, object radii
+SENSING = 256  # sets the draws of a sensor apart from those of a deformation: no byte of a name is as large
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ import numpy as np
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
 
-Box = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Two opposite corners, centimetres, z up."""
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # two opposite corners, centimetres, z up
 
 
 def _legs(x: float, y: float, thick: float, height: float) -> list[Box]:

@@ -20,14 +20,10 @@ from nextview.simulation.scene import Scene
 from nextview.simulation.scene_layout import clutter_level
 from nextview.simulation.simulated import TARGET, SceneCamera, visible_shares
 
-SIDE = 80
-"""Of the pictures of the whole scene, pixels."""
-HALF = 2.0
-"""They show so many object radii to each side of the target's centre."""
-SCENE_UNIT = 2e-4
-"""Their depth is stored as uint16 in steps of this many object radii: up to 13.1."""
-SHARE_SIZE = 112
-"""Side of the picture in which the share that shows is measured, pixels; as when the scene was drawn."""
+SIDE = 80  # of the pictures of the whole scene, pixels
+HALF = 2.0  # they show so many object radii to each side of the target's centre
+SCENE_UNIT = 2e-4  # their depth is stored as uint16 in steps of this many object radii: up to 13.1
+SHARE_SIZE = 112  # side of the picture in which the share that shows is measured, pixels; as when the scene was drawn
 
 
 def scene_intrinsics(distance: float, side: int = SIDE) -> NDArray[np.float64]:

@@ -25,13 +25,10 @@ from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere
 
 FORMAT = 2
-DEPTH_UNIT = 1e-4
-"""Depth is stored as uint16 in steps of this many object radii."""
-POINT_UNIT = 1 / 32767
-"""Points are stored as int16 in steps of this many object radii."""
+DEPTH_UNIT = 1e-4  # depth is stored as uint16 in steps of this many object radii
+POINT_UNIT = 1 / 32767  # points are stored as int16 in steps of this many object radii
 PENDING, DONE, FAILED = 0, 1, 2
-PLANNED = 5
-"""Views of a plan: the thesis's longest episode."""
+PLANNED = 5  # views of a plan: the thesis's longest episode
 RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
 """The arrays that rendering makes; others are added later. Those of cluttered scenes, see ``data.scene_views``:"""
 SCENE = ("scene/depth", "scene/owner", "scene/reachable", "measures/visible_share", "measures/clearance")

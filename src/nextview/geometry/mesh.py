@@ -11,10 +11,8 @@ from nextview.errors import MeshError
 from nextview.files import regular_file
 from nextview.geometry.mesh_file import check_faces, read_by_trimesh, read_obj, read_off
 
-MAX_FACES = 10_000_000
-"""Triangles that a mesh may have if nothing else is asked for."""
-BYTES_PER_FACE = 60
-"""How many bytes a mesh file may have for each triangle that it may have."""
+MAX_FACES = 10_000_000  # triangles that a mesh may have if nothing else is asked for
+BYTES_PER_FACE = 60  # how many bytes a mesh file may have for each triangle that it may have
 FORMATS = (".off", ".obj", ".ply", ".stl", ".glb")
 UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}
 """What a file's unit of length may be, and how many metres it is."""

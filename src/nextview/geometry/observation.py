@@ -15,14 +15,10 @@ from nextview.geometry.depth import FARTHEST, headlight, object_depth, visible_p
 LEAST_SHARE = 0.006
 """An object is seen if one connected part of it fills this share of the image. In the networks' images of 112 pixels a
 side, less are specks of 8 x 9 pixels. The thinnest object of ModelNet10, a screen seen from its edge, fills 0.011."""
-SPECKS = 8
-"""Or if all its parts together fill so many times as much."""
-LEAST_PIXELS = 9
-"""The least share in pixels, for small images."""
-LARGEST = 1e9
-"""Numbers of poses and intrinsics are smaller."""
-RIGID = 1e-3
-"""How far a pose may be from a rigid motion: numbers may have been written with four digits."""
+SPECKS = 8  # or if all its parts together fill so many times as much
+LEAST_PIXELS = 9  # the least share in pixels, for small images
+LARGEST = 1e9  # numbers of poses and intrinsics are smaller
+RIGID = 1e-3  # how far a pose may be from a rigid motion: numbers may have been written with four digits
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Triangles = tuple[NDArray[np.floating], NDArray[np.int32]]
-"""Vertices, (N, 3), and faces, (F, 3)."""
+Triangles = tuple[NDArray[np.floating], NDArray[np.int32]]  # vertices, (N, 3), and faces, (F, 3)
 
 
 def embree_scene(things: Sequence[Triangles]) -> Any:

@@ -6,10 +6,8 @@ from numpy.typing import NDArray
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.viewsphere import Directions
 
-LIKELY, MOST = 0.1, 3
-"""Resting poses less likely than this are left out, and all but so many."""
-SAME_TILT = np.radians(20)
-"""Resting poses whose directions up are within this angle are one."""
+LIKELY, MOST = 0.1, 3  # resting poses less likely than this are left out, and all but so many
+SAME_TILT = np.radians(20)  # resting poses whose directions up are within this angle are one
 _DIRECTIONS = np.concatenate([half := Directions.fibonacci(250).directions, -half])
 
 

@@ -19,14 +19,11 @@ from nextview.errors import UsageError
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-DISTANCE = 3.0
-"""Distance of the camera from the object's centre, in object radii."""
+DISTANCE = 3.0  # distance of the camera from the object's centre, in object radii
 CELL = np.radians((18.0, 45.0))
 """Elevation and azimuth of a cell of the 40 views: travel between directions that are on no grid is counted in it."""
-MOST = 99_999
-"""Viewpoints that there may be, and views on a ring."""
-SNAP = 1e-6
-"""Radians within which a camera stands at a candidate. What is more is a place of its own."""
+MOST = 99_999  # viewpoints that there may be, and views on a ring
+SNAP = 1e-6  # radians within which a camera stands at a candidate. What is more is a place of its own
 
 
 def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = DISTANCE) -> Float:

@@ -193,10 +193,8 @@ def error_bound(failed: Float, stopped: Float, weights: Float, delta: float) -> 
     return float(beta.ppf(1 - delta, effective * rate + 1, max(effective * (1 - rate), 1e-9)))
 
 
-RADII = np.geomspace(0.02, 20, 93)
-"""Metres; steps of 7.8 %."""
-ANY_SIZE = 0.05
-"""Share of the objects of a class that may have any size: toys, and models in wrong units."""
+RADII = np.geomspace(0.02, 20, 93)  # metres; steps of 7.8 %
+ANY_SIZE = 0.05  # share of the objects of a class that may have any size: toys, and models in wrong units
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.recognition.evidence import Evidence, items_at
 
 Float = NDArray[np.float64]
-Scope = Literal["global", "local"]
-"""Where a policy may go: to all views, or to those of the local window."""
+Scope = Literal["global", "local"]  # where a policy may go: to all views, or to those of the local window
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,8 @@ VISIBILITY = "visibility"
 Frame = Literal["camera", "object"]
 """From where azimuths of cells are counted: the camera's, or that at which the object, if of the class believed most,
 most likely shows its azimuth bin 0."""
-FLOOR = np.log(1e-4)
-"""Logarithm of the smallest belief that is told apart from none."""
-FEATURES_INPUT = "told"
-"""The name that the features have in the ONNX file."""
+FLOOR = np.log(1e-4)  # logarithm of the smallest belief that is told apart from none
+FEATURES_INPUT = "told"  # the name that the features have in the ONNX file
 
 
 # What it decides by

@@ -27,14 +27,11 @@ POLICIES: dict[str, Callable[[Any], Policy]] = {
     "visibility": Visibility,
 }
 """Those that follow no map; every predicted map has its own, see ``map_policy``."""
-GROUP = "nextview.policies"
-"""Entry points by which packages add policies of their own."""
-ANYWHERE = ("random-all", "spread", "visibility")
-"""Those that need no grid."""
+GROUP = "nextview.policies"  # entry points by which packages add policies of their own
+ANYWHERE = ("random-all", "spread", "visibility")  # those that need no grid
 VISIBLE = "visible-"
 """Before the name of a gain policy: its values times the share of the object that is expected to show."""
-DEFAULT = "gain"
-"""The policy where none is named."""
+DEFAULT = "gain"  # the policy where none is named
 
 
 def make_policy(

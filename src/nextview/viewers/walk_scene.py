@@ -15,8 +15,7 @@ from nextview.viewers.exploration import Walk
 
 Float = NDArray[np.float64]
 
-BALL = 0.12
-"""Radius of a candidate view, object radii."""
+BALL = 0.12  # radius of a candidate view, object radii
 
 
 class WalkScene:
