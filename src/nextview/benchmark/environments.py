@@ -276,11 +276,7 @@ def info_of(seen: Seen) -> dict[str, Any]:
 
 
 class RecogniseEnv(TaskEnv):
-    """Recognise an object by few views; what the models see in them is looked up in predictions.
-
-    Args:
-        predictions, split, balanced: see ``replayed``.
-        rules: options of ``Rules``, by name.
+    """Recognise an object by few views, looked up in predictions: see ``replayed``; ``rules`` are options of ``Rules``.
 
     >>> env = gymnasium.make("nextview/Recognise-v0", predictions="validation.npz")    # doctest: +SKIP
     """

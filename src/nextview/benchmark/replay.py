@@ -1,9 +1,8 @@
 """Replay: run policies through all episodes at once, from predictions instead of a camera.
 
-A policy does not know the threshold, so where it goes does not depend on it. Every policy is run once, to the last
-view, through the same loop as live use; ``truncate`` ends the episodes where a ``Stopping`` rule does. A random policy
-draws once for all thresholds in this way, which also pairs its episodes. A path ends early only where the belief is
-exactly 1 in double precision: no threshold can want more.
+A policy does not know the threshold, so every policy is run once, to the last view, through the same loop as live use;
+``truncate`` ends the episodes where a ``Stopping`` rule does. So a random policy draws once for all thresholds, which
+also pairs its episodes. A path ends early only where the belief is exactly 1 in double precision.
 """
 
 from collections.abc import Iterator, Sequence

@@ -136,10 +136,7 @@ def _figures(results: Results, best: str, at: float) -> dict[str, Figure]:
 
 
 def _thresholds(results: Results, at: float) -> dict[str, float]:
-    """Policies by class, as tables 8 to 11 of the thesis, each at the threshold of its published numbers.
-
-    Of scenes nothing is published; there the policies of the curves are at the same threshold.
-    """
+    """Policies by class (tables 8 to 11), each at its published threshold; for scenes nothing is published."""
     if not results.tables.levels.empty:
         return {name: at for name in draw.compared(results) if not is_oracle(name)}
     ran, thresholds = set(results.tables.sweep["policy"]), results.settings["thresholds"]

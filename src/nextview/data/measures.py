@@ -133,10 +133,7 @@ def normalise_per_object(values: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def confidence_maps(logits: NDArray[np.floating], labels: NDArray[np.integer]) -> NDArray[np.float32]:
-    """Confidence in each view alone where it is recognised rightly, 0 where it is not: (N, V) float32.
-
-    Of equal logits the lower index wins.
-    """
+    """Confidence in each view alone where it is right, the first of equal classes counting, else 0: (N, V) float32."""
     from scipy.special import softmax
 
     logits = np.asarray(logits, np.float64)

@@ -12,10 +12,7 @@ from nextview.recognition.model_card import ModelCard, find_card
 
 
 def duplicate_groups(measured: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Which objects look the same from every view: a number for each, shared by those that do, (N,).
-
-    Copies of a mesh, also moved and scaled, have identical depth-entropies, (N, V); others hardly ever do.
-    """
+    """A number for each object, (N,), the same for those whose depth-entropies, (N, V), are: copies of one mesh."""
     return np.unique(measured, axis=0, return_inverse=True)[1].ravel()
 
 

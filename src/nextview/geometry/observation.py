@@ -25,24 +25,14 @@ RIGID = 1e-3  # how far a pose may be from a rigid motion: numbers may have been
 class SceneView:
     """All that one frame shows, the object and what stands around it, in the object frame and object radii.
 
-    It may be of another pinhole than the observation that it goes with, and from another distance.
-
-    Attributes:
-        depth: along the optical axis, (H, W) float32, object radii, 0 where nothing was measured.
-        target: pixels that show the object, (H, W) bool.
-        pose: camera-to-world, (4, 4) float64, OpenCV axes; the world is the object frame.
-        intrinsics: pinhole matrix, (3, 3) float64, pixels; the first pixel's centre is at 0.5.
-        background_free: whether nothing is there where nothing was measured, as in renders. A sensor may measure
-            nothing on what is black or shiny.
-
-    Raises:
-        ObservationError: depth and target are no images of one shape.
+    Its pinhole and distance may be others than those of its observation. ObservationError: no images of one shape.
     """
 
-    depth: NDArray[np.float32]
-    target: NDArray[np.bool_]
-    pose: NDArray[np.float64]
-    intrinsics: NDArray[np.float64]
+    depth: NDArray[np.float32]  # along the optical axis, (H, W), object radii, 0 where nothing was measured
+    target: NDArray[np.bool_]  # pixels that show the object, (H, W)
+    pose: NDArray[np.float64]  # camera-to-world, (4, 4), OpenCV axes; the world is the object frame
+    intrinsics: NDArray[np.float64]  # pinhole matrix, (3, 3), pixels; the first pixel's centre is at 0.5
+    # whether nothing is there where nothing was measured, as in renders; a sensor may miss what is black or shiny
     background_free: bool = False
 
     def __post_init__(self) -> None:

@@ -14,9 +14,8 @@ _DIRECTIONS = np.concatenate([half := Directions.fibonacci(250).directions, -hal
 def resting_poses(mesh: Mesh) -> NDArray[np.float64]:
     """Rotations from a mesh's own axes into its likely resting poses, (P, 3, 3) float64; the first is the identity.
 
-    An object that is dropped comes to rest on a face of its convex hull, the likelier the larger this looks from the
-    centre of mass (Goldberg et al., "Part pose statistics", IJRR 1999, as in trimesh). The pose that the mesh stands in
-    is always among them.
+    A dropped object rests on a face of its convex hull, the likelier the larger it looks from the centre of mass
+    (Goldberg et al., "Part pose statistics", IJRR 1999, as in trimesh). The mesh's own pose is always among them.
     """
     from trimesh import Trimesh
     from trimesh.poses import compute_stable_poses

@@ -291,15 +291,11 @@ LAYOUTS = {
 
 
 def viewpoints_of(what: str | Viewpoints | Any) -> Viewpoints:
-    """A layout of candidate viewpoints.
+    """A layout of candidate viewpoints; UsageError if it is none.
 
-    Args:
-        what: "40" or "12", the thesis's; "rings:0,30,60x12", elevations in degrees by views on each ring;
-            "fibonacci:60", so many spread evenly over the upper half; directions from the object, (V, 3), or poses of
-            cameras in the object frame, (V, 4, 4), of which only the directions count; or such a layout itself.
-
-    Raises:
-        UsageError: it is none of these.
+    "40" or "12", the thesis's; "rings:0,30,60x12", elevations in degrees by views on each ring; "fibonacci:60", so many
+    spread evenly over the upper half; directions from the object, (V, 3), or poses of cameras in the object frame, (V,
+    4, 4), of which only the directions count; or such a layout itself.
     """
     if isinstance(what, Viewpoints):
         return what

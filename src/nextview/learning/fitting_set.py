@@ -69,10 +69,7 @@ def blind_walks(sphere: ViewSphere, policy: Policy, starts: Indices, n_views: in
 
 @contextmanager
 def card_to_fit(path: Path, recogniser: bool = True) -> Iterator[tuple[ModelCard, Callable[..., None]]]:
-    """A card and ``write(name, about, sources, **fields)``, for what was fitted to it; only one run fits it.
-
-    ``name`` and ``about`` are an entry of the card's ``fitted_to``; ``sources`` are what it was fitted to.
-    """
+    """A card, and ``write(name, about, sources, **fields)`` for what was fitted to these sources; one run at a time."""
     with only_one(path):
         card, known = read_card(path), path.read_bytes()
         if recogniser and not card.is_recogniser:

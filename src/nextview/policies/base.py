@@ -92,10 +92,7 @@ class ValuesViews(Protocol):
 
 @runtime_checkable
 class ScoresViews(Protocol):
-    """A policy on a grid that goes to the free view with the highest score less its weighted travel.
-
-    It can be asked from any place about any views, see ``policies.off_grid``.
-    """
+    """A policy on a grid that goes to the free view with the best score less weighted travel; see ``off_grid``."""
 
     @property
     def travel_weight(self) -> float:
@@ -153,9 +150,9 @@ def best_view(
 
 
 def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]) -> NDArray[np.int64]:
-    """The free view of the local window with the highest score, by finite scores of its cells, (B, rings, 3).
+    """The free view of the local window with the highest of finite scores, (B, rings, 3).
 
-    Where none of the window is free, the free view with the shortest travel; where none is, the window's best.
+    With none free there, the free view with the shortest travel; with none at all, the window's best.
     """
     b = len(state.current)
     rows = np.arange(b)

@@ -41,20 +41,15 @@ def make_policy(
     classes: Sequence[str] | None = None,
     maps: Collection[str] = (),
 ) -> Policy:
-    """A policy by name.
+    """A policy by name; PolicyError if there is no such policy, or it cannot be made.
 
-    Args:
-        name: one of POLICIES; one by a map ("lem", "lem-peak", "lem-sphere-peak", see ``map_policy``); a learned one
-            that is bundled; the path of a learned one's card (.json); a gain policy with "visible-" before its name;
-            one that an installed package adds; or "MODULE:CLASS" for one of your own, which is called with the
-            viewpoints alone. NAME@WEIGHT sets the travel weight of one that weighs travel.
-        sphere: the viewpoints; a ``ViewSphere`` but for those of ANYWHERE and your own.
-        valley_classes: classes (indices) whose believers go to the map's valley.
-        classes: names of the recogniser's classes; a learned policy for others is refused.
-        maps: names of the maps that are predicted, beside those of the bundled networks.
-
-    Raises:
-        PolicyError: there is no such policy, or it cannot be made.
+    ``name`` is one of POLICIES; one by a map ("lem", "lem-peak", "lem-sphere-peak", see ``map_policy``); a learned one
+    that is bundled; the path of a learned one's card (.json); a gain policy with "visible-" before its name; one that
+    an installed package adds; or "MODULE:CLASS" for one of your own, which is called with the viewpoints alone.
+    NAME@WEIGHT sets the travel weight of one that weighs travel. ``sphere`` is a ``ViewSphere`` but for those of
+    ANYWHERE and your own; ``valley_classes`` are indices of those whose believers go to the map's valley; ``classes``
+    names those of the recogniser: a learned policy for others is refused; ``maps`` are predicted beside those of the
+    bundled networks.
     """
     if "@" in name and ":" not in name:
         plain, _, travel_weight = name.partition("@")

@@ -25,10 +25,7 @@ STEP = 0.0001  # metres that one step of the depth images stands for
 
 @dataclass(frozen=True)
 class Setting:
-    """How a mesh is captured.
-
-    The world is z up and has the axes of the mesh; its origin is below the object's centre, at its lowest point.
-    """
+    """How a mesh is captured: z up, the axes of the mesh, the origin below the object at its lowest point."""
 
     radius: float  # of the object, metres
     distance: float = 3.0  # of the camera from the object's centre, object radii

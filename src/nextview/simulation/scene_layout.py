@@ -47,10 +47,7 @@ class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
 
 
 class Block(Struct, frozen=True, forbid_unknown_fields=True):
-    """An upright box that stands on the table, lengths in object radii of the target, angles in radians.
-
-    A ``wall`` ends the space in which the camera can move: what lies beyond cannot be reached.
-    """
+    """An upright box on the table, target's radii and radians; beyond a ``wall`` the camera cannot be brought."""
 
     x: Length
     y: Length

@@ -110,10 +110,7 @@ class SimulatedCamera:
 
 
 class OccludedCamera:
-    """Looks at the target of a scene; what hides it is cut out, as if it had been told from the target exactly.
-
-    Where nothing hides it, the observations are those of a ``SimulatedCamera`` before the target alone, to the bit.
-    """
+    """A ``SimulatedCamera`` before the target of a scene; what hides it is cut out, as if told from it exactly."""
 
     def __init__(self, scene: Scene, size: int = 224, distance: float = DISTANCE) -> None:
         self.scene = scene
