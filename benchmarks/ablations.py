@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from nextview.cli.extra import require
+from nextview.cli.ending import require
 
 require("train")
 require("benchmark")
@@ -31,7 +31,7 @@ from nextview.data.splits import split_training
 from nextview.data.store import ViewStore
 from nextview.errors import PredictionsError
 from nextview.learning.card_fits import fit_temperature
-from nextview.learning.fitting_set import FittingSet
+from nextview.learning.fitting_set import for_fitting
 from nextview.recognition.belief import Calibration
 
 Float = NDArray[np.float64]
@@ -92,7 +92,7 @@ def agreement(
         store: that the predictions are of; with it, how often the azimuth bin is right is added.
     """
     known, other = Predictions.load(validation).deduplicate(), Predictions.load(test)
-    data = FittingSet.of_all(known)
+    data = for_fitting(known)
     alone, agreeing = (
         fit_temperature(way, np.random.default_rng([0, 0]), walks=1 + 8000 // len(data))
         for way in (replace(data, azimuth_bins=None), data)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from nextview.cli.extra import require
+from nextview.cli.ending import require
 
 require("train")
 

@@ -13,7 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from nextview.cli.extra import require
+from nextview.cli.ending import require
 
 require("benchmark")
 

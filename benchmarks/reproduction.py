@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from nextview.cli.extra import require
+from nextview.cli.ending import require
 
 require("benchmark")
 

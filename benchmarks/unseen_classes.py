@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nextview.cli.extra import require
+from nextview.cli.ending import require
 
 require("benchmark")
 

@@ -23,7 +23,7 @@ from itertools import pairwise, product
 from pathlib import Path
 from typing import Literal
 
-from nextview.cli.extra import require
+from nextview.cli.ending import require
 
 require("benchmark")
 

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from nextview.cli.ending import orderly_end
 from nextview.data.predictions import Predictions
-from nextview.errors import UsageError
+from nextview.data.splits import divide
+from nextview.errors import PredictionsError, UsageError
 from nextview.files import check_new, command, sha256_of
 from nextview.learning.card_fits import calibration_of
-from nextview.learning.fitting_set import FittingSet, blind_walks, described, fitting_set
+from nextview.learning.fitting_set import blind_walks, for_fitting
 from nextview.policies.base import Scope
 from nextview.policies.learned_tables import FixedRing, cells_from, cells_to
 from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
@@ -77,7 +78,7 @@ def fit_policies(
         check_new(path, overwrite)
     table = Predictions.load(predictions)
     data = fitting_set(table, validation, split_seed)
-    calibration = calibration_of(table, data, np.random.default_rng([seed, 0]), walks=1 + 8000 // len(data))
+    calibration = calibration_of(data, np.random.default_rng([seed, 0]), walks=1 + 8000 // len(data))
     values = fit_class_table(data, n_views, shrinkage, calibration, np.random.default_rng(seed))
     settings = {"length": length, "n_views": n_views, "shrinkage": shrinkage, "seed": seed}
     for suffix, scope in VARIANTS:
@@ -89,7 +90,7 @@ def fit_policies(
             table.sphere.azimuths,
             table.classes,
             {},
-            described(len(data)),
+            f"{len(data)} objects of the training split, classes weighted evenly",
             (LearnedFrom(sha256_of(predictions), table.models),),
             ((calibration.temperature, calibration.correlation),),
             settings,
@@ -101,7 +102,18 @@ def fit_policies(
     return FittedPolicies(tuple(cards.values()), len(data))
 
 
-def _tables(data: FittingSet, calibration: Calibration, card: PolicyCard, values: Float) -> dict[str, dict[str, Any]]:
+def fitting_set(predictions: Predictions, validation: float, seed: int) -> Predictions:
+    """The objects of the training split that the recogniser was not trained on, duplicates left out."""
+    for_fitting(predictions)
+    if not 0 < validation <= 1:
+        raise PredictionsError(f"the validation part lies between 0 and 1, not {validation}")
+    _, kept = divide(predictions.labels, predictions.depth_entropy, validation, seed)
+    if len(kept) == 0:
+        raise PredictionsError("no object is left to fit to")
+    return predictions.of_objects(kept).deduplicate()
+
+
+def _tables(data: Predictions, calibration: Calibration, card: PolicyCard, values: Float) -> dict[str, dict[str, Any]]:
     """The tables of a scope and travel weight, by the kinds of their cards; ``values`` are those of the class table."""
     length, n_views, paid = (card.settings[name] for name in ("length", "n_views", "travel_weight"))
     travel = data.sphere.travel[:: data.sphere.azimuths]  # from each ring to each cell
@@ -113,13 +125,13 @@ def _tables(data: FittingSet, calibration: Calibration, card: PolicyCard, values
     }
 
 
-def log_belief(data: FittingSet, calibration: Calibration, total: NDArray[np.floating], n_views: int) -> Float:
+def log_belief(data: Predictions, calibration: Calibration, total: NDArray[np.floating], n_views: int) -> Float:
     """Logarithm of the belief in the true class, (N, ...), after so many views with that sum, (N, ..., D)."""
     return of_true_class(calibration.log_belief(total, n_views, len(data.classes)), data.labels)
 
 
 def fit_sequence(
-    data: FittingSet, scope: Scope, length: int, calibration: Calibration, travel_weight: float = 0.0
+    data: Predictions, scope: Scope, length: int, calibration: Calibration, travel_weight: float = 0.0
 ) -> NDArray[np.int64]:
     """The greedily best moves from each ring, for all objects and azimuths together: (rings, length) cells, int64."""
     sphere, moves = data.sphere, []
@@ -138,7 +150,7 @@ def fit_sequence(
     return np.array(moves)
 
 
-def fit_ring(data: FittingSet, scope: Scope, n_views: int, calibration: Calibration) -> tuple[int, int]:
+def fit_ring(data: Predictions, scope: Scope, n_views: int, calibration: Calibration) -> tuple[int, int]:
     """The best ring to go to and the azimuth steps along it, over all starts, after 2 to ``n_views`` views."""
     sphere, n_views = data.sphere, min(n_views, len(data.sphere))
 
@@ -156,7 +168,12 @@ def fit_ring(data: FittingSet, scope: Scope, n_views: int, calibration: Calibrat
 
 
 def fit_class_table(
-    data: FittingSet, n_views: int, shrinkage: float, calibration: Calibration, rng: np.random.Generator, walks: int = 8
+    data: Predictions,
+    n_views: int,
+    shrinkage: float,
+    calibration: Calibration,
+    rng: np.random.Generator,
+    walks: int = 8,
 ) -> Float:
     """Mean gain of views 2 to ``n_views`` by believed class, current ring and cell: (classes, rings, V) float64."""
     sphere, c, n = data.sphere, len(data.classes), len(data)

@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from nextview.cli.extra import require
+from nextview.cli.ending import require
 
 require("benchmark")
 

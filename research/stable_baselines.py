@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,7 +15,9 @@ from torch import nn
 
 from nextview.benchmark.environments import TaskVectorEnv
 from nextview.errors import ModelError
-from nextview.learning.gain_training import Layers
+
+Layers = Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
+"""Weights (in, out) and biases (out,) of one perceptron, ReLU between them."""
 
 
 @dataclass(frozen=True)

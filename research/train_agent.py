@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 import tyro
 from numpy.typing import NDArray
 
@@ -25,12 +26,12 @@ from nextview.data.predictions import Predictions
 from nextview.data.progress import Track, silently
 from nextview.errors import UsageError
 from nextview.files import check_new, command, sha256_of
-from nextview.learning.fitting_set import FittingSet, hold_out
-from nextview.learning.gain_training import Layers, Perceptrons, Score, write_gain
+from nextview.learning.fitting_set import for_fitting, hold_out
+from nextview.learning.gain_training import Perceptrons, Score, write_gain
 from nextview.learning.rollout import ReplayTable, Value, judge, rollout
 from nextview.policies.gain import Gain, features
 from nextview.policies.policy_card import LearnedFrom, PolicyCard
-from research.stable_baselines import MVSELECT, AgentRecipe, learn, learner
+from research.stable_baselines import MVSELECT, AgentRecipe, Layers, learn, learner
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def train_agent(
         view_price=recipe.view_price, travel_price=recipe.travel_price,
     )  # fmt: skip
     env = TaskVectorEnv(replayed(table.of_objects(learning), "train", True, rules), recipe.envs)
-    judges = ReplayTable(FittingSet.of_all(table).select(judging), _maps(table, judging), table.calibration)
+    judges = ReplayTable(for_fitting(table).of_objects(judging))
     steps, policy, value = _best(env, judges, recipe, track)
     about = PolicyCard(
         "gain",
@@ -104,10 +105,6 @@ def train_agent(
     card.parent.mkdir(parents=True, exist_ok=True)
     write_gain(card, policy, about, _states(judges, policy, recipe))
     return TrainedAgent(card, len(learning), len(judging), value, steps)
-
-
-def _maps(table: Predictions, kept: NDArray[np.int64]) -> dict[str, NDArray[np.float32]]:
-    return {name: values[kept] for name, values in table.maps.items()}
 
 
 def _best(env: TaskVectorEnv, judges: ReplayTable, recipe: AgentRecipe, track: Track) -> tuple[int, Gain, Value]:
@@ -133,7 +130,8 @@ def _agent(env: TaskVectorEnv, layers: Layers, recipe: AgentRecipe) -> Gain:
     task = env.task
     width, v = len(layers[0][0]), len(task.sphere)
     # A mirror that leaves everything in its place: reinforcement has not learned what is alike.
-    score = Score(Perceptrons.from_layers([layers], np.arange(width), np.arange(v)))
+    weights, biases = ([torch.from_numpy(part)[None].float() for part in parts] for parts in zip(*layers, strict=True))
+    score = Score(Perceptrons(weights, [bias[None] for bias in biases], np.arange(width), np.arange(v)))
     return Gain(task.sphere, len(task.classes), score, recipe.inputs, frame=recipe.frame)
 
 

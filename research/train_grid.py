@@ -23,15 +23,14 @@ from nextview.benchmark.published import published_recognisers, read_rows
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track as progress
 from nextview.data.progress import Track, silently
-from nextview.data.splits import test_objects
 from nextview.data.store import ViewStore
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_file
 from nextview.learning.export import run_network
 from nextview.learning.inputs import PackedViews, load_inputs
-from nextview.learning.loop import is_first
 from nextview.learning.recipes import THESIS_RECOGNISER, Hardware, RecogniserRecipe
 from nextview.learning.recogniser_training import train_recogniser
+from nextview.learning.runs import is_first
 from nextview.session.style import ACCENT, BLUE, legend, new_figure, percent_axis, to_png
 from research.training_curves import draw_curves
 
@@ -156,7 +155,7 @@ def _scores(run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe, 
     if kept.exists():
         return json.loads(kept.read_text())
     network = run_network(run, recipe, views)
-    objects, labels = test_objects(views), views.labels
+    objects, labels = np.flatnonzero(views.done & (views.splits == "test")), views.labels
     right: list[int] = []
 
     def judged() -> Iterator[int]:

@@ -166,6 +166,14 @@ def some_predictions(n: int = 6, seed: int = 0) -> Predictions:
     )
 
 
+def train_predictions(logits, labels, sphere, classes, azimuth_bins=None, **fields) -> Predictions:
+    """Predictions of objects of the training split of which nothing but this is known."""
+    n, v, _ = logits.shape
+    entropy, splits, conflicting = np.zeros((n, v), np.float32), np.array(["train"] * n), np.zeros(n, bool)
+    given = logits, {}, entropy, tuple(map(str, range(n))), labels, classes, splits, conflicting, sphere, {}, {}
+    return replace(Predictions(*given, azimuth_bins=azimuth_bins), **fields)
+
+
 def scene_predictions(store: Path, classes: Sequence[str]) -> Predictions:
     """Random logits of a store of cluttered scenes. A view that hardly shows the target says nothing."""
     opened, rng = ViewStore.open(store), np.random.default_rng(0)

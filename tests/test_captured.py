@@ -19,7 +19,7 @@ from nextview.sensing import Box
 from nextview.sensing.object_frame import upright_axes
 from nextview.simulation.captured import read_box, read_capture
 from nextview.simulation.captured_camera import CapturedCamera
-from nextview.simulation.capturing import Setting, write_capture
+from nextview.simulation.capturing import write_capture
 
 TWELVE = ViewSphere.named("12")
 RADIUS = 0.55
@@ -102,7 +102,7 @@ def test_pose_intrinsics_and_depth_are_those_of_the_layout(layout, tmp_path):
 def captured(tmp_path_factory):
     """The sample chair on a table, from twelve viewpoints."""
     folder = tmp_path_factory.mktemp("captures") / "chair"
-    done = list(write_capture(sample_mesh("chair"), folder, TWELVE, Setting(RADIUS, table=True), rng()))
+    done = list(write_capture(sample_mesh("chair"), folder, TWELVE, RADIUS, table=True))
     assert done == list(range(1, 13))
     return folder
 
@@ -134,7 +134,7 @@ def test_the_object_is_found_without_a_box(captured, system):
 
 
 def test_an_object_without_a_table_is_found_by_its_masks(tmp_path, system):
-    list(write_capture(sample_mesh("chair"), tmp_path / "free", TWELVE, Setting(RADIUS), rng()))
+    list(write_capture(sample_mesh("chair"), tmp_path / "free", TWELVE, RADIUS))
     result = system.recognise(tmp_path / "free", start=0, up="z")
     assert result.answer == "chair"
     assert all(view.degrees_off < 3 for view in result.views)

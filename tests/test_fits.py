@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import make_recogniser, some_predictions
+from pipeline import make_recogniser, some_predictions, train_predictions
 from scipy.special import log_softmax, softmax
 from scipy.stats import binomtest
 
@@ -19,7 +19,7 @@ from nextview.errors import DatasetError, ModelError, PredictionsError, ResultsE
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning import card_fits as calibration
 from nextview.learning.card_fits import error_bound, fit_calibration, fit_risk, fit_temperature, loss, valley_gains
-from nextview.learning.fitting_set import FittingSet, blind_walks, card_to_fit, fitting_set
+from nextview.learning.fitting_set import blind_walks, card_to_fit
 from nextview.learning.unknown import FAMILIES, fit_novelty, fit_unknown, synthetic_outlier
 from nextview.policies.baselines import Random
 from nextview.policies.learned_tables import ClassTable, cells_from, cells_to
@@ -27,20 +27,20 @@ from nextview.policies.registry import make_policy
 from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.inference import Recogniser
 from nextview.recognition.model_card import read_card
-from research.fit_policies import fit_class_table, fit_policies, fit_ring, fit_sequence
+from research.fit_policies import fit_class_table, fit_policies, fit_ring, fit_sequence, fitting_set
 
 SPHERE = ViewSphere.named("40")
 SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
 
 
-def correlated(n: int, correlation: float, temperature: float, seed: int = 0) -> FittingSet:
+def correlated(n: int, correlation: float, temperature: float, seed: int = 0) -> Predictions:
     """Two classes at -1 and +1, seen through Gaussian noise that is shared in part by all views of an object."""
     rng, spread = np.random.default_rng(seed), 1.5
     labels = (rng.random(n) < 0.8).astype(np.int64)  # a mix that the even weights have to undo
     shared, own = rng.normal(size=(n, 1)), rng.normal(size=(n, len(SMALL)))
     seen = 2.0 * labels[:, None] - 1 + spread * (np.sqrt(correlation) * shared + np.sqrt(1 - correlation) * own)
     logits = np.stack([-((seen - m) ** 2) / (2 * spread**2) for m in (-1, 1)], -1)
-    return FittingSet((temperature * logits).astype(np.float32), labels, SMALL, ("minus", "plus"))
+    return train_predictions((temperature * logits).astype(np.float32), labels, SMALL, ("minus", "plus"))
 
 
 @pytest.mark.parametrize(("correlation", "temperature"), [(0.0, 1.0), (0.4, 0.5), (0.8, 2.0)])
@@ -65,7 +65,9 @@ def test_sides_count_as_far_as_looks_are_right_about_them(right):
     wrong = (true + rng.integers(1, s, (n, v))) % s
     claimed[np.arange(n)[:, None], np.arange(v), labels[:, None]] = np.where(rng.random((n, v)) < right, true, wrong)
     azimuth_bins = np.log(np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))).astype(np.float32)
-    data = FittingSet(rng.normal(size=(n, v, 2)).astype(np.float32) / 100, labels, SMALL, ("a", "b"), azimuth_bins)
+    data = train_predictions(
+        rng.normal(size=(n, v, 2)).astype(np.float32) / 100, labels, SMALL, ("a", "b"), azimuth_bins
+    )
     found = fit_temperature(data, np.random.default_rng(1), walks=1)
     if right == 0.8:  # as good as they claim, and each by itself
         assert found.bin_correlation == pytest.approx(0, abs=0.05)
@@ -107,7 +109,7 @@ def test_promises_are_kept_as_often_as_promised():
     promises, broken = 0, 0
     for seed in range(60):
         some = np.random.default_rng([5, seed]).choice(len(whole), 300, replace=False)
-        part = replace(whole, logits=whole.logits[some], labels=whole.labels[some])
+        part = whole.of_objects(some)
         bounds = fit_risk(part, calibration, np.random.default_rng(seed), delta, n_views, walks=1)
         if min(bounds.bounds[n_views - 1]) <= risk:  # else it promises nothing, and nothing is broken
             promises += 1
@@ -150,7 +152,7 @@ def test_it_is_fitted_to_the_objects_that_validate():
 # Tables
 
 
-def telling(sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, seed: int = 0) -> FittingSet:
+def telling(sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, seed: int = 0) -> Predictions:
     """Every view says little of the class, but those on some rings, which depend on the class, say it loudly."""
     rng = np.random.default_rng(seed)
     c = len(rings_of_class)
@@ -160,7 +162,7 @@ def telling(sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, se
     for i, label in enumerate(labels):
         loud = np.isin(sphere.ring, rings_of_class[label])
         logits[i, loud, label] += 3
-    return FittingSet(logits.astype(np.float32), labels, sphere, tuple("abcdef"[:c]))
+    return train_predictions(logits.astype(np.float32), labels, sphere, tuple("abcdef"[:c]))
 
 
 @pytest.mark.parametrize("scope", ["global", "local"])
@@ -180,7 +182,7 @@ def test_what_tells_most_is_found(scope):
 def test_each_move_of_a_sequence_is_the_best_there_is(scope):
     rng, calibration = np.random.default_rng(0), Calibration(0.8, 0.5)
     labels = np.array([0, 0, 0, 1, 2])
-    data = FittingSet(rng.normal(size=(5, len(SMALL), 3)).astype(np.float32), labels, SMALL, ("a", "b", "c"))
+    data = train_predictions(rng.normal(size=(5, len(SMALL), 3)).astype(np.float32), labels, SMALL, ("a", "b", "c"))
     travel_weight = 0.05
     moves = fit_sequence(data, scope, 2, calibration, travel_weight)
 
@@ -216,7 +218,9 @@ def training_predictions(tmp_path):
     p = some_predictions(90)
     logits = p.logits.copy()
     logits[np.arange(90), :, p.labels] += np.random.default_rng(0).normal(0.6, 0.8, (90, 1))
-    recogniser = ("tiny", json.loads(card.read_text())["sha256"])
+    about = json.loads(card.read_text())
+    card.write_text(json.dumps(about | {"held_out": list(p.names[:45])}))
+    recogniser = ("tiny", about["sha256"])
     models = {**p.models, "recogniser": recogniser}
     path = tmp_path / "training.npz"
     replace(p, logits=logits.astype(np.float32), splits=np.array(["train"] * 90), models=models).save(path)
@@ -227,7 +231,7 @@ def test_a_calibration_goes_into_the_card_and_is_used(training_predictions, monk
     card, path = training_predictions
     before = json.loads(card.read_text())
     monkeypatch.setattr("sys.argv", ["/bin/nextview", "fit", "calibration", "a b"])
-    fitted = fit_calibration(path, card, validation=0.5)
+    fitted = fit_calibration(path, card)
     after = json.loads(card.read_text())
     assert {name: after[name] for name in before} == before | {"schema": 2}  # written anew
     assert after["training"]["commands"] == ["nextview fit calibration 'a b'"]
@@ -277,7 +281,7 @@ def test_a_card_that_was_changed_meanwhile_or_does_not_fit_is_left_alone(trainin
 
     monkeypatch.setattr(calibration, "fit_temperature", fit_slowly)
     with pytest.raises(ModelError, match="was changed while this ran"):
-        fit_calibration(path, card, validation=0.5)
+        fit_calibration(path, card)
     for spoilt, sentence in [
         (replace(p, splits=np.array(["test"] * 90)), "test split"),
         (replace(p, models={"recogniser": ("other", "f" * 64)}), "another recogniser"),

@@ -36,7 +36,7 @@ from nextview.policies.gain import Gain, features, mirrored, mirrored_features
 from nextview.policies.maps import SpherePeak
 from nextview.policies.policy_card import PolicyCard
 from nextview.policies.registry import make_policy
-from nextview.recognition.belief import PLAIN_SUM, Calibration, reorient
+from nextview.recognition.belief import Calibration, reorient
 from nextview.session.session import Session
 
 CLASSES = 4
@@ -49,12 +49,12 @@ def some_gain(sphere=SPHERE, inputs=INPUTS, networks=2, seed=0, frame="camera", 
     """With weights at random: whatever it was trained to, these promises hold."""
     rng = np.random.default_rng(seed)
     widths = [len(mirrored_features(sphere, CLASSES, inputs, frame)), 8, 8, len(sphere)]
-    layers = [
-        tuple((rng.normal(size=(a, b)) / a**0.5, rng.normal(size=b)) for a, b in pairwise(widths))
-        for _ in range(networks)
-    ]
+    pairs = list(pairwise(widths))
+    drawn = [[(rng.normal(size=(a, b)) / a**0.5, rng.normal(size=(1, b))) for a, b in pairs] for _ in range(networks)]
+    layers = [[np.stack(part) for part in zip(*layer, strict=True)] for layer in zip(*drawn, strict=True)]
+    weights, biases = ([torch.from_numpy(layer[k]).float() for layer in layers] for k in (0, 1))
     flips = mirrored_features(sphere, CLASSES, inputs, frame), mirrored(sphere)
-    score = Score(Perceptrons.from_layers(layers, *flips))
+    score = Score(Perceptrons(weights, biases, *flips))
     return Gain(sphere, CLASSES, score, inputs, frame=frame, **rest)
 
 
@@ -161,8 +161,9 @@ def some_table(n=30, sphere=SMALL, seed=0, azimuth_bins=False) -> ReplayTable:
     maps = {"lem-sphere": rng.random((n, len(sphere), sphere.rings, sphere.azimuths), dtype=np.float32)}
     shape = (n, len(sphere), len(data.classes), sphere.azimuths)
     likely = log_softmax(rng.normal(size=shape), axis=3).astype(np.float32) if azimuth_bins else None
-    data = replace(data, logits=noisy.astype(np.float32), azimuth_bins=likely)
-    return ReplayTable(data, maps, Calibration(0.8, 0.5, bin_correlation=0.1 if azimuth_bins else None))
+    calibration = Calibration(0.8, 0.5, bin_correlation=0.1 if azimuth_bins else None)
+    known = {"logits": noisy.astype(np.float32), "azimuth_bins": likely}
+    return ReplayTable(replace(data, **known, maps=maps, calibration=calibration))
 
 
 @pytest.mark.parametrize("azimuth_bins", [False, True])
@@ -263,8 +264,8 @@ QUICK = GainRecipe(epochs=6, walks=2, batch=128, networks=2, n_views=3, lr=1e-2)
 
 def test_training_finds_the_views_that_tell_the_class_believed():
     """Every class is told on one ring alone, and each view hints at the class: go to the ring of the class believed."""
-    learned = ReplayTable(telling(SMALL, [[0], [1], [2]], 240), {}, PLAIN_SUM)
-    fresh = ReplayTable(telling(SMALL, [[0], [1], [2]], 90, seed=1), {}, PLAIN_SUM)
+    learned = ReplayTable(telling(SMALL, [[0], [1], [2]], 240))
+    fresh = ReplayTable(telling(SMALL, [[0], [1], [2]], 90, seed=1))
     recipe = replace(QUICK, inputs=("belief", "view", "place"), frame="camera", epochs=20)
     *_, ((policy,), value) = best_epoch([train(learned, recipe)], [fresh], recipe)
     first, second = (SMALL.ring[m.state.current] for m in rollout(fresh, policy, 2, np.random.default_rng(5)))
@@ -340,7 +341,7 @@ def test_it_learns_from_what_sensors_made_of_the_same_objects(unseen, tmp_path, 
     table = ReplayTable.select(p, kept, np.random.default_rng(0), [sensed])
     np.testing.assert_array_equal(table.data.logits[3:], p.logits[kept][:, ::-1])
     np.testing.assert_array_equal(table.data.labels, np.tile(p.labels[kept], 2))
-    np.testing.assert_array_equal(table.maps["lem-sphere"], np.tile(p.maps["lem-sphere"][kept], (2, 1, 1, 1)))
+    np.testing.assert_array_equal(table.data.maps["lem-sphere"], np.tile(p.maps["lem-sphere"][kept], (2, 1, 1, 1)))
     card = tmp_path / "mine.json"
     more = ["--sensed", str(tmp_path / "sensed.npz"), "--epochs", "1", "--folds", "2"]
     start = ["train", "gain", str(unseen), str(card), *more]

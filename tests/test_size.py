@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from pipeline import make_recogniser, refused
+from pipeline import make_recogniser, refused, train_predictions
 from scipy.stats import norm
 
 from nextview.cli.main import main
@@ -19,7 +19,6 @@ from nextview.errors import DatasetError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.card_fits import ANY_SIZE, RADII, densities, fit_weight
-from nextview.learning.fitting_set import FittingSet
 from nextview.recognition.inference import Recogniser
 from nextview.recognition.model_card import read_card
 from nextview.simulation.simulated import SimulatedCamera
@@ -70,8 +69,8 @@ def test_the_weight_is_the_most_likely_one():
     logs = rng.normal(np.log([0.3, 0.6])[labels], 0.5)
     density = norm.logpdf(np.log(RADII)[None], np.log([[0.3], [0.6]]), 0.5)
     shape = rng.normal(np.where(labels == 0, 1, -1), np.sqrt(2))  # log-odds of the first class
-    logits = np.stack([shape, np.zeros(n)], 1)[:, None].astype(np.float32)
-    data = FittingSet(logits, labels, SPHERE, ("a", "b"))
+    logits = np.stack([shape, np.zeros(n)], 1)[:, None].repeat(3, 1).astype(np.float32)  # three views, all alike
+    data = train_predictions(logits, labels, ViewSphere((0.0,), 3), ("a", "b"))
     evidence, before, after = fit_weight(data, np.exp(logs), density)
     assert evidence.weight == pytest.approx(1, abs=0.15)
     alone = np.log1p(np.exp(np.where(labels == 0, -shape, shape)))

@@ -19,8 +19,8 @@ from nextview.data.store import DONE, ViewStore, describe
 from nextview.errors import ModelError, ResultsError, UsageError
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning import loop as fitting
 from nextview.learning import recogniser_training as recogniser
+from nextview.learning import runs as fitting
 from nextview.learning.architectures import ResNet, ViewMap
 from nextview.learning.export import export_map, export_recogniser, run_network
 from nextview.learning.fitting_set import hold_out

@@ -25,7 +25,7 @@ EXAMPLES = {
     "": "import nextview; assert nextview.recognise('samples/chair.off', start=3).answer == 'chair'",
     "benchmark": "from nextview.benchmark.run import run_benchmark; from nextview.benchmark.report import report",
     "cluster": "from distributed import LocalCluster; import nextview.data.pool",
-    "train": "import lightning, torch; from nextview.learning import export, loop",
+    "train": "import lightning, torch; from nextview.learning import export, runs",
     "workflow": "import snakemake",
     "explore": "import viser; from nextview.viewers.exploration import Exploration",
     "browser": "import playwright",

@@ -15,7 +15,7 @@ from math import isfinite
 from pathlib import Path
 from textwrap import wrap
 
-from nextview.cli.extra import require
+from nextview.cli.ending import require
 
 require("benchmark")
 

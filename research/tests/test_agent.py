@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tyro
-from pipeline import some_predictions
+from pipeline import some_predictions, train_predictions
 from scipy.special import log_softmax
 
 pytest.importorskip("stable_baselines3")
@@ -17,7 +17,6 @@ from nextview.cli.main import main
 from nextview.data.predictions import Predictions
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning.fitting_set import FittingSet
 from nextview.learning.rollout import ReplayTable, judge, rollout
 from nextview.policies.baselines import RandomAll
 from nextview.policies.registry import make_policy
@@ -54,7 +53,7 @@ def test_an_agent_finds_the_ring_of_the_class_believed(tmp_path, preset):
     learns = ["--steps", "24000", "--envs", "64", "--evaluations", "4", "--batch", "256", "--n-views", "2"]
     train([preset, str(tmp_path / "p.npz"), str(tmp_path / "a.json"), *learns, "--objective", "log-belief", *PLAIN])
     labels, logits = hinting(90, seed=1)
-    fresh = ReplayTable(FittingSet(logits, labels, SMALL, ("a", "b", "c")), {}, Calibration(1.01))
+    fresh = ReplayTable(train_predictions(logits, labels, SMALL, ("a", "b", "c"), calibration=Calibration(1.01)))
     agent = make_policy(str(tmp_path / "a.json"), SMALL)
     first, second = (SMALL.ring[m.state.current] for m in rollout(fresh, agent, 2, np.random.default_rng(5)))
     assert np.mean((second == labels)[first != labels]) > 0.7  # a third by chance

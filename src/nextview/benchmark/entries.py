@@ -1,7 +1,5 @@
 """Who can take part in the benchmark, by name: policies, oracles, fixed views, and a user's own."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@
 - ``nextview/RecogniseMesh-v0``: over meshes, rendered and shown to the networks as the agent goes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -39,39 +37,27 @@ from nextview.simulation.simulated import SimulatedCamera
 
 Rows = NDArray[np.int64]
 Source = str | Path | Predictions
-CAMERAS = 16
-"""Meshes that are kept ready to be looked at."""
+CAMERAS = 16  # meshes that are kept ready to be looked at
 _HERE = "nextview.benchmark.environments"
 gymnasium.register("nextview/Recognise-v0", f"{_HERE}:RecogniseEnv", vector_entry_point=f"{_HERE}:RecogniseVectorEnv")
 gymnasium.register("nextview/RecogniseMesh-v0", f"{_HERE}:RecogniseMeshEnv")
-Split = Literal["train", "test"]
-"""Objects to learn from, or objects to judge by."""
-FAR = 100.0
-"""Bound of the observation space for what a map network says; the networks of this project stay far below."""
+Split = Literal["train", "test"]  # objects to learn from, or objects to judge by
+FAR = 100.0  # bound of the observation space for what a map network says; the networks of this project stay far below
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What the agent sees, what it is paid for, and when an episode ends.
+    """What the agent sees, what it is paid for, and when an episode ends."""
 
-    Attributes:
-        inputs: of an observation: "belief", "view" (what the last one alone says), "place" (the ring and which views
-            were taken), "azimuth_bin", and predicted maps by name ("lem", "view_area-sphere").
-        frame: where azimuths are counted from: the "camera", or the "object" as it is believed to be turned.
-        objective: paid is by how much a view changes "right", the "belief" in the true class, or its "log-belief".
-        max_views: views at most, at least 2; the first is not the agent's.
-        threshold: belief that ends an episode after the second view or later; None always takes ``max_views``.
-        view_price: taken from the reward for each view.
-        travel_price: taken from it for each grid cell of travel.
-    """
-
+    # of an observation: "belief", "view" (what the last one alone says), "place" (the ring and which views were taken),
+    # "azimuth_bin", and predicted maps by name ("lem", "view_area-sphere")
     inputs: tuple[str, ...] = ("belief", "view", "place")
-    frame: Frame = "camera"
-    objective: str = "right"
-    max_views: int = 5
-    threshold: float | None = None
-    view_price: float = 0.0
-    travel_price: float = 0.0
+    frame: Frame = "camera"  # where azimuths are counted from: or the "object" as it is believed to be turned
+    objective: str = "right"  # or "belief" in the true class, or its "log-belief": what is paid is the change by a view
+    max_views: int = 5  # at most, at least 2; the first is not the agent's
+    threshold: float | None = None  # belief that ends an episode after the second view or later; None takes all views
+    view_price: float = 0.0  # taken from the reward for each view
+    travel_price: float = 0.0  # taken from it for each grid cell of travel
 
     def __post_init__(self) -> None:
         if not self.inputs or VISIBILITY in self.inputs:
@@ -128,7 +114,7 @@ class Task:
     def __post_init__(self) -> None:
         whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
 
-    def begin(self, n: int, rng: np.random.Generator, options: dict[str, Any] | None = None) -> Cohort:
+    def begin(self, n: int, rng: np.random.Generator, options: dict[str, Any] | None = None) -> "Cohort":
         """Begin ``n`` episodes: the options of ``reset`` may name each "object" and "start"; else they are drawn."""
         weight = 1 / np.bincount(self.labels)[self.labels]
         chance = weight / weight.sum() if self.balanced else None
@@ -154,16 +140,11 @@ class Task:
 def replayed(
     predictions: Source, split: Split | None = "train", balanced: bool = False, rules: Rules = Rules()
 ) -> Task:
-    """The task of recognising the objects of one split.
+    """The task of recognising the objects of one split, each shape once for "train"; None takes all objects.
 
-    Args:
-        predictions: to learn from, of objects that the recogniser was not trained on (``nextview predict --held-out``).
-        split: "train" to learn from, each shape once; "test" to judge by; None for all.
-        balanced: draw every class equally often.
-        rules: see ``Rules``.
-
-    Raises:
-        PredictionsError: there are no objects of that split, or no such map or azimuth bins.
+    ``predictions`` to learn from are of objects that the recogniser was not trained on (``nextview predict
+    --held-out``); ``balanced`` draws every class equally often. PredictionsError: no objects of that split, no such map
+    or azimuth bins.
     """
     p = predictions if isinstance(predictions, Predictions) else Predictions.load(Path(predictions))
     p = p if split is None else p.of_split(split)
@@ -295,11 +276,7 @@ def info_of(seen: Seen) -> dict[str, Any]:
 
 
 class RecogniseEnv(TaskEnv):
-    """Recognise an object by few views; what the models see in them is looked up in predictions.
-
-    Args:
-        predictions, split, balanced: see ``replayed``.
-        rules: options of ``Rules``, by name.
+    """Recognise an object by few views, looked up in predictions: see ``replayed``; ``rules`` are options of ``Rules``.
 
     >>> env = gymnasium.make("nextview/Recognise-v0", predictions="validation.npz")    # doctest: +SKIP
     """
@@ -377,19 +354,12 @@ class RecogniseVectorEnv(TaskVectorEnv):
 class RecogniseMeshEnv(TaskEnv):
     """Recognise an object by few views of its mesh.
 
-    Args:
-        meshes: a folder, CLASS/train|test/MESH or CLASS/MESH; the bundled samples by default, which have no splits.
-        split: "train", "test", or None for a folder without splits.
-        models: the name of bundled models, or a folder of your own.
-        viewpoints: a layout of ``ViewSphere.named``.
-        depth: add the depth image: the observation is then {"state": (D,), "depth": (size, size) float32, object radii,
-            0 where there is no object}.
-        size: side of the image, pixels; a multiple of what the networks take, 112 for the bundled ones.
-        balanced: draw every class equally often.
-        rules: options of ``Rules``, by name.
-
-    Raises:
-        DatasetError: there are no such meshes, or one is of a class that the recogniser does not know.
+    ``meshes`` are a folder, CLASS/train|test/MESH or CLASS/MESH; ``split`` None is for one without splits, as are the
+    samples, the default. ``models`` are bundled ones by name, or a folder; ``viewpoints`` a layout of
+    ``ViewSphere.named``. With ``depth`` the observation is {"state": (D,), "depth": (size, size) float32, object radii,
+    0 where there is no object}; ``size`` is a multiple of what the networks take, 112 for the bundled ones.
+    ``balanced`` draws every class equally often; ``rules`` are options of ``Rules``. DatasetError: no such meshes, or a
+    class that the recogniser does not know.
     """
 
     def __init__(
@@ -407,7 +377,12 @@ class RecogniseMeshEnv(TaskEnv):
         given, found, sphere = Rules(**rules), find_models(models), ViewSphere.named(viewpoints)
         self._models = Models(Recogniser(found.recogniser), open_maps(found.maps, given.maps))
         classes, calibration = self._models.classes, self._models.recogniser.calibration
-        objects = _meshes(meshes, split)
+        objects: list[tuple[str, Callable[[], Mesh]]] = [(name, partial(sample_mesh, name)) for name in SAMPLES]
+        if meshes is not None:
+            entries = [e for e in list_dataset(Path(meshes)) if split in (None, e.split)]
+            objects = [(e.label, partial(load_mesh, e.path)) for e in entries]
+        if not objects:
+            raise DatasetError(f"{meshes}: holds no meshes of the split {split!r}; split=None takes all that there are")
         for label, _ in objects:
             if label not in classes:
                 raise DatasetError(f"the recogniser knows no class {label!r}; it knows {', '.join(classes)}")
@@ -429,13 +404,3 @@ class RecogniseMeshEnv(TaskEnv):
         """The state, and the depth image if it is wanted."""
         state = super().observed(seen)
         return {"state": state, "depth": self._last.depth} if self._depth else state
-
-
-def _meshes(folder: str | Path | None, split: str | None) -> list[tuple[str, Callable[[], Mesh]]]:
-    """The class of each mesh of a folder, or of the samples, and what reads it."""
-    if folder is None:
-        return [(name, partial(sample_mesh, name)) for name in SAMPLES]
-    entries = [e for e in list_dataset(Path(folder)) if split in (None, e.split)]
-    if not entries:
-        raise DatasetError(f"{folder}: holds no meshes of the split {split!r}; split=None takes all that there are")
-    return [(e.label, partial(load_mesh, e.path)) for e in entries]

@@ -1,7 +1,5 @@
 """How good the models under the policies are: every view of every object judged, no policy asked."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -22,32 +20,24 @@ from nextview.recognition.model_card import ModelCard
 
 Float = NDArray[np.float64]
 
-RELIABILITY_LOOKS = (1, 2, 5)
-"""Views after which confidence is compared with accuracy, beside all of them."""
+RELIABILITY_LOOKS = (1, 2, 5)  # views after which confidence is compared with accuracy, beside all of them
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``.
+    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``."""
 
-    Attributes:
-        accuracy: by n_views (1, or V: all logits summed), label (empty: all) and measure: ``accuracy``;
-            ``clean_accuracy``, without the objects whose very mesh also has another label; ``shape_accuracy``, where
-            the recogniser is not told the size; with ``class_`` before it the mean over classes.
-        fusion: the same, mean confidence and calibration error of so many random views fused.
-        confusion: answers by n_views, label and answer; a view is an answer, or a whole object.
-        reliability: confidence and accuracy by n_views and bin.
-        maps: scores (``metrics.map_errors``) by map, by, label. ``by`` is the network, or the mean of the true maps of
-            these very objects: over all, or for the object's true class at the view.
-        left_out: for each map that is not judged, or not of all objects, why.
-    """
-
+    # by n_views (1, or V: all logits summed), label (empty: all) and measure: ``accuracy``; ``clean_accuracy``, without
+    # the objects whose very mesh also has another label; ``shape_accuracy``, where the recogniser is not told the size;
+    # with ``class_`` before it the mean over classes
     accuracy: pd.DataFrame
-    fusion: pd.DataFrame
-    confusion: pd.DataFrame
-    reliability: pd.DataFrame
+    fusion: pd.DataFrame  # the same, mean confidence and calibration error of so many random views fused
+    confusion: pd.DataFrame  # answers by n_views, label and answer; a view is an answer, or a whole object
+    reliability: pd.DataFrame  # confidence and accuracy by n_views and bin
+    # scores (``metrics.map_errors``) by map, by, label. ``by`` is the network, or the mean of the true maps of these
+    # very objects: over all, or for the true class at the view
     maps: pd.DataFrame
-    left_out: dict[str, str]
+    left_out: dict[str, str]  # for each map that is not judged, or not of all objects, why
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """The tables by name."""

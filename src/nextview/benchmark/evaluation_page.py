@@ -1,7 +1,5 @@
 """The stage that judges the models behind some predictions: a folder of tables and one HTML page."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,38 +21,26 @@ from nextview.recognition.model_card import find_card, write_card
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """What is judged.
+    """What is judged."""
 
-    Attributes:
-        split: take only the objects of this one; needed where the predictions hold several.
-        deduplicate: of objects with the same label that look the same from every view, copies of one mesh, judge
-            only the first; the published numbers count them all.
-        cards: of the models that made the predictions; their scores are noted on these.
-        samples: of the bootstrap.
-        seed: decides the bootstrap and the orders of views.
-    """
-
+    # take only the objects of this one; needed where the predictions hold several
     split: Literal["train", "test", "val"] | None = None
+    # of objects with the same label that look the same from every view, copies of one mesh, judge only the first; the
+    # published numbers count them all
     deduplicate: bool = False
-    cards: tuple[str, ...] = ()
-    samples: int = 2000
-    seed: int = 0
+    cards: tuple[str, ...] = ()  # of the models that made the predictions; their scores are noted on these
+    samples: int = 2000  # of the bootstrap
+    seed: int = 0  # decides the bootstrap and the orders of views
 
 
 def write_evaluation(
-    predictions: Path,
-    out: Path,
+    predictions: Path,  # made by nextview predict
+    out: Path,  # folder for tables (.csv), settings and evaluate.html
     settings: EvaluationSettings = EvaluationSettings(),
     *,
-    overwrite: bool = False,
+    overwrite: bool = False,  # replace the files of an earlier evaluation
 ) -> Evaluation:
     """Judge recogniser and maps on every view: accuracy, confusions, calibration, map scores, beside the published.
-
-    Args:
-        predictions: made by nextview predict.
-        out: folder for tables (.csv), settings and evaluate.html.
-        settings: what is judged.
-        overwrite: replace the files of an earlier evaluation.
 
     Raises:
         UsageError: the predictions hold several splits, and none is chosen.

@@ -1,7 +1,5 @@
 """The figures of a benchmark, from its tables, and of an evaluation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,8 +24,7 @@ COLOURS = {
 }  # fmt: skip
 OWN = ("#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff7043", "#5c6bc0")
 """For all others, in turn."""
-MOST = 8
-"""Curves of policies that a robot could follow, at most."""
+MOST = 8  # curves of policies that a robot could follow, at most
 
 
 def ceiling(results: Results) -> list[str]:

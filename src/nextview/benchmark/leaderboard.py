@@ -1,7 +1,5 @@
 """Who leads under one threshold, which differences can be told from chance, and when there are too few objects."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,8 +8,7 @@ import pandas as pd
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.summary import Tables
 
-SIGNIFICANT = 0.05
-"""A difference is called one when its p-value after Holm's correction is below this."""
+SIGNIFICANT = 0.05  # a difference is called one when its p-value after Holm's correction is below this
 FEW_OBJECTS, WIDE = 200, 0.03
 """With fewer objects, or intervals of differences in accuracy that reach farther to either side, little can be told."""
 
@@ -24,10 +21,9 @@ def headline_threshold(thresholds: Sequence[float]) -> float:
 def leaderboard(tables: Tables, threshold: float) -> list[Any]:
     """The policies under one threshold, the most accurate first and those that no robot could follow last.
 
-    Returns:
-        Rows with policy, accuracy, its 95 % interval low to high, class_accuracy, n_views, travel (grid cells, over all
-        episodes), difference and p_holm to the reference (NaN for the reference itself), and differs: whether that is
-        significant.
+    Rows with policy, accuracy, its 95 % interval low to high, class_accuracy, n_views, travel (grid cells, over all
+    episodes), difference and p_holm to the reference (NaN for the reference itself), and differs: whether that is
+    significant.
     """
     rows = tables.summary[tables.summary["threshold"] == threshold]
     table = rows.pivot(index="policy", columns="measure", values="value")

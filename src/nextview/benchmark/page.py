@@ -1,7 +1,5 @@
 """The pages of a benchmark and of an evaluation: numbers as they are written, and the templates that take them."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from typing import Any, NamedTuple

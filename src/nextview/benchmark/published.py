@@ -1,7 +1,5 @@
 """The numbers of the thesis "Multi-View 3D Object Recognition: Selecting the Best Sequences of Views", beside ours."""
 
-from __future__ import annotations
-
 import csv
 from functools import cache
 from importlib.resources import files

@@ -1,12 +1,9 @@
 """Replay: run policies through all episodes at once, from predictions instead of a camera.
 
-A policy does not know the threshold, so where it goes does not depend on it. Every policy is run once, to the last
-view, through the same loop as live use; ``truncate`` ends the episodes where a ``Stopping`` rule does. A random policy
-draws once for all thresholds in this way, which also pairs its episodes. A path ends early only where the belief is
-exactly 1 in double precision: no threshold can want more.
+A policy does not know the threshold, so every policy is run once, to the last view, through the same loop as live use;
+``truncate`` ends the episodes where a ``Stopping`` rule does. So a random policy draws once for all thresholds, which
+also pairs its episodes. A path ends early only where the belief is exactly 1 in double precision.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -27,10 +24,8 @@ from nextview.recognition.map_names import maps_among
 from nextview.recognition.own_stopping import Rule, own_stopping
 from nextview.session.episode import run_episodes
 
-THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)
-"""The thesis's (section 5.3)."""
-PART = 4096
-"""Episodes of fixed views that are run at once."""
+THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)  # the thesis's (section 5.3)
+PART = 4096  # episodes of fixed views that are run at once
 
 
 @dataclass(frozen=True)
@@ -65,14 +60,8 @@ class Outcomes:
 def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
     """Every object from ``runs`` random first views: episode = run * objects + object.
 
-    Args:
-        predictions: what the models say.
-        runs: first views of each object.
-        seed: decides the first views: they are the same for every policy and threshold. In scenes they are drawn among
-            those that can be reached.
-
-    Raises:
-        UsageError: fewer than one run.
+    The seed decides the first views, the same for every policy and threshold; in scenes among those that can be
+    reached.
     """
     if runs < 1:
         raise UsageError(f"at least one run is needed, not {runs}")
@@ -141,9 +130,8 @@ def _run(
 
 
 def _moved(sphere: ViewSphere, views: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    legs = (views[:, :-1], views[:, 1:])
+    legs, going = (views[:, :-1], views[:, 1:]), views[:, 1:] >= 0
     still = np.zeros((len(views), 1))
-    going = views[:, 1:] >= 0
     travel, arc = (np.hstack([still, np.cumsum(d[legs] * going, axis=1)]) for d in (sphere.travel, sphere.arc))
     return travel, arc
 

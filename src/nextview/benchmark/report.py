@@ -1,7 +1,5 @@
 """The report: one self-contained HTML page from a folder of benchmark results."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from io import BytesIO
@@ -30,21 +28,21 @@ from nextview.geometry.depth import headlight
 from nextview.policies.registry import DEFAULT
 from nextview.recognition.map_names import LEM
 
-PICTURE = 112
-"""Side of a view's picture, pixels."""
+PICTURE = 112  # side of a view's picture, pixels
 OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])
 """Colours of nothing, the target, other things and the table in a scene."""
 
 
-def report(results: Path, out: Path | None = None, /, store: Path | None = None, overwrite: bool = False) -> Path:
+def report(
+    results: Path,  # folder made by nextview benchmark
+    out: Path | None = None,  # the page; RESULTS/report.html by default
+    /,
+    # take the pictures of the objects from this view store; by default from that of the predictions, if it still is
+    # where it was
+    store: Path | None = None,
+    overwrite: bool = False,  # replace an earlier page
+) -> Path:
     """Write one self-contained HTML page: tables, curves, and the worst failures.
-
-    Args:
-        results: folder made by nextview benchmark.
-        out: the page; RESULTS/report.html by default.
-        store: take the pictures of the objects from this view store; by default from that of the predictions, if it
-            still is where it was.
-        overwrite: replace an earlier page.
 
     Raises:
         ResultsError: there are no results, or fixed views only; or the page cannot be written.
@@ -138,10 +136,7 @@ def _figures(results: Results, best: str, at: float) -> dict[str, Figure]:
 
 
 def _thresholds(results: Results, at: float) -> dict[str, float]:
-    """Policies by class, as tables 8 to 11 of the thesis, each at the threshold of its published numbers.
-
-    Of scenes nothing is published; there the policies of the curves are at the same threshold.
-    """
+    """Policies by class (tables 8 to 11), each at its published threshold; for scenes nothing is published."""
     if not results.tables.levels.empty:
         return {name: at for name in draw.compared(results) if not is_oracle(name)}
     ran, thresholds = set(results.tables.sweep["policy"]), results.settings["thresholds"]

@@ -1,7 +1,5 @@
 """The benchmark: from predictions to a folder of results, and back from the folder."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.replay import THRESHOLDS, Grid, make_specs, run_grid
@@ -29,36 +26,23 @@ from nextview.recognition.own_stopping import own_stopping
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """What is run.
+    """What is run."""
 
-    Attributes:
-        policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
-        models: a folder with models of your own: the policies learned for them take part, by their names.
-        thresholds: of the belief.
-        risks: error rates; the thresholds that promise them, by the recogniser's calibration, are run too. With them
-            thresholds stay; else they come down with the views, by the recogniser's correlation.
-        stopping: MODULE:NAME of a stopping rule of your own, asked with each threshold; see docs/add_a_policy.md.
-        uncalibrated: believe the plain sum of the logits, as published, whatever the recogniser's card says.
-        split: take only the objects of this one; needed where the predictions hold several.
-        runs: random first views of each object.
-        max_views: views at most.
-        reference: the policy that the others are compared with.
-        samples: of the bootstrap.
-        seed: decides first views, random policies and the bootstrap.
-    """
-
-    policies: tuple[str, ...] = ()
-    models: str = "modelnet10"
-    thresholds: tuple[float, ...] = THRESHOLDS
+    policies: tuple[str, ...] = ()  # names, or MODULE:CLASS for your own; all that the predictions allow by default
+    models: str = "modelnet10"  # a folder with models of your own: the policies learned for them take part, by name
+    thresholds: tuple[float, ...] = THRESHOLDS  # of the belief
+    # error rates; the thresholds that promise them, by the recogniser's calibration, are run too. With them thresholds
+    # stay; else they come down with the views, by the recogniser's correlation
     risks: tuple[float, ...] = ()
-    stopping: str | None = None
-    uncalibrated: bool = False
+    stopping: str | None = None  # MODULE:NAME of a stopping rule of your own, asked with each threshold
+    uncalibrated: bool = False  # believe the plain sum of the logits, as published, whatever the recogniser's card says
+    # take only the objects of this one; needed where the predictions hold several
     split: Literal["train", "test", "val"] | None = None
-    runs: int = 10
-    max_views: int = 5
-    reference: str = "random"
-    samples: int = 2000
-    seed: int = 0
+    runs: int = 10  # random first views of each object
+    max_views: int = 5  # views at most
+    reference: str = "random"  # the policy that the others are compared with
+    samples: int = 2000  # of the bootstrap
+    seed: int = 0  # decides first views, random policies and the bootstrap
 
 
 @dataclass(frozen=True)
@@ -77,11 +61,11 @@ class Results:
 
 
 def run_benchmark(
-    predictions: Path,
-    out: Path,
+    predictions: Path,  # made by nextview predict
+    out: Path,  # folder for the results
     settings: BenchmarkSettings = BenchmarkSettings(),
     *,
-    overwrite: bool = False,
+    overwrite: bool = False,  # replace the files of earlier results
     track: Track = silently,
 ) -> Results:
     """Run every policy under every threshold from the same first views, and say which are better than the reference.
@@ -89,17 +73,8 @@ def run_benchmark(
     Episodes, tables and tests are written; nextview report makes a page of them. Why a policy failed stands in the
     settings of the results.
 
-    Args:
-        predictions: made by nextview predict.
-        out: folder for the results.
-        settings: what is run.
-        overwrite: replace the files of earlier results.
-        track: shows how far it is.
-
     Raises:
-        UsageError: settings that make no sense.
-        RiskError: the recogniser's calibration does not promise such an error rate.
-        EntryError: not one policy came to its end.
+        UsageError, RiskError, EntryError: settings make no sense, nothing promises a risk, or no policy ends.
     """
     check_new(out, overwrite, folder=True)
     grid, names, promised = _prepare(predictions, settings)
@@ -191,6 +166,8 @@ def _write_episodes(path: Path, grid: Grid) -> None:
     writer = None
     for policy, threshold, ends in grid.cells():
         paths = grid.paths[policy]
+        taken = paths.views[np.arange(paths.views.shape[1]) < ends.n_views[:, None]].astype(np.int16)
+        begins = np.concatenate([[0], np.cumsum(ends.n_views)]).astype(np.int32)
         table = pa.table(
             {
                 "object": names,
@@ -198,7 +175,7 @@ def _write_episodes(path: Path, grid: Grid) -> None:
                 "run": run,
                 "policy": words(np.zeros(n), (policy,)),
                 "threshold": pa.array(np.full(n, np.nan if threshold is None else threshold)),
-                "views": _lists(paths.views, ends.n_views),
+                "views": pa.ListArray.from_arrays(pa.array(begins), pa.array(taken)),
                 "stop": words(np.where(paths.fixed, 2, ends.confident), STOPS),
                 "answer": words(ends.answer, p.classes),
                 "confidence": pa.array(ends.confidence),
@@ -211,9 +188,3 @@ def _write_episodes(path: Path, grid: Grid) -> None:
         writer.write_table(table)
     if writer is not None:
         writer.close()
-
-
-def _lists(views: NDArray[np.int64], n_views: NDArray[np.int64]) -> pa.ListArray:
-    taken = np.arange(views.shape[1]) < n_views[:, None]
-    offsets = np.concatenate([[0], np.cumsum(n_views)]).astype(np.int32)
-    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(views[taken].astype(np.int16)))

@@ -1,7 +1,5 @@
 """Error bars and tests. What is drawn anew is the object: the views and runs of one object are not independent."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm

@@ -1,7 +1,5 @@
 """From episodes to tables: every number with its interval, its test and the published value."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -24,37 +22,28 @@ Cell = tuple[str, float | None, Outcomes]
 TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
 SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)
 """Thresholds of the curves of accuracy against views and travel: from the first view for all to the last for most."""
-LEVEL_VIEWS = (2, 3, 5)
-"""After so many views the policies are compared."""
+LEVEL_VIEWS = (2, 3, 5)  # after so many views the policies are compared
 LEVEL_COLUMNS = ["level", "scenes", "policy", "n_views", "accuracy", "low", "high", "travel", "difference"]
 LEVEL_COLUMNS += ["difference_low", "difference_high", "p"]
 
 
 @dataclass(frozen=True)
 class Tables:
-    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``.
+    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``."""
 
-    Attributes:
-        summary: a row a policy, threshold and measure: ``accuracy``; ``clean_accuracy``, without the objects whose very
-            mesh also has another label; ``n_views``; ``travel_moved``, over the episodes that moved, as published, and
-            ``travel_all``, grid cells; ``arc_all``, radians; ``confident``, the share that reached the threshold, and
-            ``confident_accuracy``, of these; ``calibration_error``; with ``class_`` before it the mean over classes.
-        per_class: the same of classes (accuracy, travel_moved).
-        tests: differences to the reference, p (paired bootstrap), for accuracy mcnemar, and both after Holm's
-            correction over all rows of a measure.
-        sweep: the points of the curves of accuracy against views and travel.
-        reliability: confidence and accuracy by bin.
-        risks: error rates that were promised and those measured among the episodes that reached their threshold.
-        levels: of scenes: accuracy after so many views by the level of clutter, see ``by_level``.
-    """
-
+    # a row a policy, threshold and measure: ``accuracy``; ``clean_accuracy``, without the objects whose very mesh also
+    # has another label; ``n_views``; ``travel_moved``, over the episodes that moved, as published, and ``travel_all``,
+    # grid cells; ``arc_all``, radians; ``confident``, the share that reached the threshold, and ``confident_accuracy``,
+    # of these; ``calibration_error``; with ``class_`` before it the mean over classes
     summary: pd.DataFrame
-    per_class: pd.DataFrame
+    per_class: pd.DataFrame  # the same of classes (accuracy, travel_moved)
+    # differences to the reference, p (paired bootstrap), for accuracy mcnemar, and both after Holm's correction over
+    # all rows of a measure
     tests: pd.DataFrame
-    sweep: pd.DataFrame
-    reliability: pd.DataFrame
-    risks: pd.DataFrame
-    levels: pd.DataFrame
+    sweep: pd.DataFrame  # the points of the curves of accuracy against views and travel
+    reliability: pd.DataFrame  # confidence and accuracy by bin
+    risks: pd.DataFrame  # error rates promised, and those measured among the episodes that reached their threshold
+    levels: pd.DataFrame  # of scenes: accuracy after so many views by the level of clutter, see ``by_level``
 
 
 def summarise(

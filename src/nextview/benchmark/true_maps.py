@@ -1,7 +1,5 @@
 """What no model predicts: true measures and maps of every view, and plans, from predictions and their view store."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -13,8 +11,7 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, EntryError
 from nextview.recognition.map_names import CONFIDENCE, map_name, measure_of
 
-TRUE = "true-"
-"""How the names of true maps begin."""
+TRUE = "true-"  # how the names of true maps begin
 IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {
     "depth_entropy": lambda p: normalise_per_object(p.depth_entropy),
     CONFIDENCE: lambda p: confidence_maps(p.logits, p.labels),  # 0 where the recogniser is wrong (section 4.1.3)

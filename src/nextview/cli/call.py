@@ -1,7 +1,5 @@
 """Call a function with the arguments of a command line: tyro reads its parameters, their comments and its docstring."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The commands of ``nextview``: a table from each name to the function that it calls, which is imported when called."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

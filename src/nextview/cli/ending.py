@@ -1,16 +1,24 @@
 """How a command ends, whatever happens: a mistake of the user's in one sentence, a bug with its traceback."""
 
-from __future__ import annotations
-
 import os
 import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import Any
 
-from nextview.cli.extra import missing_extra
 from nextview.errors import NextviewError
+
+EXTRAS = {
+    "benchmark": ("jinja2", "pandas", "pyarrow"),
+    "cluster": ("dask", "distributed"),
+    "explore": ("viser",),
+    "record": ("rerun",),
+    "envs": ("gymnasium",),
+    "train": ("lightning", "numcodecs", "onnx", "onnxscript", "torch", "torchmetrics"),
+}
+"""Packages by the optional part of the installation that brings them."""
 
 
 def printable(text: str) -> str:
@@ -51,3 +59,18 @@ def orderly_end(after_ctrl_c: str) -> Iterator[None]:
 def _end(sentence: str, status: int) -> Any:
     print(f"nextview: {printable(sentence)}", file=sys.stderr)
     sys.exit(status)
+
+
+def missing_extra(error: ModuleNotFoundError) -> str | None:
+    """What to install; None where the module belongs to no optional part."""
+    package = (error.name or "").partition(".")[0]
+    extra = next((extra for extra, packages in EXTRAS.items() if package in packages), None)
+    return None if extra is None else f"this needs the package {package}: pip install 'nextview[{extra}]'"
+
+
+def require(extra: str) -> None:
+    """End a script, before its imports fail, with the sentence that says what to install."""
+    for package in EXTRAS[extra]:
+        if find_spec(package) is None:
+            print(f"{sys.argv[0]} needs the package {package}: pip install 'nextview[{extra}]'", file=sys.stderr)
+            sys.exit(2)

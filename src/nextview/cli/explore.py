@@ -1,7 +1,5 @@
 """``nextview explore``: an object, the views of it and what policies value them at, in the browser."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

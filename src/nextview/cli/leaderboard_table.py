@@ -1,7 +1,5 @@
 """The results of a benchmark and of an evaluation as tables in the terminal."""
 
-from __future__ import annotations
-
 from math import isfinite
 from typing import Any
 
@@ -9,17 +7,9 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from nextview.benchmark import leaderboard as board
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.evaluation import Evaluation
-from nextview.benchmark.leaderboard import (
-    SIGNIFICANT,
-    headline_threshold,
-    leaderboard,
-    level_differences,
-    nothing_differs,
-    promised_risks,
-    too_few,
-)
 from nextview.benchmark.page import Number, numbers
 from nextview.benchmark.run import Results
 from nextview.cli.progress import Terminal
@@ -38,30 +28,31 @@ def print_leaderboard(results: Results) -> None:
     tables, reference = results.tables, results.settings["reference"]
     console = Terminal()
     if not tables.sweep.empty:
-        at = headline_threshold(results.settings["thresholds"])
-        console.print(_policies(leaderboard(tables, at), at, reference))
-        console.print(f"* differs from {reference} in accuracy: p after Holm's correction is below {SIGNIFICANT}")
-        for sentence in (nothing_differs(tables, at, reference), too_few(tables, at, len(results.predictions))):
+        at = board.headline_threshold(results.settings["thresholds"])
+        console.print(_policies(board.leaderboard(tables, at), at, reference))
+        console.print(f"* differs from {reference} in accuracy: p after Holm's correction is below {board.SIGNIFICANT}")
+        few = board.too_few(tables, at, len(results.predictions))
+        for sentence in (board.nothing_differs(tables, at, reference), few):
             if sentence:
                 console.print(sentence)
-    if sentence := level_differences(tables, reference):
+    if sentence := board.level_differences(tables, reference):
         console.print(sentence)
-    for r in promised_risks(tables):
+    for r in board.promised_risks(tables):
         if r.broken:
             wrong = f"of the episodes that stopped at {r.threshold:.4g}, {100 * r.error:.1f} % are wrong"
             console.print(f"{r.policy}: {wrong}; at most {100 * r.risk:g} % was promised.")
 
 
-def _policies(board: list[Any], threshold: float, reference: str) -> Table:
+def _policies(rows: list[Any], threshold: float, reference: str) -> Table:
     """In 80 columns; only a long name of a policy is folded."""
     title = f"threshold {threshold:g}; in brackets 95 % intervals; points over {reference}"
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
     table.add_column("policy", overflow="fold", min_width=20)
     for column in ("accuracy", "class\nmean", "views", "travel\ncells", f"over\n{reference}", "p"):
         table.add_column(column, justify="right", no_wrap=True)
-    for i, s in enumerate(board):
+    for i, s in enumerate(rows):
         oracle, over, p = is_oracle(s.policy), "", ""
-        if oracle and i > 0 and not is_oracle(board[i - 1].policy):
+        if oracle and i > 0 and not is_oracle(rows[i - 1].policy):
             table.add_section()
             table.add_row("oracles:", style="dim")
         if s.p_holm == s.p_holm:  # not the reference

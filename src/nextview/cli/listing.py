@@ -1,7 +1,5 @@
 """``nextview list`` and ``nextview download``: what ships with the package, and published datasets."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace

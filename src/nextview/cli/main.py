@@ -1,7 +1,5 @@
 """The ``nextview`` command: finds one of those in commands.py, and calls it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

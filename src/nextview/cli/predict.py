@@ -1,7 +1,5 @@
 """``nextview predict``: what the models say of every view of a store, into one file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

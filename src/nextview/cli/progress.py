@@ -1,7 +1,5 @@
 """Progress on standard error: a bar in a terminal, else a line now and then."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -12,8 +10,7 @@ from rich.text import Text
 
 from nextview.cli.ending import printable
 
-EVERY = 30.0
-"""Seconds between two lines where the output is no terminal."""
+EVERY = 30.0  # seconds between two lines where the output is no terminal
 
 
 class Terminal(Console):

@@ -1,13 +1,9 @@
 """``nextview recognise`` and ``demo``: look at one object until it is clear what it is; ``capture`` for the former."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
-
-import numpy as np
 
 from nextview.cli.episode_table import episode_as_json, print_episode
 from nextview.cli.progress import console, track
@@ -105,14 +101,14 @@ def capture(
     overwrite: bool = False,  # replace the files of an earlier capture
 ) -> None:
     """Write captured views of a mesh: depth images, poses, intrinsics, as ``nextview recognise FOLDER`` reads them."""
-    from nextview.simulation.capturing import Setting, write_capture
+    from nextview.simulation.capturing import write_capture
 
     check_new(folder, overwrite, folder=True)
     loaded = load_mesh(mesh, up, unit, max_faces)
     metres = loaded.metres if radius is None else radius
     if metres is None:
         raise UsageError(f"{mesh}: how large is it? Give the file's --unit or the object's --radius in metres")
-    sphere, setting = ViewSphere.named(viewpoints), Setting(metres, table=table, masks=not table)
-    frames = write_capture(loaded, folder, sphere, setting, np.random.default_rng(0), overwrite)
+    sphere = ViewSphere.named(viewpoints)
+    frames = write_capture(loaded, folder, sphere, metres, table, not table, overwrite)
     track(frames, len(sphere), f"capturing {mesh.name}")
     console.print(f"{folder}: {len(sphere)} views; look at them with: nextview recognise {folder}")

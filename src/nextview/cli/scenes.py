@@ -1,7 +1,5 @@
 """``nextview scenes``: draw cluttered scenes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

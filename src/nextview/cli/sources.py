@@ -1,7 +1,5 @@
 """Options of several commands: who looks, what is looked at, and files of pictures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """``nextview render``, ``check`` and ``measure``: view stores."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path

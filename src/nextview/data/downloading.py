@@ -1,7 +1,5 @@
 """Download a published dataset: verified, and unpacked whole or not at all."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from dataclasses import dataclass
@@ -12,8 +10,7 @@ from nextview.checks import one_line
 from nextview.errors import DatasetError
 from nextview.files import new_folder, only_one
 
-LONGEST = 200
-"""Letters of what a server says of itself."""
+LONGEST = 200  # letters of what a server says of itself
 
 
 @dataclass(frozen=True)

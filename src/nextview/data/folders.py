@@ -1,11 +1,8 @@
 """Folders of meshes: which files are objects, of which class and split, and what is left out.
 
-Understood are CLASS/MESH, CLASS/SPLIT/MESH and SPLIT/CLASS/MESH, each also with folders between the last of these and
-the mesh (CLASS/ID/models/MESH). Where all meshes lie in the folder itself, each is a class of its
-own. Links are followed.
+Understood are CLASS/MESH, CLASS/SPLIT/MESH and SPLIT/CLASS/MESH, each also with folders before the mesh
+(CLASS/ID/models/MESH). Where all meshes lie in the folder itself, each is a class of its own. Links are followed.
 """
-
-from __future__ import annotations
 
 import os
 from collections import Counter
@@ -17,8 +14,7 @@ from nextview.geometry.mesh import FORMATS
 from nextview.recognition.model_card import read_card
 
 SPLITS = ("train", "test", "val")
-FEW = 3
-"""Files that are named of those left out for one reason."""
+FEW = 3  # files that are named of those left out for one reason
 
 
 @dataclass(frozen=True)
@@ -62,8 +58,7 @@ def list_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> list[
 def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> Listing:
     """All meshes of a dataset folder, or other files in its layout, and those that were left out.
 
-    Raises:
-        DatasetError: there is no such folder, it holds none, or two of them would have one name.
+    DatasetError if there is no such folder, it holds none, or two of them would have one name.
     """
     root = Path(root)
     if not root.is_dir():

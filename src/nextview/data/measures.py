@@ -1,7 +1,5 @@
 """View measures: what they are handed; depth entropy and the recogniser's confidence; users' own by import path."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,24 +14,16 @@ from nextview.geometry.depth import object_depth
 from nextview.geometry.observation import depth_image
 from nextview.recognition.map_names import Good
 
-QUANTUM = 1e-3
-"""Depth values closer than this count as equal, object radii."""
+QUANTUM = 1e-3  # depth values closer than this count as equal, object radii
 
 
 @dataclass(frozen=True)
 class MeasuredView:
-    """One view of an object. What several measures ask for is computed once, when the first one asks.
+    """One view of an object. What several measures ask for is computed once, when the first one asks."""
 
-    Attributes:
-        depth: distance along the optical axis, (H, W) float, object radii, 0 where there is no object. What a sensor
-            gives for nothing else becomes 0 here.
-        pose: camera-to-world, (4, 4) float64, OpenCV axes; the world is the object frame, z up.
-        intrinsics: pinhole matrix, (3, 3) float64, pixels, the first pixel's centre at 0.5.
-    """
-
-    depth: NDArray[np.floating]
-    pose: NDArray[np.float64]
-    intrinsics: NDArray[np.float64]
+    depth: NDArray[np.floating]  # along the optical axis, (H, W) float, object radii, 0 where there is no object
+    pose: NDArray[np.float64]  # camera-to-world, (4, 4), OpenCV axes; the world is the object frame, z up
+    intrinsics: NDArray[np.float64]  # pinhole matrix, (3, 3), pixels, the first pixel's centre at 0.5
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "depth", object_depth(depth_image(self.depth)))
@@ -74,10 +64,7 @@ class MeasuredView:
 
 @dataclass(frozen=True)
 class Measure:
-    """A view measure: a function from a view to a finite number, and what is to be known of it.
-
-    It needs the depth alone, or the mesh too. Good views have high or low values of it, by its source.
-    """
+    """A function of a view, of its depth alone or of the mesh too; good views have high or low values of it."""
 
     function: Callable[[MeasuredView], float]
     needs: Literal["depth", "mesh"] = "depth"
@@ -146,11 +133,7 @@ def normalise_per_object(values: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def confidence_maps(logits: NDArray[np.floating], labels: NDArray[np.integer]) -> NDArray[np.float32]:
-    """Confidence in each view alone where it is recognised rightly, 0 where it is not: (N, V) float32.
-
-    An object that is right from no view has a row of zeros; the thesis leaves it out. Of equal logits the lower index
-    wins.
-    """
+    """Confidence in each view alone where it is right, the first of equal classes counting, else 0: (N, V) float32."""
     from scipy.special import softmax
 
     logits = np.asarray(logits, np.float64)

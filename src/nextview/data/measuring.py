@@ -1,7 +1,5 @@
 """Compute something of every rendered object of a store, into the store; resumable by object."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -16,8 +14,7 @@ from nextview.data.pool import counted
 from nextview.data.store import DEPTH_UNIT, ViewStore, opened, writing
 from nextview.errors import MeasureError
 
-Made = dict[str, NDArray[np.float32]]
-"""The values of one object, by the names of their arrays."""
+Made = dict[str, NDArray[np.float32]]  # the values of one object, by the names of their arrays
 
 
 def depth_views(store: ViewStore, i: int) -> Iterator[MeasuredView]:
@@ -35,18 +32,11 @@ def measure(
     overwrite: bool = False,
     views: Callable[[ViewStore, int], Iterator[MeasuredView]] = depth_views,
 ) -> Iterator[tuple[int, int]]:
-    """Put view measures into a store, as ``measures/NAME`` (N, V) float32; see ``nextview measure``.
+    """Put view measures of rendered objects, or of some rows, into a store: ``measures/NAME`` (N, V) float32.
 
-    Args:
-        path: the store.
-        names: of the measures, "all", or "MODULE:FUNCTION", see ``find_measure``; by default all that can be had.
-        workers, scheduler: see ``pool.each``.
-        objects: indices of those to measure; all that are rendered by default.
-        overwrite: measure anew what is there.
-        views: what the measures are handed, if they need more than the depth.
-
-    Yields:
-        Objects done so far, and how many there are.
+    ``names`` as ``find_measure`` takes them, or "all"; by default all that can be had from what ``views`` hands them.
+    ``workers`` and ``scheduler`` as of ``pool.each``; ``overwrite`` measures anew what is there. Yields objects done so
+    far, and how many there are.
     """
     names = names_of(names, views is not depth_views)
     ViewStore.open(path).array("depth")  # says if it is missing, before anything is begun

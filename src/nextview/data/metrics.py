@@ -1,7 +1,5 @@
 """Every score, once: accuracy and its mean over classes, calibration error, and how well maps are predicted."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Run one function on many items: on this machine's cores, or on a cluster through dask.distributed."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal
@@ -16,10 +14,8 @@ from threadpoolctl import threadpool_limits
 from nextview.checks import whole
 from nextview.errors import DatasetError
 
-MOST = 1024
-"""Processes on one machine."""
-PATIENCE = "10s"
-"""How long a scheduler may take to answer."""
+MOST = 1024  # processes on one machine
+PATIENCE = "10s"  # how long a scheduler may take to answer
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -39,10 +35,9 @@ def each(
 ) -> Iterator[tuple[Item, Result | WorkerDied]]:
     """Call ``function(item)`` for every item, side by side; yields (item, result) as they come, in any order.
 
-    Function and items must be picklable, items hashable. A process that dies costs no more than the item it was working
-    on, and that only if it dies again when it works on nothing else. What the function raises ends the run. ``workers``
-    are processes, one for each core by default, 0 to work in this one; ``scheduler`` is the address of a
-    dask.distributed scheduler to use instead.
+    Function and items are picklable, items hashable. A process that dies costs its item, if it dies again with that
+    alone. What the function raises ends the run. ``workers`` are processes, one for each core by default, 0 to work in
+    this one; ``scheduler`` is the address of a dask.distributed scheduler to use instead.
     """
     if scheduler is not None:
         yield from _on_cluster(function, items, scheduler)
@@ -80,8 +75,7 @@ def counted(
 ) -> Iterator[tuple[int, int]]:
     """Call a function for the items that are left of ``total``, see ``each``; yields how many are done, and the total.
 
-    Raises:
-        DatasetError: the process of an item died; it begins with the item's ``name``.
+    DatasetError if the process of an item died; it begins with the item's ``name``.
     """
     before = total - len(items)
     yield before, total

@@ -1,7 +1,5 @@
 """Run the models over every view of a store, once; resumable by object."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil
@@ -26,10 +24,8 @@ from nextview.recognition.memory import open_recogniser
 from nextview.recognition.model_card import BUNDLED, ModelCard
 from nextview.recognition.network_input import from_store
 
-BATCH = 8
-"""Views a call of the networks."""
-Arrays = dict[str, NDArray[np.float32]]
-"""What the networks give: ``logits``, ``azimuth_bins`` and ``map/NAME``."""
+BATCH = 8  # views a call of the networks
+Arrays = dict[str, NDArray[np.float32]]  # what the networks give: ``logits``, ``azimuth_bins`` and ``map/NAME``
 
 
 def predict(
@@ -44,25 +40,12 @@ def predict(
     scheduler: str | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """Write the predictions of a store's rendered objects.
+    """Write the predictions of a store's rendered objects into an .npz file; options as of ``nextview predict``.
 
-    What is done is kept in a folder beside ``out``, so that a run that was killed goes on from there.
-
-    Args:
-        path, out: the view store, and the .npz file to make.
-        recogniser: its card.
-        maps: card of the network for each map.
-        size: let the recogniser know how large the objects are, where store and card tell.
-        split, held_out, overwrite: as of ``nextview predict``.
-        workers, scheduler: see ``pool.each``; a scheduler's workers see the same files.
-
-    Yields:
-        Objects done so far, and how many there are.
-
-    Raises:
-        DatasetError: the store holds no such objects, or a class that the recogniser does not know; or one of them
-            kills its process.
-        ResultsError: ``out`` exists, or cannot be written.
+    ``size`` lets the recogniser know how large the objects are, where store and card tell. What is done is kept beside
+    ``out``: a run that was killed goes on from there. Yields objects done so far, and how many there are.
+    DatasetError: no such objects, a class that the recogniser does not know, or an object that kills its process.
+    ResultsError: ``out`` exists, or cannot be written.
     """
     path, out = Path(path), Path(out)
     check_new(out, overwrite)

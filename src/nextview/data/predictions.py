@@ -1,7 +1,5 @@
 """What the models say of every view of every object: the table from which policies are replayed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -24,54 +22,33 @@ from nextview.policies.base import Evidence
 from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
 
 FORMAT = 1
-PACKED, SPARE = 100, 64 * 2**20
-"""A file holds at most this many times its size, and so many bytes more."""
-SAME = 1e-5
-"""Difference between logits that are the same, but for rounding."""
-KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}
-"""Of numpy's types; all other arrays are of floats."""
+PACKED, SPARE = 100, 64 * 2**20  # a file holds at most this many times its size, and so many bytes more
+SAME = 1e-5  # difference between logits that are the same, but for rounding
+KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}  # of numpy's types; all other arrays are of floats
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """What the models say of N objects from the V views of a sphere; C classes, R rings.
+    """What the models say of N objects from the V views of a sphere; C classes, R rings."""
 
-    Attributes:
-        logits: of the recogniser for each view alone, (N, V, C) float32.
-        maps: predicted local maps around each view by name ("lem"), each (N, V, R, 3) float32; those of the whole
-            sphere ("lem-sphere") are (N, V, R, azimuths), once round from the view.
-        depth_entropy: the true measure, bits, (N, V) float32.
-        names: of the objects, unique.
-        labels: true class of each as an index into ``classes``, (N,) int64.
-        classes: their names, in the order of the logits.
-        splits: "train", "test" or "" for each object, (N,).
-        conflicting: objects that are the very mesh of another one with another label, (N,) bool.
-        sphere: the viewpoints.
-        models: name and SHA-256 of the recogniser ("recogniser") and of each map network ("lem").
-        valley_classes: for each map, the classes for which its card says that the valley is the better view.
-        calibration: how far a sum of the recogniser's logits is to be trusted.
-        azimuth_bins: see ``Evidence``, (N, V, hypotheses, azimuth bins) float32; None if the recogniser cannot tell.
-        of_size: what the object's size added to the logits, (N, C) float32; None if sizes are not known.
-        store: absolute path of the view store they were made from; empty if it is not known.
-        commands: all that made them, in order, from the meshes on; () if that is not known.
-    """
-
-    logits: NDArray[np.float32]
+    logits: NDArray[np.float32]  # of the recogniser for each view alone, (N, V, C)
+    # predicted local maps around each view by name ("lem"), each (N, V, R, 3); those of the whole sphere ("lem-sphere")
+    # are (N, V, R, azimuths), once round from the view
     maps: dict[str, NDArray[np.float32]]
-    depth_entropy: NDArray[np.float32]
-    names: tuple[str, ...]
-    labels: NDArray[np.int64]
-    classes: tuple[str, ...]
-    splits: NDArray[np.str_]
-    conflicting: NDArray[np.bool_]
+    depth_entropy: NDArray[np.float32]  # the true measure, bits, (N, V)
+    names: tuple[str, ...]  # of the objects, unique
+    labels: NDArray[np.int64]  # true class of each as an index into ``classes``, (N,)
+    classes: tuple[str, ...]  # their names, in the order of the logits
+    splits: NDArray[np.str_]  # "train", "test" or "" for each object, (N,)
+    conflicting: NDArray[np.bool_]  # objects that are the very mesh of another one with another label, (N,)
     sphere: ViewSphere
-    models: dict[str, tuple[str, str]]
-    valley_classes: dict[str, tuple[str, ...]]
-    calibration: Calibration = PLAIN_SUM
-    azimuth_bins: NDArray[np.float32] | None = None
-    of_size: NDArray[np.float32] | None = None
-    store: str = ""
-    commands: tuple[str, ...] = ()
+    models: dict[str, tuple[str, str]]  # name and SHA-256 of the "recogniser" and of each map network ("lem")
+    valley_classes: dict[str, tuple[str, ...]]  # of each map: those for which the valley is the better view
+    calibration: Calibration = PLAIN_SUM  # how far a sum of the recogniser's logits is to be trusted
+    azimuth_bins: NDArray[np.float32] | None = None  # see ``Evidence``, (N, V, hypotheses, bins); None if not known
+    of_size: NDArray[np.float32] | None = None  # what the size added to the logits, (N, C); None if not known
+    store: str = ""  # absolute path of the view store they were made from; empty if it is not known
+    commands: tuple[str, ...] = ()  # all that made them, in order, from the meshes on; () if that is not known
 
     def __post_init__(self) -> None:
         n, v, c = len(self.names), len(self.sphere), len(self.classes)
@@ -120,6 +97,12 @@ class Predictions:
         seen = np.ptp(self.by_shape().logits, axis=2) > (SAME if len(self.classes) > 1 else -1)
         return seen if self.azimuth_bins is None else seen | (np.ptp(self.azimuth_bins, axis=(2, 3)) > SAME)
 
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Of the objects, (N,), sum N: all classes that occur count the same."""
+        count = np.bincount(self.labels, minlength=len(self.classes))
+        return len(self) / ((count > 0).sum() * count[self.labels])
+
     def evidence(self, objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
         """What the models say of objects (rows), (B,), each seen from one view, (B,)."""
         return Evidence(
@@ -129,7 +112,7 @@ class Predictions:
             seen=self.seen[objects, views],
         )
 
-    def of_split(self, split: str) -> Predictions:
+    def of_split(self, split: str) -> "Predictions":
         """The objects of one split."""
         kept = self.splits == split
         if not kept.any():
@@ -137,23 +120,35 @@ class Predictions:
             raise PredictionsError(f"these predictions hold no objects of the split {split!r}, only of {there}")
         return self.of_objects(np.flatnonzero(kept))
 
-    def deduplicate(self) -> Predictions:
+    def deduplicate(self) -> "Predictions":
         """One object of each shape and label: without the copies that look the same from every view."""
         return self.of_objects(deduplicated(self.labels, self.depth_entropy))
 
-    def of_objects(self, kept: NDArray[np.int64]) -> Predictions:
+    def of_objects(self, kept: NDArray[np.int64]) -> "Predictions":
         """Some of the objects, by their rows, (n,)."""
         arrays: dict[str, Any] = {name: values[kept] for name, values in self._arrays().items()}
         maps = {name: values[kept] for name, values in self.maps.items()}
         return replace(self, **arrays, maps=maps, names=tuple(self.names[i] for i in kept))
 
-    def by_shape(self) -> Predictions:
+    @classmethod
+    def joined(cls, parts: Sequence["Predictions"]) -> "Predictions":
+        """All objects of predictions by the same models, one after the other: in part K their names end in #K."""
+        found = [part._arrays() for part in parts]
+        arrays: dict[str, Any] = {
+            name: np.concatenate([own[name] for own in found]) if all(name in own for own in found) else None
+            for name in found[0]
+        }
+        maps = {name: np.concatenate([part.maps[name] for part in parts]) for name in parts[0].maps}
+        names = (f"{name}#{k}" if k else name for k, part in enumerate(parts) for name in part.names)
+        return replace(parts[0], **arrays, maps=maps, names=tuple(names))
+
+    def by_shape(self) -> "Predictions":
         """What the recogniser says to those who do not know how large the objects are."""
         if self.of_size is None:
             return self
         return replace(self, logits=self.logits - self.of_size[:, None], of_size=None)
 
-    def with_size(self, of_size: NDArray[np.float32] | None) -> Predictions:
+    def with_size(self, of_size: NDArray[np.float32] | None) -> "Predictions":
         """The inverse of ``by_shape``: logits by size, (N, C), are added."""
         return self if of_size is None else replace(self, logits=self.logits + of_size[:, None], of_size=of_size)
 
@@ -164,7 +159,7 @@ class Predictions:
         logits: ArrayLike,
         classes: Sequence[str] | None = None,
         split: str | None = None,
-    ) -> Predictions:
+    ) -> "Predictions":
         """Predictions by a recogniser of your own, of no maps; they name no model.
 
         Args:
@@ -186,7 +181,7 @@ class Predictions:
         return made
 
     @classmethod
-    def of_objects_in(cls, store: ViewStore, objects: NDArray[np.int64], classes: Sequence[str]) -> Predictions:
+    def of_objects_in(cls, store: ViewStore, objects: NDArray[np.int64], classes: Sequence[str]) -> "Predictions":
         """What a store says of objects, by index; all logits are 0."""
         labels = [store.classes[label] for label in store.labels[objects]]
         if unknown := sorted(set(labels) - set(classes)):
@@ -231,7 +226,7 @@ class Predictions:
             np.savez_compressed(file, **arrays)
 
     @classmethod
-    def load(cls, path: str | Path) -> Predictions:
+    def load(cls, path: str | Path) -> "Predictions":
         """Read what ``save`` wrote; PredictionsError if it is missing or damaged. Nothing is unpickled."""
         path = Path(path)
         if not path.exists():
@@ -248,7 +243,7 @@ class Predictions:
             raise PredictionsError(f"{path}: not a predictions file ({reason})") from None
 
     @classmethod
-    def _from(cls, f: dict[str, NDArray]) -> Predictions:
+    def _from(cls, f: dict[str, NDArray]) -> "Predictions":
         def group(prefix: str) -> dict[str, NDArray]:
             return {name.removeprefix(prefix): values for name, values in f.items() if name.startswith(prefix)}
 

@@ -1,7 +1,5 @@
 """How a long job tells how far it is, to whoever wants to know: a progress bar, a log or nobody."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Render a dataset into a view store, on all cores, resumable."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -33,25 +31,17 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named
 from nextview.simulation.simulated import OccludedCamera, SimulatedCamera
 
-LARGEST_CHUNK = 2**31 - 2**20
-"""Bytes that may be compressed at once, the compressor's own included."""
-FARTHEST = np.iinfo(np.uint16).max * DEPTH_UNIT
-"""Depth that can be stored, object radii."""
-SENSING = 256
-"""Sets the draws of a sensor apart from those of a deformation: no byte of a name is as large."""
+LARGEST_CHUNK = 2**31 - 2**20  # bytes that may be compressed at once, the compressor's own included
+FARTHEST = np.iinfo(np.uint16).max * DEPTH_UNIT  # depth that can be stored, object radii
+SENSING = 256  # sets the draws of a sensor apart from those of a deformation: no byte of a name is as large
 
 
 @dataclass(frozen=True)
 class Deform:
-    """Make a new object of a mesh.
+    """Make a new object of a mesh."""
 
-    Attributes:
-        stretch: scale each axis by a factor from 1/(1 + stretch) to 1 + stretch, drawn log-uniformly.
-        rotated: rotate about the vertical by any angle.
-    """
-
-    stretch: float = 0.0
-    rotated: bool = False
+    stretch: float = 0.0  # scale each axis by a factor from 1/(1 + stretch) to 1 + stretch, drawn log-uniformly
+    rotated: bool = False  # rotate about the vertical by any angle
 
     def draw(self, seed: int, name: str) -> tuple[NDArray[np.float64], float]:
         """The factors of the three axes, (3,), and the angle, radians, of the object of that name."""
@@ -87,27 +77,18 @@ def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What is rendered, and how.
+    """What is rendered, and how."""
 
-    Attributes:
-        seed: decides deformations and errors of a sensor: those of an object by its name alone.
-        deform: how to make a new object of each mesh.
-        sensor: look through it with all its errors: NAME or NAME:STRENGTH (docs/your_camera.md); clean by default.
-        unit: of length in the mesh files (mm, cm, inch, foot, m), so that sizes are known (ModelNet: inch).
-        split: only this split of the dataset.
-        held_out: only objects that the model of this card calls held out of its training.
-        meshes: of scenes: the folder of the meshes that they are made of.
-        max_faces: leave out a mesh of more triangles, or a file of more than 60 bytes for each of these.
-    """
-
-    seed: int = 0
-    deform: Deform = Deform()
+    seed: int = 0  # decides deformations and errors of a sensor: those of an object by its name alone
+    deform: Deform = Deform()  # how to make a new object of each mesh
+    # look through it with all its errors: NAME or NAME:STRENGTH (docs/your_camera.md); clean by default
     sensor: str | None = None
+    # of length in the mesh files (mm, cm, inch, foot, m), so that sizes are known (ModelNet: inch)
     unit: str | None = None
-    split: str | None = None
-    held_out: Path | None = None
-    meshes: Path | None = None
-    max_faces: int = MAX_FACES
+    split: str | None = None  # only this split of the dataset
+    held_out: Path | None = None  # only objects that the model of this card calls held out of its training
+    meshes: Path | None = None  # of scenes: the folder of the meshes that they are made of
+    max_faces: int = MAX_FACES  # leave out a mesh of more triangles, or a file of more than 60 bytes for each of these
 
 
 def render(
@@ -122,20 +103,10 @@ def render(
 ) -> Iterator[tuple[str, str | None]]:
     """Render every mesh, or the target of every scene, that the store lacks; one that failed before is tried again.
 
-    The run may end at any moment, even by a kill or a full disk; the next one goes on with what is missing.
-
-    Args:
-        dataset, path: folder of meshes, or of scenes, and the store.
-        sphere, size: the viewpoints, and the side of the images, pixels.
-        workers, scheduler: see ``pool.each``; a scheduler's workers see the same files.
-        overwrite: replace a store of other objects or settings.
-
-    Yields:
-        (name, None) for each object done, (name, reason) for one that cannot be rendered.
-
-    Raises:
-        DatasetError: the dataset or the store cannot be used, or another run is writing it.
-        UsageError: a setting that makes no sense.
+    It may end at any moment, by a kill or a full disk; the next run goes on. ``size`` is the side of the images,
+    pixels; ``overwrite`` replaces a store of other objects or settings; workers as of ``pool.each`` see the same files.
+    Yields (name, None) for each object done, (name, reason) for one that cannot be rendered. DatasetError: dataset or
+    store cannot be used, or another run is writing it. UsageError: a setting that makes no sense.
     """
     dataset, path = Path(dataset).absolute(), Path(path).absolute()
     sensor = _check(path, sphere, size, options)

@@ -1,7 +1,5 @@
 """Sample objects of our own, made of boxes: something to look at before any dataset is there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -9,8 +7,7 @@ import numpy as np
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
 
-Box = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Two opposite corners, centimetres, z up."""
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # two opposite corners, centimetres, z up
 
 
 def _legs(x: float, y: float, thick: float, height: float) -> list[Box]:

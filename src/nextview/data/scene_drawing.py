@@ -4,8 +4,6 @@ Things are set beside a target, where nothing stands yet, until so much of it sh
 upright on the table. Their footprints, which are convex hulls, never overlap.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -69,6 +67,14 @@ class Task:
     path: Path
 
 
+@dataclass(frozen=True)
+class Meshes:
+    """The mesh files that may stand around a target: a folder, and paths below it, with forward slashes, sorted."""
+
+    folder: Path
+    files: tuple[str, ...]
+
+
 def draw_scenes(
     dataset: Path,
     out: Path,
@@ -84,15 +90,8 @@ def draw_scenes(
 
     The objects of each split are taken in an order that the seed draws, each once before any is taken again, the same
     at all levels. What stands around an object is of its own split. Files are CLASS/SPLIT/NAME@LEVEL-NUMBER.json, or
-    CLASS/NAME@LEVEL-NUMBER.json where the dataset has no splits.
-
-    Args:
-        dataset, out: folder of meshes, and of scenes.
-        levels, scenes, seed, split, held_out: as of ``nextview scenes``.
-        workers, scheduler: see ``pool.each``; a scheduler's workers see the same files.
-
-    Yields:
-        (name, None) for each scene that is there, (name, reason) for one that cannot be drawn.
+    CLASS/NAME@LEVEL-NUMBER.json where the dataset has no splits. Options as of ``nextview scenes`` and ``pool.each``.
+    Yields (name, None) for each scene that is there, (name, reason) for one that cannot be drawn.
     """
     dataset, out = Path(dataset), Path(out)
     wanted = tasks(dataset, out, levels, scenes, seed, split, held_out)
@@ -156,20 +155,10 @@ def _draw(meshes: dict[str, Meshes], seed: int, task: Task) -> str | None:
     return None
 
 
-@dataclass(frozen=True)
-class Meshes:
-    """The mesh files that may stand around a target: a folder, and paths below it, with forward slashes, sorted."""
-
-    folder: Path
-    files: tuple[str, ...]
-
-
 def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) -> SceneLayout:
     """A scene of some level around a target, a mesh file of the folder; seed and name decide all that is random.
 
-    Raises:
-        MeshError: the target cannot be used.
-        DatasetError: no layout shows as much of it as the level wants; or a file cannot be read.
+    MeshError if the target cannot be used; DatasetError if no layout shows as much of it as the level wants.
     """
     rng = np.random.default_rng([seed, *name.encode()])
     mesh = cached_mesh(meshes.folder / target)

@@ -1,7 +1,5 @@
 """What a store keeps of scenes, and what a robot in them would expect to see from each view."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,14 +20,10 @@ from nextview.simulation.scene import Scene
 from nextview.simulation.scene_layout import clutter_level
 from nextview.simulation.simulated import TARGET, SceneCamera, visible_shares
 
-SIDE = 80
-"""Of the pictures of the whole scene, pixels."""
-HALF = 2.0
-"""They show so many object radii to each side of the target's centre."""
-SCENE_UNIT = 2e-4
-"""Their depth is stored as uint16 in steps of this many object radii: up to 13.1."""
-SHARE_SIZE = 112
-"""Side of the picture in which the share that shows is measured, pixels; as when the scene was drawn."""
+SIDE = 80  # of the pictures of the whole scene, pixels
+HALF = 2.0  # they show so many object radii to each side of the target's centre
+SCENE_UNIT = 2e-4  # their depth is stored as uint16 in steps of this many object radii: up to 13.1
+SHARE_SIZE = 112  # side of the picture in which the share that shows is measured, pixels; as when the scene was drawn
 
 
 def scene_intrinsics(distance: float, side: int = SIDE) -> NDArray[np.float64]:
@@ -92,7 +86,7 @@ def scene_views(store: ViewStore, i: int) -> SceneViews:
 Constrain = Callable[[EpisodeState], EpisodeState]
 
 
-def sight_of(scenes: SceneSight | None, objects: NDArray[np.int64]) -> tuple[Constrain, Visible]:
+def sight_of(scenes: "SceneSight | None", objects: NDArray[np.int64]) -> tuple[Constrain, Visible]:
     """What ``run_episodes`` needs of scenes: where cameras can be, and what is expected to show."""
     if scenes is None:
         return unconstrained, lambda state: np.ones(state.visited.shape)
@@ -102,7 +96,7 @@ def sight_of(scenes: SceneSight | None, objects: NDArray[np.int64]) -> tuple[Con
     )
 
 
-def scenes_of(p: Predictions) -> SceneSight | None:
+def scenes_of(p: Predictions) -> "SceneSight | None":
     """The scenes that predictions are of; None if they are of single objects, whose store need not be there."""
     try:
         store = ViewStore.open(p.store) if p.store else None
@@ -127,7 +121,7 @@ class SceneSight:
     _frames: dict[tuple[int, int], tuple[bytes, float]] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, store: ViewStore, names: Sequence[str]) -> SceneSight | None:
+    def of(cls, store: ViewStore, names: Sequence[str]) -> "SceneSight | None":
         """Of some of a store's objects; None if it holds no scenes."""
         if store.attributes.scene is None:
             return None
@@ -138,7 +132,7 @@ class SceneSight:
         rows = np.array([row[name] for name in names])
         return cls(store, rows, np.stack([store.read("scene/reachable", i) for i in rows]))
 
-    def of_scenes(self, kept: NDArray[np.int64]) -> SceneSight:
+    def of_scenes(self, kept: NDArray[np.int64]) -> "SceneSight":
         """Some of the scenes, by their index; also the same one several times."""
         return replace(self, rows=self.rows[kept], reachable=self.reachable[kept])
 

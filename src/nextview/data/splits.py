@@ -1,7 +1,5 @@
 """Which objects train and which validate: by object, stratified by class, identical meshes together. And samples."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +12,7 @@ from nextview.recognition.model_card import ModelCard, find_card
 
 
 def duplicate_groups(measured: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Which objects look the same from every view: a number for each, shared by those that do, (N,).
-
-    Copies of a mesh, also moved and scaled, have identical depth-entropies, (N, V); others hardly ever do.
-    """
+    """A number for each object, (N,), the same for those whose depth-entropies, (N, V), are: copies of one mesh."""
     return np.unique(measured, axis=0, return_inverse=True)[1].ravel()
 
 
@@ -60,11 +55,6 @@ def check_any(store: ViewStore, training: NDArray[np.int64], validation: NDArray
 def deduplicate(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.int64]:
     """One object of each shape and label among some of a store, see ``deduplicated``."""
     return objects[deduplicated(store.labels[objects], store.measure()[objects])]
-
-
-def test_objects(store: ViewStore) -> NDArray[np.int64]:
-    """Indices of the rendered objects of the test split."""
-    return np.flatnonzero(store.done & (store.splits == "test"))
 
 
 def sample(objects: NDArray[np.int64], count: int | None = None) -> NDArray[np.int64]:

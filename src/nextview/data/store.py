@@ -1,7 +1,5 @@
 """The view store: every view of every object of a dataset, in one Zarr group, one chunk an object."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -27,13 +25,10 @@ from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere
 
 FORMAT = 2
-DEPTH_UNIT = 1e-4
-"""Depth is stored as uint16 in steps of this many object radii."""
-POINT_UNIT = 1 / 32767
-"""Points are stored as int16 in steps of this many object radii."""
+DEPTH_UNIT = 1e-4  # depth is stored as uint16 in steps of this many object radii
+POINT_UNIT = 1 / 32767  # points are stored as int16 in steps of this many object radii
 PENDING, DONE, FAILED = 0, 1, 2
-PLANNED = 5
-"""Views of a plan: the thesis's longest episode."""
+PLANNED = 5  # views of a plan: the thesis's longest episode
 RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
 """The arrays that rendering makes; others are added later. Those of cluttered scenes, see ``data.scene_views``:"""
 SCENE = ("scene/depth", "scene/owner", "scene/reachable", "measures/visible_share", "measures/clearance")
@@ -96,7 +91,7 @@ class ViewStore:
     attributes: Attributes
 
     @classmethod
-    def create(cls, path: Path, attributes: Attributes, overwrite: bool = False) -> ViewStore:
+    def create(cls, path: Path, attributes: Attributes, overwrite: bool = False) -> "ViewStore":
         """Make an empty store, whole or not at all; with ``overwrite`` it replaces the store at ``path``."""
         with new_folder(path, overwrite) as part:
             store = cls(part, zarr.open_group(part, mode="w"), attributes)
@@ -110,7 +105,7 @@ class ViewStore:
         return cls.open(path)
 
     @classmethod
-    def open(cls, path: str | Path) -> ViewStore:
+    def open(cls, path: str | Path) -> "ViewStore":
         """Open a store; DatasetError if there is none, it is of another format, or damaged."""
         path = Path(path)
         if not (path / "zarr.json").is_file():
@@ -362,11 +357,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def check(path: Path, workers: int | None = None, scheduler: str | None = None) -> Iterator[tuple[str, str | None]]:
-    """Read every array of every rendered object: every chunk is there and has its checksum.
-
-    Yields:
-        (name, None) for each sound object, (name, what is wrong with it) for a damaged one.
-    """
+    """Read all arrays of all rendered objects, by their checksums; yields (name, None) or (name, what is wrong)."""
     store = ViewStore.open(path)
     for name in store.rendered:
         store.array(name)  # says what is wrong

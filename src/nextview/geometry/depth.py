@@ -1,7 +1,5 @@
 """Depth images in object radii, 0 where there is no object: their points, and how they look under a headlight."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np
@@ -9,10 +7,8 @@ from numpy.typing import NDArray
 
 FARTHEST = 50.0
 """Depth at which nothing counts as an object any more, object radii: depth cameras have large numbers for "nothing"."""
-AMBIENT = 0.15
-"""Brightness of a surface seen edge-on, so that it stays apart from the black background."""
-POINTS = 1024
-"""Points in the partial cloud of one view (thesis, section 4.1.2)."""
+AMBIENT = 0.15  # brightness of a surface seen edge-on, so that it stays apart from the black background
+POINTS = 1024  # points in the partial cloud of one view (thesis, section 4.1.2)
 
 
 def object_depth(depth: NDArray[np.floating]) -> NDArray[np.floating]:

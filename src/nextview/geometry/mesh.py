@@ -1,7 +1,5 @@
 """Read a mesh file and bring it into the object frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +11,8 @@ from nextview.errors import MeshError
 from nextview.files import regular_file
 from nextview.geometry.mesh_file import check_faces, read_by_trimesh, read_obj, read_off
 
-MAX_FACES = 10_000_000
-"""Triangles that a mesh may have if nothing else is asked for."""
-BYTES_PER_FACE = 60
-"""How many bytes a mesh file may have for each triangle that it may have."""
+MAX_FACES = 10_000_000  # triangles that a mesh may have if nothing else is asked for
+BYTES_PER_FACE = 60  # how many bytes a mesh file may have for each triangle that it may have
 FORMATS = (".off", ".obj", ".ply", ".stl", ".glb")
 UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}
 """What a file's unit of length may be, and how many metres it is."""
@@ -26,23 +22,14 @@ FLAT = 1e-12
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex at radius 1.
+    """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex at radius 1."""
 
-    Attributes:
-        vertices: (V, 3) float64, object radii.
-        faces: (F, 3) int32, indices into the vertices.
-        centre: bounding-box centre in the file's frame, (3,) float64, the file's units.
-        radius: object radius in the file's units; ``vertices * radius + centre`` are the file's positions.
-        name: what to call it in messages.
-        unit: the file's unit, one of UNITS; None if it is not known.
-    """
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    centre: NDArray[np.float64]
-    radius: float
-    name: str = "mesh"
-    unit: str | None = None
+    vertices: NDArray[np.float64]  # (V, 3), object radii
+    faces: NDArray[np.int32]  # (F, 3), indices into the vertices
+    centre: NDArray[np.float64]  # bounding-box centre in the file's frame, (3,), the file's units
+    radius: float  # the file's units; ``vertices * radius + centre`` are the file's positions
+    name: str = "mesh"  # what to call it in messages
+    unit: str | None = None  # the file's, one of UNITS; None if it is not known
 
     @property
     def metres(self) -> float | None:
@@ -53,20 +40,11 @@ class Mesh:
 def make_mesh(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], name: str = "mesh", unit: str | None = None
 ) -> Mesh:
-    """Check raw arrays and normalise them.
+    """Check raw vertices, (V, 3), any unit, and faces, (F, 3), and normalise them.
 
-    Args:
-        vertices: (V, 3), any unit.
-        faces: (F, 3), indices into the vertices.
-        name: used in messages.
-        unit: of the positions, one of UNITS; None if it is not known.
-
-    Returns:
-        The mesh in the object frame, without the vertices that no face uses, and each triangle once: copies in the same
-        place show nothing new, and a great many of them take a minute a view.
-
-    Raises:
-        MeshError: no faces, not triangles, an index out of range, a position that is not finite, no extent, or no area.
+    Returns the mesh in the object frame, without the vertices that no face uses, and each triangle once: copies in the
+    same place show nothing new, and a great many of them take a minute a view. MeshError: no faces, not triangles, an
+    index out of range, a position that is not finite, no extent, or no area.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     for array, what in ((vertices, "vertices"), (faces, "faces")):
@@ -98,16 +76,11 @@ def make_mesh(
     if reach > np.finfo(float).max / radius:
         raise MeshError(f"{name}: the mesh is too large, its radius is not a finite number")
     normalised: NDArray[np.float64] = vertices / radius
-    if not _has_area(normalised, faces):
+    parts = (faces[first : first + 4096].T for first in range(0, len(faces), 4096))  # most often the first few tell
+    areas = (np.cross(normalised[b] - normalised[a], normalised[c] - normalised[a]) for a, b, c in parts)
+    if not any(np.abs(area).max() > FLAT for area in areas):
         raise MeshError(f"{name}: the mesh has no area, all its faces are lines or points")
     return Mesh(normalised, faces.astype(np.int32), centre, float(radius * reach), name, unit)
-
-
-def _has_area(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> bool:
-    """Whether any face is more than a line; most often the first few tell."""
-    parts = (faces[first : first + 4096].T for first in range(0, len(faces), 4096))
-    areas = (np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a]) for a, b, c in parts)
-    return any(np.abs(area).max() > FLAT for area in areas)
 
 
 def _first_of_equals(rows: NDArray) -> NDArray[np.int64]:
@@ -121,19 +94,11 @@ def _first_of_equals(rows: NDArray) -> NDArray[np.int64]:
 
 
 def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None, max_faces: int = MAX_FACES) -> Mesh:
-    """Read an OFF, OBJ, PLY, STL or GLB file; the parts of a scene are joined.
+    """Read an OFF, OBJ, PLY, STL or GLB file, by its suffix, into the object frame; the parts of a scene are joined.
 
-    Args:
-        path: the file; its suffix tells the format.
-        up: the file's up axis, "y" or "z". By default z, but y for GLB, whose standard says so.
-        unit: the file's unit of length, one of UNITS; None if it is not known.
-        max_faces: refuse a mesh of more triangles, or in a file of more than BYTES_PER_FACE bytes for each.
-
-    Returns:
-        The mesh in the object frame.
-
-    Raises:
-        MeshError: what is wrong with the file, in one sentence.
+    The ``up`` axis is "y" or "z"; by default z, but y for GLB, whose standard says so. The ``unit`` of length is one of
+    UNITS; None if it is not known. A mesh of more triangles than ``max_faces``, or in a file of more than
+    BYTES_PER_FACE bytes for each, is refused. MeshError: what is wrong with the file, in one sentence.
     """
     path = Path(path)
     suffix = path.suffix.lower()

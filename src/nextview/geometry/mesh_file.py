@@ -4,8 +4,6 @@ OFF and OBJ are read here. ModelNet's OFF files break the standard (``OFF490926 
 takes a truncated one for whole; its OBJ reader counts relative indices from the end of the file.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re
@@ -20,12 +18,10 @@ from numpy.typing import NDArray
 
 from nextview.errors import MeshError
 
-Shape = tuple[NDArray[np.float64], NDArray[np.int64]]
-"""Vertices, (V, 3), and triangles, (F, 3)."""
+Shape = tuple[NDArray[np.float64], NDArray[np.int64]]  # vertices, (V, 3), and triangles, (F, 3)
 STL_HEADER, STL_FACET = 84, 50
 GLB_TRIANGLES, GLB_STRIP, GLB_FAN = 4, 5, 6
-GLB_NODES = 20_000
-"""Trimesh takes some seconds to place so many."""
+GLB_NODES = 20_000  # Trimesh takes some seconds to place so many
 
 
 def read_off(data: bytes) -> Shape:

@@ -1,7 +1,5 @@
 """What one view yields, and what can take a view."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -17,38 +15,24 @@ from nextview.geometry.depth import FARTHEST, headlight, object_depth, visible_p
 LEAST_SHARE = 0.006
 """An object is seen if one connected part of it fills this share of the image. In the networks' images of 112 pixels a
 side, less are specks of 8 x 9 pixels. The thinnest object of ModelNet10, a screen seen from its edge, fills 0.011."""
-SPECKS = 8
-"""Or if all its parts together fill so many times as much."""
-LEAST_PIXELS = 9
-"""The least share in pixels, for small images."""
-LARGEST = 1e9
-"""Numbers of poses and intrinsics are smaller."""
-RIGID = 1e-3
-"""How far a pose may be from a rigid motion: numbers may have been written with four digits."""
+SPECKS = 8  # or if all its parts together fill so many times as much
+LEAST_PIXELS = 9  # the least share in pixels, for small images
+LARGEST = 1e9  # numbers of poses and intrinsics are smaller
+RIGID = 1e-3  # how far a pose may be from a rigid motion: numbers may have been written with four digits
 
 
 @dataclass(frozen=True)
 class SceneView:
     """All that one frame shows, the object and what stands around it, in the object frame and object radii.
 
-    It may be of another pinhole than the observation that it goes with, and from another distance.
-
-    Attributes:
-        depth: along the optical axis, (H, W) float32, object radii, 0 where nothing was measured.
-        target: pixels that show the object, (H, W) bool.
-        pose: camera-to-world, (4, 4) float64, OpenCV axes; the world is the object frame.
-        intrinsics: pinhole matrix, (3, 3) float64, pixels; the first pixel's centre is at 0.5.
-        background_free: whether nothing is there where nothing was measured, as in renders. A sensor may measure
-            nothing on what is black or shiny.
-
-    Raises:
-        ObservationError: depth and target are no images of one shape.
+    Its pinhole and distance may be others than those of its observation. ObservationError: no images of one shape.
     """
 
-    depth: NDArray[np.float32]
-    target: NDArray[np.bool_]
-    pose: NDArray[np.float64]
-    intrinsics: NDArray[np.float64]
+    depth: NDArray[np.float32]  # along the optical axis, (H, W), object radii, 0 where nothing was measured
+    target: NDArray[np.bool_]  # pixels that show the object, (H, W)
+    pose: NDArray[np.float64]  # camera-to-world, (4, 4), OpenCV axes; the world is the object frame
+    intrinsics: NDArray[np.float64]  # pinhole matrix, (3, 3), pixels; the first pixel's centre is at 0.5
+    # whether nothing is there where nothing was measured, as in renders; a sensor may miss what is black or shiny
     background_free: bool = False
 
     def __post_init__(self) -> None:
@@ -153,10 +137,9 @@ class Camera(Protocol):
 
 
 def checked_pose(pose: Any) -> NDArray[np.float64]:
-    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii, if it is one.
+    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii.
 
-    Raises:
-        ObservationError: not a rigid motion, or one to a place from which no object can be seen.
+    ObservationError if it is no rigid motion, or leads to a place from which no object can be seen.
     """
     pose = numbers(pose, "the pose").astype(np.float64, copy=False)
     if pose.shape != (4, 4):
@@ -180,11 +163,7 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
 
 
 def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """A pinhole matrix, (3, 3) float64, pixels, of an image of some shape, if it is one.
-
-    Raises:
-        ObservationError: another shape, or numbers that no camera has.
-    """
+    """A pinhole matrix, (3, 3) float64, pixels, of an image of some shape; ObservationError if no camera has it."""
     intrinsics = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64, copy=False)
     if intrinsics.shape != (3, 3):
         raise ObservationError(f"the intrinsics are a pinhole matrix of the shape (3, 3), not {intrinsics.shape}")
@@ -204,11 +183,7 @@ def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.fl
 
 
 def numbers(values: Any, what: str) -> NDArray[Any]:
-    """An array of real numbers; ``what`` says in the message what it should be.
-
-    Raises:
-        ObservationError: it is none.
-    """
+    """An array of real numbers; ObservationError if it is none: ``what`` names it there."""
     array = array_of(values, what)
     if array.dtype.kind not in "fiu":
         raise ObservationError(f"{what} is an array of numbers, not of {array.dtype}")
@@ -216,11 +191,7 @@ def numbers(values: Any, what: str) -> NDArray[Any]:
 
 
 def array_of(values: Any, what: str) -> NDArray[Any]:
-    """An array of anything.
-
-    Raises:
-        ObservationError: it cannot become one.
-    """
+    """An array of anything; ObservationError if it cannot become one."""
     try:
         return np.asarray(values)
     except (ValueError, TypeError) as error:  # rows of different lengths, or what cannot become an array at all
@@ -228,11 +199,7 @@ def array_of(values: Any, what: str) -> NDArray[Any]:
 
 
 def depth_image(depth: Any) -> NDArray[Any]:
-    """A depth image, (H, W), of numbers in any unit.
-
-    Raises:
-        ObservationError: it is none.
-    """
+    """A depth image, (H, W), of numbers in any unit; ObservationError if it is none."""
     depth = numbers(depth, "the depth")
     if depth.ndim != 2 or depth.size == 0:
         raise ObservationError(f"the depth is one image of the shape (H, W), not {depth.shape}")
@@ -268,17 +235,9 @@ def _image(image: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
 
 
 def pinhole(size: int, distance: float) -> NDArray[np.float64]:
-    """Intrinsics of a square image that just holds the unit sphere seen from a distance.
+    """Pinhole matrix, (3, 3) float64, of a square image that just holds the unit sphere seen from a distance.
 
-    Args:
-        size: side of the image, pixels.
-        distance: from the sphere's centre, object radii, greater than 1.
-
-    Returns:
-        (3, 3) float64.
-
-    Raises:
-        ObservationError: the camera stands inside the sphere.
+    ``size`` is its side, pixels; the distance is from the centre, object radii. ObservationError if that is inside.
     """
     distance = number(distance, "the distance")
     if not 1 < distance < LARGEST:

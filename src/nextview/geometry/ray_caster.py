@@ -1,15 +1,12 @@
 """Several things in one Embree scene: how far rays go, and which thing they end on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Triangles = tuple[NDArray[np.floating], NDArray[np.int32]]
-"""Vertices, (N, 3), and faces, (F, 3)."""
+Triangles = tuple[NDArray[np.floating], NDArray[np.int32]]  # vertices, (N, 3), and faces, (F, 3)
 
 
 def embree_scene(things: Sequence[Triangles]) -> Any:
@@ -24,11 +21,7 @@ def embree_scene(things: Sequence[Triangles]) -> Any:
 
 
 class RayCaster:
-    """Casts rays at some things of one frame.
-
-    Args:
-        things: at least one.
-    """
+    """Casts rays at some things of one frame, at least one."""
 
     def __init__(self, things: Sequence[Triangles]) -> None:
         self._scene = embree_scene(things)
@@ -38,8 +31,7 @@ class RayCaster:
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Where rays, (N, 3), of any length, end first, from (N, 3) points or one for all, (3,).
 
-        Returns:
-            How many times its length each ray goes, (N,), infinity if it ends nowhere; and on which thing, -1 for none.
+        How many times its length each goes, (N,), infinity if it ends nowhere; and on which thing, -1 for none.
         """
         origins = np.ascontiguousarray(np.broadcast_to(origins, rays.shape), np.float32)
         hits = self._scene.run(origins, np.ascontiguousarray(rays, np.float32), output=1)

@@ -1,26 +1,21 @@
 """The ways in which an object is likely to lie on a plane."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.viewsphere import Directions
 
-LIKELY, MOST = 0.1, 3
-"""Resting poses less likely than this are left out, and all but so many."""
-SAME_TILT = np.radians(20)
-"""Resting poses whose directions up are within this angle are one."""
+LIKELY, MOST = 0.1, 3  # resting poses less likely than this are left out, and all but so many
+SAME_TILT = np.radians(20)  # resting poses whose directions up are within this angle are one
 _DIRECTIONS = np.concatenate([half := Directions.fibonacci(250).directions, -half])
 
 
 def resting_poses(mesh: Mesh) -> NDArray[np.float64]:
     """Rotations from a mesh's own axes into its likely resting poses, (P, 3, 3) float64; the first is the identity.
 
-    An object that is dropped comes to rest on a face of its convex hull, the likelier the larger this looks from the
-    centre of mass (Goldberg et al., "Part pose statistics", IJRR 1999, as in trimesh). The pose that the mesh stands in
-    is always among them.
+    A dropped object rests on a face of its convex hull, the likelier the larger it looks from the centre of mass
+    (Goldberg et al., "Part pose statistics", IJRR 1999, as in trimesh). The mesh's own pose is always among them.
     """
     from trimesh import Trimesh
     from trimesh.poses import compute_stable_poses

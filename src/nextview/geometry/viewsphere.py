@@ -5,8 +5,6 @@ On a ``ViewSphere`` they lie on rings of equal elevation, evenly spaced in azimu
 azimuth_index``. ``Directions`` lie anywhere.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,26 +19,18 @@ from nextview.errors import UsageError
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-DISTANCE = 3.0
-"""Distance of the camera from the object's centre, in object radii."""
+DISTANCE = 3.0  # distance of the camera from the object's centre, in object radii
 CELL = np.radians((18.0, 45.0))
 """Elevation and azimuth of a cell of the 40 views: travel between directions that are on no grid is counted in it."""
-MOST = 99_999
-"""Viewpoints that there may be, and views on a ring."""
-SNAP = 1e-6
-"""Radians within which a camera stands at a candidate. What is more is a place of its own."""
+MOST = 99_999  # viewpoints that there may be, and views on a ring
+SNAP = 1e-6  # radians within which a camera stands at a candidate. What is more is a place of its own
 
 
 def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = DISTANCE) -> Float:
-    """Camera-to-world poses of cameras that look at the origin with the horizon level.
+    """Camera-to-world poses, (..., 4, 4) float64, of cameras that look at the origin with the horizon level.
 
-    Args:
-        elevation: angle above the horizontal plane, radians, (...).
-        azimuth: angle about +z, counter-clockwise from +x, radians, (...).
-        distance: from the origin, object radii.
-
-    Returns:
-        (..., 4, 4) float64, in OpenCV's camera axes: x right, y down, z forward.
+    Camera axes are OpenCV's: x right, y down, z forward. Elevation above the horizontal plane and azimuth about +z,
+    counter-clockwise from +x, are radians, (...); the distance is from the origin, object radii.
     """
     elevation, azimuth = np.broadcast_arrays(np.asarray(elevation, float), np.asarray(azimuth, float))
     ce, se, ca, sa = np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth)
@@ -187,7 +177,7 @@ class Directions(Viewpoints):
         object.__setattr__(self, "directions", _fixed(given / length))
 
     @classmethod
-    def fibonacci(cls, n: int) -> Directions:
+    def fibonacci(cls, n: int) -> "Directions":
         """n views spread evenly over the upper half (Fibonacci lattice; Swinbank and Purser, QJRMS 132, 2006)."""
         whole(n, "the number of viewpoints", 1, MOST)
         height, azimuth = (np.arange(n) + 0.5) / n, np.arange(n) * np.pi * (3 - np.sqrt(5))
@@ -222,7 +212,7 @@ class ViewSphere(Viewpoints):
         number(self.distance, "the distance", above=0)
 
     @classmethod
-    def named(cls, name: str) -> ViewSphere:
+    def named(cls, name: str) -> "ViewSphere":
         """The thesis's layouts: "40" (5 rings of 8, section 4.1.1) and "12" (one ring at 45 degrees)."""
         if name not in LAYOUTS:
             raise UsageError(f"no view sphere is called {one_line(repr(name))}; there are {', '.join(LAYOUTS)}")
@@ -236,7 +226,7 @@ class ViewSphere(Viewpoints):
         """How many rings."""
         return len(self.elevations)
 
-    def same_grid(self, other: ViewSphere) -> bool:
+    def same_grid(self, other: "ViewSphere") -> bool:
         """Whether another one has the same views, from whatever distance."""
         return (self.elevations, self.azimuths) == (other.elevations, other.azimuths)
 
@@ -301,15 +291,11 @@ LAYOUTS = {
 
 
 def viewpoints_of(what: str | Viewpoints | Any) -> Viewpoints:
-    """A layout of candidate viewpoints.
+    """A layout of candidate viewpoints; UsageError if it is none.
 
-    Args:
-        what: "40" or "12", the thesis's; "rings:0,30,60x12", elevations in degrees by views on each ring;
-            "fibonacci:60", so many spread evenly over the upper half; directions from the object, (V, 3), or poses of
-            cameras in the object frame, (V, 4, 4), of which only the directions count; or such a layout itself.
-
-    Raises:
-        UsageError: it is none of these.
+    "40" or "12", the thesis's; "rings:0,30,60x12", elevations in degrees by views on each ring; "fibonacci:60", so many
+    spread evenly over the upper half; directions from the object, (V, 3), or poses of cameras in the object frame, (V,
+    4, 4), of which only the directions count; or such a layout itself.
     """
     if isinstance(what, Viewpoints):
         return what

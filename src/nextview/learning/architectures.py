@@ -1,7 +1,5 @@
 """The networks: ResNet with torchvision's parameter names, PointNet with its two transforms, and a ResNet of maps."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F

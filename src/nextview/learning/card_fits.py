@@ -1,7 +1,5 @@
 """What is fitted into a card from held-out predictions: calibration and promised error rates, sizes, valleys."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,19 +11,11 @@ from scipy.stats import beta, gaussian_kde
 
 from nextview.checks import number
 from nextview.data.predictions import Predictions
+from nextview.data.splits import deduplicated
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, PredictionsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning.fitting_set import (
-    FittingSet,
-    blind_walks,
-    card_to_fit,
-    check_recogniser,
-    described,
-    fitting_set,
-    held_out_by,
-    load_sensed,
-)
+from nextview.learning.fitting_set import blind_walks, card_to_fit, for_fitting, load_sensed
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.maps import MapPeak
@@ -49,72 +39,65 @@ class FittedCalibration:
 
 
 def fit_calibration(
-    predictions: Path,
-    card: Path,
-    validation: float | None = None,
-    split_seed: int = 0,
+    predictions: Path,  # of the training split (nextview predict --held-out, or --split train)
+    card: Path,  # of the recogniser; "calibration" is written into it. Fitted to the objects that it calls held out
+    # predictions of the same objects through sensors (nextview render --sensor mix), fitted to as well
     sensed: tuple[Path, ...] = (),
-    delta: float = 0.1,
-    seed: int = 0,
+    delta: float = 0.1,  # how often a promised error rate may not hold
+    seed: int = 0,  # decides the walks over which is fitted
 ) -> FittedCalibration:
     """Calibrate a recogniser: how far to trust the sum of several views, and which error rates can be promised.
 
     Both go into its card; nextview predict takes them into predictions made before, without predicting again. The size
     of the objects is not used.
 
-    Args:
-        predictions: of the training split (nextview predict --held-out, or --split train).
-        card: of the recogniser; "calibration" is written into it. Fitted to the objects that it calls held out.
-        validation: take this part of every class instead, as training kept it out; 1 for out-of-fold predictions.
-        split_seed: the recogniser's seed, which decided that part.
-        sensed: predictions of the same objects through sensors (nextview render --sensor mix), fitted to as well.
-        delta: how often a promised error rate may not hold.
-        seed: decides the walks over which is fitted.
-
     Raises:
         UsageError, ModelError, PredictionsError: the arguments make no sense, or do not fit together.
     """
     if not 0 < number(delta, "--delta") < 1:
         raise UsageError(f"delta is a probability between 0 and 1, not {delta}")
-    if sensed and validation is not None:
-        raise UsageError("predictions through sensors are of the objects that the card calls held out: no --validation")
     table = Predictions.load(predictions).by_shape()
     with card_to_fit(card) as (model, write):
-        if validation != 1:
-            check_recogniser(card, model, predictions, table)
-        if validation is None:
-            FittingSet.of_all(table)  # refuses the test split
-            table = _held_out(predictions, table, card, model)
-            data = FittingSet.joined([FittingSet.of_all(part) for part in (table, *load_sensed(sensed, table))])
-        else:
-            data = fitting_set(table, validation, split_seed)
+        _check_recogniser(card, model, predictions, table)
+        table = _held_out(predictions, table, card, model)
+        data = Predictions.joined([table, *load_sensed(sensed, table)])
         walks = 1 + 8000 // len(data)  # few objects are walked over more often
         calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=walks)
         risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
         calibration = replace(calibration, risk=risk)
-        about = described(len(data) // (1 + len(sensed))) + ", clean and through sensors" * bool(sensed)
+        about = f"{len(table)} objects of the training split, classes weighted evenly"
+        about += ", clean and through sensors" * bool(sensed)
         write("calibration", about, [table], calibration=calibration)
     before, after = (loss(data, c, np.random.default_rng([seed, 2]), walks=walks) for c in (PLAIN_SUM, calibration))
     return FittedCalibration(calibration, len(data), before, after)
 
 
 def _held_out(path: Path, table: Predictions, card: Path, model: ModelCard) -> Predictions:
-    kept = held_out_by(model, table)
+    """The objects that a card calls held out of its training, without duplicates."""
+    once = deduplicated(for_fitting(table).labels, table.depth_entropy)
+    kept = once[np.isin(np.array(table.names)[once], model.held_out)]
     if len(kept) == 0:
         raise PredictionsError(f"{path}: holds no object that {card} calls held out of its training")
     return table.of_objects(kept)
+
+
+def _check_recogniser(path: Path, card: ModelCard, predictions: Path, table: Predictions) -> None:
+    """Refuse predictions by another recogniser than a card's. Those that name none are the user's word."""
+    by = table.models.get("recogniser")
+    if card.sha256 != by[1] if by else card.classes != table.classes:
+        raise PredictionsError(f"{predictions}: comes from another recogniser than {path}")
 
 
 @dataclass(frozen=True)
 class Walks:
     """Walks over all objects of a set: as many in the local window as over the sphere, those last."""
 
-    data: FittingSet
+    data: Predictions
     objects: NDArray[np.int64]  # (walks,)
     totals: Float  # log-evidence summed over the views so far, (walks, views, D)
 
     @classmethod
-    def draw(cls, data: FittingSet, rng: np.random.Generator, n_views: int, walks: int) -> Walks:
+    def draw(cls, data: Predictions, rng: np.random.Generator, n_views: int, walks: int) -> "Walks":
         """So many walks of each kind over every object."""
         objects, views, n_views = np.tile(np.arange(len(data)), 2 * walks), [], min(n_views, len(data.sphere))
         for policy in (Random(data.sphere), RandomAll(data.sphere)):
@@ -136,7 +119,7 @@ class Walks:
         return -float((weights / weights.sum() / len(self.numbers)) @ of_truth.sum(1))
 
 
-def fit_temperature(data: FittingSet, rng: np.random.Generator, n_views: int = 5, walks: int = 4) -> Calibration:
+def fit_temperature(data: Predictions, rng: np.random.Generator, n_views: int = 5, walks: int = 4) -> Calibration:
     """Temperature of one view and correlations of several, by maximum likelihood over 1 to ``n_views`` views."""
     walked = Walks.draw(data, rng, n_views, walks)
 
@@ -153,21 +136,20 @@ def fit_temperature(data: FittingSet, rng: np.random.Generator, n_views: int = 5
     return calibration(np.round(fitted.x, 4))
 
 
-def calibration_of(predictions: Predictions, data: FittingSet, rng: np.random.Generator, walks: int = 4) -> Calibration:
-    """The calibration of predictions; fitted to some of them where their recogniser was not calibrated."""
-    known = predictions.calibration != PLAIN_SUM
-    return predictions.calibration if known else fit_temperature(data, rng, walks=walks)
+def calibration_of(data: Predictions, rng: np.random.Generator, walks: int = 4) -> Calibration:
+    """The calibration of predictions; fitted to them where their recogniser was not calibrated."""
+    return data.calibration if data.calibration != PLAIN_SUM else fit_temperature(data, rng, walks=walks)
 
 
 def loss(
-    data: FittingSet, calibration: Calibration, rng: np.random.Generator, n_views: int = 5, walks: int = 4
+    data: Predictions, calibration: Calibration, rng: np.random.Generator, n_views: int = 5, walks: int = 4
 ) -> float:
     """Mean negative log-likelihood of the true class over 1 to ``n_views`` views; see ``fit_temperature``."""
     return Walks.draw(data, rng, n_views, walks).loss(calibration)
 
 
 def fit_risk(
-    data: FittingSet,
+    data: Predictions,
     calibration: Calibration,
     rng: np.random.Generator,
     delta: float = 0.1,
@@ -213,10 +195,8 @@ def error_bound(failed: Float, stopped: Float, weights: Float, delta: float) -> 
     return float(beta.ppf(1 - delta, effective * rate + 1, max(effective * (1 - rate), 1e-9)))
 
 
-RADII = np.geomspace(0.02, 20, 93)
-"""Metres; steps of 7.8 %."""
-ANY_SIZE = 0.05
-"""Share of the objects of a class that may have any size: toys, and models in wrong units."""
+RADII = np.geomspace(0.02, 20, 93)  # metres; steps of 7.8 %
+ANY_SIZE = 0.05  # share of the objects of a class that may have any size: toys, and models in wrong units
 
 
 @dataclass(frozen=True)
@@ -230,18 +210,18 @@ class FittedSize:
     after: float
 
 
-def fit_size(store: Path, predictions: Path, card: Path) -> FittedSize:
+def fit_size(
+    # view store that knows the unit of its meshes (nextview render --unit). Its training objects teach, except those in
+    # the predictions
+    store: Path,
+    # of training objects that the recogniser has not seen (nextview predict --held-out); they decide the weight of the
+    # size beside the shape
+    predictions: Path,
+    card: Path,  # of the recogniser; "size" is written into it
+) -> FittedSize:
     """Learn how large the objects of each class are, for stores and cameras that know the scale.
 
-    It goes into the recogniser's card; nextview predict takes it into predictions made before, without predicting
-    again.
-
-    Args:
-        store: view store that knows the unit of its meshes (nextview render --unit). Its training objects teach, except
-            those in the predictions.
-        predictions: of training objects that the recogniser has not seen (nextview predict --held-out); they decide the
-            weight of the size beside the shape.
-        card: of the recogniser; "size" is written into it.
+    It goes into the card; nextview predict takes it into predictions made before, without predicting again.
 
     Raises:
         DatasetError, ModelError, PredictionsError: the arguments do not fit together.
@@ -255,8 +235,8 @@ def fit_size(store: Path, predictions: Path, card: Path) -> FittedSize:
     if unknown:
         raise PredictionsError(f"{predictions}: holds {unknown[0]!r}, which {store} does not")
     with card_to_fit(card) as (model, write):
-        check_recogniser(card, model, predictions, table)
-        data, judged = FittingSet.of_all(table), [row[name] for name in table.names]
+        _check_recogniser(card, model, predictions, table)
+        data, judged = for_fitting(table), [row[name] for name in table.names]
         of_training = views.done & (views.splits == "train") & np.isin(views.attributes.labels, table.classes)
         taught = np.setdiff1d(np.flatnonzero(of_training), [row[name] for name in predicted.names])
         classes = np.array([table.classes.index(name) if name in table.classes else -1 for name in views.classes])
@@ -282,7 +262,7 @@ def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
     return density
 
 
-def fit_weight(data: FittingSet, radii: Float, log_density: Float) -> tuple[SizeEvidence, float, float]:
+def fit_weight(data: Predictions, radii: Float, log_density: Float) -> tuple[SizeEvidence, float, float]:
     """The most likely weight beside the logits, over single views, at the temperature most likely with it."""
     of_size = SizeEvidence.from_arrays(RADII, log_density, 1.0).logits(radii)[:, None]
 
@@ -305,16 +285,15 @@ class FittedValleys:
     objects: int
 
 
-def fit_valleys(predictions: Path, card: Path) -> FittedValleys:
+def fit_valleys(
+    # of the training split, by a recogniser that was not trained on the objects (nextview predict --held-out). Fitted
+    # to the objects that the map network was not trained on either
+    predictions: Path,
+    card: Path,  # of the map network; "valley_classes" is written into it
+) -> FittedValleys:
     """Choose the classes for which the valley of a predicted map is the better view than its peak.
 
-    They go into the map network's card; nextview predict takes them into predictions made before, without predicting
-    again.
-
-    Args:
-        predictions: of the training split, by a recogniser that was not trained on the objects (nextview predict
-            --held-out). Fitted to the objects that the map network was not trained on either.
-        card: of the map network; "valley_classes" is written into it.
+    They go into the network's card; nextview predict takes them into predictions made before, without predicting again.
 
     Raises:
         ModelError, PredictionsError: the arguments do not fit together.
@@ -323,7 +302,6 @@ def fit_valleys(predictions: Path, card: Path) -> FittedValleys:
     with card_to_fit(card, recogniser=False) as (model, write):
         if model.kind not in table.maps or table.models.get(model.kind) != (model.name, model.sha256):
             raise PredictionsError(f"{predictions}: holds no maps by {card}")
-        FittingSet.of_all(table)  # refuses the test split
         kept = _held_out(predictions, table, card, model)
         by_class = valley_gains(kept.sphere, kept.logits, kept.maps[model.kind], kept.labels)
         classes = tuple(table.classes[c] for c, gain in by_class.items() if gain > 0)

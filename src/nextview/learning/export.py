@@ -1,7 +1,5 @@
 """From finished training runs to a model that ships: an ONNX file with half-precision weights, and its card."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -157,28 +155,17 @@ class _Candidate:
 
 
 def export_recogniser(
-    run: Path,
-    store: Path,
-    out: Path,
-    also: tuple[Path, ...] = (),
-    bits: Literal[8, 16] = 16,
-    name: str | None = None,
-    note: str = "",
-    overwrite: bool = False,
+    run: Path,  # folder made by nextview train recogniser
+    store: Path,  # that it was trained on
+    out: Path,  # folder for NAME.onnx and NAME.json
+    also: tuple[Path, ...] = (),  # further runs on the same store and input; the logits of all are averaged
+    bits: Literal[8, 16] = 16,  # that a weight takes in the file
+    name: str | None = None,  # of the model; by default recogniser-DATASET, after the mesh folder of the store
+    note: str = "",  # what else the card should say
+    overwrite: bool = False,  # replace a model of this name
     track: Track = silently,
 ) -> Exported:
     """Export a trained recogniser: ONNX, with a card of its validation scores. Calibrate it with nextview fit.
-
-    Args:
-        run: folder made by nextview train recogniser.
-        store: that it was trained on.
-        out: folder for NAME.onnx and NAME.json.
-        also: further runs on the same store and input; the logits of all are averaged.
-        bits: that a weight takes in the file.
-        name: of the model; by default recogniser-DATASET, after the mesh folder of the store.
-        note: what else the card should say.
-        overwrite: replace a model of this name.
-        track: follows the validation views.
 
     Raises:
         ModelError: a run is not finished or of another store, runs do not fit together, or the file's answers differ.
@@ -230,28 +217,17 @@ def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet
 
 
 def export_map(
-    run: Path,
-    store: Path,
-    out: Path,
-    predictions: Path | None = None,
-    bits: Literal[8, 16] = 16,
-    name: str | None = None,
-    note: str = "",
-    overwrite: bool = False,
+    run: Path,  # folder made by nextview train map
+    store: Path,  # that it was trained on
+    out: Path,  # folder for NAME.onnx and NAME.json
+    predictions: Path | None = None,  # that a map of the confidence was trained on
+    bits: Literal[8, 16] = 16,  # that a weight takes in the file
+    name: str | None = None,  # of the model; by default MEASURE-DATASET, after the mesh folder of the store
+    note: str = "",  # what else the card should say
+    overwrite: bool = False,  # replace a model of this name
     track: Track = silently,
 ) -> Exported:
     """Export a trained map network: ONNX, with a card of its validation scores.
-
-    Args:
-        run: folder made by nextview train map.
-        store: that it was trained on.
-        out: folder for NAME.onnx and NAME.json.
-        predictions: that a map of the confidence was trained on.
-        bits: that a weight takes in the file.
-        name: of the model; by default MEASURE-DATASET, after the mesh folder of the store.
-        note: what else the card should say.
-        overwrite: replace a model of this name.
-        track: follows the validation maps.
 
     Raises:
         ModelError, ResultsError: the run is not finished, the file's answers differ, or the model exists.

@@ -1,7 +1,5 @@
 """From predictions to the gain policy: its networks, their training, and its card with the ONNX file beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
@@ -45,8 +43,6 @@ from nextview.recognition.map_names import in_order
 BOUND = 1e-5
 """Largest difference of the file's answers from those of the networks in double precision, relative to the largest
 answer beyond 1. For gains a fiftieth of the lowest travel weight that is tried."""
-Layers = Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
-"""Weights (in, out) and biases (out,) of one perceptron, ReLU between them."""
 
 
 class Perceptrons(nn.Module):
@@ -59,14 +55,6 @@ class Perceptrons(nn.Module):
         self.weights, self.biases = nn.ParameterList(weights), nn.ParameterList(biases)
         self.register_buffer("features_flip", torch.as_tensor(features_flip))
         self.register_buffer("cells_flip", torch.as_tensor(cells_flip))
-
-    @classmethod
-    def from_layers(cls, networks: Sequence[Layers], features_flip: NDArray, cells_flip: NDArray) -> Perceptrons:
-        """Of equally shaped perceptrons, in single precision."""
-        layers = list(zip(*networks, strict=True))
-        weights = [torch.from_numpy(np.stack([w for w, _ in layer])).float() for layer in layers]
-        biases = [torch.from_numpy(np.stack([b[None] for _, b in layer])).float() for layer in layers]
-        return cls(weights, biases, features_flip, cells_flip)
 
     def each(self, x: Tensor) -> Tensor:
         """Of each perceptron, without the mirror image, (E, B, V)."""
@@ -235,33 +223,25 @@ class TrainedGain:
 
 
 def train_gain(
-    predictions: Path,
-    out: Path,
+    predictions: Path,  # of training objects that the recogniser has not seen (nextview predict --held-out)
+    out: Path,  # card to write (NAME.json); the networks are written beside it (NAME.onnx)
+    # predictions of other such objects, which choose the epoch and the travel weight; those among them are left out of
+    # the training. By default PREDICTIONS choose them, in folds
     validation: Path | None = None,
+    # without VALIDATION, so many policies are trained, each without its share of the objects, which validate it; the
+    # result is the mean of all
     folds: int = 20,
+    # of a grid cell of travel; by default the lowest at which the policy travels no farther than a random walk in the
+    # local window
     travel_weight: float | None = None,
-    local: bool = False,
+    local: bool = False,  # let it choose in the local window only
+    # predictions of the same objects through sensors (nextview render --sensor mix), to learn from as well
     sensed: tuple[Path, ...] = (),
     recipe: GainRecipe = GainRecipe(),
-    overwrite: bool = False,
+    overwrite: bool = False,  # replace files of these names
     track: Track = silently,
 ) -> TrainedGain:
     """Train the gain policy, which predicts what a view from each viewpoint brings. When stopped, it begins anew.
-
-    Args:
-        predictions: of objects of the training split that the recogniser has not seen (nextview predict --held-out).
-        out: card to write (NAME.json); the networks are written beside it (NAME.onnx).
-        validation: predictions of other such objects, which choose the epoch and the travel weight; those among them
-            are left out of the training. By default PREDICTIONS choose them, in folds.
-        folds: without VALIDATION, so many policies are trained, each without its share of the objects, which validate
-            it; the result is the mean of all.
-        travel_weight: of a grid cell of travel; by default the lowest at which the policy travels no farther than a
-            random walk in the local window.
-        local: let it choose in the local window only.
-        sensed: predictions of the same objects through sensors (nextview render --sensor mix), to learn from as well.
-        recipe: how to train.
-        overwrite: replace files of these names.
-        track: follows the epochs.
 
     Raises:
         UsageError, ResultsError: the card is not called NAME.json, or exists.
@@ -317,7 +297,7 @@ class _Data:
             {},
             f"{self.learned_from}, classes weighted evenly; epoch and travel weight chosen on {self.validated_on}",
             tuple(LearnedFrom(sha256_of(path), p.models) for path, p in self.sources),
-            tuple((part.calibration.temperature, part.calibration.correlation) for part in self.learned),
+            tuple((part.data.calibration.temperature, part.data.calibration.correlation) for part in self.learned),
             asdict(recipe),
             tuple(dict.fromkeys((*(line for _, p in self.sources for line in p.commands), command()))),
         )

@@ -1,7 +1,5 @@
 """The networks' inputs of a whole store: computed once and kept beside the store, each view packed for itself."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Iterator
@@ -58,7 +56,7 @@ def inputs_path(store: Path, size: int, kind: InputKind = "geometry") -> Path:
 
 def ready_inputs(path: Path, size: int, kind: InputKind = "geometry", track: Track = silently) -> PackedViews:
     """The inputs of a store, (N, V, C, size, size) uint8, computed if they are not there."""
-    from nextview.learning.loop import is_first  # not above: the processes that compute inputs need no torch
+    from nextview.learning.runs import is_first  # not above: the processes that compute inputs need no torch
 
     target = inputs_path(path, size, kind)
     if is_first() and not target.exists():

@@ -1,7 +1,5 @@
 """One picture of what was learned: how sure it will be, and which things it will confuse."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

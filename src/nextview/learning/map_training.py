@@ -1,7 +1,5 @@
 """The stage from a view store to a trained map network: it learns one value for every view of an object."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,9 +20,8 @@ from nextview.errors import ModelError, PredictionsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.architectures import map_columns, map_network, orthogonality
 from nextview.learning.inputs import PackedViews, ready_inputs
-from nextview.learning.loop import OwnBatches, fit, optimiser
 from nextview.learning.recipes import Hardware, MapRecipe
-from nextview.learning.runs import new_run, read_run, refuse_seen, start_from, train_once
+from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, read_run, refuse_seen, start_from, train_once
 from nextview.recognition.map_names import CONFIDENCE
 from nextview.recognition.network_input import cloud_input
 
@@ -123,9 +120,12 @@ class MapModule(L.LightningModule):
 
 
 def train_map(
-    store: Path,
-    out: Path,
+    store: Path,  # view store made by nextview render, with the 40 views and the measure (nextview measure)
+    out: Path,  # folder for checkpoints, logs and network.pt, the network of the epoch with the lowest squared error
+    # for --measure confidence, of the store's training split, by the recogniser whose confidence is to be predicted
     predictions: Path | None = None,
+    # folder of a finished run of the same depth and input from which a ResNet starts: a recogniser's, or a map
+    # network's to go on with
     weights: Path | None = None,
     recipe: MapRecipe = MapRecipe(),
     hardware: Hardware = Hardware(),
@@ -133,25 +133,9 @@ def train_map(
 ) -> list[Path]:
     """Train a network that predicts a measure of the views around one. Resumes if OUT holds a run that was cut off.
 
-    Args:
-        store: view store made by nextview render, with the 40 views and the measure (nextview measure).
-        out: folder for checkpoints, logs and network.pt, the network of the epoch with the lowest squared error.
-        predictions: for --measure confidence, of the store's training split, by the recogniser whose confidence is to
-            be predicted.
-        weights: folder of a finished run of the same depth and input from which a ResNet starts: a recogniser's, or a
-            map network's to go on with.
-        recipe: how to train.
-        hardware: on what.
-        track: follows the preparation of the inputs.
-
-    Returns:
-        The folder of the finished run.
-
     Raises:
-        DatasetError: the store cannot be used, lacks the measure or has nothing to train on, or another process trains
-            in the same folder.
-        PredictionsError: the predictions are of other views.
-        ModelError: the weights cannot be used, or have seen what validates; or ``out`` holds another run.
+        DatasetError: the store lacks what it takes, or another process trains in the same folder.
+        ModelError, PredictionsError: weights or predictions cannot be used; or ``out`` holds another run.
     """
     views = ViewStore.open(store)
     predicted = None if predictions is None else Predictions.load(predictions)

@@ -1,7 +1,5 @@
 """How the bundled models are trained; a comment beside a field is its help. No torch: the command line reads it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """The stage from a view store to a trained recogniser."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -22,9 +20,8 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.learning.architectures import recogniser_network
 from nextview.learning.inputs import PackedViews, ready_inputs
-from nextview.learning.loop import OwnBatches, fit, optimiser
 from nextview.learning.recipes import Hardware, RecogniserRecipe
-from nextview.learning.runs import new_run, refuse_seen, start_from, train_once
+from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, refuse_seen, start_from, train_once
 
 Indices = NDArray[np.int64]
 
@@ -218,29 +215,19 @@ def side_loss(likely: Tensor, label: Tensor, side: Tensor) -> Tensor:
 
 
 def train_recogniser(
-    store: Path,
-    out: Path,
+    store: Path,  # view store made by nextview render
+    out: Path,  # folder for checkpoints, logs and network.pt, the network of the epoch with the best class mean
+    # stores of the same objects or some of them, stretched and rotated (nextview render --stretch .25 --rotated --seed
+    # 1 and so on) or through sensors (--sensor mix); their views may be others
     deformed: tuple[Path, ...] = (),
+    # start from a published checkpoint, torchvision's of the same depth or EfficientNet-Lite0's, or go on from the run
+    # in this folder, on other data or for longer
     weights: Path | None = None,
     recipe: RecogniserRecipe = RecogniserRecipe(),
     hardware: Hardware = Hardware(),
     track: Track = silently,
 ) -> list[Path]:
     """Train the recogniser on a store's training split. Resumes if OUT holds a run that was cut off.
-
-    Args:
-        store: view store made by nextview render.
-        out: folder for checkpoints, logs and network.pt, the network of the epoch with the best class mean.
-        deformed: stores of the same objects or some of them, stretched and rotated (nextview render --stretch .25
-            --rotated --seed 1 and so on) or through sensors (--sensor mix); their views may be others.
-        weights: start from a published checkpoint, torchvision's of the same depth or EfficientNet-Lite0's, or go on
-            from the run in this folder, on other data or for longer.
-        recipe: how to train.
-        hardware: on what.
-        track: follows the preparation of the inputs.
-
-    Returns:
-        The folder of the finished run.
 
     Raises:
         DatasetError: a store cannot be used, or another process trains in the same folder.

@@ -1,10 +1,7 @@
 """Decision states on the way of a policy, and the value of every next view there, by replay of predictions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +10,11 @@ from nextview.data.predictions import Predictions
 from nextview.data.scene_views import SceneSight, scenes_of, sight_of
 from nextview.errors import PredictionsError
 from nextview.learning.card_fits import calibration_of
-from nextview.learning.fitting_set import FittingSet
-from nextview.policies.base import EpisodeState, Evidence, Policy
+from nextview.learning.fitting_set import for_fitting
+from nextview.policies.base import EpisodeState, Policy
 from nextview.policies.baselines import Random
 from nextview.policies.gain import Gain
-from nextview.recognition.belief import Calibration, FixedLength, of_true_class
+from nextview.recognition.belief import FixedLength, of_true_class
 from nextview.session.episode import run_episodes
 
 Float = NDArray[np.float64]
@@ -28,17 +25,10 @@ OBJECTIVES = ("belief", "log-belief", "right")
 
 @dataclass(frozen=True)
 class ReplayTable:
-    """What held-out models say of N objects."""
+    """What held-out models say of N objects, by a calibrated recogniser, and the scenes that these stand in."""
 
-    data: FittingSet
-    maps: dict[str, NDArray[np.float32]]  # each (N, V, R, 3)
-    calibration: Calibration
+    data: Predictions
     scenes: SceneSight | None = None
-
-    @cached_property
-    def weights(self) -> Float:
-        """Weight of each view in the sum, (N, V); 0 where nothing is seen."""
-        return self.data.seen.astype(np.float64)
 
     @classmethod
     def select(
@@ -48,16 +38,14 @@ class ReplayTable:
         rng: np.random.Generator,
         sensed: Sequence[Predictions] = (),
         scenes: SceneSight | None = None,
-    ) -> ReplayTable:
+    ) -> "ReplayTable":
         """Some of the objects of predictions, by index; calibrated here where their recogniser is not."""
         if len(kept) == 0:
             raise PredictionsError("no object is left to learn from")
-        parts = [part.of_objects(kept) for part in (predictions, *sensed)]
-        data = FittingSet.joined([FittingSet.of_all(part) for part in parts])
-        maps = {name: np.concatenate([part.maps[name] for part in parts]) for name in predictions.maps}
-        calibration = calibration_of(predictions, data, rng)
-        scenes = scenes or scenes_of(predictions)
-        return cls(data, maps, calibration, None if scenes is None else scenes.of_scenes(np.tile(kept, len(parts))))
+        parts = [for_fitting(part.of_objects(kept)) for part in (predictions, *sensed)]
+        data, scenes = Predictions.joined(parts), scenes or scenes_of(predictions)
+        data = replace(data, calibration=calibration_of(data, rng))
+        return cls(data, None if scenes is None else scenes.of_scenes(np.tile(kept, len(parts))))
 
 
 @dataclass(frozen=True)
@@ -79,32 +67,23 @@ def rollout(
     if table.scenes is not None:
         starts = np.where(table.scenes.reachable, rng.random(table.scenes.reachable.shape), -1).argmax(1)
     constrain, visible = sight_of(table.scenes, everything)
-
-    def observe(objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
-        return Evidence(
-            data.logits[objects, views],
-            {name: values[objects, views] for name, values in table.maps.items()},
-            azimuth_bins=None if data.azimuth_bins is None else data.azimuth_bins[objects, views],
-            seen=data.seen[objects, views],
-        )
-
     length = FixedLength(max_views=n_views)
-    steps = run_episodes(observe, sphere, policy, starts, length, rng, table.calibration, constrain, visible).steps
+    run = run_episodes(data.evidence, sphere, policy, starts, length, rng, data.calibration, constrain, visible)
     visited, travel = np.zeros((len(data), len(sphere)), bool), np.zeros(len(data))
-    for k, step in enumerate(steps, 1):
+    for k, step in enumerate(run.steps, 1):
         visited[step.episodes, step.views] = True
         azimuth, seen = sphere.azimuth[step.views], np.maximum(step.seen, 1)
-        azimuth_bins = table.calibration.azimuth_bins(step.total, seen, len(data.classes), azimuth)
+        azimuth_bins = data.calibration.azimuth_bins(step.total, seen, len(data.classes), azimuth)
         state = EpisodeState(step.views, visited.copy(), step.belief, step.evidence, k, step.episodes, azimuth_bins)
         state = constrain(replace(state, visibility=visible(state) if visibility else None))
         yield DecisionState(state, step.total, travel, step.seen)
-        if k < len(steps):
+        if k < len(run.steps):
             travel = travel + sphere.travel[step.views, step.next_views]
 
 
 def value_after(table: ReplayTable, total: Float, n_views: NDArray | int, kind: str) -> Float:
     """The value, (N, ...), of sums of the log-evidence, (N, ..., D), after ``n_views`` views, by one of OBJECTIVES."""
-    return value_of(table.calibration.log_belief(total, n_views, len(table.data.classes)), table.data.labels, kind)
+    return value_of(table.data.calibration.log_belief(total, n_views, len(table.data.classes)), table.data.labels, kind)
 
 
 def value_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
@@ -117,8 +96,9 @@ def value_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
 
 def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Float:
     """The value of looking from every view next, (N, V) float64."""
-    n_views = np.maximum(moment.seen[:, None] + table.weights, 1)
-    evidence = table.weights[..., None] * table.data.log_evidence
+    counts = table.data.seen.astype(np.float64)  # a view in which nothing is seen has no weight in the sum
+    n_views = np.maximum(moment.seen[:, None] + counts, 1)
+    evidence = counts[..., None] * table.data.log_evidence
     return value_after(table, moment.total[:, None] + evidence, n_views, kind)
 
 

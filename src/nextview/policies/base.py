@@ -1,7 +1,5 @@
 """The contract of a policy: what it sees, and what it answers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -15,8 +13,7 @@ from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.recognition.evidence import Evidence, items_at
 
 Float = NDArray[np.float64]
-Scope = Literal["global", "local"]
-"""Where a policy may go: to all views, or to those of the local window."""
+Scope = Literal["global", "local"]  # where a policy may go: to all views, or to those of the local window
 
 
 @dataclass(frozen=True)
@@ -62,7 +59,7 @@ class EpisodeState:
         """The views that may be chosen: reachable and not visited, (B, V) bool."""
         return ~self.visited if self.reachable is None else ~self.visited & self.reachable
 
-    def select(self, rows: Any) -> EpisodeState:
+    def select(self, rows: Any) -> "EpisodeState":
         """Some of the episodes, by index or mask."""
         parts: dict[str, Any] = {}
         for name, value in vars(self).items():
@@ -95,10 +92,7 @@ class ValuesViews(Protocol):
 
 @runtime_checkable
 class ScoresViews(Protocol):
-    """A policy on a grid that goes to the free view with the highest score less its weighted travel.
-
-    It can be asked from any place about any views, see ``policies.off_grid``.
-    """
+    """A policy on a grid that goes to the free view with the best score less weighted travel; see ``off_grid``."""
 
     @property
     def travel_weight(self) -> float:
@@ -156,9 +150,9 @@ def best_view(
 
 
 def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]) -> NDArray[np.int64]:
-    """The free view of the local window with the highest score, by finite scores of its cells, (B, rings, 3).
+    """The free view of the local window with the highest of finite scores, (B, rings, 3).
 
-    Where none of the window is free, the free view with the shortest travel; where none is, the window's best.
+    With none free there, the free view with the shortest travel; with none at all, the window's best.
     """
     b = len(state.current)
     rows = np.arange(b)

@@ -3,8 +3,6 @@
 The thesis's baselines (section 5.3, figure 11) are ``Random``, ``Furthest`` and ``Unidirectional``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ the absolute azimuth: all views are written as cells (see ``policies.learned_tab
 stands, or from where the recogniser believes the object's own zero to be. An object and its mirror image are alike.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,15 +17,7 @@ from numpy.typing import NDArray
 
 from nextview.errors import ModelError, PolicyError
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.policies.base import (
-    EpisodeState,
-    Scope,
-    best_view,
-    check_weight,
-    considered,
-    travel_from,
-    visibility_of,
-)  # fmt: skip
+from nextview.policies.base import EpisodeState, Scope, best_view, check_weight, considered, travel_from, visibility_of
 from nextview.policies.learned_tables import cells_from, cells_to
 from nextview.recognition.inference import OnnxFile, check_end, open_onnx, run_onnx
 from nextview.recognition.map_names import SPHERE, in_order, maps_among
@@ -42,10 +32,8 @@ VISIBILITY = "visibility"
 Frame = Literal["camera", "object"]
 """From where azimuths of cells are counted: the camera's, or that at which the object, if of the class believed most,
 most likely shows its azimuth bin 0."""
-FLOOR = np.log(1e-4)
-"""Logarithm of the smallest belief that is told apart from none."""
-FEATURES_INPUT = "told"
-"""The name that the features have in the ONNX file."""
+FLOOR = np.log(1e-4)  # logarithm of the smallest belief that is told apart from none
+FEATURES_INPUT = "told"  # the name that the features have in the ONNX file
 
 
 # What it decides by
@@ -156,25 +144,17 @@ class Gain:
     view (``nextview train gain``): fitted one-step lookahead, as in the value functions for sensor planning of Denzler
     and Brown, "Information theoretic sensor data selection for active object recognition", PAMI 24 (2002), but
     regressed from the decision state instead of simulated. They decide by ``features`` alone.
-
-    Attributes:
-        sphere: the viewpoints.
-        classes: how many, C.
-        score: from the features, (B, D) float32, to the value of each cell, (B, V) float32: the mean over some
-            networks and over the object and its mirror image. Each row by itself, to the last bit.
-        inputs: of which the features are made.
-        travel_weight: of a grid cell of travel, in the unit of the values: log-belief for the bundled one.
-        scope: where it may go.
-        frame: in which cells are counted.
     """
 
     sphere: ViewSphere
-    classes: int
+    classes: int  # how many, C
+    # from features, (B, D) float32, to the value of each cell, (B, V): the mean over some networks and over the object
+    # and its mirror image; each row by itself, to the last bit
     score: Callable[[NDArray[np.float32]], NDArray[np.floating]]
-    inputs: tuple[str, ...]
-    travel_weight: float = 0.0
-    scope: Scope = "global"
-    frame: Frame = "camera"
+    inputs: tuple[str, ...]  # of which the features are made
+    travel_weight: float = 0.0  # of a grid cell, in the unit of the values: log-belief for the bundled one
+    scope: Scope = "global"  # where it may go
+    frame: Frame = "camera"  # in which cells are counted
 
     def __post_init__(self) -> None:
         maps = maps_of(self.inputs)

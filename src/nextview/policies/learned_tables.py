@@ -1,11 +1,8 @@
 """Policies that follow a table learned from predictions. They know the ring (from gravity), never the object's azimuth.
 
-So every place is written as a *cell*: its ring, and how many azimuth steps it lies ahead of where the camera stands,
-``cell = ring * azimuths + steps``. What no table says (it has come to its end, or the best is taken) is left to the
-view farthest from all visited.
+So a place is a *cell*: its ring, and how many azimuth steps it lies ahead of the camera, ``cell = ring * azimuths +
+steps``. What no table says is left to the view farthest from all visited.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property

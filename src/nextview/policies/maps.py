@@ -1,7 +1,5 @@
 """Policies that climb a predicted local map (thesis, section 4.2.3)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ All that a policy on a grid is told counts azimuth from the camera. So the grid 
 through the camera; the policy values the turned grid, and between its views the values are interpolated.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Policies that see the truth: the ceiling of what can be gained, and the thesis's own choice, named for what it is."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The card of a policy that was learned from predictions: one JSON file, table and all; weights are ONNX beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -96,11 +94,9 @@ def read_policy_card(path: Path) -> PolicyCard:
 
 
 def read_policy(path: Path, sphere: Viewpoints, classes: Sequence[str] | None = None) -> Policy:
-    """Make the policy that a card describes, for the viewpoints, and classes if given, that it was learned for.
+    """Make the policy that a card describes.
 
-    Raises:
-        OtherUseError: it is for other viewpoints or classes.
-        PolicyError: there is no such card, or it or its weights are damaged.
+    OtherUseError: it was learned for other viewpoints or classes. PolicyError: there is no such card, or it is damaged.
     """
     card, weights = read_policy_card(path), path.with_suffix(".onnx")
     if not isinstance(sphere, ViewSphere) or (card.elevations, card.azimuths) != (sphere.elevations, sphere.azimuths):

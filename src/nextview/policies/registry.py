@@ -1,7 +1,5 @@
 """Policies by name, or by the import path of a user's own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,14 +27,11 @@ POLICIES: dict[str, Callable[[Any], Policy]] = {
     "visibility": Visibility,
 }
 """Those that follow no map; every predicted map has its own, see ``map_policy``."""
-GROUP = "nextview.policies"
-"""Entry points by which packages add policies of their own."""
-ANYWHERE = ("random-all", "spread", "visibility")
-"""Those that need no grid."""
+GROUP = "nextview.policies"  # entry points by which packages add policies of their own
+ANYWHERE = ("random-all", "spread", "visibility")  # those that need no grid
 VISIBLE = "visible-"
 """Before the name of a gain policy: its values times the share of the object that is expected to show."""
-DEFAULT = "gain"
-"""The policy where none is named."""
+DEFAULT = "gain"  # the policy where none is named
 
 
 def make_policy(
@@ -46,20 +41,15 @@ def make_policy(
     classes: Sequence[str] | None = None,
     maps: Collection[str] = (),
 ) -> Policy:
-    """A policy by name.
+    """A policy by name; PolicyError if there is no such policy, or it cannot be made.
 
-    Args:
-        name: one of POLICIES; one by a map ("lem", "lem-peak", "lem-sphere-peak", see ``map_policy``); a learned one
-            that is bundled; the path of a learned one's card (.json); a gain policy with "visible-" before its name;
-            one that an installed package adds; or "MODULE:CLASS" for one of your own, which is called with the
-            viewpoints alone. NAME@WEIGHT sets the travel weight of one that weighs travel.
-        sphere: the viewpoints; a ``ViewSphere`` but for those of ANYWHERE and your own.
-        valley_classes: classes (indices) whose believers go to the map's valley.
-        classes: names of the recogniser's classes; a learned policy for others is refused.
-        maps: names of the maps that are predicted, beside those of the bundled networks.
-
-    Raises:
-        PolicyError: there is no such policy, or it cannot be made.
+    ``name`` is one of POLICIES; one by a map ("lem", "lem-peak", "lem-sphere-peak", see ``map_policy``); a learned one
+    that is bundled; the path of a learned one's card (.json); a gain policy with "visible-" before its name; one that
+    an installed package adds; or "MODULE:CLASS" for one of your own, which is called with the viewpoints alone.
+    NAME@WEIGHT sets the travel weight of one that weighs travel. ``sphere`` is a ``ViewSphere`` but for those of
+    ANYWHERE and your own; ``valley_classes`` are indices of those whose believers go to the map's valley; ``classes``
+    names those of the recogniser: a learned policy for others is refused; ``maps`` are predicted beside those of the
+    bundled networks.
     """
     if "@" in name and ":" not in name:
         plain, _, travel_weight = name.partition("@")
@@ -76,7 +66,11 @@ def make_policy(
         return Discriminate.from_card(card, sphere, None if classes is None else tuple(classes))
     if card is not None:
         policy = read_policy(card, sphere, classes)
-        return _visible(policy, name) if name.startswith(VISIBLE) else policy
+        if not name.startswith(VISIBLE):
+            return policy
+        if not isinstance(policy, Gain):
+            raise PolicyError(f"{name}: this policy values no views that could be weighed by what shows")
+        return VisibleGain(policy, policy.travel_weight)
     path = plugins(GROUP).get(name, name)
     if ":" in path:
         return _import_policy(path, sphere)
@@ -139,12 +133,6 @@ def with_cards(name: str, cards: Mapping[str, Path]) -> str:
         return f"{cards[policy]}{weighted}{travel_weight}"
     card = cards.get(policy.removeprefix(VISIBLE)) if policy.startswith(VISIBLE) else None
     return name if card is None else f"{VISIBLE}{card}{weighted}{travel_weight}"
-
-
-def _visible(policy: Policy, name: str) -> Policy:
-    if not isinstance(policy, Gain):
-        raise PolicyError(f"{name}: this policy values no views that could be weighed by what shows")
-    return VisibleGain(policy, policy.travel_weight)
 
 
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:

@@ -3,8 +3,6 @@
 BOP: Hodan et al., ECCV 2018. TUM RGB-D: Sturm et al., IROS 2012. 7-Scenes: Shotton et al., CVPR 2013.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -88,15 +86,9 @@ def read_capture(
 ) -> Capture:
     """Find out which layout a folder has, and read its poses and intrinsics; the images are read when they are used.
 
-    Args:
-        folder: one scene.
-        intrinsics: fx, fy, cx, cy, pixels, first pixel's centre at 0; or a file with the pinhole matrix. By default
-            those of the folder.
-        object_id: which object of a BOP scene with several, its obj_id.
-
-    Raises:
-        DatasetError: what is missing or wrong, and in which file.
-        UsageError: ``object_id`` is given for another layout.
+    ``intrinsics``: fx, fy, cx, cy, pixels, first pixel's centre at 0, or a file with the pinhole matrix; by default
+    those of the folder. ``object_id``: which object of a BOP scene with several. DatasetError: what is missing or
+    wrong, and in which file. UsageError: ``object_id`` is given for another layout.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -1,7 +1,5 @@
 """A camera that has been everywhere already: the nearest captured view answers a request."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,19 +30,10 @@ class CapturedCamera:
     The object is found by the masks of the folder, unless a point or a box is given. Views whose picture does not hold
     its centre come last. A view that does not show the object is left out, and the next nearest answers.
 
-    Args:
-        capture: the views.
-        up: direction against gravity, world, (3,); by default by the layout, or the normal of the support plane.
-        point: near the object, world, metres, (3,), if not the largest thing on the support plane is meant.
-        box: upright, into which the object just fits.
-        denoise: as for ``ObservedObject``, as is life_size.
-
-    Attributes:
-        taken: the views that answered, in order.
-        left_out: why views were left out, by name.
-
-    Raises:
-        ObservationError: the object is found in none of the views.
+    ``up``: against gravity, world, (3,); by default by the layout, or the normal of the support plane. ``point``: near
+    the object, world, metres, (3,), if not the largest thing on the support plane is meant. ``box``: upright, into
+    which the object just fits. The others as for ``ObservedObject``. ``taken``: the views that answered, in order;
+    ``left_out``: why views were left out, by name. ObservationError if the object is found in none of the views.
     """
 
     def __init__(

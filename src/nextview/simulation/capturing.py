@@ -1,10 +1,7 @@
 """Write captured views of a mesh in BOP's layout, from a camera that casts rays: what ``captured`` reads."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +12,8 @@ from nextview.errors import UsageError
 from nextview.files import new_folder
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
-from nextview.geometry.viewsphere import ViewSphere, look_at_origin
-from nextview.simulation.captured import NOTHING, Float, pinhole_of
+from nextview.geometry.viewsphere import DISTANCE, ViewSphere, look_at_origin
+from nextview.simulation.captured import NOTHING, pinhole_of
 from nextview.simulation.scene import square
 
 PINHOLE = pinhole_of(525.0, 525.0, 319.5, 239.5)  # a Kinect's as ROS has it by default; first pixel's centre at 0
@@ -25,47 +22,43 @@ TABLE = 2.0  # half the side of the table, object radii
 STEP = 0.0001  # metres that one step of the depth images stands for
 
 
-@dataclass(frozen=True)
-class Setting:
-    """How a mesh is captured.
-
-    The world is z up and has the axes of the mesh; its origin is below the object's centre, at its lowest point.
-    """
-
-    radius: float  # of the object, metres
-    distance: float = 3.0  # of the camera from the object's centre, object radii
-    table: bool = False  # the object stands on a table that is seen too
-    masks: bool = True  # write masks of the object
-    jitter: float = 0.0  # standard deviation of the camera's direction from the candidate viewpoint's, degrees
-
-    def __post_init__(self) -> None:
-        number(self.radius, "the object radius, in metres,", above=0)
-        number(self.distance, "the distance of the camera, in object radii,", above=1)
-        number(self.jitter, "the jitter, in degrees,", 0, 45)
-        if (farthest := self.radius * (self.distance + max(1.0, 1.5 * TABLE * self.table))) > STEP * NOTHING:
-            raise UsageError(f"the camera sees {farthest:.3g} m far, the depth images end at {STEP * NOTHING:.3g} m")
-
-
 def write_capture(
-    mesh: Mesh, folder: Path, sphere: ViewSphere, setting: Setting, rng: np.random.Generator, overwrite: bool = False
+    mesh: Mesh,
+    folder: Path,
+    sphere: ViewSphere,
+    radius: float,
+    table: bool = False,
+    masks: bool = True,
+    overwrite: bool = False,
 ) -> Iterator[int]:
-    """Write a folder of captured views, and box.json, the object's upright box, whole; yields how many are done."""
-    height = -setting.radius * float(mesh.vertices[:, 2].min())
-    vertices = setting.radius * mesh.vertices + np.array([0, 0, height])
+    """Write a folder of captured views, and box.json, the object's upright box, whole; yields how many are done.
+
+    The world, metres, is z up and has the axes of the mesh, whose object radius is ``radius``; its origin is below the
+    object's centre, at its lowest point. The object may stand on a ``table`` that is seen too, and have ``masks``.
+    """
+    number(radius, "the object radius, in metres,", above=0)
+    if (farthest := radius * (DISTANCE + max(1.0, 1.5 * TABLE * table))) > STEP * NOTHING:
+        raise UsageError(f"the camera sees {farthest:.3g} m far, the depth images end at {STEP * NOTHING:.3g} m")
+    height = -radius * float(mesh.vertices[:, 2].min())
+    vertices = radius * mesh.vertices + np.array([0, 0, height])
     things = [(vertices, mesh.faces)]
-    if setting.table:
-        things.append(square(TABLE * setting.radius, 0.0))
+    if table:
+        things.append(square(TABLE * radius, 0.0))
     caster, rays = RayCaster(things), pixel_rays(pinhole_of(525.0, 525.0, 320.0, 240.0), SHAPE).reshape(-1, 3)
     # The box has an inside, even that of a flat mesh.
-    low, high = vertices.min(0) - 1e-6 * setting.radius, vertices.max(0) + 1e-6 * setting.radius
+    low, high = vertices.min(0) - 1e-6 * radius, vertices.max(0) + 1e-6 * radius
     # The object is number 1, its model the mesh as in its file but in mm.
-    model = [0, 0, height] - setting.radius / mesh.radius * mesh.centre
+    model = [0, 0, height] - radius / mesh.radius * mesh.centre
+    x, y, z = sphere.directions.T
+    elevation = np.clip(np.arcsin(np.clip(z, -1, 1)), 0.0 if table else -np.pi / 2, np.pi / 2)  # not below the table
+    poses = look_at_origin(elevation, np.arctan2(y, x), DISTANCE * radius)
+    poses[:, 2, 3] += height
     cameras, objects = {}, {}
     with new_folder(folder, overwrite) as new:
         (new / "box.json").write_text(json.dumps({"low": low.tolist(), "high": high.tolist()}) + "\n")
-        for name in ("depth", "mask_visib")[: 1 + setting.masks]:
+        for name in ("depth", "mask_visib")[: 1 + masks]:
             (new / name).mkdir()
-        for i, pose in enumerate(_camera_poses(sphere, setting, height, rng)):
+        for i, pose in enumerate(poses):
             rotation = pose[:3, :3].T
             translation, flat = -rotation @ pose[:3, 3], rotation.ravel().tolist()
             there = {"cam_R_w2c": flat, "cam_t_w2c": (1000 * translation).tolist()}
@@ -75,21 +68,9 @@ def write_capture(
             depth, which = caster.cast(pose[:3, 3], rays @ np.ascontiguousarray(rotation, np.float32))
             steps = np.rint(np.where(which < 0, np.float32(0), depth) / STEP).astype(np.uint16).reshape(SHAPE)
             Image.fromarray(steps).save(new / f"depth/{i:06d}.png")
-            if setting.masks:
+            if masks:
                 mask = np.where(which == 0, 255, 0).astype(np.uint8).reshape(SHAPE)
                 Image.fromarray(mask).save(new / f"mask_visib/{i:06d}_000000.png")
             yield i + 1
         for name, values in (("scene_camera", cameras), ("scene_gt", objects)):
             (new / f"{name}.json").write_text(json.dumps(values, indent=1) + "\n")
-
-
-def _camera_poses(sphere: ViewSphere, setting: Setting, height: float, rng: np.random.Generator) -> Float:
-    """At every candidate viewpoint, or near it: camera-to-world, (V, 4, 4), metres; ``height`` is the object's."""
-    x, y, z = sphere.directions.T
-    off = np.radians(setting.jitter) * rng.standard_normal((2, len(sphere)))
-    elevation = np.arcsin(np.clip(z, -1, 1))
-    azimuth = np.arctan2(y, x) + off[1] / np.maximum(np.cos(elevation), 0.1)
-    lowest = 0.0 if setting.table else -np.pi / 2
-    poses = look_at_origin(np.clip(elevation + off[0], lowest, np.pi / 2), azimuth, setting.distance * setting.radius)
-    poses[:, 2, 3] += height
-    return poses

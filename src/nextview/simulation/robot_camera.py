@@ -1,7 +1,5 @@
 """A robot's camera in a scene: frames in metres, through a sensor, of a target that is named as a user would."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -25,10 +23,7 @@ SAME = 1e-6  # radians between directions that are the same
 def sensed_camera(
     scene: Scene, sensor: Sensor | SensorMix | str, rng: np.random.Generator, denoise: bool = True
 ) -> SensedCamera:
-    """A ``SensedCamera`` before a scene's target; what hides it is told from it exactly.
-
-    The sensor stands three object radii from the target, whose size follows, and brings no boxes of its own.
-    """
+    """A ``SensedCamera`` before a scene's target, three radii away; what hides it is told from it exactly."""
     drawn = sensor_named(sensor).draw(rng.spawn(1)[0])
     drawn = replace(drawn, radius=drawn.distance / DISTANCE, boxes=0.0)
     return SensedCamera(scene.target, drawn, rng, denoise, scene.around, TABLE)

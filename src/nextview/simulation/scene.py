@@ -1,7 +1,5 @@
 """A scene as geometry: upright things on a table, in the target's object frame, and where a camera can be."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -91,9 +89,8 @@ class Scene:
 def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FACES) -> Scene:
     """A scene as geometry, of the mesh files below a folder, with at most so many faces together.
 
-    Raises:
-        DatasetError: a mesh file is not the one that the scene was made with.
-        MeshError: it cannot be used, or there are too many faces.
+    DatasetError: a file is not the one that the scene was made with. MeshError: it cannot be used, or has too many
+    faces.
     """
     loaded: list[Mesh] = []
     for placed in (layout.target, *layout.objects):

@@ -1,7 +1,5 @@
 """What stands where on the table of a cluttered scene: one small JSON file, of which it is built to the bit."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated
@@ -49,10 +47,7 @@ class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
 
 
 class Block(Struct, frozen=True, forbid_unknown_fields=True):
-    """An upright box that stands on the table, lengths in object radii of the target, angles in radians.
-
-    A ``wall`` ends the space in which the camera can move: what lies beyond cannot be reached.
-    """
+    """An upright box on the table, target's radii and radians; beyond a ``wall`` the camera cannot be brought."""
 
     x: Length
     y: Length
@@ -64,10 +59,7 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
-    """A target at rest on a table, and what stands around it.
-
-    Its frame is the target's object frame. The table is as high as the target's lowest point.
-    """
+    """A target at rest on a table as high as its lowest point, in its object frame, and what stands around it."""
 
     name: str  # unique in its folder, "chair_0890@medium-1"
     level: str  # one of LEVELS, or another word for scenes of one's own
@@ -90,6 +82,6 @@ class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
         write_record(path, self)
 
     @classmethod
-    def load(cls, path: str | Path) -> SceneLayout:
+    def load(cls, path: str | Path) -> "SceneLayout":
         """Read what ``save`` wrote; DatasetError if there is nothing, or something else."""
         return read_record(Path(path), cls, "a scene", DatasetError)

@@ -1,7 +1,5 @@
 """A simulated camera behind a sensor: true depth in metres, the sensor's errors, then the product's own way in."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -29,19 +27,13 @@ OBJECT, TABLE_TOP, BOX = 0, 1, 2  # what a pixel shows; where it shows nothing, 
 
 
 class SensedCamera:
-    """Looks at a mesh through a sensor, as a robot would see the object.
+    """Looks at a normalised mesh through a sensor, as a robot would see the object.
 
     The object stands on a table, among boxes if the sensor's setup has any. Each frame goes through ``ObservedObject``,
     which knows the object's frame up to the errors of the setup. The mask is what was measured near the object, without
-    boxes and most of the table.
-
-    Args:
-        mesh: a normalised mesh.
-        sensor: a sensor, or the name of one, see ``sensor_named``. Of a mix, one is drawn now.
-        rng: for all errors; those of the object's frame, and the boxes, are drawn now.
-        denoise: as in ``ObservedObject``.
-        around: what hides parts of the object, object frame, object radii, instead of the setup's boxes.
-        table: radius of the table, object radii.
+    boxes and most of the table. A mix of sensors is drawn from now, as are the errors of the object's frame and the
+    boxes. ``around`` hides parts of the object instead of these boxes, object frame; ``table`` is a radius, object
+    radii.
     """
 
     def __init__(

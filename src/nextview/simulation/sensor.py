@@ -1,7 +1,5 @@
 """Depth sensors as numbers: how strong each of their errors is, and those of the setup. Known ones, and a mix."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
@@ -31,10 +29,7 @@ class Sensor:
 
     The simulated object is ``radius`` metres large and ``distance`` metres away. ``scaled`` multiplies every strength,
     that is all but what the sensor is (height to radius). Deviations are standard deviations; those of the setup are
-    drawn for each axis.
-
-    Raises:
-        UsageError: numbers that no sensor has.
+    drawn for each axis. UsageError: numbers that no sensor has.
     """
 
     name: str = "none"
@@ -79,7 +74,7 @@ class Sensor:
         if not self.distance > self.radius:
             raise UsageError(f"sensor {self.name}: at {self.distance} m it stands inside an object of {self.radius} m")
 
-    def scaled(self, strength: float) -> Sensor:
+    def scaled(self, strength: float) -> "Sensor":
         """The same sensor with all errors so many times as strong; 0 for none, STRONGEST at most."""
         number(strength, "the strength of a sensor", 0, STRONGEST)
         name = self.name if strength == 1 else f"{self.name}:{strength:g}"
@@ -99,7 +94,7 @@ class Sensor:
         """Its name and all its numbers, for JSON."""
         return asdict(self)
 
-    def draw(self, rng: np.random.Generator) -> Sensor:
+    def draw(self, rng: np.random.Generator) -> "Sensor":
         """Itself: what ``SensorMix`` draws anew for every object."""
         return self
 

@@ -35,20 +35,12 @@ LARGEST = 16_384  # pixels that an image may be high or wide
 
 
 class SimulatedCamera:
-    """Looks at one mesh from any pose.
+    """Looks at one normalised mesh from any pose.
 
     The image is lit by a headlight: a pixel's brightness grows with the cosine between the ray and the surface normal.
-
-    Args:
-        mesh: a normalised mesh.
-        size: side of the square image, pixels.
-        distance: distance at which the unit sphere just fills the image, object radii.
-        intrinsics: instead, a pinhole matrix, (3, 3), pixels, the first pixel's centre at 0.5.
-        shape: height and width of the image that goes with it.
-
-    Raises:
-        UsageError: no size of an image.
-        ObservationError: the camera stands in the object, or a matrix that no pinhole has.
+    It is a square of ``size`` pixels that the unit sphere just fills from ``distance`` object radii; or of ``shape``,
+    height and width, through ``intrinsics``, (3, 3), pixels, the first pixel's centre at 0.5. UsageError: no size of an
+    image. ObservationError: the camera stands in the object, or a matrix that no pinhole has.
     """
 
     def __init__(
@@ -118,10 +110,7 @@ class SimulatedCamera:
 
 
 class OccludedCamera:
-    """Looks at the target of a scene; what hides it is cut out, as if it had been told from the target exactly.
-
-    Where nothing hides it, the observations are those of a ``SimulatedCamera`` before the target alone, to the bit.
-    """
+    """A ``SimulatedCamera`` before the target of a scene; what hides it is cut out, as if told from it exactly."""
 
     def __init__(self, scene: Scene, size: int = 224, distance: float = DISTANCE) -> None:
         self.scene = scene

@@ -1,7 +1,5 @@
 """What the last view of a walk showed and changed, as a piece of HTML."""
 
-from __future__ import annotations
-
 from base64 import b64encode
 from collections.abc import Iterable
 from html import escape
@@ -17,10 +15,8 @@ from nextview.session.style import ACCENT, FAINT, INK, heat
 from nextview.session.view import View
 from nextview.viewers.exploration import Walk
 
-CELL = 11
-"""Side of a cell of a map, pixels."""
-SHOWN = 5
-"""Classes of which the belief is shown."""
+CELL = 11  # side of a cell of a map, pixels
+SHOWN = 5  # classes of which the belief is shown
 STYLE = f"""<style>
 .nv {{ font: 13px sans-serif; color: {INK}; padding: 0.4em 0.8em 0.8em }}
 .nv h3 {{ margin: 0 0 0.2em; font-size: 15px }}

@@ -1,7 +1,5 @@
 """What is explored, without any page: an object, one or two walks around it, and what their policies value."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -133,7 +131,7 @@ class Walk:
         """Take the view that the policy asks for."""
         return self.look(self.session.view)
 
-    def with_policy_of(self, system: System) -> Walk:
+    def with_policy_of(self, system: System) -> "Walk":
         """The same views under another policy: what would it do now?"""
         other = Walk(system, self.camera, self.start, self.seed)
         for view in self.views:

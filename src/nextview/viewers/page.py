@@ -1,7 +1,5 @@
 """The explorer's page: what is clicked and dragged goes to an ``Exploration``, and what follows is drawn."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
@@ -24,10 +22,8 @@ from nextview.viewers.server import serve
 from nextview.viewers.walk_scene import WalkScene
 
 NOTHING, CLEAN = "nothing", "clean renders"
-APART = 8.5
-"""Between two objects side by side, object radii."""
-PAUSE = 0.5
-"""Between the views of a policy that walks, seconds: long enough to see each."""
+APART = 8.5  # between two objects side by side, object radii
+PAUSE = 0.5  # between the views of a policy that walks, seconds: long enough to see each
 HELP = """Click a **ball** to look from there. Drag the **arrows** to look from anywhere else. Balls are coloured by
 what the policy values them at: yellow most, violet least, grey what it does not consider. It would go to the large red
 one next; small dark ones were visited."""

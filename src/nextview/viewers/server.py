@@ -1,7 +1,5 @@
 """The web server of the explorer: viser's, which answers its own page and refuses requests from other sites."""
 
-from __future__ import annotations
-
 import errno
 import re
 import socket

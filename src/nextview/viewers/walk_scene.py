@@ -1,7 +1,5 @@
 """A walk in 3D: the object, the candidate views in the colours of their values, the path and the camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -17,8 +15,7 @@ from nextview.viewers.exploration import Walk
 
 Float = NDArray[np.float64]
 
-BALL = 0.12
-"""Radius of a candidate view, object radii."""
+BALL = 0.12  # radius of a candidate view, object radii
 
 
 class WalkScene:
