@@ -243,13 +243,13 @@ def test_a_calibration_goes_into_the_card_and_is_used(training_predictions, monk
 
 def test_logits_of_ones_own_are_fitted_to_where_they_name_no_model(training_predictions):
     card, path = training_predictions
-    named = fit_calibration(path, card, validation=0.5).calibration
+    named = fit_calibration(path, card).calibration
     unnamed = replace(Predictions.load(path), models={})
     unnamed.save(path, overwrite=True)
-    assert fit_calibration(path, card, validation=0.5).calibration == named
+    assert fit_calibration(path, card).calibration == named
     replace(unnamed, classes=("ball", "box", "cone")).save(path, overwrite=True)
     with pytest.raises(PredictionsError, match="another recogniser"):
-        fit_calibration(path, card, validation=0.5)
+        fit_calibration(path, card)
 
 
 def test_a_calibration_by_a_bad_sensor_trusts_views_less(training_predictions, tmp_path):
