@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from nextview.benchmark import figures as draw
 from nextview.benchmark.evaluation import Evaluation, evaluate, scores_for_card
-from nextview.benchmark.page import numbers, origin, picture, render
+from nextview.benchmark.page import numbers, origin, picture, render, write_figures
 from nextview.benchmark.published import comparable_classes, published_recognisers
 from nextview.benchmark.run import chosen_split
 from nextview.data.predictions import Predictions
@@ -46,6 +46,7 @@ def write_evaluation(
     out: Path,
     settings: EvaluationSettings = EvaluationSettings(),
     *,
+    figures: Path | None = None,
     overwrite: bool = False,
 ) -> Evaluation:
     """Judge recogniser and maps on every view: accuracy, confusions, calibration, map scores, beside the published.
@@ -54,13 +55,15 @@ def write_evaluation(
         predictions: made by nextview predict.
         out: folder for tables (.csv), settings and evaluate.html.
         settings: what is judged.
+        figures: write every figure of the page as PDF and SVG too, and the tables as CSV and LaTeX, into this folder.
         overwrite: replace the files of an earlier evaluation.
 
     Raises:
         UsageError: the predictions hold several splits, and none is chosen.
         ResultsError: there is nothing to judge, or a card's model did not make them.
     """
-    check_new(out, overwrite, folder=True)
+    for folder in filter(None, (out, figures)):
+        check_new(folder, overwrite, folder=True)
     p = chosen_split(Predictions.load(predictions), predictions, settings.split)
     p = p.deduplicate() if settings.deduplicate else p
     noted = {}
@@ -82,6 +85,8 @@ def write_evaluation(
         notes = {"settings": made, "left_out": found.left_out}
         (part / "evaluate.json").write_text(json.dumps(notes, indent=1) + "\n")
         (part / "evaluate.html").write_text(page(found, p, made), encoding="utf-8")
+    if figures is not None:
+        write_figures(figures, _figures(found, p), found.tables(), overwrite)
     for path, card in noted.items():
         write_card(path.with_suffix(".json"), card)
     return found

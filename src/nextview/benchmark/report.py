@@ -17,10 +17,11 @@ from PIL import Image
 from nextview.benchmark import figures as draw
 from nextview.benchmark import leaderboard as board
 from nextview.benchmark.entries import is_oracle
-from nextview.benchmark.page import numbers, origin, picture, render
+from nextview.benchmark.page import numbers, origin, picture, render, write_figures
 from nextview.benchmark.published import COLUMNS, published_threshold
 from nextview.benchmark.run import Results, load
 from nextview.benchmark.true_maps import stored_rows
+from nextview.benchmark.views import as_rows
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import scene_views
 from nextview.data.store import ViewStore
@@ -36,7 +37,14 @@ OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225
 """Colours of nothing, the target, other things and the table in a scene."""
 
 
-def report(results: Path, out: Path | None = None, /, store: Path | None = None, overwrite: bool = False) -> Path:
+def report(
+    results: Path,
+    out: Path | None = None,
+    /,
+    store: Path | None = None,
+    figures: Path | None = None,
+    overwrite: bool = False,
+) -> Path:
     """Write one self-contained HTML page: tables, curves, and the worst failures.
 
     Args:
@@ -44,7 +52,8 @@ def report(results: Path, out: Path | None = None, /, store: Path | None = None,
         out: the page; RESULTS/report.html by default.
         store: take the pictures of the objects from this view store; by default from that of the predictions, if it
             still is where it was.
-        overwrite: replace an earlier page.
+        figures: write every figure of it as PDF and SVG too, and its tables as CSV and LaTeX, into this folder.
+        overwrite: replace an earlier page, and earlier figures.
 
     Raises:
         ResultsError: there are no results, or fixed views only; or the page cannot be written.
@@ -52,12 +61,19 @@ def report(results: Path, out: Path | None = None, /, store: Path | None = None,
     """
     path = out or results / "report.html"
     check_new(path, overwrite)
+    if figures is not None:
+        check_new(figures, overwrite, folder=True)
     loaded = load(results)
     if loaded.tables.sweep.empty:
         raise ResultsError(f"{results}: holds fixed views only; a report needs a policy that chooses")
     views, why_not = pictures_of(loaded.predictions, store)
     with new_file(path, overwrite) as part:
         part.write_text(page(loaded, views, why_not), encoding="utf-8")
+    if figures is not None:
+        at, tables = board.headline_threshold(loaded.settings["thresholds"]), loaded.tables
+        shown = {"leaderboard": pd.DataFrame(board.leaderboard(tables, at)), "tests": tables.tests}
+        shown |= {} if tables.views.empty else {"views": as_rows(tables.views)}
+        write_figures(figures, _figures(loaded, headline_policy(loaded, at), at), shown, overwrite)
     return path
 
 

@@ -22,6 +22,7 @@ from nextview.benchmark.leaderboard import (
 )
 from nextview.benchmark.page import Number, numbers
 from nextview.benchmark.run import Results
+from nextview.benchmark.views import as_rows, markdown
 from nextview.cli.progress import Terminal
 from nextview.errors import EntryError
 
@@ -44,6 +45,8 @@ def print_leaderboard(results: Results) -> None:
         for sentence in (nothing_differs(tables, at, reference), too_few(tables, at, len(results.predictions))):
             if sentence:
                 console.print(sentence)
+    if not tables.views.empty:
+        print(markdown(as_rows(tables.views)), end="")
     if sentence := level_differences(tables, reference):
         console.print(sentence)
     for r in promised_risks(tables):
