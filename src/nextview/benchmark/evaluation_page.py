@@ -17,8 +17,9 @@ from nextview.benchmark.page import numbers, origin, picture, render, write_figu
 from nextview.benchmark.published import comparable_classes, published_recognisers
 from nextview.benchmark.run import chosen_split
 from nextview.data.predictions import Predictions
-from nextview.files import check_new, new_folder, sha256_of
-from nextview.recognition.model_card import find_card, write_card
+from nextview.errors import ModelError
+from nextview.files import check_new, new_folder, only_one, sha256_of
+from nextview.recognition.model_card import find_card, read_card, write_card
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def write_evaluation(
         card = find_card(name)
         what = f"{'shapes' if settings.deduplicate else 'objects'}{'' if p.of_size is None else ', of known size'}"
         scores = {f"{settings.split or p.splits[0] or 'all'} ({len(p)} {what})": scores_for_card(card, p)}
-        noted[card.path] = replace(card, scores={**card.scores, **scores})
+        noted[card.path.with_suffix(".json")] = card.sha256, scores
     made = asdict(settings) | {
         "predictions": predictions.name,
         "predictions_sha256": sha256_of(predictions),
@@ -87,8 +88,12 @@ def write_evaluation(
         (part / "evaluate.html").write_text(page(found, p, made), encoding="utf-8")
     if figures is not None:
         write_figures(figures, _figures(found, p), found.tables(), overwrite)
-    for path, card in noted.items():
-        write_card(path.with_suffix(".json"), card)
+    for path, (sha256, scores) in noted.items():
+        with only_one(path):
+            card = read_card(path)  # as it is by now
+            if card.sha256 != sha256:
+                raise ModelError(f"{path}: became the card of another model while this ran, and is left as it is")
+            write_card(path, replace(card, scores={**card.scores, **scores}))
     return found
 
 
