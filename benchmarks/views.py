@@ -1,24 +1,16 @@
-"""Compare policies at a fixed number of views: nobody stops early, and each view and each cell of travel is counted.
+"""``nextview benchmark --views`` with a choice of policies and references of its own, and its figure.
 
     python benchmarks/views.py test.npz --out views [--policies gain@0.01 ...] [--n-views 2 3 5] [--against lem ...]
 
 Writes views.md (the table), views.csv (every number in a row of its own) and front.png (accuracy against travel) into
-the folder, and prints the table. A policy chooses without knowing how many views there will be, so it is run once and
-its path cut after each number of views; the numbers are those of
-
-    nextview benchmark test.npz --thresholds 1 --max-views 2
-
-and so on. Intervals are 95 % bootstrap intervals over objects; p is McNemar's test over objects,
-corrected by Holm's method for all comparisons of the run: every policy that chooses without the truth, with every
-reference, after every number of views. The gap is that between random and oracle-gain, which sees what every
-view of the window would say.
+the folder, and prints the table. The gap is that between random and oracle-gain, which sees what every view of the
+window would say.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Literal
@@ -39,11 +31,10 @@ from matplotlib.transforms import Bbox
 
 from nextview.benchmark.entries import EpisodeSpecs, entry_policy, knows_truth
 from nextview.benchmark.figures import COLOURS, OWN
-from nextview.benchmark.replay import Grid, Outcomes, Trajectories, make_specs, run_grid, truncate
-from nextview.benchmark.statistics import holm, interval, mcnemar, resample
+from nextview.benchmark.replay import Grid, make_specs, run_grid
+from nextview.benchmark.views import CEILING, as_rows, by_key, markdown, measured
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
-from nextview.data.metrics import ratio
 from nextview.data.predictions import Predictions
 from nextview.errors import UsageError
 from nextview.session.style import GREY, STYLE, to_png
@@ -67,84 +58,6 @@ POLICIES = (
     "oracle-gain",
 )
 REFERENCES = ("random", "random-all")
-CEILING = "oracle-gain"
-
-
-def after(paths: Trajectories, n_views: int) -> Outcomes:
-    """How the episodes stand after so many views."""
-    fields = ("views", "answers", "confidences", "travel", "arc")
-    return truncate(replace(paths, **{name: getattr(paths, name)[:, :n_views] for name in fields}), None)
-
-
-def measured(grid: Grid, n_views: Sequence[int], samples: int, references: Sequence[str] = REFERENCES) -> pd.DataFrame:
-    """Every number: policy, n_views, measure, value, low, high, p, p_holm.
-
-    The measures: ``accuracy``; ``travel``, grid cells; ``to_random`` and so on, differences of accuracy to references;
-    ``share_of_gap``, how much of what ``oracle-gain`` has over ``random`` the policy has too. The bootstrap samples are
-    those of the benchmark, the same for all policies, which pairs the differences.
-    """
-    names = list(grid.paths)
-    weights = resample(len(grid.specs.predictions), samples, np.random.default_rng([grid.seed, 1]))
-    rows: list[tuple] = []
-    for k in n_views:
-        ends = [after(grid.paths[name], k) for name in names]
-        right = dict(zip(names, (grid.right(e.answer) for e in ends), strict=True))
-        columns = {(name, "accuracy"): r.mean(0) for name, r in right.items()}
-        columns |= {
-            (name, "travel"): e.travel.reshape(grid.runs, -1).mean(0) for name, e in zip(names, ends, strict=True)
-        }
-        for name, reference in product(names, references):
-            columns[name, f"to_{reference}"] = columns[name, "accuracy"] - columns[reference, "accuracy"]
-        top = np.stack(list(columns.values()), 1)
-        low, high = interval(ratio(top, np.ones_like(top), weights))
-        value = dict(zip(columns, top.mean(0), strict=True))
-        for i, (name, measure) in enumerate(columns):
-            reference = measure.removeprefix("to_")
-            p = mcnemar(right[name], right[reference]) if reference in references and name != reference else np.nan
-            rows.append((name, k, measure, value[name, measure], low[i], high[i], p))
-        gap = value[CEILING, "to_random"]
-        for name in names:
-            share = value[name, "to_random"] / gap if gap > 0 else np.nan
-            rows.append((name, k, "share_of_gap", share, np.nan, np.nan, np.nan))
-    table = pd.DataFrame(rows, columns=["policy", "n_views", "measure", "value", "low", "high", "p"])
-    blind = ~table["policy"].map(knows_truth)
-    table["p_holm"] = holm(np.where(blind, table["p"], np.nan))
-    return table
-
-
-Numbers = dict[tuple[str, int, str], tuple[float, float, float, float, float]]
-"""Value, low, high, p and p after Holm's correction, by policy, number of views and measure."""
-
-
-def by_key(table: pd.DataFrame) -> Numbers:
-    return {(policy, k, measure): tuple(rest) for policy, k, measure, *rest in table.itertuples(index=False)}
-
-
-def markdown(table: pd.DataFrame, left_out: Sequence[str], references: Sequence[str] = REFERENCES) -> str:
-    """The table as text."""
-    found, n_views = by_key(table), table["n_views"].unique().tolist()
-    at = " at " + ", ".join(map(str, n_views))
-
-    def difference(name: str, k: int, reference: str) -> str:
-        value, *_, p = found[name, k, f"to_{reference}"]
-        # rounded first: no minus before a zero
-        shown = f"{round(100 * value, 1) + 0.0:+.1f}"
-        if np.isnan(p):  # a ceiling is no rival
-            return shown
-        return f"{shown} (p {'< 0.0001' if p < 1e-4 else f'{p:.2g}'})"
-
-    head = ["policy", *(f"{k} view{'s' * (k > 1)}" for k in n_views), f"travel{at}"]
-    head += [f"points over {reference}{at}" for reference in references] + [f"of the gap{at}"]
-    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-    for name in table["policy"].unique():
-        cells = ["{:.3f} ({:.3f}-{:.3f})".format(*found[name, k, "accuracy"][:3]) for k in n_views]
-        cells.append(", ".join(f"{found[name, k, 'travel'][0]:.2f}" for k in n_views))
-        for reference in references:
-            cells.append("" if name == reference else ", ".join(difference(name, k, reference) for k in n_views))
-        shares = [found[name, k, "share_of_gap"][0] for k in n_views]
-        cells.append(", ".join("-" if np.isnan(s) else f"{100 * s:.0f} %" for s in shares))
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join([*lines, *(f"\nLeft out: {sentence}" for sentence in left_out)]) + "\n"
 
 
 def families(names: Sequence[str], specs: EpisodeSpecs) -> dict[str, list[tuple[float, str]]]:
@@ -315,7 +228,7 @@ def main(
         del grid.paths[name]
     compared = [name for name in dict.fromkeys((REFERENCES[0], *against)) if name in grid.paths]
     found = measured(grid, sorted(set(n_views)), samples, compared)
-    text = markdown(found, list(grid.failures.values()), compared)
+    text = markdown(as_rows(found), list(grid.failures.values()))
     out.mkdir(parents=True, exist_ok=True)
     (out / "views.md").write_text(text, encoding="utf-8")
     found.to_csv(out / "views.csv", index=False)

@@ -205,12 +205,21 @@ def fifo(path):
     os.mkfifo(path)
 
 
+def link_out(path):
+    """What was there lies elsewhere now, a file or a folder, and is linked to."""
+    there = path.rename(path.parents[1] / f"elsewhere-{path.name}")
+    path.symlink_to(there)
+
+
 CAMERAS, TRAJECTORY = "scene_camera.json", "groundtruth.txt"
 POSE, DEPTH = "frame-000003.pose.txt", "frame-000003.depth.png"
 DAMAGE = {
     "a missing image": ("bop", "depth/000007.png", Path.unlink, "no such file"),
     "a truncated image": ("7scenes", DEPTH, lambda p: p.write_bytes(p.read_bytes()[:-40]), "damaged"),
     "a pipe for an image": ("7scenes", DEPTH, fifo, "is no file"),
+    "a link to an image elsewhere": ("7scenes", DEPTH, link_out, "link out of this folder"),
+    "a link to a list elsewhere": ("tum", TRAJECTORY, link_out, "link out of this folder"),
+    "a link to a folder elsewhere": ("bop", "depth", link_out, "link out of this folder"),
     "8 bits": ("tum", "depth/a.png", lambda p: write_png(p, depth_image(90), np.uint8), "16 bits"),
     "no JSON": ("bop", CAMERAS, put("{"), "not the cameras"),
     "no scale": ("bop", CAMERAS, edited(lambda v: v.update(depth_scale=0)), "depth_scale"),
@@ -228,11 +237,13 @@ DAMAGE = {
 @pytest.mark.parametrize("what", DAMAGE)
 def test_what_is_damaged_is_named(what, tmp_path, capsys):
     layout, name, damage, said = DAMAGE[what]
-    WRITERS[layout](tmp_path)
-    damage(tmp_path / name)
-    sentence = refused(capsys, "recognise", tmp_path).replace(" ", "")  # it may be broken in two lines anywhere
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    WRITERS[layout](folder)
+    damage(folder / name)
+    sentence = refused(capsys, "recognise", folder).replace(" ", "")  # it may be broken in two lines anywhere
     assert said.replace(" ", "") in sentence
-    assert (tmp_path.name if what == "no intrinsics" else name) in sentence
+    assert (folder.name if what == "no intrinsics" else name) in sentence
 
 
 # nextview capture

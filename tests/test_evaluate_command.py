@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +12,11 @@ import numpy as np
 import pytest
 from pipeline import refused, some_predictions
 
+from nextview.benchmark import evaluation_page
 from nextview.cli.main import main
 from nextview.data.predictions import Predictions
 from nextview.files import sha256_of
-from nextview.recognition.model_card import ModelCard, write_card
+from nextview.recognition.model_card import ModelCard, read_card, write_card
 from nextview.recognition.network_input import InputSpec
 
 TABLES = ("accuracy", "fusion", "confusion", "reliability", "maps")
@@ -57,8 +59,37 @@ def test_the_page_shows_the_numbers_of_the_tables(made):
 
 def test_predictions_that_name_no_model_are_judged_alike(made, tmp_path, capsys):
     replace(Predictions.load(made / "p.npz"), models={}).save(tmp_path / "p.npz")
-    main(["evaluate", str(tmp_path / "p.npz"), str(tmp_path / "out"), "--samples", "50"])
+    main(
+        [
+            "evaluate",
+            str(tmp_path / "p.npz"),
+            str(tmp_path / "out"),
+            "--samples",
+            "50",
+            "--figures",
+            str(tmp_path / "fig"),
+        ]
+    )
+    written = {path.name for path in (tmp_path / "fig").iterdir()}
+    assert written >= {f"fusion.{kind}" for kind in ("pdf", "svg", "csv", "tex")}
     assert table(tmp_path, "accuracy") == table(made, "accuracy")
+
+
+def test_a_card_that_changed_while_it_was_judged_keeps_the_change(predictions, models, tmp_path, monkeypatch):
+    for path in models.iterdir():
+        shutil.copy(path, tmp_path)
+    card = tmp_path / "tiny.json"
+    judge = evaluation_page.evaluate
+
+    def slowly(*given):
+        write_card(card, msgspec.structs.replace(read_card(card), note="changed"))
+        return judge(*given)
+
+    monkeypatch.setattr(evaluation_page, "evaluate", slowly)
+    settings = evaluation_page.EvaluationSettings("test", cards=(str(card),), samples=10)
+    evaluation_page.write_evaluation(predictions, tmp_path / "out", settings)
+    after = read_card(card)
+    assert (after.note, list(after.scores)) == ("changed", ["test (6 objects)"])
 
 
 def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(tmp_path, capsys):

@@ -37,6 +37,22 @@ def test_json_holds_the_whole_episode(chair, capsys):
     assert views[-1]["travel_cells"] == pytest.approx(sum(legs), abs=1e-5)
 
 
+def test_several_are_a_line_of_json_each_and_what_cannot_be_used_is_named(chair, capsys):
+    table = chair.with_name("table.off")
+    with pytest.raises(SystemExit) as end:
+        main(["recognise", str(chair), "no.off", str(table), "--unit", "cm", "--json", "--start", "3"])
+    out, err = capsys.readouterr()
+    assert end.value.code == 2
+    assert "no.off" in err
+    assert "1 of 3 were left out" in err
+    found = [json.loads(line) for line in out.splitlines()]
+    assert [(one["name"], one["answer"]) for one in found] == [("chair.off", "chair"), ("table.off", "table")]
+    for one, path in zip(found, (chair, table), strict=True):
+        assert (one["radius"], one["unit"]) == (pytest.approx(nextview.load_mesh(path, unit="cm").metres), "m")
+        assert one["beliefs"] == one["views"][-1]["belief"]
+        assert (one["unknown"], one["warnings"]) == (False, [])
+
+
 def test_a_risk_stops_at_the_threshold_that_the_recogniser_promises(chair, capsys):
     main(["recognise", str(chair), "--risk", "0.1", "--start", "3", "--json"])
     by_risk = capsys.readouterr().out

@@ -126,3 +126,18 @@ def test_threads_that_share_a_session_wait_for_each_other(system, camera):
     for view in session.views:
         alone.update(view.observation)
     np.testing.assert_array_equal([v.belief for v in session.views], [v.belief for v in alone.views])
+
+
+def test_half_way_the_result_is_what_is_believed_so_far(system, camera):
+    session = Session(system.models, system.policy, system.sphere, 20, Stopping(1.0, 3))
+    before = session.result
+    assert (before.answer, before.beliefs, before.travel, before.radius, before.views) == (None, {}, 0, None, ())
+    assert repr(before) == "nothing is seen (0 views, 0.00 cells of travel)"
+    view = session.update(camera.observe(session.pose))
+    result = session.result
+    assert result.views == (view,)
+    assert (result.confident, result.stranded) == (False, False)
+    assert result.beliefs == dict(zip(system.classes, view.belief.tolist(), strict=True))
+    assert result.answer == max(result.beliefs, key=result.beliefs.get)
+    session.run(camera)
+    assert len(session.result.views) == 3

@@ -3,11 +3,13 @@
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
-from pipeline import some_predictions
+from pipeline import refused, some_predictions
 
 from nextview.benchmark.run import BenchmarkSettings, run_benchmark
+from nextview.cli.main import main
 
 VIEWS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "views.py"))
 NAMES = ("lem", "furthest", "spread", "orbit-4", "best-4")
@@ -46,3 +48,30 @@ def test_the_gap_is_that_between_random_and_one_step_of_foresight(made):
         assert (share["random"], share["oracle-gain"]) == (0, pytest.approx(1))
         floor, top = accuracy["random"], accuracy["oracle-gain"]
         assert share["spread"] == pytest.approx((accuracy["spread"] - floor) / (top - floor))
+
+
+def test_the_command_writes_the_same_table_beside_its_own(made, capsys):
+    """``nextview benchmark --views``, from the same first views; then figures and tables for papers."""
+    out = made / "command"
+    main(["benchmark", str(made / "p.npz"), str(out), "--policies", "lem", "spread", "oracle-gain", "--views", "4", "2",
+          "--runs", "3", "--samples", "200", "--thresholds", "0.9"])  # fmt: skip
+    assert "| policy | 2 views | 4 views |" in capsys.readouterr().out
+    keys = ["policy", "n_views", "measure"]
+    ours, script = (pd.read_csv(f / "views.csv").set_index(keys).sort_index() for f in (out, made / "out"))
+    shared = ours.index[ours.index.get_level_values("policy") != "random-all"]
+    for column in ("value", "low", "high", "p"):
+        np.testing.assert_allclose(ours.loc[shared, column], script.loc[shared, column], atol=1e-9)
+    assert (out / "views.md").read_text().startswith("| policy | 2 views")
+    main(["report", str(out), "--figures", str(made / "figures")])
+    written = {path.name for path in (made / "figures").iterdir()}
+    for name in ("accuracy", "n_views", "reliability"):
+        assert (made / "figures" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+        assert "<svg" in (made / "figures" / f"{name}.svg").read_text()
+    for name in ("leaderboard", "tests", "views"):
+        assert {f"{name}.csv", f"{name}.tex"} <= written
+        assert (made / "figures" / f"{name}.tex").read_text().count("oracle-gain") >= 1
+
+
+def test_more_views_than_are_taken_are_refused(made, capsys):
+    words = refused(capsys, "benchmark", made / "p.npz", made / "no", "--views", "3", "7")
+    assert "policies take 1 to 5 views (--max-views), and --views asks for 3 7" in words

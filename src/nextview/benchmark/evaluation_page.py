@@ -11,12 +11,13 @@ from msgspec.structs import replace
 
 from nextview.benchmark import figures as draw
 from nextview.benchmark.evaluation import Evaluation, evaluate, scores_for_card
-from nextview.benchmark.page import numbers, origin, picture, render
+from nextview.benchmark.page import numbers, origin, picture, render, write_figures
 from nextview.benchmark.published import comparable_classes, published_recognisers
 from nextview.benchmark.run import chosen_split
 from nextview.data.predictions import Predictions
-from nextview.files import check_new, new_folder, sha256_of
-from nextview.recognition.model_card import find_card, write_card
+from nextview.errors import ModelError
+from nextview.files import check_new, new_folder, only_one, sha256_of
+from nextview.recognition.model_card import find_card, read_card, write_card
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,8 @@ def write_evaluation(
     out: Path,  # folder for tables (.csv), settings and evaluate.html
     settings: EvaluationSettings = EvaluationSettings(),
     *,
+    # write every figure of the page as PDF and SVG too, and the tables as CSV and LaTeX, into this folder
+    figures: Path | None = None,
     overwrite: bool = False,  # replace the files of an earlier evaluation
 ) -> Evaluation:
     """Judge recogniser and maps on every view: accuracy, confusions, calibration, map scores, beside the published.
@@ -46,7 +49,8 @@ def write_evaluation(
         UsageError: the predictions hold several splits, and none is chosen.
         ResultsError: there is nothing to judge, or a card's model did not make them.
     """
-    check_new(out, overwrite, folder=True)
+    for folder in filter(None, (out, figures)):
+        check_new(folder, overwrite, folder=True)
     p = chosen_split(Predictions.load(predictions), predictions, settings.split)
     p = p.deduplicate() if settings.deduplicate else p
     noted = {}
@@ -54,7 +58,7 @@ def write_evaluation(
         card = find_card(name)
         what = f"{'shapes' if settings.deduplicate else 'objects'}{'' if p.of_size is None else ', of known size'}"
         scores = {f"{settings.split or p.splits[0] or 'all'} ({len(p)} {what})": scores_for_card(card, p)}
-        noted[card.path] = replace(card, scores={**card.scores, **scores})
+        noted[card.path.with_suffix(".json")] = card.sha256, scores
     made = asdict(settings) | {
         "predictions": predictions.name,
         "predictions_sha256": sha256_of(predictions),
@@ -68,8 +72,14 @@ def write_evaluation(
         notes = {"settings": made, "left_out": found.left_out}
         (part / "evaluate.json").write_text(json.dumps(notes, indent=1) + "\n")
         (part / "evaluate.html").write_text(page(found, p, made), encoding="utf-8")
-    for path, card in noted.items():
-        write_card(path.with_suffix(".json"), card)
+    if figures is not None:
+        write_figures(figures, _figures(found, p), found.tables(), overwrite)
+    for path, (sha256, scores) in noted.items():
+        with only_one(path):
+            card = read_card(path)  # as it is by now
+            if card.sha256 != sha256:
+                raise ModelError(f"{path}: became the card of another model while this ran, and is left as it is")
+            write_card(path, replace(card, scores={**card.scores, **scores}))
     return found
 
 

@@ -15,10 +15,11 @@ from PIL import Image
 from nextview.benchmark import figures as draw
 from nextview.benchmark import leaderboard as board
 from nextview.benchmark.entries import is_oracle
-from nextview.benchmark.page import numbers, origin, picture, render
+from nextview.benchmark.page import numbers, origin, picture, render, write_figures
 from nextview.benchmark.published import COLUMNS, published_threshold
 from nextview.benchmark.run import Results, load
 from nextview.benchmark.true_maps import stored_rows
+from nextview.benchmark.views import as_rows
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import scene_views
 from nextview.data.store import ViewStore
@@ -40,7 +41,9 @@ def report(
     # take the pictures of the objects from this view store; by default from that of the predictions, if it still is
     # where it was
     store: Path | None = None,
-    overwrite: bool = False,  # replace an earlier page
+    # write every figure of it as PDF and SVG too, and its tables as CSV and LaTeX, into this folder
+    figures: Path | None = None,
+    overwrite: bool = False,  # replace an earlier page, and earlier figures
 ) -> Path:
     """Write one self-contained HTML page: tables, curves, and the worst failures.
 
@@ -50,12 +53,19 @@ def report(
     """
     path = out or results / "report.html"
     check_new(path, overwrite)
+    if figures is not None:
+        check_new(figures, overwrite, folder=True)
     loaded = load(results)
     if loaded.tables.sweep.empty:
         raise ResultsError(f"{results}: holds fixed views only; a report needs a policy that chooses")
     views, why_not = pictures_of(loaded.predictions, store)
     with new_file(path, overwrite) as part:
         part.write_text(page(loaded, views, why_not), encoding="utf-8")
+    if figures is not None:
+        at, tables = board.headline_threshold(loaded.settings["thresholds"]), loaded.tables
+        shown = {"leaderboard": pd.DataFrame(board.leaderboard(tables, at)), "tests": tables.tests}
+        shown |= {} if tables.views.empty else {"views": as_rows(tables.views)}
+        write_figures(figures, _figures(loaded, headline_policy(loaded, at), at), shown, overwrite)
     return path
 
 

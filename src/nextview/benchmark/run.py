@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.replay import THRESHOLDS, Grid, make_specs, run_grid
 from nextview.benchmark.summary import Tables, summarise
+from nextview.benchmark.views import as_rows, markdown
 from nextview.data.predictions import Predictions
 from nextview.data.progress import Track, silently
 from nextview.errors import EntryError, ResultsError, UsageError
@@ -34,6 +35,7 @@ class BenchmarkSettings:
     # error rates; the thresholds that promise them, by the recogniser's calibration, are run too. With them thresholds
     # stay; else they come down with the views, by the recogniser's correlation
     risks: tuple[float, ...] = ()
+    views: tuple[int, ...] = ()  # compare the policies after these fixed numbers of views too (1 2 3 5)
     stopping: str | None = None  # MODULE:NAME of a stopping rule of your own, asked with each threshold
     uncalibrated: bool = False  # believe the plain sum of the logits, as published, whatever the recogniser's card says
     # take only the objects of this one; needed where the predictions hold several
@@ -82,7 +84,7 @@ def run_benchmark(
     if not grid.paths:
         raise EntryError("\n".join(grid.failures.values()))
     rng = np.random.default_rng([settings.seed, 1])
-    tables = summarise(grid, settings.reference, settings.samples, rng, promised)
+    tables = summarise(grid, settings.reference, settings.samples, rng, promised, sorted(set(settings.views)))
     table = grid.specs.predictions
     made = asdict(settings) | {
         "command": command(),
@@ -101,6 +103,8 @@ def run_benchmark(
         _write_episodes(part / "episodes.parquet", grid)
         for name, frame in vars(tables).items():
             frame.to_csv(part / f"{name}.csv", index=False)
+        if settings.views:
+            (part / "views.md").write_text(markdown(as_rows(tables.views)), encoding="utf-8")
         table.save(part / "predictions.npz")
         (part / "benchmark.json").write_text(json.dumps(made, indent=1) + "\n")
     return load(out)
@@ -110,6 +114,9 @@ def _prepare(predictions: Path, s: BenchmarkSettings) -> tuple[Grid, list[str], 
     """What is run, the names of the entries, and the threshold that promises each error rate."""
     if not s.thresholds:
         raise UsageError("at least one threshold is needed")
+    if s.views and not 1 <= min(s.views) <= max(s.views) <= s.max_views:
+        asked = " ".join(map(str, s.views))
+        raise UsageError(f"policies take 1 to {s.max_views} views (--max-views), and --views asks for {asked}")
     table = Predictions.load(predictions)
     if s.uncalibrated:
         table = replace(table, calibration=PLAIN_SUM)
@@ -143,7 +150,9 @@ def load(folder: Path) -> Results:
     folder = Path(folder)
     try:
         settings = json.loads((folder / "benchmark.json").read_text())
-        tables = Tables(**{name: pd.read_csv(folder / f"{name}.csv") for name in Tables.__dataclass_fields__})
+        files = {name: folder / f"{name}.csv" for name in Tables.__dataclass_fields__}
+        files = {name: file for name, file in files.items() if name != "views" or file.exists()}  # earlier results
+        tables = Tables(**{name: pd.read_csv(file) for name, file in files.items()})
         pq.read_schema(folder / "episodes.parquet")
     except (FileNotFoundError, NotADirectoryError):
         raise ResultsError(f"{folder}: holds no benchmark results; make some with nextview benchmark") from None

@@ -1,7 +1,7 @@
 """From episodes to tables: every number with its interval, its test and the published value."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -12,6 +12,7 @@ from nextview.benchmark import statistics as st
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.published import comparable_classes, published
 from nextview.benchmark.replay import Grid, Outcomes
+from nextview.benchmark.views import COLUMNS, measured
 from nextview.data import metrics
 from nextview.simulation.scene_layout import LEVELS, clutter_level
 
@@ -44,10 +45,17 @@ class Tables:
     reliability: pd.DataFrame  # confidence and accuracy by bin
     risks: pd.DataFrame  # error rates promised, and those measured among the episodes that reached their threshold
     levels: pd.DataFrame  # of scenes: accuracy after so many views by the level of clutter, see ``by_level``
+    # accuracy and travel after fixed numbers of views, see ``views.measured``
+    views: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=COLUMNS))
 
 
 def summarise(
-    grid: Grid, reference: str, samples: int, rng: np.random.Generator, promised: Mapping[float, float] | None = None
+    grid: Grid,
+    reference: str,
+    samples: int,
+    rng: np.random.Generator,
+    promised: Mapping[float, float] | None = None,
+    n_views: Sequence[int] = (),
 ) -> Tables:
     """All tables of a grid."""
     weights, cells = target_weights(grid.specs.predictions.names, samples, rng), list(grid.cells())
@@ -60,6 +68,7 @@ def summarise(
         _reliability(grid, cells),
         _risks(summary, promised or {}),
         by_level(grid, reference, samples, rng),
+        *([measured(grid, n_views, samples, [reference])] if n_views else []),
     )
 
 

@@ -59,7 +59,7 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
         console.print(f"Of objects of known classes, {100 * result.novelty:.2g} % are at least as novel.")
 
 
-def episode_as_json(result: Recognition, frames: Sequence[str] = ()) -> str:
+def episode_as_json(result: Recognition, name: str, frames: Sequence[str] = (), indent: int | None = 1) -> str:
     """Everything the table shows, and the whole beliefs and maps, as one JSON object."""
     views = []
     for step, view in enumerate(result.views, 1):
@@ -74,9 +74,11 @@ def episode_as_json(result: Recognition, frames: Sequence[str] = ()) -> str:
         one |= {"values": view.values, "threshold": float(result.stopping.threshold_at(step))}
         one |= {"next_view": view.next_view, "travel_cells": view.travel, "travel_radians": view.arc}
         views.append(one | {"warnings": [warning.message for warning in view.warnings]})
-    parts = ("answer", "confidence", "most_like", "unknown", "novelty")
-    whole = {name: getattr(result, name) for name in parts} | {"threshold_reached": result.confident, "views": views}
-    return json.dumps(_plain(whole), indent=1)
+    parts = ("answer", "confidence", "beliefs", "most_like", "unknown", "novelty", "radius")
+    whole = {"name": name} | {part: getattr(result, part) for part in parts}
+    whole |= {"unit": None if result.radius is None else "m", "threshold_reached": result.confident, "views": views}
+    whole["warnings"] = sorted({warning.name for view in result.views for warning in view.warnings})
+    return json.dumps(_plain(whole), indent=indent)
 
 
 def _plain(value: Any) -> Any:

@@ -12,6 +12,7 @@ from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.evaluation import Evaluation
 from nextview.benchmark.page import Number, numbers
 from nextview.benchmark.run import Results
+from nextview.benchmark.views import as_rows, markdown
 from nextview.cli.progress import Terminal
 from nextview.errors import EntryError
 
@@ -35,6 +36,8 @@ def print_leaderboard(results: Results) -> None:
         for sentence in (board.nothing_differs(tables, at, reference), few):
             if sentence:
                 console.print(sentence)
+    if not tables.views.empty:
+        print(markdown(as_rows(tables.views)), end="")
     if sentence := board.level_differences(tables, reference):
         console.print(sentence)
     for r in board.promised_risks(tables):

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from nextview.cli.episode_table import episode_as_json, print_episode
 from nextview.cli.progress import console, track
 from nextview.cli.sources import Looking, Source, Unit, check_file
-from nextview.errors import ObservationError, UsageError
+from nextview.errors import NextviewError, ObservationError, UsageError
 from nextview.files import check_new, new_file
 from nextview.geometry.mesh import MAX_FACES, load_mesh
 from nextview.geometry.viewsphere import ViewSphere
@@ -27,6 +27,7 @@ class Output:
 
 def recognise(
     path: Path,  # OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder of captured views
+    more: tuple[Path, ...] = (),  # further ones; with --json each is a line
     /,
     source: Source = Source(),
     looking: Looking = Looking(),
@@ -41,10 +42,22 @@ def recognise(
     7-Scenes. Of these the view nearest to the one asked for answers. The object is what the masks show; else what lies
     in the box; else the thing on the support plane that is nearest to the point, or the largest.
     """
+    if more and (output.figure or output.record):
+        raise UsageError("--figure and --record are of one object; give them with one file or folder")
     check_file(output.figure, output.overwrite)
     check_file(output.record, output.overwrite, (".rrd",))
-    name = path.name if source.sensor is None else f"{path.name} through {source.sensor}"
-    show(source.camera(path, seed), name, load(**vars(looking)), output, start, seed)
+    system, failed = load(**vars(looking)), []
+    for one in (path, *more):
+        name = one.name if source.sensor is None else f"{one.name} through {source.sensor}"
+        try:
+            show(source.camera(one, seed), name, system, output, start, seed, None if more else 1)
+        except NextviewError as error:
+            if not more:
+                raise
+            failed.append(str(error))
+            console.print(f"left out: {error}", style="yellow", soft_wrap=True)
+    if failed:
+        raise UsageError(f"{len(failed)} of {1 + len(more)} were left out, see above")
 
 
 def demo(
@@ -61,7 +74,15 @@ def demo(
     show(camera, f"the sample {shape}", load(), Output(figure, overwrite=overwrite), start)
 
 
-def show(camera: Any, name: str, system: System, output: Output, start: int | None, seed: int = 0) -> None:
+def show(
+    camera: Any,
+    name: str,
+    system: System,
+    output: Output,
+    start: int | None,
+    seed: int = 0,
+    indent: int | None = 1,
+) -> None:
     """Recognise what a camera sees, print the episode and write what is asked for."""
     session = system.session_with(camera, start, seed)
     with ExitStack() as recorded:
@@ -78,7 +99,7 @@ def show(camera: Any, name: str, system: System, output: Output, start: int | No
         raise ObservationError(f"{name}: {nothing}; {why}")
     frames = [taken.frame.name for taken in getattr(camera, "taken", ())]
     if output.json:
-        print(episode_as_json(result, frames))
+        print(episode_as_json(result, name, frames, indent))
     else:
         print_episode(result, name, system.policy_name, frames)
     for frame, reason in getattr(camera, "left_out", {}).items():

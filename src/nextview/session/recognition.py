@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Recognition:
-    """The end of an episode."""
+    """The end of an episode, or how it stands; before the first view nothing is seen."""
 
     views: tuple[View, ...]  # in order
     classes: tuple[str, ...]  # their names
@@ -64,13 +64,23 @@ class Recognition:
         return 0.0 if self.answer is None else float(self.views[-1].belief.max())
 
     @property
+    def beliefs(self) -> dict[str, float]:
+        """The belief in each class by its name, over all views; empty if nothing was seen."""
+        return dict(zip(self.classes, self.views[-1].belief.tolist(), strict=True)) if self.seen else {}
+
+    @property
+    def radius(self) -> float | None:
+        """The object radius, metres, as it is known by now; None if the camera does not know its scale."""
+        return self.views[-1].observation.radius if self.views else None
+
+    @property
     def travel(self) -> float:
         """Of the whole episode, grid cells."""
-        return self.views[-1].travel
+        return self.views[-1].travel if self.views else 0.0
 
     def __repr__(self) -> str:
         """One line: ``chair (belief 0.998, 2 views, 1.41 cells of travel, confident)``."""
-        views = f"{len(self.views)} view{'s' * (len(self.views) > 1)}, {self.travel:.2f} cells of travel"
+        views = f"{len(self.views)} view{'s' * (len(self.views) != 1)}, {self.travel:.2f} cells of travel"
         if not self.seen:
             return f"nothing is seen ({views})"
         if self.unknown:

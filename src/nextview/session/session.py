@@ -431,12 +431,13 @@ class Session:
 
     @property
     def result(self) -> Recognition:
-        """How it ended."""
-        confident = bool(self._episodes.outcome.confident[0])
-        all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
-        ended = tuple(self.views), self.models.classes, confident, self.sphere, self.stopping
-        stranded = not confident and not all_taken
-        return Recognition(*ended, stranded, score=self.models.recogniser.novelty, unknown_rate=self.unknown)
+        """How it ended; or what is believed so far, not confident, while it goes on."""
+        with self._lock:
+            confident = self.done and bool(self._episodes.outcome.confident[0])
+            all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
+            ended = tuple(self.views), self.models.classes, confident, self.sphere, self.stopping
+            stranded = self.done and not confident and not all_taken
+            return Recognition(*ended, stranded, score=self.models.recogniser.novelty, unknown_rate=self.unknown)
 
 
 def _next_of(step: Step) -> int | None:

@@ -93,6 +93,9 @@ def read_capture(
     folder = Path(folder)
     if not folder.is_dir():
         raise DatasetError(f"{folder}: there is no such folder")
+    for path in folder.rglob("*"):  # a capture from elsewhere may not read other files of this machine
+        if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
+            raise DatasetError(f"{path}: is a link out of this folder; put what it points to in its place")
     found = [layout for layout, (files, _) in LAYOUTS.items() if next(folder.glob(files), None)]
     if len(found) > 1:
         raise DatasetError(f"{folder}: has the files of two layouts, {found[0]} and {found[1]}; move one of them away")
