@@ -20,20 +20,18 @@ from nextview.learning.unknown import quantiles
 from nextview.recognition.novelty import NEIGHBOUR, Novelty, read_novelty
 
 
-def some_score(rng, f=7, d=3, h=5, neighbours=40, objects=50, levels=31, n_views=4) -> Novelty:
-    rows = rng.normal(size=(neighbours, d))
+def some_score(rng, f=7, neighbours=40, objects=50, levels=31, n_views=4) -> Novelty:
     return Novelty(
-        middle=rng.normal(size=f).astype(np.float32),
-        directions=rng.normal(size=(f, d)).astype(np.float16).astype(np.float32),
-        neighbours=(rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16).astype(np.float32),
-        hidden=rng.normal(size=(f, h)).astype(np.float16).astype(np.float32),
-        hidden_bias=rng.normal(size=h).astype(np.float32),
-        output=rng.normal(size=h).astype(np.float32),
-        output_bias=rng.normal(size=1).astype(np.float32),
-        standard=np.array([[-0.8, 0.2], [1.5, 2.0]], np.float32),
         quantiles=np.sort(rng.normal(size=(n_views, levels)), axis=1).astype(np.float32),
         objects=np.array([objects]),
+        neighbours=units(rng, neighbours, f).astype(np.float16).astype(np.float32),
+        standard=np.array([[-0.8, 0.2], [-0.9, 0.1]], np.float32),
     )
+
+
+def units(rng, n, f):
+    rows = rng.normal(size=(n, f))
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
 # The score
@@ -41,20 +39,12 @@ def some_score(rng, f=7, d=3, h=5, neighbours=40, objects=50, levels=31, n_views
 
 def test_the_score_is_what_brute_force_gives():
     rng = np.random.default_rng(0)
-    score, features = some_score(rng), rng.normal(size=(20, 7)).astype(np.float32)
-    on = (features - score.middle) @ score.directions
+    score, views = some_score(rng), units(rng, 20, 7)
     # Between unit vectors the squared distance is 2 less twice their product; the rows are units up to half precision.
-    on /= np.linalg.norm(on, axis=1, keepdims=True)
-    lengths = (score.neighbours**2).sum(1)
-    products = (1 + lengths - cdist(on, score.neighbours) ** 2) / 2
-    for row, found in enumerate(score.scores(features)):
-        tenth = sorted(products[row], reverse=True)[NEIGHBOUR - 1]
-        logit = score.output_bias[0]
-        for j in range(5):
-            units = sum(score.hidden[i, j] * (features[row, i] - score.middle[i]) for i in range(7))
-            logit += score.output[j] * np.tanh(units + score.hidden_bias[j])
-        assert found == pytest.approx((-tenth + 0.8) / 0.2 + (logit - 1.5) / 2.0, abs=1e-4)
-    np.testing.assert_allclose(score.scores(features[:1]), score.scores(features)[:1], atol=1e-5)
+    products = (1 + (score.neighbours**2).sum(1) - cdist(views, score.neighbours) ** 2) / 2
+    tenth = np.sort(products, 1)[:, -NEIGHBOUR]
+    np.testing.assert_allclose(score.scores(views), (-tenth + 0.8) / 0.2, atol=1e-4)
+    np.testing.assert_allclose(score.scores(views, np.arange(20) > 9)[10:], (-tenth[10:] + 0.9) / 0.1, atol=1e-4)
 
 
 def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
@@ -101,16 +91,13 @@ def test_a_score_that_is_missing_damaged_or_another_is_refused(tmp_path):
 
 
 class FixedNovelty:
-    """A novelty score of which a test says what it is: that of the first feature."""
+    """A novelty score of which a test says what it is."""
 
     def __init__(self, p):
         self.p = p
 
-    def scores(self, features):
-        return np.arange(len(features), dtype=float)
-
     def of_views(self, scores):
-        return self.p if scores else 1.0
+        return self.p
 
 
 def recognised(p, unknown, camera=None):
@@ -130,7 +117,9 @@ def test_an_object_more_novel_than_the_rate_allows_has_no_answer():
     assert (novel.answer, novel.unknown, novel.novelty) == (None, True, 0.03)
     assert novel.most_like == "chair"
     assert novel.confidence == 0.0
-    assert repr(novel).startswith("unknown (most like chair, ")
+    assert repr(novel).startswith(
+        "none of the 10 classes it knows, most like a chair (3 % of known objects are as novel"
+    )
     assert "\n" not in repr(novel)
     told = json.loads(episode_as_json(novel))
     assert (told["answer"], told["unknown"], told["novelty"], told["most_like"]) == (None, True, 0.03, "chair")
@@ -139,7 +128,7 @@ def test_an_object_more_novel_than_the_rate_allows_has_no_answer():
 
 @pytest.fixture(scope="module")
 def wary():
-    return nextview.load(unknown=0.05)
+    return nextview.load()
 
 
 def scrambled(seed):
@@ -155,7 +144,7 @@ def test_a_ball_and_a_scrambled_chair_are_unknown_and_the_samples_are_not(wary):
     for mesh in (make_mesh(ball.vertices, ball.faces), scrambled(0), scrambled(1)):
         result = wary.recognise(mesh, start=3)
         assert (result.answer, result.unknown) == (None, True)
-        assert result.novelty < 0.05
+        assert result.novelty < 0.02
     for name in ("chair", "table", "monitor"):
         assert wary.recognise(sample_mesh(name), start=3).answer == name
 
@@ -165,7 +154,24 @@ def test_the_command_says_that_it_does_not_know(tmp_path, capsys):
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / "heap.off")
     main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0.05"])
     said = " ".join(capsys.readouterr().out.split())
-    assert "It is of no known class: most like a " in said
+    assert "It is none of the 10 classes it knows, most like a " in said
     assert "are at least as novel" in said
-    main(["recognise", str(tmp_path / "heap.off"), "--start", "3"])
+    main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0"])
     assert "It is a " in capsys.readouterr().out
+
+
+def test_an_object_of_a_size_that_its_class_never_has_is_none_of_it():
+    chair = sample_mesh("chair")
+    for radius, known in ((0.6, True), (0.05, False), (60.0, False)):
+        seen = SimulatedCamera(chair)
+        seen.radius = radius
+        result = nextview.load().recognise(seen, start=3)
+        assert (result.answer is not None) == known
+        assert result.confident == known
+    assert "radius of 60 m is that of no" in repr(result)
+
+
+def test_a_suspicious_object_gets_no_confident_answer_and_is_looked_at_longer():
+    usual, suspicious = recognised(0.5, 0.05), recognised(0.2, 0.05)
+    assert (usual.confident, len(usual.views)) == (True, 1)
+    assert (suspicious.answer, suspicious.confident, len(suspicious.views)) == ("chair", False, 2)

@@ -74,8 +74,7 @@ COMMANDS = {
     "fit unknown": Command(
         f"{LEARNING}.unknown:fit_unknown",
         "learn to notice objects of no known class",
-        "{found.objects} known objects against {found.outliers} synthetic outliers; false-alarm rates by "
-        "{found.held_out} others",
+        "views of {found.objects} known objects; false-alarm rates by {found.held_out} others",
     ),
     "fit valleys": Command(
         f"{LEARNING}.card_fits:fit_valleys",

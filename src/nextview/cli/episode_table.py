@@ -46,13 +46,13 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
     for step, view in enumerate(result.views, 1):
         for warning in view.warnings:
             console.print(f"Step {step}: warning ({warning.name}): {warning.message}.")
-    left = "no other view in reach" if result.stranded else "no views left"
+    left = "no other view in reach" if result.stranded else "not confident"
     reason = "threshold reached" if result.confident else left
     views = f"{len(result.views)} view{'s' * (len(result.views) > 1)}"
     rest = f"{result.views[-1].belief.max():.3f}, after {views} and {result.travel:.2f} cells of travel ({reason})."
     if result.unknown:
-        most_like = f": most like a {printable(f'{result.most_like}')}, belief "
-        console.print(Text.assemble("It is ", ("of no known class", "bold"), most_like, rest))
+        console.print(Text.assemble("It is ", (printable(result.none_of_them), "bold"), ", belief ", rest))
+        console.print(f"Why: {printable(result.why_unknown)}.")
     else:
         console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), ", belief ", rest))
     if result.novelty is not None:

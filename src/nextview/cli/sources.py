@@ -36,9 +36,9 @@ class Looking:
     # where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in degrees by views on each ring), or
     # fibonacci:60 (spread evenly over the upper half)
     viewpoints: str = "40"
-    # say "unknown" of an object that is as novel as at most this share of the objects of known classes (0.05: one in 20
-    # of these is called unknown); 0 always names a class
-    unknown: float = 0.0
+    # say "none of these" of an object that is as novel as at most this share of the objects of known classes (0.02, the
+    # default: one in 50 of these is called unknown), or of a size that the class never has; 0 always names a class
+    unknown: float | None = None
 
 
 @dataclass(frozen=True)

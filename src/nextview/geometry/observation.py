@@ -56,6 +56,7 @@ class Observation:
         radius: the object radius, metres: what positions were divided by. None if the camera does not know its scale.
         image: grey picture, (H, W) uint8, 0 where there is no object. None if the camera has none.
         scene: all that the camera saw. None where only the object is known: then nothing is taken to hide it.
+        exact: whether the depth is without a sensor's errors, as of a render.
 
     Raises:
         ObservationError: shapes that are not these, or numbers that no camera can have: what is wrong, and what it
@@ -68,6 +69,7 @@ class Observation:
     radius: float | None = None
     image: NDArray[np.uint8] | None = None
     scene: SceneView | None = None
+    exact: bool = False
 
     def __post_init__(self) -> None:
         given = _depth(self.depth)

@@ -221,6 +221,8 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return self.risk.threshold(risk, max_views)
 
 
+RARE, MUCH = 0.05, 2.0
+"""Share of the objects of a class that are smaller than usual, and larger; and times beyond that which none has."""
 PLAIN_SUM = Calibration()
 """Trusts the sum of the logits as it stands, as the thesis did."""
 
@@ -249,6 +251,19 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
     @cached_property
     def _table(self) -> tuple[Float, Float]:
         return np.log(np.array(self.radii_m)), np.array(self.log_density)
+
+    @cached_property
+    def _usual(self) -> tuple[Float, Float]:
+        """Logarithms of the radii between which nearly all objects of each class are, (C,) each."""
+        grid, table = self._table
+        share = np.cumsum(np.exp(table) * np.gradient(grid), axis=1)
+        low, high = (np.array([np.interp(at * row[-1], row, grid) for row in share]) for at in (RARE, 1 - RARE))
+        return low, high
+
+    def impossible(self, radius: float) -> NDArray[np.bool_]:
+        """Whether an object of this radius, metres, is much smaller or larger than nearly all of each class, (C,)."""
+        low, high = self._usual
+        return (np.log(radius) < low - np.log(MUCH)) | (np.log(radius) > high + np.log(MUCH))
 
     def logits(self, radii: Floating) -> NDArray[np.float32]:
         """What is added to the logits, (B, C) float32, for object radii in metres, (B,); zero where these are NaN."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
@@ -111,8 +111,6 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
         shapes = {"logits": (len(card.classes),)}
         if card.azimuth_bins:
             shapes[BINS_OUTPUT] = (len(card.classes), card.azimuth_bins)
-        if card.novelty_sha256:
-            shapes[FEATURES_OUTPUT] = (None,)
     else:
         shapes = {"map": (None, 3)} | ({"sphere": (None, None)} if card.output == "sphere" else {})
     check_input(card.path, session, INPUT if card.is_recogniser else None, kind, card.input.shape)
@@ -138,7 +136,8 @@ class Recogniser:
         self.azimuth_bins = self.card.azimuth_bins
         self.calibration = self.card.calibration
         self._session = open_weights(self.card, threads)
-        sha256 = self.card.novelty_sha256
+        self._known: Features | None = None
+        self._threads, sha256 = threads, self.card.novelty_sha256
         self.novelty: Quantiles | None = read_novelty(novelty_path(self.card.path), sha256) if sha256 else None
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
@@ -146,6 +145,9 @@ class Recogniser:
         inputs = from_observations(self.card.input, observations)
         elevations = np.array([elevation_of(direction_of(o.pose)) for o in observations])
         evidence = replace(self.from_inputs(inputs, elevations), seen=np.array([o.seen for o in observations]))
+        if isinstance(self.novelty, Novelty):
+            exact = np.array([o.exact for o in observations])
+            evidence = replace(evidence, novelty=self.novelty.scores(self._embeddings(observations, inputs), exact))
         if self.card.size is None:
             return evidence
         radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
@@ -156,10 +158,16 @@ class Recogniser:
 
         ``elevations`` of the cameras, radians, (B,), are for memories of things.
         """
-        names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins) + [FEATURES_OUTPUT] * (self.novelty is not None)
+        names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins)
         outputs = dict(zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True))
-        novelty = None if self.novelty is None else cast(Novelty, self.novelty).scores(outputs[FEATURES_OUTPUT])
-        return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT), novelty=novelty)
+        return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT))
+
+    def _embeddings(self, observations: Sequence[Observation], inputs: NDArray[Any]) -> NDArray[np.float32]:
+        """What the features that know no classes make of views, (B, F); ``inputs`` are what the recogniser takes."""
+        if self._known is None:
+            self._known = Features(self._threads)
+        spec = self._known.card.input
+        return self._known(inputs if spec == self.card.input else from_observations(spec, observations))
 
     def features(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
         """What the last layer makes the logits of, (B, F), from what the network takes."""

@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,63 +60,45 @@ class Quantiles:
 
 @dataclass(frozen=True)
 class Novelty(Quantiles):
-    """A novelty score of views by the recogniser's features, and its distribution over objects of known classes.
+    """A novelty score of views by the features that know no classes, and its distribution over objects of known ones.
 
-    The score is the sum of two parts, each standardised over known views that the recogniser was not trained on: the
-    distance to the tenth nearest of known views, of unit vectors (Sun et al., ICML 2022), and a perceptron that was
-    trained to discriminate known objects and synthetic outliers (outlier exposure, Hendrycks et al., ICLR 2019). The
+    The score of a view is its distance to the tenth nearest of the known views (Sun et al., "Out-of-Distribution
+    Detection with Deep Nearest Neighbors", ICML 2022), standardised over views of objects that are not among these. The
     score of an object is the mean over its views.
 
     Attributes:
-        middle: of the features, (F,) float32.
-        directions: on which the distances are measured, (F, D) float32.
-        neighbours: known views on them, unit vectors, (R, D) float32.
-        hidden, hidden_bias: first layer of the perceptron, (F, H) and (H,) float32.
-        output, output_bias: its second, (H,) and (1,) float32.
-        standard: mean and deviation of the distance, then of the perceptron's, over known views, (2, 2) float32.
+        neighbours: embeddings of known views, unit vectors, (R, F) float32.
+        standard: mean and deviation of the distance over other views of known classes, through a sensor, and without
+            one's errors, (2, 2) float32.
 
     Raises:
         ModelError: shapes that do not fit, or numbers that are not finite.
     """
 
-    middle: Float
-    directions: Float
     neighbours: Float
-    hidden: Float
-    hidden_bias: Float
-    output: Float
-    output_bias: Float
     standard: Float
 
     def __post_init__(self) -> None:
-        f, d, h = len(self.middle), self.directions.shape[-1], self.hidden.shape[-1]
-        shapes = {"middle": (f,), "directions": (f, d), "neighbours": (len(self.neighbours), d), "hidden": (f, h)}
-        shapes |= {"hidden_bias": (h,), "output": (h,), "output_bias": (1,), "standard": (2, 2), "objects": (1,)}
-        shapes |= {"quantiles": (len(self.quantiles), self.quantiles.shape[-1])}
-        for name, shape in shapes.items():
-            values = getattr(self, name)
-            if values.shape != shape or 0 in shape or not np.isfinite(values).all():
-                raise ModelError(f"no novelty score: {name} has the shape {values.shape}, or is not finite")
+        finite = all(np.isfinite(a).all() for a in (self.quantiles, self.neighbours, self.standard))
+        if not finite or self.neighbours.ndim != 2 or self.standard.shape != (2, 2) or self.objects.shape != (1,):
+            raise ModelError("no novelty score: shapes that do not fit, or numbers that are not finite")
         if len(self.neighbours) < NEIGHBOUR or (self.standard[:, 1] <= 0).any() or self.objects[0] < 1:
             raise ModelError("no novelty score: too few known views, or a deviation that is not positive")
         super().__post_init__()
 
-    def scores(self, features: Float) -> NDArray[np.float64]:
-        """The novelty score of each view, (B,) float64, from features (B, F): the higher, the more novel."""
-        return ((self.parts(features) - self.standard[:, 0]) / self.standard[:, 1]).sum(1)
+    def scores(self, embeddings: Float, exact: NDArray[np.bool_] | bool = False) -> NDArray[np.float64]:
+        """The novelty score of each view, (B,) float64, from embeddings (B, F): the higher, the more novel.
 
-    def parts(self, features: Float) -> NDArray[np.float64]:
-        """Distance and perceptron of each view before they are standardised, (B, 2) float64."""
-        centred = np.asarray(features, np.float32) - self.middle
-        nearness = unit(centred @ self.directions) @ self.neighbours.T
-        distance = -np.partition(nearness, -NEIGHBOUR, axis=1)[:, -NEIGHBOUR]
-        perceptron = np.tanh(centred @ self.hidden + self.hidden_bias) @ self.output + self.output_bias
-        return np.stack([distance, perceptron], 1).astype(np.float64)
+        ``exact`` views, (B,), are without a sensor's errors.
+        """
+        nearness = np.asarray(embeddings, np.float32) @ self.neighbours.T
+        distance = -np.partition(nearness, -NEIGHBOUR, axis=1)[:, -NEIGHBOUR].astype(np.float64)
+        middle, deviation = self.standard[np.broadcast_to(exact, distance.shape).astype(int)].T
+        return (distance - middle) / deviation
 
     def save(self, path: Path, overwrite: bool = False) -> str:
-        """Write a .safetensors file, the large tables in half precision if that holds them; returns its SHA-256."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self)}
-        arrays |= {name: in_half(arrays[name]) for name in ("directions", "neighbours", "hidden")}
+        """Write a .safetensors file, the known views in half precision; returns its SHA-256."""
+        arrays = {f.name: getattr(self, f.name) for f in fields(self)} | {"neighbours": in_half(self.neighbours)}
         content = save({name: np.ascontiguousarray(values) for name, values in arrays.items()})
         with new_file(path, overwrite) as part:
             part.write_bytes(content)
@@ -143,7 +124,7 @@ def read_novelty(path: Path, sha256: str) -> Novelty:
     """Read what ``Novelty.save`` wrote."""
     try:
         arrays = load(checked_bytes(path, sha256, "a novelty score"))
-        wide: dict[str, Any] = {f.name: arrays[f.name] for f in fields(Novelty)}
+        read = {f.name: arrays[f.name] for f in fields(Novelty)}
     except (SafetensorError, KeyError) as error:
         raise ModelError(f"{path}: not a novelty score ({error})") from None
-    return Novelty(**{k: v.astype(np.float32) if v.dtype == np.float16 else v for k, v in wide.items()})
+    return Novelty(**read | {"neighbours": read["neighbours"].astype(np.float32)})

@@ -123,12 +123,16 @@ class Episodes:
         return taken.step
 
     def next_step(
-        self, evidence: Evidence, directions: Float | None = None, constrain: Constrain = unconstrained
+        self,
+        evidence: Evidence,
+        directions: Float | None = None,
+        constrain: Constrain = unconstrained,
+        hold: bool = False,
     ) -> Taken:
-        """What ``update`` would take in. Nothing is changed; ``keep`` takes it in."""
+        """What ``update`` would take in. Nothing is changed; ``keep`` takes it in. On ``hold`` no threshold stops."""
         taken = self._taken(evidence, directions)
         step, n_views = taken.step, len(self.steps) + 1
-        stopped = self.stopping.reached(step.belief, np.maximum(step.seen, 1)) & taken.counts
+        stopped = self.stopping.reached(step.belief, np.maximum(step.seen, 1)) & taken.counts & (not hold)
         if n_views >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
         if not stopped.all():

@@ -14,19 +14,27 @@ from nextview.session.view import View
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+SUSPICIOUS = 5.0
+"""An object as novel as so many times the share that may be called unknown gets no confident answer."""
+
 
 @dataclass(frozen=True)
 class Recognition:
-    """The end of an episode, or how it stands; before the first view nothing is seen."""
+    """The end of an episode, or how it stands; before the first view nothing is seen.
+
+    It is confident where the threshold was reached in a view without warnings, by an object that is not suspiciously
+    novel (see ``SUSPICIOUS``) and may be of the class by its size.
+    """
 
     views: tuple[View, ...]  # in order
     classes: tuple[str, ...]  # their names
-    confident: bool  # whether the threshold was reached (else the views ran out); never if nothing was seen
+    confident: bool  # else the views ran out
     sphere: Viewpoints  # the candidates
     stopping: Stopping  # the rule that ended it
     stranded: bool = False  # whether it ended because no view that was left could be reached; then it is not confident
     score: Quantiles | None = None  # gives the novelty of views; None if the recogniser has none
     unknown_rate: float = 0.0  # share of objects of known classes that may be called unknown; 0: none
+    impossible: tuple[str, ...] = ()  # classes whose objects have not such a size
 
     @property
     def seen(self) -> bool:
@@ -45,8 +53,24 @@ class Recognition:
 
     @property
     def unknown(self) -> bool:
-        """Whether the object is called one of no known class."""
-        return self.novelty is not None and self.novelty < self.unknown_rate
+        """Whether the object is called one of no known class: too novel, or of another size than the class believed."""
+        if not self.unknown_rate or not self.seen:
+            return False
+        novel = self.novelty is not None and self.novelty < self.unknown_rate
+        return novel or self.most_like in self.impossible
+
+    @property
+    def none_of_them(self) -> str:
+        """The answer for an unknown object: ``none of the 10 classes it knows, most like a toilet``."""
+        a = "an" if str(self.most_like)[:1].lower() in "aeiou" else "a"
+        return f"none of the {len(self.classes)} classes it knows, most like {a} {self.most_like}"
+
+    @property
+    def why_unknown(self) -> str:
+        """What an object is called unknown for, in words."""
+        if self.most_like in self.impossible:
+            return f"a radius of {self.radius:.2g} m is that of no {self.most_like}"
+        return f"{100 * (self.novelty or 0):.2g} % of known objects are as novel"
 
     @property
     def most_like(self) -> str | None:
@@ -84,8 +108,7 @@ class Recognition:
         if not self.seen:
             return f"nothing is seen ({views})"
         if self.unknown:
-            belief = self.views[-1].belief.max()
-            return f"unknown (most like {self.most_like}, {belief:.2f}; novelty p {self.novelty:.3f}, {views})"
+            return f"{self.none_of_them} ({self.why_unknown}, {views})"
         sure = "confident" if self.confident else "not confident" + ", no other view in reach" * self.stranded
         names = dict.fromkeys(warning.name for view in self.views for warning in view.warnings)
         warnings = f", warnings: {', '.join(names)}" if names else ""

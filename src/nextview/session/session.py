@@ -20,13 +20,14 @@ from nextview.geometry.viewsphere import Viewpoints, angle_between, azimuth_of, 
 from nextview.policies.base import EpisodeState, Policy, ValuesViews
 from nextview.policies.off_grid import anywhere
 from nextview.recognition.belief import Stopping, log_evidence_of
+from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Models
 from nextview.recognition.map_names import maps_among
 from nextview.sensing.frame import Frame
 from nextview.sensing.plausibility import ViewWarning, check_observation, check_views
 from nextview.session.episode import Episodes, Step
 from nextview.session.reach import Reach, Reachable, TravelCost, as_reachable, as_travel_cost
-from nextview.session.recognition import Recognition
+from nextview.session.recognition import SUSPICIOUS, Recognition
 from nextview.session.repeated import REPEATED, after_repeated, is_repeated
 from nextview.session.view import View
 
@@ -341,8 +342,12 @@ class Session:
             for k, step in enumerate(self._episodes.steps):
                 episodes.take(evidence.get(k, step.evidence), directions[k][None])
         reach = self._reach
+        novelty = [*(view.novelty for view in self.views), *self._novelty(evidence[last], observations[last])]
         taken = episodes.next_step(
-            evidence[last], directions[last][None], lambda state: self._constrained(state, reach, object, here)
+            evidence[last],
+            directions[last][None],
+            lambda state: self._constrained(state, reach, object, here),
+            hold=bool(warnings) or self._suspicious([score for score in novelty if score is not None]),
         )
         steps, views = [*episodes.steps, taken.step], list(self.views)
         travel = self._travelled([int(step.views[0]) for step in steps], directions)
@@ -371,7 +376,6 @@ class Session:
         classes, evidence = len(self.models.classes), step.evidence
         bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), classes, azimuth)
         alone = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth)
-        novelty = evidence.novelty if evidence.seen is None or evidence.seen[0] else None
         return View(
             int(step.views[0]),
             observation,
@@ -383,8 +387,19 @@ class Session:
             arc=travel[1],
             direction=direction,
             azimuth_bins=None if bins is None else bins[0],
-            novelty=float(novelty[0]) if novelty is not None and observation.seen else None,
+            novelty=next(iter(self._novelty(evidence, observation)), None),
         )
+
+    @staticmethod
+    def _novelty(evidence: Evidence, observation: Observation) -> list[float]:
+        """The novelty score of a view; none where nothing is seen, or the recogniser has no score."""
+        counts = observation.seen and (evidence.seen is None or bool(evidence.seen[0]))
+        return [float(evidence.novelty[0])] if evidence.novelty is not None and counts else []
+
+    def _suspicious(self, novelty: Sequence[float]) -> bool:
+        """Whether an object with these scores is too novel for a confident answer."""
+        score = self.models.recogniser.novelty
+        return score is not None and bool(self.unknown) and score.of_views(novelty) < SUSPICIOUS * self.unknown
 
     def _travelled(self, views: Sequence[int], directions: Sequence[Float]) -> list[tuple[float, float]]:
         """Cells and radians on the way to each view, from the places where the camera stood."""
@@ -433,11 +448,31 @@ class Session:
     def result(self) -> Recognition:
         """How it ended; or what is believed so far, not confident, while it goes on."""
         with self._lock:
-            confident = self.done and bool(self._episodes.outcome.confident[0])
+            novelty = [view.novelty for view in self.views if view.novelty is not None]
+            reached = self.done and bool(self._episodes.outcome.confident[0])
+            reached = reached and not self.views[-1].warnings and not self._suspicious(novelty)
             all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
-            ended = tuple(self.views), self.models.classes, confident, self.sphere, self.stopping
-            stranded = self.done and not confident and not all_taken
-            return Recognition(*ended, stranded, score=self.models.recogniser.novelty, unknown_rate=self.unknown)
+            impossible = self._impossible()
+            result = Recognition(
+                tuple(self.views),
+                self.models.classes,
+                reached,
+                self.sphere,
+                self.stopping,
+                stranded=self.done and not reached and not all_taken,
+                score=self.models.recogniser.novelty,
+                unknown_rate=self.unknown,
+                impossible=impossible,
+            )
+            return replace(result, confident=reached and not result.unknown)
+
+    def _impossible(self) -> tuple[str, ...]:
+        """Classes whose objects have not the size of this one; none where it is not known."""
+        card, radius = self.models.recogniser.card, self.views[-1].observation.radius if self.views else None
+        sizes = card.size
+        if sizes is None or radius is None:
+            return ()
+        return tuple(name for name, off in zip(self.models.classes, sizes.impossible(radius), strict=True) if off)
 
 
 def _next_of(step: Step) -> int | None:

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 MOST_THREADS = 1024
 DEFAULT = "modelnet10"
+UNKNOWN = 0.02
 """The models that ship with the package."""
 
 
@@ -154,7 +155,7 @@ def load(
     max_views: int = 5,
     viewpoints: str | Viewpoints | ArrayLike = "40",
     threads: int = 0,
-    unknown: float = 0.0,
+    unknown: float | None = None,
     stopping: Stopping | Rule | str | None = None,
 ) -> System:
     """Open models, and what belongs to them.
@@ -171,7 +172,8 @@ def load(
             see ``viewsphere.viewpoints_of``.
         threads: of ONNX Runtime, 0 for one on each core.
         unknown: answer None where an object is as novel as at most this share of the objects of known classes: so
-            often one of these is called unknown. 0 always names a class.
+            often one of these is called unknown; or where no object of the class has its size. 0 always names a class.
+            By default 0.02, where the recogniser has a novelty score.
         stopping: a rule of your own: "MODULE:NAME" or a function, which is asked with what is believed and the
             threshold, see ``recognition.own_stopping``; or a ``Stopping``, instead of threshold, risk and views.
 
@@ -183,7 +185,7 @@ def load(
     """
     given = locals() | {"models": str(models)}
     whole(threads, "the number of threads", 0, MOST_THREADS)
-    if number(unknown, "the share of known objects called unknown", 0) >= 1:
+    if unknown is not None and number(unknown, "the share of known objects called unknown", 0) >= 1:
         raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
     Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
     found = find_models(models)
@@ -191,6 +193,10 @@ def load(
     recogniser = open_recogniser(found.recogniser, threads)
     if unknown and recogniser.novelty is None:
         raise ModelError(f"{found.recogniser}: cannot tell unknown objects; nextview fit unknown teaches it")
+    if unknown is None:
+        unknown = 0.0 if recogniser.novelty is None else UNKNOWN
+    if not unknown:
+        recogniser.novelty = None  # it takes time
     if policy is None:
         policy, made = _default_policy(found.policies, sphere, recogniser)
     else:

@@ -93,7 +93,7 @@ class SimulatedCamera:
             shade = np.where(hit, 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5, 0)
             image[bound] = shade.reshape(height, width)
             depth[bound] = np.where(hit, hits["tfar"], 0).reshape(height, width)
-        return Observation(depth, pose, self.intrinsics, self.radius, image)
+        return Observation(depth, pose, self.intrinsics, self.radius, image, exact=True)
 
     def _bound(self, rotation: NDArray[np.float32], origin: NDArray[np.float32]) -> tuple[slice, slice]:
         """Rows and columns that hold the projection of every vertex; the whole image if one is behind the camera."""

@@ -31,13 +31,14 @@ class StoredViews:
     def __init__(self, store: ViewStore, row: int) -> None:
         self.sphere, self._intrinsics = store.sphere, store.intrinsics
         self._depth, self._image = store.depth(row), store.image(row)
-        radius = float(store.radii[row])
+        radius, self._exact = float(store.radii[row]), store.attributes.sensor is None
         self._radius = radius if 0 < radius < np.inf else None
 
     def observe(self, pose: Float) -> Observation:
         """The stored view nearest to a pose, (4, 4), object frame; its own pose comes with it."""
         k, _ = self.sphere.nearest(direction_of(pose))
-        return Observation(self._depth[k], self.sphere.poses[k], self._intrinsics, self._radius, self._image[k])
+        seen = self._depth[k], self.sphere.poses[k], self._intrinsics, self._radius, self._image[k]
+        return Observation(*seen, exact=self._exact)
 
 
 @dataclass(frozen=True)
