@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nextview.data.measuring import measure
+from nextview.data.measures import measure
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, MeasureError
 

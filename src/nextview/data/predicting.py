@@ -50,7 +50,10 @@ def predict(
     path, out = Path(path), Path(out)
     check_new(out, overwrite)
     store = ViewStore.open(path)
-    objects = _asked(store, recogniser, split, held_out)
+    objects = some_objects(store, split, recogniser if held_out else None)
+    unknown = sorted({store.classes[label] for label in store.labels[objects]} - set(recogniser.classes))
+    if unknown:
+        raise DatasetError(f"{path}: recogniser {recogniser.name} does not know the class {unknown[0]!r}")
     plan, radii, of_size = _plan(store, objects, recogniser, maps), store.radii[objects], None
     if size and recogniser.size is not None and not np.isnan(radii).all():
         of_size = recogniser.size.logits(radii).astype(np.float32)
@@ -70,15 +73,6 @@ def predict(
         made = replace(plan, logits=arrays["logits"], azimuth_bins=arrays.get("azimuth_bins"), maps=maps_found)
         made.with_size(of_size).save(out, overwrite)
         shutil.rmtree(place)
-
-
-def _asked(store: ViewStore, recogniser: ModelCard, split: str | None, held_out: bool) -> NDArray[np.int64]:
-    """The objects to predict, rows of the store."""
-    objects = some_objects(store, split, recogniser if held_out else None)
-    unknown = sorted({store.classes[label] for label in store.labels[objects]} - set(recogniser.classes))
-    if unknown:
-        raise DatasetError(f"{store.path}: recogniser {recogniser.name} does not know the class {unknown[0]!r}")
-    return objects
 
 
 def _plan(

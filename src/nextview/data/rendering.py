@@ -123,12 +123,12 @@ def render(
         items = [(i, entries[i]) for i in todo]
         for (i, entry), problem in each(partial(_render_entry, path, options, sensor), items, workers, scheduler):
             reason = None if problem is None else f"{problem}"
-            others = {name: said for name, said in store.failures.items() if name != entry.name}
+            others = {name: said for name, said in store.attributes.failures.items() if name != entry.name}
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is done.
                 store.note(failures=others | {entry.name: reason})
                 store.write(i, {"status": np.array(FAILED, np.uint8)})
-            elif len(others) < len(store.failures):
+            elif len(others) < len(store.attributes.failures):
                 store.note(failures=others)
             yield entry.name, reason
 

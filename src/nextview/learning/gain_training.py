@@ -322,7 +322,10 @@ def _load(
         _check(path, p, recipe)
     everything = np.arange(len(table))
     if validation is None:
-        validating = hold_out(table.labels, _shapes(table), folds, recipe.seed)
+        shapes: NDArray = table.depth_entropy  # rows that are the same where the shape is: of scenes by their names
+        if scenes_of(table) is not None:
+            shapes = np.unique(_targets(table), return_inverse=True)[1][:, None].astype(np.float64)
+        validating = hold_out(table.labels, shapes, folds, recipe.seed)
         learning = [np.setdiff1d(everything, part) for part in validating]
         validated_on = f"the same, each judged by networks of {folds - 1} other folds"
     else:
@@ -340,13 +343,6 @@ def _load(
 def _targets(p: Predictions) -> list[str]:
     """Names of the objects, without their scenes."""
     return [name.partition("@")[0] for name in p.names]
-
-
-def _shapes(p: Predictions) -> NDArray[np.floating]:
-    """Rows that are the same where the shape is, (N, ...): by what is seen of it, or in scenes by its name."""
-    if scenes_of(p) is None:
-        return p.depth_entropy
-    return np.unique(_targets(p), return_inverse=True)[1][:, None].astype(np.float64)
 
 
 def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
