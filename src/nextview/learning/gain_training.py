@@ -123,7 +123,16 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
     """Train the networks: after every epoch, the policy as it then is, at travel weight 0 and over all views."""
     rng, data = np.random.default_rng([recipe.seed, fold]), table.data
     sphere, n, c = data.sphere, len(data), len(data.classes)
-    networks = _untrained(table, recipe, torch.Generator().manual_seed(int(rng.integers(2**31))))
+    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+    features_flip = mirrored_features(sphere, c, recipe.inputs, recipe.frame)
+    widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)]))
+    scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
+    first = [
+        scale * torch.randn(recipe.networks, *width, generator=generator)
+        for scale, width in zip(scales, widths, strict=True)
+    ]
+    biases = [torch.zeros(recipe.networks, 1, outputs) for _, outputs in widths]
+    networks = Perceptrons(first, biases, features_flip, mirrored(sphere))
     drawn = rng.multinomial(n, np.full(n, 1 / n), size=recipe.networks)
     weights = torch.from_numpy(drawn * data.weights).float()
     optimiser = torch.optim.AdamW(networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay)
@@ -145,19 +154,6 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
         policy = Gain(sphere, c, Score(deepcopy(networks)), recipe.inputs, frame=recipe.frame)
         policies[::2] = [policy] * len(policies[::2])
         yield policy
-
-
-def _untrained(table: ReplayTable, recipe: GainRecipe, generator: torch.Generator) -> Perceptrons:
-    sphere = table.data.sphere
-    features_flip = mirrored_features(sphere, len(table.data.classes), recipe.inputs, recipe.frame)
-    widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)]))
-    scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
-    weights = [
-        scale * torch.randn(recipe.networks, *width, generator=generator)
-        for scale, width in zip(scales, widths, strict=True)
-    ]
-    biases = [torch.zeros(recipe.networks, 1, outputs) for _, outputs in widths]
-    return Perceptrons(weights, biases, features_flip, mirrored(sphere))
 
 
 def best_epoch(
