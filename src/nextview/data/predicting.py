@@ -81,6 +81,9 @@ def _plan(
     """What store and cards say of the objects; what the networks say is still to come."""
     classes = recogniser.classes
     own = [card for card in (recogniser, *maps.values()) if card.path.parent != BUNDLED]
+    group = duplicate_groups(store.measure())
+    several = np.zeros((group.max() + 1, len(store.classes)), bool)  # labels of those that look exactly the same
+    several[group, store.labels] = True
     made_by = [*store.commands, *(line for card in own for line in card.training.commands), command()]
     return Predictions(
         logits=np.zeros((len(objects), len(store.sphere), len(classes)), np.float32),
@@ -90,7 +93,7 @@ def _plan(
         labels=np.array([classes.index(store.classes[label]) for label in store.labels[objects]]),
         classes=classes,
         splits=store.splits[objects],
-        conflicting=conflicting_objects(store)[objects],
+        conflicting=(several.sum(1) > 1)[group][objects],
         sphere=store.sphere,
         models={name: (card.name, card.sha256) for name, card in ({"recogniser": recogniser} | maps).items()},
         valley_classes={name: card.valleys(classes) for name, card in maps.items()},
@@ -98,14 +101,6 @@ def _plan(
         store=str(store.path.resolve()),
         commands=tuple(dict.fromkeys(made_by)),
     )
-
-
-def conflicting_objects(store: ViewStore) -> NDArray[np.bool_]:
-    """Objects that look exactly like one with another label, in any split of the store, (N,) bool."""
-    group = duplicate_groups(store.measure())
-    several = np.zeros((group.max() + 1, len(store.classes)), bool)
-    several[group, store.labels] = True
-    return (several.sum(1) > 1)[group] & store.done
 
 
 def _card_file(card: ModelCard) -> str:

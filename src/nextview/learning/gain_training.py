@@ -265,7 +265,7 @@ def train_gain(
         travel_weight = fit_travel_weight(judged, recipe.n_views, recipe.objective, recipe.seed)
     policy = replace(averaged(policies), travel_weight=travel_weight)
     states = np.concatenate([walk(part, [policy], recipe, data.rng).features for part in data.validated])
-    difference = write_gain(out, policy, data.card(policy, recipe), states, overwrite)
+    difference = write_gain(out, policy, data.about, states, overwrite)
     return TrainedGain(out, data.objects, data.validated_on, value.mean, travel_weight, len(states), difference)
 
 
@@ -273,30 +273,12 @@ def train_gain(
 class _Data:
     """What is learned from, and what validates: tables side by side, one pair for each fold."""
 
-    sources: list[tuple[Path, Predictions]]
     learned: list[ReplayTable]
     validated: list[ReplayTable]
     objects: int
-    learned_from: str
     validated_on: str
+    about: PolicyCard  # of a policy that is trained on it, as yet without its table
     rng: np.random.Generator
-
-    def card(self, policy: Gain, recipe: GainRecipe) -> PolicyCard:
-        """The card of a policy that was trained on it, as yet without its table."""
-        _, table = self.sources[0]
-        return PolicyCard(
-            "gain",
-            policy.scope,
-            table.sphere.elevations,
-            table.sphere.azimuths,
-            table.classes,
-            {},
-            f"{self.learned_from}, classes weighted evenly; epoch and travel weight chosen on {self.validated_on}",
-            tuple(LearnedFrom(sha256_of(path), p.models) for path, p in self.sources),
-            tuple((part.data.calibration.temperature, part.data.calibration.correlation) for part in self.learned),
-            asdict(recipe),
-            tuple(dict.fromkeys((*(line for _, p in self.sources for line in p.commands), command()))),
-        )
 
 
 def _load(
@@ -333,7 +315,20 @@ def _load(
     validated = [ReplayTable.select(other, part, rng, variants, others) for part in validating]
     objects = len(np.unique(np.concatenate(learning)))
     learned_from = f"{objects} objects of the training split{', clean and through sensors' * bool(sensed)}"
-    return _Data(sources, learned, validated, objects, learned_from, validated_on, rng)
+    about = PolicyCard(
+        "gain",
+        "global",
+        table.sphere.elevations,
+        table.sphere.azimuths,
+        table.classes,
+        {},
+        f"{learned_from}, classes weighted evenly; epoch and travel weight chosen on {validated_on}",
+        tuple(LearnedFrom(sha256_of(path), p.models) for path, p in sources),
+        tuple((part.data.calibration.temperature, part.data.calibration.correlation) for part in learned),
+        asdict(recipe),
+        tuple(dict.fromkeys((*(line for _, p in sources for line in p.commands), command()))),
+    )
+    return _Data(learned, validated, objects, validated_on, about, rng)
 
 
 def _targets(p: Predictions) -> list[str]:
