@@ -59,20 +59,13 @@ def report(
     return path
 
 
-def headline_policy(results: Results, threshold: float) -> str:
-    """The most accurate policy that a robot could follow, other than the reference; the reference if it is alone."""
-    found = numbers(results.tables.summary, "policy", "threshold", "measure")
-    reference = results.settings["reference"]
-    names = [n for n in results.tables.sweep["policy"].unique() if not is_oracle(n) and n != reference]
-    return max(names, key=lambda n: found[n, threshold, "accuracy"].value, default=reference)
-
-
 def page(results: Results, store: ViewStore | None, why_not: str) -> str:
     """The whole page as text."""
     s, t, p = results.settings, results.tables, results.predictions
     at, reference = board.headline_threshold(s["thresholds"]), s["reference"]
-    best, found = headline_policy(results, at), numbers(t.summary, "policy", "threshold", "measure")
-    policies = list(t.sweep["policy"].unique())
+    found, policies = numbers(t.summary, "policy", "threshold", "measure"), list(t.sweep["policy"].unique())
+    robots = [n for n in policies if not is_oracle(n) and n != reference]  # the most accurate that a robot could follow
+    best = max(robots, key=lambda n: found[n, at, "accuracy"].value, default=reference)
     tests = t.tests.query("threshold == @at and measure == 'accuracy'").set_index("policy").to_dict("index")
     shown = [n for n in dict.fromkeys((reference, best, DEFAULT, *draw.ceiling(results))) if n in policies]
 
