@@ -60,7 +60,9 @@ def visible_normals(view: MeasuredView) -> NDArray[np.float32]:
     a, b = (_change(inverse, axis) for axis in (1, 0))
     known = view.seen & (np.maximum(np.abs(a), np.abs(b)) < BACKGROUND / 2)
     a, b = a[known] * np.float32(view.intrinsics[0, 0]), b[known] * np.float32(view.intrinsics[1, 1])
-    x, y = (slopes.astype(np.float32) for slopes in view.rays)
+    (rows, columns), (fx, _, cx), (_, fy, cy) = view.box, *view.intrinsics[:2]
+    x = ((np.arange(columns.start, columns.stop) + 0.5 - cx) / fx).astype(np.float32)
+    y = ((np.arange(rows.start, rows.stop) + 0.5 - cy) / fy).astype(np.float32)
     x, y = (np.broadcast_to(slopes, known.shape)[known] for slopes in (x, y[:, None]))
     normals = np.stack([a, b, inverse[known] - a * x - b * y])
     return normals / np.sqrt((normals**2).sum(0))

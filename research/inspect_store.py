@@ -91,8 +91,8 @@ def summary(store: ViewStore) -> dict[str, str]:
     shown = {
         "objects": f"{len(store):,} in {len(store.classes)} classes",
         "rendered": f"{rendered:,}",
-        "left out": f"{len(store.failures):,}",
-        "not rendered yet": f"{len(store) - rendered - len(store.failures):,}",
+        "left out": f"{len(store.attributes.failures):,}",
+        "not rendered yet": f"{len(store) - rendered - len(store.attributes.failures):,}",
         "views": f"{rendered * views:,}  ({views} of {side} x {side} each)",
         "byte-identical copies": f"{copies:,}  ({conflicting} with several labels)",
         "size on disk": f"{size / 1e9:.2f} GB" if size > 1e9 else f"{size / 1e6:.1f} MB",
@@ -175,12 +175,14 @@ def inspect(store: Path, out: Path | None = None, /, object: str | None = None, 
             raise DatasetError(f"{store}: has no object {object!r}; there are {', '.join(near)} and others")
         row = views.names.index(object)
         if not views.done[row]:
-            raise DatasetError(f"{store}: {object} is not rendered ({views.failures.get(object, 'not yet')})")
+            raise DatasetError(
+                f"{store}: {object} is not rendered ({views.attributes.failures.get(object, 'not yet')})"
+            )
         figure = object_figure(views, row)
     else:
         for what, value in summary(views).items():
             console.print(f"{what:22} {value}", soft_wrap=True)
-        for reason in views.failures.values():
+        for reason in views.attributes.failures.values():
             console.print(f"left out: {reason}", style="yellow")
         figure = store_figure(views)
     with new_file(out, overwrite) as part:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import follow
-from nextview.data import measuring
+from nextview.data import measures
 from nextview.data.folders import list_dataset
 from nextview.data.rendering import deformed
 from nextview.data.splits import some_objects
@@ -37,7 +37,7 @@ def measure(
     overwrite: bool = False,
     max_faces: int = MAX_FACES,
 ) -> Iterator[tuple[int, int]]:
-    """As ``nextview.data.measuring.measure``, with views that know which face each pixel shows.
+    """As ``nextview.data.measures.measure``, with views that know which face each pixel shows.
 
     ``meshes`` is the dataset folder, as the store was rendered from it; ``max_faces`` are those of a mesh at most.
     """
@@ -49,7 +49,7 @@ def measure(
     if lacking:
         raise DatasetError(f"{meshes}: holds no mesh called {lacking[0]}, of which {path} has views")
     views = partial(_mesh_views, files, max_faces)
-    yield from measuring.measure(path, names, workers, scheduler, objects, overwrite, views)
+    yield from measures.measure(path, names, workers, scheduler, objects, overwrite, views)
 
 
 def _mesh_views(files: dict[str, Path], max_faces: int, store: ViewStore, i: int) -> Iterator[MeshView]:

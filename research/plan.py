@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
-from nextview.data.measuring import Made, keep
+from nextview.data.measures import Made, keep
 from nextview.data.scene_views import SceneSight, scene_views, sight_of
 from nextview.data.splits import some_objects
 from nextview.data.store import PLANNED, ViewStore

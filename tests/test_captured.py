@@ -26,10 +26,6 @@ RADIUS = 0.55
 """Metres; the sample chair's is 0.54."""
 
 
-def rng():
-    return np.random.default_rng(0)
-
-
 K = [[500.0, 0, 7.5], [0, 510.0, 5.5], [0, 0, 1]]
 DOWN = np.array([[1.0, 0, 0, 0.25], [0, -1, 0, -0.5], [0, 0, -1, 2], [0, 0, 0, 1]])
 """A camera 2 m above the world's floor that looks straight down."""

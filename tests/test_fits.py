@@ -66,9 +66,8 @@ def test_sides_count_as_far_as_looks_are_right_about_them(right):
     wrong = (true + rng.integers(1, s, (n, v))) % s
     claimed[np.arange(n)[:, None], np.arange(v), labels[:, None]] = np.where(rng.random((n, v)) < right, true, wrong)
     azimuth_bins = np.log(np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))).astype(np.float32)
-    data = train_predictions(
-        rng.normal(size=(n, v, 2)).astype(np.float32) / 100, labels, SMALL, ("a", "b"), azimuth_bins
-    )
+    logits = rng.normal(size=(n, v, 2)).astype(np.float32) / 100
+    data = train_predictions(logits, labels, SMALL, ("a", "b"), azimuth_bins)
     found = fit_temperature(data, np.random.default_rng(1), walks=1)
     if right == 0.8:  # as good as they claim, and each by itself
         assert found.bin_correlation == pytest.approx(0, abs=0.05)
@@ -221,8 +220,7 @@ def training_predictions(tmp_path):
     logits[np.arange(90), :, p.labels] += np.random.default_rng(0).normal(0.6, 0.8, (90, 1))
     about = json.loads(card.read_text())
     card.write_text(json.dumps(about | {"held_out": list(p.names[:45])}))
-    recogniser = ("tiny", about["sha256"])
-    models = {**p.models, "recogniser": recogniser}
+    models = {**p.models, "recogniser": ("tiny", about["sha256"])}
     path = tmp_path / "training.npz"
     replace(p, logits=logits.astype(np.float32), splits=np.array(["train"] * 90), models=models).save(path)
     return card, path

@@ -48,9 +48,8 @@ INPUTS = ("belief", "view", "place", *MAPS, "azimuth_bin")
 def some_gain(sphere=SPHERE, inputs=INPUTS, networks=2, seed=0, frame="camera", **rest) -> Gain:
     """With weights at random: whatever it was trained to, these promises hold."""
     rng = np.random.default_rng(seed)
-    widths = [len(mirrored_features(sphere, CLASSES, inputs, frame)), 8, 8, len(sphere)]
-    pairs = list(pairwise(widths))
-    drawn = [[(rng.normal(size=(a, b)) / a**0.5, rng.normal(size=(1, b))) for a, b in pairs] for _ in range(networks)]
+    widths = list(pairwise([len(mirrored_features(sphere, CLASSES, inputs, frame)), 8, 8, len(sphere)]))
+    drawn = [[(rng.normal(size=(a, b)) / a**0.5, rng.normal(size=(1, b))) for a, b in widths] for _ in range(networks)]
     layers = [[np.stack(part) for part in zip(*layer, strict=True)] for layer in zip(*drawn, strict=True)]
     weights, biases = ([torch.from_numpy(layer[k]).float() for layer in layers] for k in (0, 1))
     flips = mirrored_features(sphere, CLASSES, inputs, frame), mirrored(sphere)

@@ -126,10 +126,10 @@ def test_broken_meshes_are_recorded_and_tried_again(meshes, tmp_path):
     path = tmp_path / "views.zarr"
     reasons = dict(render(meshes, path, SPHERE, SIZE, workers=0))
     store = ViewStore.open(path)
-    assert store.failures == {name: reason for name, reason in reasons.items() if reason}
-    assert "cut short" in store.failures["chair_2"]
-    assert "no extent" in store.failures["chair_3"]
-    assert store.done.tolist() == [name not in store.failures for name in store.names]
+    assert store.attributes.failures == {name: reason for name, reason in reasons.items() if reason}
+    assert "cut short" in store.attributes.failures["chair_2"]
+    assert "no extent" in store.attributes.failures["chair_3"]
+    assert store.done.tolist() == [name not in store.attributes.failures for name in store.names]
     assert next(iter(render(meshes, path, SPHERE, SIZE, workers=0)))[1]  # a later run says it again
 
 

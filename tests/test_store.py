@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from pipeline import SPHERE, refused
 
-from nextview.data.measuring import measure
+from nextview.data.measures import measure
 from nextview.data.rendering import RenderOptions, render
 from nextview.data.store import RENDERED, ViewStore, check
 from nextview.errors import DatasetError

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from nextview.data.measuring import measure
+from nextview.data.measures import measure
 from nextview.data.rendering import render
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError

@@ -7,8 +7,7 @@ from pipeline import of_depth
 from skimage.draw import disk, polygon
 from skimage.measure import perimeter_crofton
 
-from nextview.data.measures import find_measure
-from nextview.data.measuring import measure
+from nextview.data.measures import find_measure, measure
 from nextview.data.rendering import Deform, RenderOptions, deformed, render
 from nextview.data.store import ViewStore, check
 from nextview.errors import DatasetError, MeasureError

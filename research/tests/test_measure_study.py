@@ -9,7 +9,7 @@ import pytest
 from pipeline import some_predictions
 from scipy.stats import spearmanr
 
-from nextview.data.measuring import measure
+from nextview.data.measures import measure
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
 from research import measure_study

@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter
 import nextview
 from nextview.benchmark.entries import default_entries, is_oracle
 from nextview.benchmark.replay import make_specs, replay
-from nextview.data.measuring import measure
+from nextview.data.measures import measure
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import render
 from nextview.data.store import PLANNED, ViewStore

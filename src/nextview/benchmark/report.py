@@ -71,8 +71,7 @@ def report(
 
 def headline_policy(results: Results, threshold: float) -> str:
     """The most accurate policy that a robot could follow, other than the reference; the reference if it is alone."""
-    found = numbers(results.tables.summary, "policy", "threshold", "measure")
-    reference = results.settings["reference"]
+    found, reference = numbers(results.tables.summary, "policy", "threshold", "measure"), results.settings["reference"]
     names = [n for n in results.tables.sweep["policy"].unique() if not is_oracle(n) and n != reference]
     return max(names, key=lambda n: found[n, threshold, "accuracy"].value, default=reference)
 
@@ -81,8 +80,8 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
     """The whole page as text."""
     s, t, p = results.settings, results.tables, results.predictions
     at, reference = board.headline_threshold(s["thresholds"]), s["reference"]
-    best, found = headline_policy(results, at), numbers(t.summary, "policy", "threshold", "measure")
-    policies = list(t.sweep["policy"].unique())
+    found, policies = numbers(t.summary, "policy", "threshold", "measure"), list(t.sweep["policy"].unique())
+    best = headline_policy(results, at)
     tests = t.tests.query("threshold == @at and measure == 'accuracy'").set_index("policy").to_dict("index")
     shown = [n for n in dict.fromkeys((reference, best, DEFAULT, *draw.ceiling(results))) if n in policies]
 

@@ -14,10 +14,10 @@ def resample(n: int, samples: int, rng: np.random.Generator) -> Float:
     return rng.multinomial(n, np.full(n, 1 / n), size=samples).astype(np.float64)
 
 
-def interval(samples: Float, level: float = 0.95) -> tuple[Float, Float]:
-    """Percentile interval of bootstrap samples (S, M): its ends, each (M,)."""
+def interval(samples: Float) -> tuple[Float, Float]:
+    """95 % percentile interval of bootstrap samples (S, M): its ends, each (M,)."""
     empty = np.isnan(samples).all(0)
-    low, high = np.nanquantile(np.where(empty, 0, samples), [(1 - level) / 2, (1 + level) / 2], axis=0)
+    low, high = np.nanquantile(np.where(empty, 0, samples), [0.025, 0.975], axis=0)
     return np.where(empty, np.nan, low), np.where(empty, np.nan, high)
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Literal
 
 from nextview.cli.progress import console, follow, track
-from nextview.data import measuring, rendering
+from nextview.data import measures as view_measures
+from nextview.data import rendering
 from nextview.data import store as view_store
 from nextview.data.splits import some_objects
 from nextview.data.store import ViewStore
@@ -71,9 +72,9 @@ def check(
     views = ViewStore.open(store)
     done = int(views.done.sum())
     damaged = track_all(view_store.check(store, **vars(workers)), done, f"checking {store.name}")
-    for reason in views.failures.values():
+    for reason in views.attributes.failures.values():
         console.print(f"left out: {reason}", style="yellow")
-    missing = len(views) - done - len(views.failures)
+    missing = len(views) - done - len(views.attributes.failures)
     console.print(f"{store}: {done - len(damaged)} objects are sound, {len(damaged)} damaged, {missing} not rendered")
     if damaged:
         raise DatasetError(f"{store}: {len(damaged)} of {done} objects are damaged; remove the store and render again")
@@ -93,7 +94,7 @@ def measure(
 ) -> None:
     """Compute view measures of every rendered object and keep them in the store. Resumes where it was."""
     select = some_objects(ViewStore.open(store), split, held_out, objects)
-    steps = measuring.measure(store, measures, **vars(workers), objects=select, overwrite=overwrite)
+    steps = view_measures.measure(store, measures, **vars(workers), objects=select, overwrite=overwrite)
     follow(steps, f"measuring {store.name}")
 
 

@@ -50,9 +50,9 @@ class Listing:
         return f"{text}; left out: {'; '.join(parts)}" if parts else text
 
 
-def list_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> list[Entry]:
-    """All meshes of a dataset folder, or other files in its layout; see ``scan_dataset``."""
-    return scan_dataset(root, suffixes).entries
+def list_dataset(root: str | Path) -> list[Entry]:
+    """All meshes of a dataset folder; see ``scan_dataset``."""
+    return scan_dataset(root).entries
 
 
 def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> Listing:

@@ -1,19 +1,24 @@
-"""View measures: what they are handed; depth entropy and the recogniser's confidence; users' own by import path."""
+"""View measures: what they are handed, users' own by import path, and their values of a whole store; resumable."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nextview.checks import plugin, plugin_errors, plugins
+from nextview.data.pool import counted
+from nextview.data.store import DEPTH_UNIT, ViewStore, opened, writing
 from nextview.errors import MeasureError
 from nextview.geometry.depth import object_depth
 from nextview.geometry.observation import depth_image
 from nextview.recognition.map_names import Good
 
+Made = dict[str, NDArray[np.float32]]  # the values of one object, by the names of their arrays
 QUANTUM = 1e-3  # depth values closer than this count as equal, object radii
 
 
@@ -51,15 +56,6 @@ class MeasuredView:
     def depths(self) -> NDArray[np.floating]:
         """Depth of the pixels that show the object, (n,), row by row."""
         return self.near[self.seen]
-
-    @cached_property
-    def rays(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Slopes x/z of the box's columns, (W',), and y/z of its rows, (H',), in the camera's axes."""
-        rows, columns = self.box
-        (fx, _, cx), (_, fy, cy) = self.intrinsics[:2]
-        x = (np.arange(columns.start, columns.stop) + 0.5 - cx) / fx
-        y = (np.arange(rows.start, rows.stop) + 0.5 - cy) / fy
-        return x, y
 
 
 @dataclass(frozen=True)
@@ -139,3 +135,83 @@ def confidence_maps(logits: NDArray[np.floating], labels: NDArray[np.integer]) -
     logits = np.asarray(logits, np.float64)
     right = logits.argmax(2) == labels[:, None]
     return np.where(right, softmax(logits, axis=2).max(2), 0).astype(np.float32)
+
+
+def depth_views(store: ViewStore, i: int) -> Iterator[MeasuredView]:
+    """Object i of a store as measures see it, from all its views."""
+    for depth, pose in zip(store.read("depth", i), store.sphere.poses, strict=True):
+        yield MeasuredView(depth * DEPTH_UNIT, pose, store.intrinsics)  # float64, as when it was rendered
+
+
+def measure(
+    path: Path,
+    names: Sequence[str] = (),
+    workers: int | None = None,
+    scheduler: str | None = None,
+    objects: NDArray[np.int64] | None = None,
+    overwrite: bool = False,
+    views: Callable[[ViewStore, int], Iterator[MeasuredView]] = depth_views,
+) -> Iterator[tuple[int, int]]:
+    """Put view measures of rendered objects, or of some rows, into a store: ``measures/NAME`` (N, V) float32.
+
+    ``names`` as ``find_measure`` takes them, or "all"; by default all that can be had from what ``views`` hands them.
+    ``workers`` and ``scheduler`` as of ``pool.each``; ``overwrite`` measures anew what is there. Yields objects done so
+    far, and how many there are.
+    """
+    names = names_of(names, views is not depth_views)
+    ViewStore.open(path).array("depth")  # says if it is missing, before anything is begun
+    function = partial(_measure, names, views)
+    yield from keep(path, [f"measures/{name}" for name in names], function, workers, scheduler, objects, overwrite)
+
+
+def _measure(
+    names: tuple[str, ...], views: Callable[[ViewStore, int], Iterator[MeasuredView]], store: ViewStore, i: int
+) -> Made:
+    object_name, functions = store.names[i], {name: find_measure(name) for name in names}
+    values = {name: np.empty(len(store.sphere), np.float32) for name in names}
+
+    def failed(name: str, said: str) -> MeasureError:
+        return MeasureError(f"measure {name} of {object_name}: {said}")
+
+    for k, view in enumerate(views(store, i)):
+        for name, function in functions.items():
+            guard = nullcontext() if name in MEASURES else plugin_errors(partial(failed, name))
+            with guard, np.errstate(over="ignore"):  # what is too large for float32 is told below
+                values[name][k] = function(view)
+    for name, found in values.items():
+        if not np.isfinite(found).all():
+            raise MeasureError(f"measure {name} of {object_name}, view {np.isfinite(found).argmin()}, is not finite")
+    return {f"measures/{name}": found for name, found in values.items()}
+
+
+def keep(
+    path: Path,
+    names: Sequence[str],
+    function: Callable[[ViewStore, int], Made],
+    workers: int | None = None,
+    scheduler: str | None = None,
+    objects: NDArray[np.int64] | None = None,
+    overwrite: bool = False,
+) -> Iterator[tuple[int, int]]:
+    """Call ``function(store, i)`` for the objects that lack values in the arrays, and keep what it returns."""
+    with writing(path):
+        store = ViewStore.open(Path(path).absolute())
+        wanted = store.done & (True if objects is None else np.isin(np.arange(len(store)), objects))
+        for name in names:
+            if overwrite:
+                store.remove(name)
+            store.add(name)
+        held = np.all([store.held(name) for name in names], axis=0)
+        items, total = np.flatnonzero(wanted & ~held).tolist(), int(wanted.sum())
+        work = partial(_keep_object, store.path, function)
+        try:
+            yield from counted(work, items, total, lambda i: f"{path}: {store.names[i]}", workers, scheduler)
+        finally:  # nothing is left of what failed at once
+            for name in names:
+                if not store.held(name).any():
+                    store.remove(name)
+
+
+def _keep_object(path: Path, function: Callable[[ViewStore, int], Made], i: int) -> None:
+    store = opened(path)
+    store.write(i, function(store, i))

@@ -56,9 +56,9 @@ def reliability(confidence: Float, right: NDArray[np.bool_], bins: int = 15) -> 
     return np.bincount(at, confidence, bins) / some, np.bincount(at, right, bins) / some, count
 
 
-def calibration_error(confidence: Float, right: NDArray[np.bool_], bins: int = 15) -> float:
+def calibration_error(confidence: Float, right: NDArray[np.bool_]) -> float:
     """Expected calibration error: the mean gap between confidence and accuracy over the bins of ``reliability``."""
-    sure, accuracy, count = reliability(confidence, right, bins)
+    sure, accuracy, count = reliability(confidence, right)
     return float((count * np.abs(sure - accuracy)).sum() / max(1, count.sum()))
 
 

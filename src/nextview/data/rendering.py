@@ -6,7 +6,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,7 +112,19 @@ def render(
     count(workers)
     entries = listing(dataset, options).entries
     with writing(path):
-        wanted = describe(entries, sphere, size, _recipe(dataset, entries, options, sensor))
+        with ThreadPoolExecutor() as pool:
+            hashes = list(pool.map(_hash, [e.path for e in entries]))
+        recipe = {
+            "seed": options.seed,
+            "stretch": options.deform.stretch,
+            "rotated": options.deform.rotated,
+            "sha256": hashes,
+            "sensor": None if sensor is None else sensor.to_dict(),
+            "scene": None if options.meshes is None else SIDE,
+            "unit": options.unit,
+            "dataset": dataset.name,
+        }
+        wanted = describe(entries, sphere, size, recipe)
         store = _begin(path, wanted, overwrite)
         if (made_by := command()) not in store.commands:
             store.note(commands=[*store.commands, made_by])
@@ -123,12 +134,12 @@ def render(
         items = [(i, entries[i]) for i in todo]
         for (i, entry), problem in each(partial(_render_entry, path, options, sensor), items, workers, scheduler):
             reason = None if problem is None else f"{problem}"
-            others = {name: said for name, said in store.failures.items() if name != entry.name}
+            others = {name: said for name, said in store.attributes.failures.items() if name != entry.name}
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is done.
                 store.note(failures=others | {entry.name: reason})
                 store.write(i, {"status": np.array(FAILED, np.uint8)})
-            elif len(others) < len(store.failures):
+            elif len(others) < len(store.attributes.failures):
                 store.note(failures=others)
             yield entry.name, reason
 
@@ -173,24 +184,6 @@ def deformed(store: ViewStore, mesh: Mesh, name: str) -> Mesh:
     """A mesh as it is deformed when a store's object of that name is rendered."""
     deform = Deform(store.attributes.stretch, store.attributes.rotated)
     return mesh if deform == Deform() else deform(mesh, store.attributes.seed, name)
-
-
-def _recipe(
-    dataset: Path, entries: list[Entry], options: RenderOptions, sensor: Sensor | SensorMix | None
-) -> dict[str, Any]:
-    """What the attributes of the store say of its making."""
-    with ThreadPoolExecutor() as pool:
-        hashes = list(pool.map(_hash, [e.path for e in entries]))
-    return {
-        "seed": options.seed,
-        "stretch": options.deform.stretch,
-        "rotated": options.deform.rotated,
-        "sha256": hashes,
-        "sensor": None if sensor is None else sensor.to_dict(),
-        "scene": None if options.meshes is None else SIDE,
-        "unit": options.unit,
-        "dataset": dataset.name,
-    }
 
 
 def _hash(path: Path) -> str:

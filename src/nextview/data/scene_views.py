@@ -51,17 +51,13 @@ def render_scene(scene: Scene, sphere: ViewSphere) -> dict[str, NDArray]:
 class SceneViews:
     """One scene of a store, as it is from all V views."""
 
-    depth: NDArray[np.float32]
-    """(V, S, S), object radii, 0 = nothing."""
-    owner: NDArray[np.uint8]
-    """Of each pixel: NOTHING, TARGET, OTHER or TABLE_TOP, (V, S, S)."""
+    depth: NDArray[np.float32]  # (V, S, S), object radii, 0 = nothing
+    owner: NDArray[np.uint8]  # of each pixel: NOTHING, TARGET, OTHER or TABLE_TOP, (V, S, S)
     intrinsics: NDArray[np.float64]
     poses: NDArray[np.float64]
     reachable: NDArray[np.bool_]
-    visible_share: NDArray[np.float32]
-    """Of the target, the truth, (V,)."""
-    clearance: NDArray[np.float32]
-    """(V,), object radii."""
+    visible_share: NDArray[np.float32]  # of the target, the truth, (V,)
+    clearance: NDArray[np.float32]  # (V,), object radii
 
     def scene_view(self, view: int) -> SceneView:
         """What a camera sees from there: things and table alike are no target."""

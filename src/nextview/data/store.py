@@ -56,7 +56,7 @@ class Attributes(msgspec.Struct, omit_defaults=True):
     sha256: list[str] | None = None
     unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None
     dataset: str = ""
-    failures: dict[str, str] = {}
+    failures: dict[str, str] = {}  # why objects were left out, by name
     commands: list[str] = []
 
 
@@ -292,11 +292,6 @@ class ViewStore:
             raise
         except Exception as error:  # a damaged chunk raises whatever its codec makes of it
             raise DatasetError(f"{self.path}: status cannot be read ({error}); {self._remedy('status')}") from None
-
-    @property
-    def failures(self) -> dict[str, str]:
-        """Why objects were left out, by name."""
-        return self.attributes.failures
 
     @property
     def radii(self) -> NDArray[np.float64]:

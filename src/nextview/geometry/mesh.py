@@ -22,14 +22,23 @@ FLAT = 1e-12
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex at radius 1."""
+    """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex at radius 1.
 
-    vertices: NDArray[np.float64]  # (V, 3), object radii
-    faces: NDArray[np.int32]  # (F, 3), indices into the vertices
-    centre: NDArray[np.float64]  # bounding-box centre in the file's frame, (3,), the file's units
-    radius: float  # the file's units; ``vertices * radius + centre`` are the file's positions
-    name: str = "mesh"  # what to call it in messages
-    unit: str | None = None  # the file's, one of UNITS; None if it is not known
+    Attributes:
+        vertices: (V, 3) float64, object radii.
+        faces: (F, 3) int32, indices into the vertices.
+        centre: bounding-box centre in the file's frame, (3,) float64, the file's units.
+        radius: object radius in the file's units; ``vertices * radius + centre`` are the file's positions.
+        name: what to call it in messages.
+        unit: the file's unit, one of UNITS; None if it is not known.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    centre: NDArray[np.float64]
+    radius: float
+    name: str = "mesh"
+    unit: str | None = None
 
     @property
     def metres(self) -> float | None:

@@ -123,7 +123,16 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
     """Train the networks: after every epoch, the policy as it then is, at travel weight 0 and over all views."""
     rng, data = np.random.default_rng([recipe.seed, fold]), table.data
     sphere, n, c = data.sphere, len(data), len(data.classes)
-    networks = _untrained(table, recipe, torch.Generator().manual_seed(int(rng.integers(2**31))))
+    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+    features_flip = mirrored_features(sphere, c, recipe.inputs, recipe.frame)
+    widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)]))
+    scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
+    first = [
+        scale * torch.randn(recipe.networks, *width, generator=generator)
+        for scale, width in zip(scales, widths, strict=True)
+    ]
+    biases = [torch.zeros(recipe.networks, 1, outputs) for _, outputs in widths]
+    networks = Perceptrons(first, biases, features_flip, mirrored(sphere))
     drawn = rng.multinomial(n, np.full(n, 1 / n), size=recipe.networks)
     weights = torch.from_numpy(drawn * data.weights).float()
     optimiser = torch.optim.AdamW(networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay)
@@ -145,19 +154,6 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
         policy = Gain(sphere, c, Score(deepcopy(networks)), recipe.inputs, frame=recipe.frame)
         policies[::2] = [policy] * len(policies[::2])
         yield policy
-
-
-def _untrained(table: ReplayTable, recipe: GainRecipe, generator: torch.Generator) -> Perceptrons:
-    sphere = table.data.sphere
-    features_flip = mirrored_features(sphere, len(table.data.classes), recipe.inputs, recipe.frame)
-    widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)]))
-    scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
-    weights = [
-        scale * torch.randn(recipe.networks, *width, generator=generator)
-        for scale, width in zip(scales, widths, strict=True)
-    ]
-    biases = [torch.zeros(recipe.networks, 1, outputs) for _, outputs in widths]
-    return Perceptrons(weights, biases, features_flip, mirrored(sphere))
 
 
 def best_epoch(
@@ -269,7 +265,7 @@ def train_gain(
         travel_weight = fit_travel_weight(judged, recipe.n_views, recipe.objective, recipe.seed)
     policy = replace(averaged(policies), travel_weight=travel_weight)
     states = np.concatenate([walk(part, [policy], recipe, data.rng).features for part in data.validated])
-    difference = write_gain(out, policy, data.card(policy, recipe), states, overwrite)
+    difference = write_gain(out, policy, data.about, states, overwrite)
     return TrainedGain(out, data.objects, data.validated_on, value.mean, travel_weight, len(states), difference)
 
 
@@ -277,30 +273,12 @@ def train_gain(
 class _Data:
     """What is learned from, and what validates: tables side by side, one pair for each fold."""
 
-    sources: list[tuple[Path, Predictions]]
     learned: list[ReplayTable]
     validated: list[ReplayTable]
     objects: int
-    learned_from: str
     validated_on: str
+    about: PolicyCard  # of a policy that is trained on it, as yet without its table
     rng: np.random.Generator
-
-    def card(self, policy: Gain, recipe: GainRecipe) -> PolicyCard:
-        """The card of a policy that was trained on it, as yet without its table."""
-        _, table = self.sources[0]
-        return PolicyCard(
-            "gain",
-            policy.scope,
-            table.sphere.elevations,
-            table.sphere.azimuths,
-            table.classes,
-            {},
-            f"{self.learned_from}, classes weighted evenly; epoch and travel weight chosen on {self.validated_on}",
-            tuple(LearnedFrom(sha256_of(path), p.models) for path, p in self.sources),
-            tuple((part.data.calibration.temperature, part.data.calibration.correlation) for part in self.learned),
-            asdict(recipe),
-            tuple(dict.fromkeys((*(line for _, p in self.sources for line in p.commands), command()))),
-        )
 
 
 def _load(
@@ -322,7 +300,10 @@ def _load(
         _check(path, p, recipe)
     everything = np.arange(len(table))
     if validation is None:
-        validating = hold_out(table.labels, _shapes(table), folds, recipe.seed)
+        shapes: NDArray = table.depth_entropy  # rows that are the same where the shape is: of scenes by their names
+        if scenes_of(table) is not None:
+            shapes = np.unique(_targets(table), return_inverse=True)[1][:, None].astype(np.float64)
+        validating = hold_out(table.labels, shapes, folds, recipe.seed)
         learning = [np.setdiff1d(everything, part) for part in validating]
         validated_on = f"the same, each judged by networks of {folds - 1} other folds"
     else:
@@ -334,19 +315,25 @@ def _load(
     validated = [ReplayTable.select(other, part, rng, variants, others) for part in validating]
     objects = len(np.unique(np.concatenate(learning)))
     learned_from = f"{objects} objects of the training split{', clean and through sensors' * bool(sensed)}"
-    return _Data(sources, learned, validated, objects, learned_from, validated_on, rng)
+    about = PolicyCard(
+        "gain",
+        "global",
+        table.sphere.elevations,
+        table.sphere.azimuths,
+        table.classes,
+        {},
+        f"{learned_from}, classes weighted evenly; epoch and travel weight chosen on {validated_on}",
+        tuple(LearnedFrom(sha256_of(path), p.models) for path, p in sources),
+        tuple((part.data.calibration.temperature, part.data.calibration.correlation) for part in learned),
+        asdict(recipe),
+        tuple(dict.fromkeys((*(line for _, p in sources for line in p.commands), command()))),
+    )
+    return _Data(learned, validated, objects, validated_on, about, rng)
 
 
 def _targets(p: Predictions) -> list[str]:
     """Names of the objects, without their scenes."""
     return [name.partition("@")[0] for name in p.names]
-
-
-def _shapes(p: Predictions) -> NDArray[np.floating]:
-    """Rows that are the same where the shape is, (N, ...): by what is seen of it, or in scenes by its name."""
-    if scenes_of(p) is None:
-        return p.depth_entropy
-    return np.unique(_targets(p), return_inverse=True)[1][:, None].astype(np.float64)
 
 
 def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:

@@ -12,8 +12,7 @@ class Hardware:
 
     devices: int = 1  # processes, each with its own GPU where there are any; they share every batch out
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"  # "auto" takes GPUs where there are any
-    # of the arithmetic; weights are kept in single precision. Take 16-mixed on GPUs older than Ampere
-    precision: Literal["bf16-mixed", "16-mixed", "32-true"] = "bf16-mixed"
+    precision: Literal["bf16-mixed", "16-mixed", "32-true"] = "bf16-mixed"  # 16-mixed on GPUs older than Ampere
 
 
 POLICY_INPUTS = ("belief", "view", "place", "lem-sphere", "azimuth_bin")
@@ -32,8 +31,7 @@ def _check(recipe: Any, at_least_one: tuple[str, ...], shares: tuple[str, ...] =
 class RecogniserRecipe:
     """How the recogniser is trained."""
 
-    # a ResNet, or EfficientNet-Lite0, which has a fifth of the arithmetic of a ResNet-18
-    network: Literal["resnet", "lite0"] = "resnet"
+    network: Literal["resnet", "lite0"] = "resnet"  # or EfficientNet-Lite0, a fifth of a ResNet-18's arithmetic
     depth: Depth = 18  # of the ResNet
     # of EfficientNet-Lite0: chance that a pooled feature is dropped; the chance that a block is skipped for a view
     # rises from 0 at the first towards it at the last
@@ -49,21 +47,14 @@ class RecogniserRecipe:
     # All objects of a class have to face the same way in their files, as ModelNet10's do
     azimuth_bins_weight: float = 0.0
     validation: float = 0.1  # part of the training split held out for validation
-    # chance that a view is drawn from the deformed objects, where such a store is given
-    deformed_share: float = 0.5
+    deformed_share: float = 0.5  # chance that a view is drawn from the deformed objects, where they are given
     seed: int = 0  # decides everything random
-    # of one network of an ensemble: --seed decides the objects that validate all of them, this one the first weights
-    # and draws
-    ensemble_seed: int = 0
-    # what the network sees: the geometry that a depth camera sees, or the shaded image
-    input: Literal["geometry", "image"] = "geometry"
+    ensemble_seed: int = 0  # of one network of an ensemble: its first weights and draws; --seed: what validates all
+    input: Literal["geometry", "image"] = "geometry"  # what the network sees: a depth camera's, or the shaded image
     augment: bool = True  # whether views are varied: mirrored, shifted, scaled, partly hidden
-    # whether rare classes are drawn more often; otherwise every view comes once before any comes again
-    balanced: bool = True
-    # of the learning rate: up and down once, or halved every fifth epoch from the peak
-    schedule: Literal["one-cycle", "halving"] = "one-cycle"
-    # stop after so many epochs without a better class mean on validation; 0 never stops early
-    patience: int = 0
+    balanced: bool = True  # draw rare classes more often; else every view comes once before any comes again
+    schedule: Literal["one-cycle", "halving"] = "one-cycle"  # of the rate: up and down, or halved every fifth epoch
+    patience: int = 0  # stop after so many epochs without a better class mean on validation; 0 never stops early
     # how far the parameters go in the end, from the first to the trained ones. Less than 1 keeps more of what the
     # network learned before (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022)
     way: float = 1.0
@@ -104,25 +95,21 @@ class MapRecipe:
     depth: Depth = 18  # of the ResNet
     size: int = 56  # side of the ResNet's input image, pixels
     points: int = 256  # drawn from each cloud in training; validation and use take all 1,024
-    # what the network predicts: the local window alone, or all views of the sphere
-    output: Literal["window", "sphere"] = "sphere"
+    output: Literal["window", "sphere"] = "sphere"  # what it predicts: the local window alone, or all views
     epochs: int = 8  # passes over the training objects
     views: int = 12  # of each object in one epoch, drawn at random
     batch: int = 64  # views a step
     lr: float = 2e-3  # peak learning rate of AdamW
     weight_decay: float = 0.05  # of AdamW
     regular: float = 1e-4  # weight of the orthogonality terms of the PointNet's transforms
-    # weight of the cross-entropy of the highest cell of the window, beside the squared error of all cells
-    peak: float = 0.0
+    peak: float = 0.0  # weight of the cross-entropy of the window's highest cell, beside the squared error of all
     sharpness: float = 0.05  # of --peak: values are divided by it to give log-odds
     reach: int = 0  # of --peak: 0 for the highest cell itself, 1 for its four neighbours too
     mirror: bool = True  # whether left and right are exchanged in half of the views, in the map too
-    # of the learning rate: up and down once, or a tenth every fifth epoch from the peak
-    schedule: Literal["one-cycle", "tenth"] = "one-cycle"
+    schedule: Literal["one-cycle", "tenth"] = "one-cycle"  # of the rate: up and down, or a tenth every fifth epoch
     validation: float = 0.1  # part of the training split held out for validation
     seed: int = 0  # decides everything random
-    # stop after so many epochs without a lower squared error on validation; 0 never stops early
-    patience: int = 0
+    patience: int = 0  # stop after so many epochs without a lower error on validation; 0 never stops early
 
     def __post_init__(self) -> None:
         _check(self, ("size", "points", "epochs", "views", "batch"), ("validation",))
@@ -157,8 +144,7 @@ class GainRecipe:
     objective: Literal["belief", "log-belief", "right"] = "log-belief"
     n_views: int = 5  # the values of views 2 to this one are learned
     hidden: int = 32  # width of the two hidden layers
-    # that are averaged, of each fold; each weighs the objects by a bootstrap draw of its own
-    networks: int = 2
+    networks: int = 2  # averaged, of each fold; each weighs the objects by a bootstrap draw of its own
     epochs: int = 15  # each over new walks of all objects
     walks: int = 8  # of each object in an epoch
     batch: int = 1024  # states in a step

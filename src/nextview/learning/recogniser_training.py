@@ -174,16 +174,12 @@ def fit_recogniser(
     start = {name: values.clone() for name, values in module.net.state_dict().items()}
     validation = ValidationViews(sources[0].inputs, parts[1], labels)
     best = fit(module, views, validation, out, "class_accuracy", "max", hardware)
-    best.net.load_state_dict(part_way(start, best.net.state_dict(), recipe.way))
-    return best.net.eval()
-
-
-def part_way(start: dict[str, Tensor], end: dict[str, Tensor], way: float) -> dict[str, Tensor]:
-    """Parameters a part of the way between two states of one network; counters are those of the end."""
-    return {
-        name: torch.lerp(start[name].to(values), values, way) if values.is_floating_point() else values
-        for name, values in end.items()
+    way = {
+        name: torch.lerp(start[name].to(values), values, recipe.way) if values.is_floating_point() else values
+        for name, values in best.net.state_dict().items()  # counters stay those of the end
     }
+    best.net.load_state_dict(way)
+    return best.net.eval()
 
 
 def mirror_planes(store: ViewStore, objects: Indices) -> NDArray[np.float64]:

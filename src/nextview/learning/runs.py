@@ -240,7 +240,14 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
     """Train a network into a run's folder unless it is there; alone, or with the other devices of this run."""
     with only_one(out) if is_first() else nullcontext():
         if (out / "run.json").exists():
-            _refuse_other(out, run)
+            before, recipe = read_record(out / "run.json", Run, "a training run"), msgspec.to_builtins(run.recipe)
+            changed = [name for name, value in recipe.items() if before.recipe.get(name) != value]
+            faults = [f"another recipe ({name} was {before.recipe.get(name)}, not {recipe[name]})" for name in changed]
+            faults += ["other first weights"] * (before.weights != run.weights)
+            faults += ["other objects"] * (before.held_out != run.held_out)
+            if faults:
+                again = "give the same options to resume it, or another folder"
+                raise ModelError(f"{out}: holds a run of {faults[0]}; {again}")
         elif is_first():
             other = [path.name for path in (out.iterdir() if out.is_dir() else ()) if not path.name.startswith(".")]
             if other:
@@ -248,17 +255,6 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
             write_record(out / "run.json", run)
         if not (out / "network.pt").exists():
             save_whole(train().state_dict(), out / "network.pt")
-
-
-def _refuse_other(out: Path, run: Run) -> None:
-    """Refuse to resume a run of another recipe, of other objects or from other weights."""
-    before, recipe = read_record(out / "run.json", Run, "a training run"), msgspec.to_builtins(run.recipe)
-    changed = [name for name, value in recipe.items() if before.recipe.get(name) != value]
-    faults = [f"another recipe ({name} was {before.recipe.get(name)}, not {recipe[name]})" for name in changed]
-    faults += ["other first weights"] * (before.weights != run.weights)
-    faults += ["other objects"] * (before.held_out != run.held_out)
-    if faults:
-        raise ModelError(f"{out}: holds a run of {faults[0]}; give the same options to resume it, or another folder")
 
 
 def read_run(out: Path) -> Run:

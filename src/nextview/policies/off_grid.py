@@ -91,6 +91,10 @@ class OffGrid:
         visited[rows[:, 0], current] = True
         lost = ~(reachable & ~visited).any(1)  # the only free view lies in the camera's own cell
         reachable[lost] = True
+        visibility = state.visibility
+        if visibility is not None:  # that of the view nearest to each cell
+            near = self._grid_directions(state) @ self.sphere.directions.T
+            visibility = np.take_along_axis(visibility, near.argmax(2), 1)
         turned = replace(
             state,
             current=current,
@@ -98,7 +102,7 @@ class OffGrid:
             reachable=reachable,
             travel=None,
             places=None,
-            visibility=None if state.visibility is None else self._nearest_of(state.visibility, state),
+            visibility=visibility,
         )
         return turned, ahead
 
@@ -108,11 +112,6 @@ class OffGrid:
         elevation = np.broadcast_to(np.radians(self.grid.elevations)[self.grid.ring], azimuth.shape)
         flat = np.cos(elevation)
         return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], 2)
-
-    def _nearest_of(self, values: Float, state: EpisodeState) -> Float:
-        """Of the views' values, (B, V), that of the view nearest to each cell of the turned grid, (B, grid)."""
-        near = self._grid_directions(state) @ self.sphere.directions.T
-        return np.take_along_axis(values, near.argmax(2), 1)
 
     def _nearest_to(self, cells: NDArray[np.int64], state: EpisodeState) -> NDArray[np.int64]:
         """The free view nearest to a cell of the turned grid, (B,)."""

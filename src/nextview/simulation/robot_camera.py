@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nextview.checks import one_line
 from nextview.errors import NoViewLeftError, ObservationError, UsageError
-from nextview.geometry.viewsphere import DISTANCE, Viewpoints, ViewSphere, angle_between, direction_of, level_pose
+from nextview.geometry.viewsphere import DISTANCE, ViewSphere, angle_between, direction_of, level_pose
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.simulation.scene import TABLE, Scene
@@ -20,13 +20,11 @@ Named = Literal["point", "box", "known", "mask"]
 SAME = 1e-6  # radians between directions that are the same
 
 
-def sensed_camera(
-    scene: Scene, sensor: Sensor | SensorMix | str, rng: np.random.Generator, denoise: bool = True
-) -> SensedCamera:
+def sensed_camera(scene: Scene, sensor: Sensor | SensorMix | str, rng: np.random.Generator) -> SensedCamera:
     """A ``SensedCamera`` before a scene's target, three radii away; what hides it is told from it exactly."""
     drawn = sensor_named(sensor).draw(rng.spawn(1)[0])
     drawn = replace(drawn, radius=drawn.distance / DISTANCE, boxes=0.0)
-    return SensedCamera(scene.target, drawn, rng, denoise, scene.around, TABLE)
+    return SensedCamera(scene.target, drawn, rng, around=scene.around, table=TABLE)
 
 
 class RobotCamera:
@@ -38,23 +36,15 @@ class RobotCamera:
 
     A pose that cannot be reached, or from which too little of the target is measured, is answered from the nearest
     other viewpoint where it has not stood yet. Ask only for what ``reachable`` allows to be answered from near.
-
-    Its errors are drawn by ``rng``, seed 0 by default; ``viewpoints`` are the 40 by default.
+    The errors of the sensor are drawn by seed 0.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        sensor: Sensor | SensorMix | str = "none",
-        rng: np.random.Generator | None = None,
-        named: Named = "point",
-        viewpoints: Viewpoints | None = None,
-    ) -> None:
+    def __init__(self, scene: Scene, sensor: Sensor | SensorMix | str = "none", named: Named = "point") -> None:
         if named not in get_args(Named):
             raise UsageError(f"a target is named by {', '.join(get_args(Named))}, not by {one_line(repr(named))}")
         self.scene, self.named = scene, named
-        self._directions = (viewpoints or ViewSphere.named("40")).directions
-        self._camera = sensed_camera(scene, sensor, rng or np.random.default_rng(0))
+        self._directions = ViewSphere.named("40").directions
+        self._camera = sensed_camera(scene, sensor, np.random.default_rng(0))
         self._truth = ObjectFrame(np.zeros(3), self._camera.sensor.radius, np.eye(3))
         denoise = self._camera.sensor.name != "none"
         corners = scene.target.vertices * self._truth.radius

@@ -1,7 +1,5 @@
 """Cameras without errors, by ray casting with Embree: of a mesh alone, of a target in a scene, of a whole scene."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -112,7 +110,7 @@ class SimulatedCamera:
 class OccludedCamera:
     """A ``SimulatedCamera`` before the target of a scene; what hides it is cut out, as if told from it exactly."""
 
-    def __init__(self, scene: Scene, size: int = 224, distance: float = DISTANCE) -> None:
+    def __init__(self, scene: "Scene", size: int = 224, distance: float = DISTANCE) -> None:
         self.scene = scene
         self._target = SimulatedCamera(scene.target, size, distance)
         self._others = RayCaster([(mesh.vertices, mesh.faces) for mesh in (scene.table, scene.around) if mesh])
@@ -143,7 +141,7 @@ class OccludedCamera:
 class SceneCamera:
     """Shows a whole scene, through a pinhole of any matrix, (3, 3), pixels, the first pixel's centre at 0.5."""
 
-    def __init__(self, scene: Scene, intrinsics: NDArray[np.float64], shape: tuple[int, int]) -> None:
+    def __init__(self, scene: "Scene", intrinsics: NDArray[np.float64], shape: tuple[int, int]) -> None:
         meshes = (scene.target, scene.table, scene.around)
         self._caster = RayCaster([(mesh.vertices, mesh.faces) for mesh in meshes if mesh])
         self._rays = pixel_rays(checked_intrinsics(intrinsics, shape), shape)
@@ -161,7 +159,7 @@ class SceneCamera:
         return np.where(which < 0, np.float32(0), depth).reshape(shape), self._owners[which].reshape(shape)
 
 
-def visible_shares(scene: Scene, poses: NDArray[np.float64], size: int, distance: float) -> NDArray[np.float64]:
+def visible_shares(scene: "Scene", poses: NDArray[np.float64], size: int, distance: float) -> NDArray[np.float64]:
     """Share of the target's picture that nothing hides, from each of some poses, (V, 4, 4); (V,) float64."""
     camera = OccludedCamera(scene, size, distance)
     return np.array([camera.visible_share(pose) for pose in poses])

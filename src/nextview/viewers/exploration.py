@@ -57,23 +57,17 @@ def shown_objects(path: Path | None = None, up: str | None = None) -> tuple[Show
     if not path.is_dir():
         return (ShownObject(path.stem, partial(load_mesh, path, up)),)
     if (path / "zarr.json").exists():
-        return _of_store(path)
+        store = ViewStore.open(path)
+        rows = np.flatnonzero(store.done).tolist()
+        if not rows:
+            raise DatasetError(f"{path}: no object in it is rendered yet")
+        labels = [store.classes[label] for label in store.labels]
+        return tuple(ShownObject(store.names[k], partial(StoredViews, store, k), labels[k]) for k in rows)
     flat = sorted(file for file in path.iterdir() if file.suffix.lower() in FORMATS and file.is_file())
     if flat:
         return tuple(ShownObject(file.name, partial(load_mesh, file, up)) for file in flat)
     entries = list_dataset(path)
     return tuple(ShownObject(entry.name, partial(load_mesh, entry.path, up), entry.label) for entry in entries)
-
-
-def _of_store(path: Path) -> tuple[ShownObject, ...]:
-    store = ViewStore.open(path)
-    found = [
-        ShownObject(store.names[row], partial(StoredViews, store, row), store.classes[store.labels[row]])
-        for row in np.flatnonzero(store.done).tolist()
-    ]
-    if not found:
-        raise DatasetError(f"{path}: no object in it is rendered yet")
-    return tuple(found)
 
 
 class Walk:

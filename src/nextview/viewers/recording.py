@@ -1,7 +1,5 @@
 """A session as a recording for the Rerun viewer: what was seen from where, and what was made of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 from uuid import uuid4
@@ -50,7 +48,7 @@ class Recorder:
         self._shown: list[object] = []
         self._open = True
 
-    def __call__(self, session: Session) -> None:
+    def __call__(self, session: "Session") -> None:
         """Write what is new in a session."""
         if not (self._open and session.views):
             return
@@ -74,7 +72,7 @@ class Recorder:
             self._stream.disconnect()
         self._open = False
 
-    def _log_place(self, step: int, view: View) -> None:
+    def _log_place(self, step: int, view: "View") -> None:
         observation = view.observation
         height, width = observation.depth.shape
         pose = rr.Transform3D(translation=observation.pose[:3, 3], mat3x3=observation.pose[:3, :3])
@@ -87,7 +85,7 @@ class Recorder:
         self._stream.log("world/camera/depth", rr.DepthImage(observation.depth, meter=1.0))
         self._stream.log("world/camera/image", rr.Image(observation.picture, color_model="L"))
 
-    def _log_belief(self, session: Session, view: View, step: int) -> None:
+    def _log_belief(self, session: "Session", view: "View", step: int) -> None:
         for name, belief in zip(session.models.classes, view.belief, strict=True):
             self._stream.log(f"belief/{rr.escape_entity_path_part(name)}", rr.Scalars(float(belief)))
         self._stream.log("belief_now", rr.BarChart(view.belief))
@@ -100,7 +98,7 @@ class Recorder:
         for warning in view.warnings:
             self._log_text(f"step {step}: warning ({warning.name}): {warning.message}", rr.TextLogLevel.WARN)
 
-    def _log_choice(self, session: Session, view: View, step: int) -> None:
+    def _log_choice(self, session: "Session", view: "View", step: int) -> None:
         """What the policy values the views at, and where it goes; again if it is asked again."""
         places, visited = session.sphere.poses[:, :3, 3], [earlier.index for earlier in session.views]
         values = np.full(len(places), np.nan) if view.values is None else view.values
