@@ -114,6 +114,37 @@ def test_of_several_objects_the_one_asked_for_is_taken():
         assert_found(thing, mesh, 0.1, 0.08)
 
 
+@pytest.mark.parametrize("gap", [0.0, 0.01, 0.03])
+def test_things_that_touch_or_nearly_touch_are_two(gap):
+    """The boxes are turned, so that they meet in a concave edge."""
+    turn = trimesh.transformations.rotation_matrix(np.radians(45), (0, 0, 1))
+    one = box((0.1, 0.1, 0.12), (0, 0, 0.06)).apply_transform(turn)
+    other = box((0.12, 0.12, 0.08), (0, 0.0707 + 0.0849 + gap, 0.04)).apply_transform(np.eye(4))
+    other.apply_translation((0, 0.06 - 0.0849, 0))
+    thing = ObservedObject(point=(0, 0, 0.1))
+    for k, azimuth in enumerate((0, 30, -20)):
+        thing.add(frame([TABLE, one, other], pose_at(35, azimuth, 0.7), seed=k))
+    assert_found(thing, one, 0.15, 0.12)
+
+
+@pytest.mark.parametrize("parts", ["handle", "back", "bowl"])
+def test_concave_edges_within_one_thing_do_not_cut_it(parts):
+    made = {
+        "handle": [box((0.1, 0.1, 0.14), (0, 0, 0.07)), box((0.02, 0.06, 0.06), (0, 0.08, 0.08))],
+        "back": [box((0.16, 0.16, 0.08), (0, 0, 0.04)), box((0.03, 0.16, 0.12), (-0.065, 0, 0.14))],
+        "bowl": [
+            box((0.2, 0.2, 0.012), (0, 0, 0.006)),
+            *(box((0.02, 0.2, 0.08), (x, 0, 0.04)) for x in (-0.09, 0.09)),
+            *(box((0.2, 0.02, 0.08), (0, y, 0.04)) for y in (-0.09, 0.09)),
+        ],
+    }[parts]
+    thing = ObservedObject(point=(0, 0, 0.05))
+    for k, azimuth in enumerate((0, 60)):
+        thing.add(frame([TABLE, *made], pose_at(40, azimuth, 0.7), seed=k))
+    assert_found(thing, trimesh.util.concatenate(made), 0.1, 0.08)
+    assert thing.warnings == []
+
+
 def test_a_wall_behind_the_table_is_not_the_object():
     seen = frame([TABLE, box((0.1, 0.1, 0.1), (0, 0, 0.05)), WALL], pose_at(20, 0, 0.9), seed=2)
     thing = ObservedObject()
@@ -245,6 +276,33 @@ def test_poses_in_millimetres_are_refused_where_the_target_or_another_frame_tell
     with pytest.raises(ObservationError, match=r"from where it was.* in millimetres"):
         thing.add(in_unit(second, pose=1000))
     assert len(thing.observations) == 1
+
+
+def test_depth_along_the_rays_is_refused():
+    seen = frame([TABLE, WEDGE], pose_at(40, 25, 0.7), seed=1)
+    (x, y), depth = seen.rays, seen.depth
+    for support in ({}, {"point": (0, 0, 0.1)}):
+        with pytest.raises(ObservationError, match="along the rays"):
+            ranged = depth * np.sqrt(x**2 + y[:, None] ** 2 + 1)
+            ObservedObject(**support).add(Frame(ranged, seen.intrinsics, seen.pose, pixel_centre=0.5))
+
+
+def test_an_old_pose_and_a_missing_plane_are_warned_of():
+    first, second = (frame([TABLE, WEDGE], pose_at(40, azimuth, 0.7), seed=1) for azimuth in (25, 80))
+    thing = ObservedObject(point=(0, 0, 0.1))
+    thing.add(first)
+    assert thing.warnings == []
+    thing.add(replace(second, pose=first.pose, axes="opencv", pixel_centre=0.5))
+    assert "stale pose" in [warning.name for warning in thing.warnings]
+    pose = pose_at(40, 25, 0.7)
+    depth, seen = cast([WEDGE, TABLE], pose)
+    alone = Frame(np.where(seen == 0, depth, 0), INTRINSICS, pose, seen == 0, pixel_centre=0.5)
+    thing = ObservedObject()
+    thing.add(alone)
+    assert [warning.name for warning in thing.warnings] == ["support"]
+    thing = ObservedObject(support=False)
+    thing.add(alone)
+    assert thing.warnings == []
 
 
 def test_a_part_of_a_picture_is_warned_of_and_taken_in():

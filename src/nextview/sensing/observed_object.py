@@ -22,8 +22,23 @@ from nextview.sensing.frame import Frame
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
 from nextview.sensing.pieces import cut
-from nextview.sensing.plausibility import ViewWarning, check_frame, check_observation, check_views, refuse_far
-from nextview.sensing.segmentation import Plane, Samples, find_plane, mistake_in_pose, refine_plane, sample
+from nextview.sensing.plausibility import (
+    ViewWarning,
+    check_frame,
+    check_observation,
+    check_pose_moved,
+    check_views,
+    refuse_far,
+)
+from nextview.sensing.segmentation import (
+    Plane,
+    Samples,
+    find_plane,
+    lies_better_as_range,
+    mistake_in_pose,
+    refine_plane,
+    sample,
+)
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -41,6 +56,9 @@ FINEST = 1 / 32
 SAME = 0.01
 """Change of the centre or the radius, in object radii, below which the object frame is left as it is."""
 
+NO_PLANE = ViewWarning(
+    "support", "no support plane is seen, so where the object ends below is guessed: support=False if it stands on none"
+)
 MAY_BE_TWO = ViewWarning(
     "outline", "the object may be two things that touch: name it by a mask or a box, or move them apart"
 )
@@ -196,6 +214,8 @@ class ObservedObject:
         revision = before.revision + any(new is not old for new, old in zip(made, before.observations, strict=True))
         made.append(self._observe(sightings[-1], latest))
         warnings = check_frame(frame) + check_observation(made[-1]) + [MAY_BE_TWO] * two
+        warnings += check_pose_moved(frame, [s.frame for s in before.sightings])
+        warnings += [NO_PLANE] * (self.support and plane is None and self.known is None)
         for view in made[-4:-1]:
             warnings = warnings or check_views(view, made[-1])
         return ObjectState(rng, latest, tuple(sightings), tuple(made), tuple(warnings), revision, cell)
@@ -209,6 +229,8 @@ class ObservedObject:
             mistake = None if largest is None else mistake_in_pose(largest, frame.camera_to_world, up)
             if largest is not None and mistake and largest.holds(samples).mean() > 2 * share:
                 raise ObservationError(f"the largest plane in view is not level: {mistake} Or up is another direction")
+        if lies_better_as_range(frame, plane, samples, rng, up):
+            raise ObservationError("the depth is measured along the rays, a range: give it along the optical axis")
         return plane
 
     def _above(self) -> Float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,9 @@ FAR_DEPTH = 10.0
 """Metres: few depth cameras measure farther, and no object that stands on something fills a picture from there."""
 TOO_FAR = 2.5
 """So many times as far as a frame shows anything an object cannot be: of a near one only the front shows."""
+STILL, CHANGED, CHANGED_SHARE = 1e-3, 0.04, 0.03
+"""Metres, and parts of a rotation, up to which a pose is the same; and the part of the distance by which a pixel has
+changed, and the share of pixels that have to."""
 FAR_ORIGIN = 30.0
 """Metres from the origin of the world, within which robots work; where positions in millimetres begin."""
 
@@ -38,7 +42,7 @@ class ViewWarning:
     """Something that is likely to be wrong, in a sentence.
 
     Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside", "contradiction" and
-    "repeated"; of a frame "intrinsics", "unit", "far origin" and "outline".
+    "repeated"; of a frame "intrinsics", "unit", "far origin", "outline", "support" and "stale pose".
     """
 
     name: str
@@ -80,6 +84,18 @@ def check_frame(frame: Frame) -> list[ViewWarning]:
         message = f"the camera is {origin:.0f} m from the world's origin, and sees {middle:.2g} m far: is the"
         found.append(ViewWarning("far origin", message + " pose in millimetres?"))
     return found
+
+
+def check_pose_moved(frame: Frame, earlier: Sequence[Frame]) -> list[ViewWarning]:
+    """Whether the picture changed though the pose did not; usually not."""
+    for other in earlier[-1:]:
+        if frame.shape != other.shape or np.abs(frame.camera_to_world - other.camera_to_world).max() > STILL:
+            continue
+        now, then = (f.depth[::4, ::4] for f in (frame, other))
+        both = (now > 0) & (then > 0)
+        if both.any() and np.mean(np.abs(now - then)[both] > CHANGED * now[both]) > CHANGED_SHARE:
+            return [ViewWarning("stale pose", "the picture changed, the pose did not: an old pose, or a moved object?")]
+    return []
 
 
 def check_observation(observation: Observation) -> list[ViewWarning]:

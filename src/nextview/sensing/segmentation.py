@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ TILT = np.cos(np.radians(12.0))
 LEAST = 0.04
 """Share of what is seen that lies on a support plane, at least; more if gravity is not known."""
 LEAST_ALONE = 0.15
+RANGE = 1.05
+"""Times as much of a frame lies on a plane as range, if it is range: wide lenses show it, narrow ones hardly bend."""
 SAMPLES = 1500
 """Pixels in which planes are searched."""
 
@@ -122,6 +125,19 @@ def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
         normal *= np.sign(normal @ plane.normal) or 1.0
         plane = Plane(normal, float(-normal @ centre))
     return plane
+
+
+def lies_better_as_range(
+    frame: Frame, plane: Plane | None, samples: Samples, rng: np.random.Generator, up: Float | None
+) -> bool:
+    """Whether more of a frame lies on a plane if its depth is taken for the distance along each ray."""
+    along = samples.points - samples.camera
+    depth = along @ frame.camera_to_world[:3, 2]
+    points = samples.camera + along * (depth / np.linalg.norm(along, axis=1))[:, None]
+    nearer = replace(samples, points=points)
+    other = find_plane(nearer, deepcopy(rng), up)
+    share = 0.0 if plane is None else plane.holds(samples).mean()
+    return other is not None and bool(other.holds(nearer).mean() > RANGE * share)
 
 
 def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
