@@ -264,7 +264,7 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
     stacked["radii"] = stacked["radii"][:, 0]
     joint = {name: np.concatenate([arrays[name] for _, arrays in taught]) for name in ("views", "rotations")}
     fit = fit_memory(joint["views"], thing, label, *(stacked[name] for name in PER_THING[:3]))
-    memory = Memory(thing=thing, head=fit.head, head_bias=fit.head_bias, quantiles=fit.quantiles, **joint, **stacked)
+    memory = Memory(thing=thing, head=fit.head, head_bias=fit.head_bias, **joint, **stacked)
     things = tuple(Thing(source.name, str(source.path), n) for (source, _), n in zip(taught, poses, strict=True))
     features = find_card(FEATURES)
     calibration = Calibration(1.0, 1.0, None, fit.correlation, tuple(label[thing].tolist()))
@@ -280,7 +280,9 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
         size=size_evidence(stacked["radii"], label),
         training=Training(f"{len(taught)} things", commands=() if old is None else old.training.commands),
         scores={"held-out views": {str(k): round(a, 4) for k, a in zip(VIEWS, fit.accuracy, strict=True)}},
-        memory=Taught(things, features.sha256, fit.weight),
+        memory=Taught(
+            things, features.sha256, fit.weight, novelty=tuple(map(tuple, np.round(fit.quantiles, 4).tolist()))
+        ),
     ).made_by(command())
     with new_folder(out, overwrite=True) as part:
         sha256 = memory.save(part / f"{NAME}.safetensors")

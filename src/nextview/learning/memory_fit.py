@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,9 +83,8 @@ def fit_memory(
     loss = [-np.mean([of_true_class(logs, truth).mean() for logs in beliefs]) for beliefs, _ in scored]
     beliefs, (weight, correlation, head) = scored[int(np.argmin(loss))]
     accuracy = tuple(float((logs.argmax(-1) == truth[:, None]).mean()) for logs in beliefs)
-    scores = -np.stack([alike_of.max((1, 2)) for alike_of in np.where(alike > FAR, alike, -1.0)])
-    kept = [np.take_along_axis(scores[:, None], drawn, 2)[..., :k].mean(-1).ravel() for k in range(1, 6)]
-    quantiles = np.stack([np.quantile(values, np.linspace(0, 1, LEVELS)) for values in kept]).astype(np.float32)
+    each = _belief(weight * alike, head * heads + sizes, where, drawn, of_class, correlation, range(1, 1 + max(VIEWS)))
+    quantiles = np.stack([np.quantile(-logs.max(-1), np.linspace(0, 1, LEVELS)) for logs in each])
     return Fit(
         weight,
         correlation,
@@ -147,12 +147,13 @@ def _belief(
     drawn: NDArray[np.int64],
     hypotheses: NDArray[np.int64],
     correlation: float,
+    after: Sequence[int] = VIEWS,
 ) -> list[NDArray[np.float64]]:
-    """Log-belief after so many drawn views as VIEWS says, (T, draws, classes) each."""
+    """Log-belief ``after`` so many drawn views, up to a constant, (T, draws, classes) each."""
     calibration = Calibration(1.0, 1.0, None, correlation, tuple(hypotheses.tolist()))
     found = []
     total = [log_evidence_of(x, a, z) for x, a, z in zip(logits, alike, where[..., 1], strict=True)]
-    for k in VIEWS:
+    for k in after:
         sums = np.stack([t[d[:, :k]].sum(1) for t, d in zip(total, drawn, strict=True)])
         found.append(calibration.log_belief(sums, k, logits.shape[-1]))
     return found
@@ -191,6 +192,7 @@ def size_evidence(radii: Float, label: NDArray[np.int64]) -> SizeEvidence | None
         if len(own):
             off = (grid[:, None] - own) / wide
             density[c] = np.log((0.9 * np.exp(-(off**2) / 2) + 0.1 / 4 * np.exp(-(off**2) / 32)).mean(1) / wide + 1e-9)
-    density[~np.isin(np.arange(len(density)), label[known])] = density.max()
+    density -= density.max()  # a usual size is no evidence against what is known
+    density[~np.isin(np.arange(len(density)), label[known])] = 0
     short = np.array([float(f"{radius:.5g}") for radius in np.exp(grid)])  # a card is read by people, too
     return SizeEvidence.from_arrays(short, np.round(density, 3), 1.0)

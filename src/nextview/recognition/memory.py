@@ -42,7 +42,6 @@ class Memory:
         radii: object radius of each thing, metres, (T,) float32; NaN where it is not known.
         pictures: a picture of each thing, (T, 64, 64) uint8.
         head, head_bias: a linear classifier of embeddings for classes of several things, (F, C) and (C,).
-        quantiles: see ``Novelty``; of the negative similarity to the nearest remembered view.
     """
 
     views: Float
@@ -54,7 +53,6 @@ class Memory:
     pictures: NDArray[np.uint8]
     head: Float
     head_bias: Float
-    quantiles: Float
 
     def __post_init__(self) -> None:
         h, t, f = len(self.thing), len(self.radii), self.views.shape[-1]
@@ -124,7 +122,8 @@ class TaughtRecogniser(Recogniser):
         if (h, things) != (len(self.calibration.hypotheses), len(self.memory.radii)):
             raise ModelError(f"{self.card.path}: holds {h} resting poses, and its card is of others")
         self._views = by_ring(self.memory.views)
-        self.novelty = Quantiles(self.memory.quantiles, np.array([self.memory.held_out[..., 0].size]))
+        judged = np.array([self.memory.held_out[..., 0].size])
+        self.novelty = Quantiles(np.array(about.novelty), judged, joint=True) if about.novelty else None
 
     def from_inputs(self, inputs: NDArray[Any], elevations: Float | None = None) -> Evidence:
         """Evidence by shape alone, from what the network takes and the elevations of the cameras, radians, (B,)."""
@@ -137,8 +136,7 @@ class TaughtRecogniser(Recogniser):
         assert self.card.memory is not None
         alike = similarities(self._views, embeddings, elevations)
         logits = embeddings @ self.memory.head + self.memory.head_bias
-        novelty = -alike.max((1, 2)).astype(np.float64)
-        return Evidence(logits, azimuth_bins=self.card.memory.weight * alike, novelty=novelty)
+        return Evidence(logits, azimuth_bins=self.card.memory.weight * alike)
 
     def features(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
         """The embeddings of views, (B, F)."""

@@ -47,12 +47,17 @@ class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a memory of things is of: the things in order, the features it is made of, and the weight of a cosine."""
+    """What a memory of things is of: the things in order, the features it is made of, and the weight of a cosine.
+
+    ``novelty`` are quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative log-likelihood of known
+    things, given the class that explains them best.
+    """
 
     things: tuple[Thing, ...]
     features_sha256: Sha256
     weight: float
     attribution: str = ""
+    novelty: tuple[tuple[float, ...], ...] = ()
 
 
 class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="schema", tag=2):

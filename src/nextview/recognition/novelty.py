@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from nextview.files import checked_bytes, new_file
 
 Float = NDArray[np.floating]
 
+ARRAYS = ("quantiles", "objects", "neighbours", "standard")
+"""In the file of a novelty score."""
 NEIGHBOUR = 10
 """The distance to this one of the nearest known views counts."""
 
@@ -29,10 +32,12 @@ class Quantiles:
         quantiles: scores of known objects after 1, 2, ... views, ascending, at even steps of probability from 0 to 1,
             (views, Q) float32.
         objects: how many known objects they are of, (1,) int64.
+        joint: whether a view's score is that of all views up to it; else the score of several is their mean.
     """
 
     quantiles: Float
     objects: NDArray[np.int64]
+    joint: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.quantiles.ndim != 2 or self.quantiles.shape[1] < 2 or not (np.diff(self.quantiles) >= 0).all():
@@ -55,7 +60,7 @@ class Quantiles:
 
     def of_views(self, scores: Sequence[float]) -> float:
         """The p-value of one object by the scores of its views so far; 1 if there is none."""
-        return float(self.p_value(float(np.mean(scores)), len(scores))) if scores else 1.0
+        return float(self.p_value(scores[-1] if self.joint else float(np.mean(scores)), len(scores))) if scores else 1.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,7 @@ class Novelty(Quantiles):
 
     def save(self, path: Path, overwrite: bool = False) -> str:
         """Write a .safetensors file, the known views in half precision; returns its SHA-256."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self)} | {"neighbours": in_half(self.neighbours)}
+        arrays = {name: getattr(self, name) for name in ARRAYS} | {"neighbours": in_half(self.neighbours)}
         content = save({name: np.ascontiguousarray(values) for name, values in arrays.items()})
         with new_file(path, overwrite) as part:
             part.write_bytes(content)
@@ -124,7 +129,7 @@ def read_novelty(path: Path, sha256: str) -> Novelty:
     """Read what ``Novelty.save`` wrote."""
     try:
         arrays = load(checked_bytes(path, sha256, "a novelty score"))
-        read = {f.name: arrays[f.name] for f in fields(Novelty)}
+        read: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
     except (SafetensorError, KeyError) as error:
         raise ModelError(f"{path}: not a novelty score ({error})") from None
     return Novelty(**read | {"neighbours": read["neighbours"].astype(np.float32)})

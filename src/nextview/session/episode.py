@@ -127,12 +127,12 @@ class Episodes:
         evidence: Evidence,
         directions: Float | None = None,
         constrain: Constrain = unconstrained,
-        hold: bool = False,
+        hold: Callable[[Step], bool] = lambda step: False,
     ) -> Taken:
-        """What ``update`` would take in. Nothing is changed; ``keep`` takes it in. On ``hold`` no threshold stops."""
+        """What ``update`` would take in. Nothing is changed; ``keep`` takes it in. No threshold stops on ``hold``."""
         taken = self._taken(evidence, directions)
         step, n_views = taken.step, len(self.steps) + 1
-        stopped = self.stopping.reached(step.belief, np.maximum(step.seen, 1)) & taken.counts & (not hold)
+        stopped = self.stopping.reached(step.belief, np.maximum(step.seen, 1)) & taken.counts & (not hold(step))
         if n_views >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
         if not stopped.all():

@@ -20,7 +20,6 @@ from nextview.geometry.viewsphere import Viewpoints, angle_between, azimuth_of, 
 from nextview.policies.base import EpisodeState, Policy, ValuesViews
 from nextview.policies.off_grid import anywhere
 from nextview.recognition.belief import Stopping, log_evidence_of
-from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Models
 from nextview.recognition.map_names import maps_among
 from nextview.sensing.frame import Frame
@@ -342,12 +341,13 @@ class Session:
             for k, step in enumerate(self._episodes.steps):
                 episodes.take(evidence.get(k, step.evidence), directions[k][None])
         reach = self._reach
-        novelty = [*(view.novelty for view in self.views), *self._novelty(evidence[last], observations[last])]
         taken = episodes.next_step(
             evidence[last],
             directions[last][None],
             lambda state: self._constrained(state, reach, object, here),
-            hold=bool(warnings) or self._suspicious([score for score in novelty if score is not None]),
+            hold=lambda step: (
+                bool(warnings) or self._suspicious([*self._scores(), *self._novelty(step, observations[last])])
+            ),
         )
         steps, views = [*episodes.steps, taken.step], list(self.views)
         travel = self._travelled([int(step.views[0]) for step in steps], directions)
@@ -387,14 +387,22 @@ class Session:
             arc=travel[1],
             direction=direction,
             azimuth_bins=None if bins is None else bins[0],
-            novelty=next(iter(self._novelty(evidence, observation)), None),
+            novelty=next(iter(self._novelty(step, observation)), None),
         )
 
-    @staticmethod
-    def _novelty(evidence: Evidence, observation: Observation) -> list[float]:
+    def _novelty(self, step: Step, observation: Observation) -> list[float]:
         """The novelty score of a view; none where nothing is seen, or the recogniser has no score."""
-        counts = observation.seen and (evidence.seen is None or bool(evidence.seen[0]))
-        return [float(evidence.novelty[0])] if evidence.novelty is not None and counts else []
+        score, evidence = self.models.recogniser.novelty, step.evidence
+        if not observation.seen or (evidence.seen is not None and not evidence.seen[0]):
+            return []
+        if score is not None and score.joint:  # how badly all views are explained by what is known
+            calibration, classes = self.models.recogniser.calibration, len(self.models.classes)
+            return [-float(calibration.log_belief(step.total, np.maximum(step.seen, 1), classes).max())]
+        return [] if evidence.novelty is None else [float(evidence.novelty[0])]
+
+    def _scores(self) -> list[float]:
+        """The novelty scores of the views so far."""
+        return [view.novelty for view in self.views if view.novelty is not None]
 
     def _suspicious(self, novelty: Sequence[float]) -> bool:
         """Whether an object with these scores is too novel for a confident answer."""
@@ -448,9 +456,8 @@ class Session:
     def result(self) -> Recognition:
         """How it ended; or what is believed so far, not confident, while it goes on."""
         with self._lock:
-            novelty = [view.novelty for view in self.views if view.novelty is not None]
             reached = self.done and bool(self._episodes.outcome.confident[0])
-            reached = reached and not self.views[-1].warnings and not self._suspicious(novelty)
+            reached = reached and not self.views[-1].warnings and not self._suspicious(self._scores())
             all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
             impossible = self._impossible()
             result = Recognition(
