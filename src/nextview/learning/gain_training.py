@@ -253,8 +253,8 @@ def train_gain(
         out: card to write (NAME.json); the networks are written beside it (NAME.onnx).
         validation: predictions of other such objects, which choose the epoch and the travel weight; those among them
             are left out of the training. By default PREDICTIONS choose them, in folds.
-        folds: without VALIDATION, so many policies are trained, each without its share of the objects, which validate
-            it; the result is the mean of all.
+        folds: without VALIDATION, so many policies are trained, at most one for each object, each without its share of
+            the objects, which validate it; the result is the mean of all.
         travel_weight: of a grid cell of travel; by default the lowest at which the policy travels no farther than a
             random walk in the local window.
         local: let it choose in the local window only.
@@ -342,6 +342,7 @@ def _load(
         _check(path, p, recipe)
     everything = np.arange(len(table))
     if validation is None:
+        folds = min(folds, len(np.unique(_shapes(table), axis=0)))  # of few objects each has a fold of its own
         validating = hold_out(table.labels, _shapes(table), folds, recipe.seed)
         learning = [np.setdiff1d(everything, part) for part in validating]
         validated_on = f"the same, each judged by networks of {folds - 1} other folds"
