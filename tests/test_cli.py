@@ -143,6 +143,14 @@ def test_where_there_is_no_terminal_a_line_tells_how_far_it_is(monkeypatch):
     assert all(re.fullmatch(r"rendering v.zarr: \d of 6 after \d+ s", line) for line in lines)
 
 
+def test_render_says_at_once_what_sizes_the_networks_take(furniture, tmp_path, capsys):
+    for size, said in (("48", True), ("112", False)):
+        command = ["render", str(furniture), str(tmp_path / f"{size}.zarr"), "--size", size, "--viewpoints", "12"]
+        main([*command, "--split", "test", "--workers", "0"])
+        words = " ".join(capsys.readouterr().err.split())
+        assert ("networks take images whose side is a multiple of 112 pixels, such as 224" in words) == said
+
+
 def test_predictions_are_summed_up():
     p = some_predictions(12, seed=0)
     n, v, c = p.logits.shape

@@ -332,6 +332,16 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
     assert policy.frame == "object"
 
 
+def test_few_objects_have_a_fold_each(unseen, tmp_path, capsys):
+    Predictions.load(unseen).of_objects(np.arange(4)).save(tmp_path / "few.npz")
+    command = ["train", "gain", str(tmp_path / "few.npz"), str(tmp_path / "few.json"), "--epochs", "1"]
+    main([*command, "--inputs", "belief", "place", "--frame", "camera"])
+    assert "judged by networks of 3 other folds" in json.loads((tmp_path / "few.json").read_text())["learned_from"]
+    Predictions.load(unseen).of_objects(np.arange(1)).save(tmp_path / "one.npz")
+    words = refused(capsys, "train", "gain", tmp_path / "one.npz", tmp_path / "one.json")
+    assert "1 objects cannot be divided into 1 folds: there have to be two at least" in words
+
+
 def test_it_learns_from_what_sensors_made_of_the_same_objects(unseen, tmp_path, capsys):
     p = Predictions.load(unseen)
     replace(p, logits=p.logits[:, ::-1]).of_objects(np.arange(90)[::-1]).save(tmp_path / "sensed.npz")

@@ -245,6 +245,11 @@ def test_every_map_has_policies_by_one_rule(name, maps):
         make_policy(f"{name}-peak-peak", SPHERE, maps=maps)
 
 
+def test_a_name_that_is_nearly_one_is_suggested():
+    with pytest.raises(PolicyError, match=r"no policy is called 'gian'; did you mean 'gain'[?]$"):
+        make_policy("gian", SPHERE)
+
+
 def test_a_card_is_written_as_it_was_read_and_a_broken_one_is_named(tmp_path):
     for name, path in bundled_policies().items():
         write_policy_card(tmp_path / f"{name}.json", read_policy_card(path))

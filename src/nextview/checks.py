@@ -7,8 +7,9 @@ import os
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
@@ -33,6 +34,12 @@ def one_line(text: str, most: int = 80) -> str:
     text = " ".join(text[: 10 * most].split())
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The known name that a wrong one is nearest to, as the next part of a sentence; "" if none is near."""
+    near = get_close_matches(name, list(known), 1, 0.6)
+    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def whole(value: Any, what: str, least: int = 0, most: int = 2**31 - 1) -> int:

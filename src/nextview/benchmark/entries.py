@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import log_softmax
 
 from nextview.benchmark.true_maps import TRUE, known_maps, stored_rows, true_measure
+from nextview.checks import did_you_mean
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import SceneSight
 from nextview.errors import EntryError, OtherUseError
@@ -133,7 +134,7 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
         return make_policy(name, p.sphere, specs.valley_classes(plain), p.classes, p.maps)
     names = [*policy_names(), *map_policy_names(p.maps), *bundled_policies(), *ORACLES]
     names += ["true-MEASURE-all", *(f"{kind}-K" for kind in FIXED)]
-    raise EntryError(f"no policy is called {name!r}; there are {', '.join(names)}")
+    raise EntryError(f"no policy is called {name!r}{did_you_mean(name, names) or '; there are ' + ', '.join(names)}")
 
 
 def _oracle(t: EpisodeSpecs, true: str, base: str, how: str) -> Policy:

@@ -26,7 +26,7 @@ COMMANDS = {
         "{found}\nnext: nextview recognise MESH --models {out}; what was learned is drawn in {out}/learned.png",
     ),
     "explore": Command(f"{CLI}.explore:explore", "choose views in the browser, and see what is believed"),
-    "capture": Command(f"{CLI}.recognise:capture", "write depth images of a mesh, as a camera would take them"),
+    "capture": Command(f"{CLI}.scenes:capture", "write depth images of a mesh, as a camera would take them"),
     "list": Command(f"{CLI}.listing:show", "list the bundled models, or the view measures"),
     "download": Command(f"{CLI}.listing:download", "download ModelNet10 or ModelNet40"),
     "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes, a target half hidden in each"),

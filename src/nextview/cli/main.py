@@ -3,10 +3,10 @@
 import os
 import shutil
 import sys
-from difflib import get_close_matches
 from itertools import takewhile
 
 from nextview import __version__
+from nextview.checks import did_you_mean
 from nextview.cli.commands import COMMANDS, RESUMES
 from nextview.cli.ending import orderly_end
 from nextview.errors import UsageError
@@ -34,9 +34,8 @@ def _run(arguments: list[str]) -> None:
     listed = {name: command.line for name, command in COMMANDS.items() if f"{name} ".startswith(f"{group} ".lstrip())}
     if len(words) == 2 or not listed:
         name = " ".join(words) if listed else group
-        near = get_close_matches(name, [*COMMANDS, *(name.split()[0] for name in COMMANDS)], 1, 0.6)
-        hint = f"did you mean {near[0]!r}?" if near else "nextview --help lists all"
-        raise UsageError(f"there is no command {name!r}; {hint}")
+        near = did_you_mean(name, [*COMMANDS, *(name.split()[0] for name in COMMANDS)])
+        raise UsageError(f"there is no command {name!r}{near or '; nextview --help lists all'}")
     usage = f"nextview {group} COMMAND".replace("  ", " ")
     print(f"usage: {usage} [ARGUMENTS]\n\n{ABOUT}\n")
     for name, line in listed.items():

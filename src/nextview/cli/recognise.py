@@ -1,4 +1,4 @@
-"""``nextview recognise`` and ``demo``: look at one object until it is clear what it is; ``capture`` for the former."""
+"""``nextview recognise`` and ``demo``: look at one object until it is clear what it is."""
 
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from nextview.cli.episode_table import episode_as_json, print_episode
-from nextview.cli.progress import console, track
-from nextview.cli.sources import Looking, Source, Unit, check_file
+from nextview.cli.progress import console
+from nextview.cli.sources import Looking, Source, check_file
 from nextview.errors import NextviewError, ObservationError, UsageError
-from nextview.files import check_new, new_file
-from nextview.geometry.mesh import MAX_FACES, load_mesh
-from nextview.geometry.viewsphere import ViewSphere
+from nextview.files import new_file
 from nextview.session.system import System, load, simulated
 
 
@@ -107,29 +105,3 @@ def show(
     if output.figure is not None:
         with new_file(output.figure, output.overwrite) as part:
             result.plot(part, name)
-
-
-def capture(
-    mesh: Path,  # OFF, OBJ, PLY, STL or GLB file of one object that stands upright
-    folder: Path,  # to write, in the layout of the BOP challenge; whole or not there at all
-    /,
-    viewpoints: Literal["40", "12"] = "40",  # from where it is captured, as in nextview recognise
-    table: bool = False,  # the object stands on a table, which is seen too; without one, masks are written
-    radius: float | None = None,  # object radius, metres, if the file's unit does not tell
-    up: Literal["y", "z"] | None = None,  # the file's up axis; z if not given, but y for GLB
-    unit: Unit | None = None,  # the file's unit of length
-    max_faces: int = MAX_FACES,  # refuse a mesh of more triangles, or a file of more than 60 bytes for each of these
-    overwrite: bool = False,  # replace the files of an earlier capture
-) -> None:
-    """Write captured views of a mesh: depth images, poses, intrinsics, as ``nextview recognise FOLDER`` reads them."""
-    from nextview.simulation.capturing import write_capture
-
-    check_new(folder, overwrite, folder=True)
-    loaded = load_mesh(mesh, up, unit, max_faces)
-    metres = loaded.metres if radius is None else radius
-    if metres is None:
-        raise UsageError(f"{mesh}: how large is it? Give the file's --unit or the object's --radius in metres")
-    sphere = ViewSphere.named(viewpoints)
-    frames = write_capture(loaded, folder, sphere, metres, table, not table, overwrite)
-    track(frames, len(sphere), f"capturing {mesh.name}")
-    console.print(f"{folder}: {len(sphere)} views; look at them with: nextview recognise {folder}")

@@ -1,12 +1,16 @@
-"""``nextview scenes``: draw cluttered scenes."""
+"""``nextview scenes`` draws cluttered scenes; ``capture`` writes depth images as a camera would take them."""
 
 from pathlib import Path
 from typing import Literal
 
-from nextview.cli.progress import console
+from nextview.cli.progress import console, track
+from nextview.cli.sources import Unit
 from nextview.cli.stores import Split, Workers, track_all
 from nextview.data import scene_drawing
-from nextview.errors import DatasetError
+from nextview.errors import DatasetError, UsageError
+from nextview.files import check_new
+from nextview.geometry.mesh import MAX_FACES, load_mesh
+from nextview.geometry.viewsphere import ViewSphere
 
 Level = Literal["light", "medium", "heavy"]
 
@@ -37,3 +41,29 @@ def scenes(
     if len(failed) == total:
         raise DatasetError(f"{out}: none of the {total} scenes can be drawn; see the reasons above")
     console.print(f"{out}: {total - len(failed)} scenes; next: nextview render {out} STORE --meshes {meshes}")
+
+
+def capture(
+    mesh: Path,  # OFF, OBJ, PLY, STL or GLB file of one object that stands upright
+    folder: Path,  # to write, in the layout of the BOP challenge; whole or not there at all
+    /,
+    viewpoints: Literal["40", "12"] = "40",  # from where it is captured, as in nextview recognise
+    table: bool = False,  # the object stands on a table, which is seen too; without one, masks are written
+    radius: float | None = None,  # object radius, metres, if the file's unit does not tell
+    up: Literal["y", "z"] | None = None,  # the file's up axis; z if not given, but y for GLB
+    unit: Unit | None = None,  # the file's unit of length
+    max_faces: int = MAX_FACES,  # refuse a mesh of more triangles, or a file of more than 60 bytes for each of these
+    overwrite: bool = False,  # replace the files of an earlier capture
+) -> None:
+    """Write captured views of a mesh: depth images, poses, intrinsics, as ``nextview recognise FOLDER`` reads them."""
+    from nextview.simulation.capturing import write_capture
+
+    check_new(folder, overwrite, folder=True)
+    loaded = load_mesh(mesh, up, unit, max_faces)
+    metres = loaded.metres if radius is None else radius
+    if metres is None:
+        raise UsageError(f"{mesh}: how large is it? Give the file's --unit or the object's --radius in metres")
+    sphere = ViewSphere.named(viewpoints)
+    frames = write_capture(loaded, folder, sphere, metres, table, not table, overwrite)
+    track(frames, len(sphere), f"capturing {mesh.name}")
+    console.print(f"{folder}: {len(sphere)} views; look at them with: nextview recognise {folder}")

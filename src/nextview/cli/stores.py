@@ -13,6 +13,7 @@ from nextview.data.splits import some_objects
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere
+from nextview.recognition.model_card import RECOGNISER, find_card
 
 Split = Literal["train", "test", "val"]
 
@@ -42,6 +43,9 @@ def render(
     """
     sphere = ViewSphere.named(viewpoints)
     sphere = sphere if azimuths is None else replace(sphere, azimuths=azimuths)
+    if size % (side := find_card(RECOGNISER).input.size):
+        takes = f"the bundled networks take images whose side is a multiple of {side} pixels, such as {2 * side}"
+        console.print(f"{takes}; those of {size} are for models of your own", style="yellow")
     found = rendering.listing(dataset, how)
     console.print(found.summary())
     try:

@@ -224,8 +224,8 @@ def train_gain(
     # predictions of other such objects, which choose the epoch and the travel weight; those among them are left out of
     # the training. By default PREDICTIONS choose them, in folds
     validation: Path | None = None,
-    # without VALIDATION, so many policies are trained, each without its share of the objects, which validate it; the
-    # result is the mean of all
+    # without VALIDATION, so many policies are trained, at most one for each object, each without its share of the
+    # objects, which validate it; the result is the mean of all
     folds: int = 20,
     # of a grid cell of travel; by default the lowest at which the policy travels no farther than a random walk in the
     # local window
@@ -300,10 +300,8 @@ def _load(
         _check(path, p, recipe)
     everything = np.arange(len(table))
     if validation is None:
-        shapes: NDArray = table.depth_entropy  # rows that are the same where the shape is: of scenes by their names
-        if scenes_of(table) is not None:
-            shapes = np.unique(_targets(table), return_inverse=True)[1][:, None].astype(np.float64)
-        validating = hold_out(table.labels, shapes, folds, recipe.seed)
+        folds = min(folds, len(np.unique(_shapes(table), axis=0)))  # of few objects each has a fold of its own
+        validating = hold_out(table.labels, _shapes(table), folds, recipe.seed)
         learning = [np.setdiff1d(everything, part) for part in validating]
         validated_on = f"the same, each judged by networks of {folds - 1} other folds"
     else:
@@ -329,6 +327,13 @@ def _load(
         tuple(dict.fromkeys((*(line for _, p in sources for line in p.commands), command()))),
     )
     return _Data(learned, validated, objects, validated_on, about, rng)
+
+
+def _shapes(p: Predictions) -> NDArray[np.floating]:
+    """Rows that are the same where the shape is, (N, ...): by what is seen of it, or in scenes by its name."""
+    if scenes_of(p) is None:
+        return p.depth_entropy
+    return np.unique(_targets(p), return_inverse=True)[1][:, None].astype(np.float64)
 
 
 def _targets(p: Predictions) -> list[str]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from nextview.checks import one_line, plugin, plugin_errors, plugins
+from nextview.checks import did_you_mean, one_line, plugin, plugin_errors, plugins
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.policies.base import Policy
@@ -75,7 +75,7 @@ def make_policy(
     if ":" in path:
         return _import_policy(path, sphere)
     known = [*policy_names(), *map_policy_names(maps), *bundled_policies(), f"{VISIBLE}{DEFAULT}"]
-    raise PolicyError(f"no policy is called {name!r}; there are {', '.join(known)}")
+    raise PolicyError(f"no policy is called {name!r}{did_you_mean(name, known) or '; there are ' + ', '.join(known)}")
 
 
 def make_policy_anywhere(

@@ -207,13 +207,16 @@ def load(
         made = make_policy_anywhere(policy, sphere, opened.valley_classes(policy), recogniser.classes, found.maps)
     if isinstance(made, MapPeak | SpherePeak):
         made = replace(made, sphere=_grid_of(opened.maps[made.map_name.removesuffix(SPHERE)], made.sphere))
-    if isinstance(stopping, Stopping) or stopping is None:
-        rule = stopping or Stopping.of(recogniser.calibration, threshold, risk, max_views)
-    elif risk is not None:
-        raise UsageError("error rates are promised for the package's own stopping rule, not for yours")
-    else:
-        rule = own_stopping(stopping, threshold, max_views)
+    rule = _rule(stopping, Stopping.of(recogniser.calibration, threshold, risk, max_views), risk)
     return System(opened, made, policy, sphere, rule, unknown, given)
+
+
+def _rule(given: Stopping | Rule | str | None, usual: Stopping, risk: float | None) -> Stopping:
+    if given is None or isinstance(given, Stopping):
+        return given or usual
+    if risk is not None:
+        raise UsageError("error rates are promised for the package's own stopping rule, not for yours")
+    return own_stopping(given, usual.threshold, usual.max_views)
 
 
 def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
