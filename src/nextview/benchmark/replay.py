@@ -84,19 +84,21 @@ def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int) -> Traject
     rng = np.random.default_rng([seed, *name.encode()])
     views = fixed_views(name, specs, rng)
     if views is None:
-        return _run(name, entry_policy(name, specs), specs, Stopping(1.0, max_views), rng)
+        return replay_policy(name, entry_policy(name, specs), specs, Stopping(1.0, max_views), rng)
     # Fixed views draw nothing more and may be long: in parts, whose steps are not all held at once.
     parts = []
     for start in range(0, len(views), PART):
         part = slice(start, start + PART)
         here = replace(specs, objects=specs.objects[part], starts=views[part, 0])
-        parts.append(_run(name, ViewList(views[part]), here, FixedLength(max_views=views.shape[1]), rng))
+        parts.append(replay_policy(name, ViewList(views[part]), here, FixedLength(max_views=views.shape[1]), rng))
     names = [f.name for f in fields(Trajectories) if f.name != "fixed"]
     whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     return replace(parts[0], **whole, fixed=True)
 
 
-def _run(name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng: np.random.Generator) -> Trajectories:
+def replay_policy(
+    name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng: np.random.Generator
+) -> Trajectories:
     p, objects = specs.predictions, specs.objects
     maps = {
         name: true_map(p, name.removeprefix(TRUE)) if name.startswith(TRUE) else p.maps[name]

@@ -91,6 +91,7 @@ class RenderOptions:
 
     Attributes:
         seed: decides deformations and errors of a sensor: those of an object by its name alone.
+        noise_seed: decides the errors of a sensor instead: the same objects seen again, with other errors.
         deform: how to make a new object of each mesh.
         sensor: look through it with all its errors: NAME or NAME:STRENGTH (docs/your_camera.md); clean by default.
         unit: of length in the mesh files (mm, cm, inch, foot, m), so that sizes are known (ModelNet: inch).
@@ -101,6 +102,7 @@ class RenderOptions:
     """
 
     seed: int = 0
+    noise_seed: int | None = None
     deform: Deform = Deform()
     sensor: str | None = None
     unit: str | None = None
@@ -166,6 +168,7 @@ def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) ->
     """Refuse settings that make no views; the sensor, if there is one."""
     whole(size, f"the size of {len(sphere)} views in pixels", 1, int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere))))
     whole(options.seed, "the seed", 0, 2**63 - 1)
+    whole(options.noise_seed or 0, "the seed of the noise", 0, 2**63 - 1)
     number(options.deform.stretch, "a stretch", 0)
     if options.unit not in (None, *UNITS):
         raise UsageError(f"the unit is one of {', '.join(UNITS)}, not {options.unit}")
@@ -212,6 +215,7 @@ def _recipe(
         hashes = list(pool.map(_hash, [e.path for e in entries]))
     return {
         "seed": options.seed,
+        "noise_seed": options.noise_seed,
         "stretch": options.deform.stretch,
         "rotated": options.deform.rotated,
         "sha256": hashes,
@@ -273,7 +277,8 @@ def _rendered(
     store: ViewStore, options: RenderOptions, sensor: Sensor | SensorMix | None, entry: Entry
 ) -> dict[str, NDArray]:
     sphere, size = store.sphere, store.attributes.size
-    rng = np.random.default_rng([options.seed, SENSING, *entry.name.encode()])
+    seed = options.seed if options.noise_seed is None else options.noise_seed
+    rng = np.random.default_rng([seed, SENSING, *entry.name.encode()])
     camera: Camera
     if options.meshes is None:
         mesh = deformed(store, load_mesh(entry.path, max_faces=options.max_faces), entry.name)
