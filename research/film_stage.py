@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
+from matplotlib import font_manager
+from PIL import Image, ImageDraw, ImageFont
 
-from nextview.geometry.viewsphere import look_at_origin
+from nextview.geometry.viewsphere import LAYOUTS, great_circle, level_pose, look_at_origin
+from nextview.policies.discriminate import Rivals
+from nextview.session.style import heat
 
-Array = np.ndarray
+Array, Colour = np.ndarray, tuple[int, int, int]
 KEY, SUN, SKY = np.array([-0.62, -0.30, 0.72]), np.array([1.30, 1.22, 1.08]), np.array([0.46, 0.50, 0.56])
 """Where the lamp is, how bright it is and the sky: red, green, blue."""
 SAMPLES = 12
 """Rays to the lamp and to the sky from each point of a still."""
+REACH = 2.0
+"""Object radii from which the camera is drawn."""
 
 
 class Stage:
@@ -31,6 +40,7 @@ class Stage:
             self.things.append((faces, normals, np.array(colour)))
 
     def blocked(self, points: Array, rays: Array) -> Array:
+        """Whether rays (..., 3) from points meet anything."""
         points, rays = np.broadcast_arrays(points, rays)
         shape = rays.shape[:-1]
         flat = [np.ascontiguousarray(x.reshape(-1, 3), np.float32) for x in (points, rays)]
@@ -115,7 +125,7 @@ def shot(stage: Stage, r: float, centre: Array, size: tuple[int, int]) -> Shot:
     """A still of a thing of radius ``r`` from before the table."""
     (width, height), rng = size, np.random.default_rng(0)
     pose, focal = look_at_origin(np.radians(23), np.radians(-63), 13 * r), width / 2 / (2.6 / 13)
-    pose[:3, 3] += centre + [0, 0, 0.5 * r]
+    pose[:3, 3] += centre + np.array([0, 0, 0.5 * r])
     rays = rays_of(pose, focal, width, height)
     hit, points, normals, colours = stage.hits(pose[:3, 3], rays)
     sky, lamp, where = np.tile(SKY * 0.9, (len(rays), 1)), np.zeros_like(rays), np.full_like(rays, np.inf)
@@ -132,3 +142,129 @@ def shot(stage: Stage, r: float, centre: Array, size: tuple[int, int]) -> Shot:
 
 def unit(x: Array) -> Array:
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class Look:
+    """A view and what followed: the leading classes with their belief, what views are worth, and the leading two."""
+
+    direction: Array
+    picture: Array
+    leading: list[tuple[str, float]]
+    values: Array | None
+    rivals: Rivals | None
+    next_view: int | None
+    travel: float
+
+
+def gadget() -> tuple[Array, Array]:
+    """A camera at the end of a wrist, looking along z; one is its distance from a thing's middle to its surface."""
+    box, lens = trimesh.creation.box((0.62, 0.26, 0.22)), trimesh.creation.cylinder(0.11, 0.14, 40)
+    lens.apply_translation((0.14, 0, 0.17))
+    second = lens.copy()
+    second.apply_translation((-0.30, 0, 0))
+    wrist = trimesh.creation.cylinder(0.15, 0.5, 40)
+    wrist.apply_translation((0, 0, -0.36))
+    parts = trimesh.util.concatenate([box, lens, second, wrist])
+    return np.array(parts.vertices), np.array(parts.faces, np.int32)
+
+
+def scene(shot: Shot, colour: Colour, looks: list[Look], at: int, progress: float) -> Image.Image:
+    """The table: what views are worth, the way so far, and the camera on its way to look ``at``."""
+    look, before = looks[at], looks[max(at - 1, 0)]
+    way = great_circle(before.direction, look.direction, 25)
+    here = way[round(24 * progress)]
+    pose = level_pose(here, REACH)
+    vertices, faces = gadget()
+    hand = Stage(
+        [((0.36 * vertices @ pose[:3, :3].T + pose[:3, 3]) * shot.radius + shot.centre, faces, (0.05, 0.055, 0.065))]
+    )
+    middle = pose[:3, 3] * shot.radius + shot.centre
+    to_lamp = KEY / np.linalg.norm(KEY)
+    off = middle - np.where(np.isfinite(shot.points), shot.points, 1e3)
+    near = np.linalg.norm(off - (off @ to_lamp)[..., None] * to_lamp, axis=2) < 0.5 * shot.radius
+    lamp = shot.lamp.copy()
+    rng = np.random.default_rng(0)
+    jitter = 0.09 * rng.normal(size=(6, 1, 3))
+    lamp[near] *= 1 - hand.blocked(shot.points[near] + 1e-4, KEY + jitter).mean(0)[:, None]
+    picture = Image.fromarray(toned(shot.sky + lamp))
+    draw = ImageDraw.Draw(picture, "RGBA")
+    dots(draw, shot, before if progress < 1 else look, colour)
+    stood = [great_circle(a.direction, b.direction) for a, b in itertools.pairwise(looks)]
+    path = np.concatenate([*stood, way[: round(24 * progress) + 1]])[::2] * REACH * shot.radius + shot.centre
+    draw.line([tuple(p) for p in shot.place(path)[0]], (*colour, 230), 5, "curve")
+    for past in looks[: at + (progress == 1)]:
+        circle(draw, shot.place((past.direction * REACH * shot.radius + shot.centre)[None])[0][0], 8, (*colour, 255))
+    if progress == 1:
+        corners = [middle, *(shot.centre + 0.62 * shot.radius * (pose[:3, 0] * x + pose[:3, 1] * y) for x, y in SQUARE)]
+        flat = [tuple(p) for p in shot.place(np.array(corners))[0]]
+        for a, b in zip(flat[1:], [*flat[2:], flat[1]], strict=True):
+            draw.polygon([flat[0], a, b], (*colour, 26))
+        draw.line([*flat[1:], flat[1]], (*colour, 150), 2)
+    pasted(picture, shot, hand, middle)
+    return picture
+
+
+SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+
+
+def dots(draw: ImageDraw.ImageDraw, shot: Shot, look: Look, colour: Colour) -> None:
+    """The candidate views, in the colours of what they are worth; those behind the thing faint."""
+    places = LAYOUTS["40"].directions * REACH * shot.radius + shot.centre
+    flat, depth = shot.place(places)
+    known = look.values is not None and np.isfinite(look.values).any()
+    colours = heat(look.values) if known else np.full((len(places), 3), 150)
+    back = np.linalg.norm(shot.pose[:3, 3] - shot.centre)
+    for k in np.argsort(-depth):
+        if look.next_view is not None and places[k, 2] > 0:
+            faint = 235 if depth[k] < back else 110
+            circle(draw, flat[k], 13 if k == look.next_view else 7, (*map(int, colours[k]), faint))
+            if k == look.next_view:
+                circle(draw, flat[k], 15, None, (*colour, 255), 4)
+
+
+def circle(
+    draw: ImageDraw.ImageDraw, at: Array, r: float, fill: tuple | None, outline: tuple | None = None, width: int = 1
+) -> None:
+    draw.ellipse((at[0] - r, at[1] - r, at[0] + r, at[1] + r), fill, outline, width)
+
+
+def pasted(picture: Image.Image, shot: Shot, hand: Stage, middle: Array) -> None:
+    """Draw the camera where nothing stands before it."""
+    (x, y), reach = (
+        shot.place(middle[None])[0][0],
+        int(0.4 * shot.radius * shot.focal / np.linalg.norm(shot.pose[:3, 3] - middle)),
+    )
+    width, height = picture.size
+    x0, x1, y0, y1 = (
+        int(np.clip(v, 0, m))
+        for v, m in ((x - reach, width), (x + reach, width), (y - reach, height), (y + reach, height))
+    )
+    if x0 >= x1 or y0 >= y1:
+        return
+    rays = rays_of(shot.pose, shot.focal, width, height).reshape(height, width, 3)[y0:y1, x0:x1].reshape(-1, 3)
+    hit, points, normals, colours = hand.hits(shot.pose[:3, 3], rays)
+    light = sum(hand.lit(points, normals, colours, np.random.default_rng(0), 6))
+    shine = np.maximum((normals * unit(unit(KEY) - unit(rays[hit]))).sum(1), 0) ** 30
+    light += 0.25 * shine[:, None]
+    eye = shot.pose[:3, 3]
+    behind = np.linalg.norm(shot.points[y0:y1, x0:x1].reshape(-1, 3)[hit] - eye, axis=1) < np.linalg.norm(
+        points - eye, axis=1
+    )
+    pixels = np.asarray(picture).copy()
+    part = pixels[y0:y1, x0:x1].reshape(-1, 3)
+    part[np.flatnonzero(hit)[~behind]] = toned(light)[~behind]
+    pixels[y0:y1, x0:x1] = part.reshape(y1 - y0, x1 - x0, 3)
+    picture.paste(Image.fromarray(pixels))
+
+
+@cache
+def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    weight = "bold" if bold else "normal"
+    return ImageFont.truetype(font_manager.findfont(font_manager.FontProperties("DejaVu Sans", weight=weight)), size)
+
+
+def tag(draw: ImageDraw.ImageDraw, text: str, at: tuple[int, int], colour: Colour) -> None:
+    wide = draw.textlength(text, font(34, True)) / 2 + 30
+    draw.rounded_rectangle((at[0] - wide, at[1] - 30, at[0] + wide, at[1] + 30), 30, (*colour, 240))
+    draw.text(at, text, (255, 255, 255), font(34, True), anchor="mm")

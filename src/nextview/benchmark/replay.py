@@ -99,6 +99,7 @@ def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int) -> Traject
 def replay_policy(
     name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng: np.random.Generator
 ) -> Trajectories:
+    """Run a policy of any kind through all episodes, until a rule ends them; ``name`` is for messages."""
     p, objects = specs.predictions, specs.objects
     maps = {
         name: true_map(p, name.removeprefix(TRUE)) if name.startswith(TRUE) else p.maps[name]

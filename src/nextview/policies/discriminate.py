@@ -95,7 +95,7 @@ class Discriminate:
         shown = self.views[hypothesis[:, None], ring, bins].astype(np.float32)
         shown = shown.swapaxes(0, 1)
         alike = shown @ shown.swapaxes(1, 2)  # (V, leading, leading)
-        known = shown.any(2)
+        known: NDArray[np.bool_] = np.asarray(shown.any(2))
         alike = np.where(known[:, :, None] & known[:, None], alike, 1)  # what is not known tells nothing
         kept = np.exp(-WEIGHT * (1 - alike.astype(np.float64))) * belief
         same = self.classes[hypothesis][:, None] == self.classes[hypothesis]
