@@ -37,8 +37,8 @@ RIVALS = ("random-all", "spread", "furthest", "orbit-10")
 OWN, FORESIGHT, CEILING = "discriminate", "foresight", "fair ceiling"
 MOST, ENOUGH = 10, 0.95
 """Views within which so many are to be right."""
-ROWS = 64
-Float = NDArray[np.floating]
+ROWS, SAMPLES = 64, 4000
+Float, Whole = NDArray[np.floating], NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ class FairCeiling:
 
     sphere: ViewSphere
     log_evidence: Float  # (draws, things, V, D)
-    labels: NDArray[np.int64]  # of the things, (N,)
-    objects: NDArray[np.int64]  # draw * things + thing of each episode, (E,)
+    labels: Whole  # of the things, (N,)
+    objects: Whole  # draw * things + thing of each episode, (E,)
     classes: int
     calibration: Calibration
     needs: tuple[str, ...] = ()
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Whole:
         """See ``Policy.next_views``."""
         rows = np.split(np.arange(len(state.current)), range(ROWS, len(state.current), ROWS))
         return best_view(self.sphere, state, np.concatenate([self._worth(state, each) for each in rows]))
@@ -72,17 +72,12 @@ class FairCeiling:
 
 def together(draws: Sequence[Predictions]) -> Predictions:
     """All draws as one: object = draw * things + thing."""
-    first = draws[0]
-    for other in draws[1:]:
-        if (other.names, other.models["recogniser"]) != (first.names, first.models["recogniser"]):
-            raise UsageError("the predictions are of other things, or by another memory")
-
-    def joined(name: str) -> NDArray:
-        return np.concatenate([getattr(draw, name) for draw in draws])
-
-    arrays = ("logits", "depth_entropy", "labels", "splits", "conflicting", "azimuth_bins")
+    if len({(draw.names, draw.models["recogniser"][1]) for draw in draws}) > 1:
+        raise UsageError("the predictions are of other things, or by another memory")
+    fields = ("logits", "depth_entropy", "labels", "splits", "conflicting", "azimuth_bins")
+    arrays = {name: np.concatenate([getattr(draw, name) for draw in draws]) for name in fields}
     names = tuple(f"{name} {k}" for k, draw in enumerate(draws) for name in draw.names)
-    return replace(first, **{name: joined(name) for name in arrays}, names=names, maps={}, of_size=None)
+    return replace(draws[0], **arrays, names=names, maps={}, of_size=None)
 
 
 def margins(recogniser: TaughtRecogniser, by_shape: bool) -> NDArray[np.float64]:
@@ -98,11 +93,9 @@ def margins(recogniser: TaughtRecogniser, by_shape: bool) -> NDArray[np.float64]
     logs = recogniser.calibration.log_belief(total, 1, len(recogniser.classes))
     first = np.unique(memory.thing, return_index=True)[1]
     label = np.repeat(np.array(recogniser.calibration.hypotheses)[first], k)
-    rows = np.arange(len(label))
-    own = logs[rows, label]
-    logs[rows, label] = -np.inf
-    margin, count = np.bincount(label, own - logs.max(1)), np.bincount(label)
-    return margin / count
+    own = logs[np.arange(len(label)), label]
+    logs[np.arange(len(label)), label] = -np.inf
+    return np.bincount(label, own - logs.max(1)) / np.bincount(label)
 
 
 def run(draws: Sequence[Predictions], card: Path, runs: int, seed: int, most: int) -> dict[str, Trajectories]:
@@ -115,20 +108,13 @@ def run(draws: Sequence[Predictions], card: Path, runs: int, seed: int, most: in
     if len(draws) > 1:
         evidence = p.log_evidence.reshape(len(draws), n, len(p.sphere), -1)
         policy = FairCeiling(p.sphere, evidence, p.labels[:n], specs.objects, len(p.classes), p.calibration)
-        rng = np.random.default_rng(seed)
-        found[CEILING] = replay_policy(CEILING, policy, specs, Stopping(1.0, most), rng)
+        found[CEILING] = replay_policy(CEILING, policy, specs, Stopping(1.0, most), np.random.default_rng(seed))
     return found
 
 
-def measured(
-    paths: dict[str, Trajectories],
-    labels: NDArray[np.int64],
-    things: NDArray[np.int64],
-    n_views: Sequence[int],
-    seed: int,
-) -> list[dict]:
+def measured(paths: dict[str, Trajectories], labels: Whole, things: Whole, n_views: Sequence[int]) -> list[dict]:
     """Numbers of some of the things: accuracy, travel, the lead over random, its p, and the share of the ceiling's."""
-    weights = resample(len(things), 4000, np.random.default_rng([seed, 1]))
+    weights = resample(len(things), SAMPLES, np.random.default_rng(1))
     right: dict[tuple[str, int], NDArray[np.bool_]] = {}
     for name, path in paths.items():
         for k in range(1, path.answers.shape[1] + 1):
@@ -136,29 +122,25 @@ def measured(
             right[name, k] = (answer.reshape(-1, len(labels)) == labels)[:, things]
     rows = []
     for (name, k), hits in right.items():
-        if k not in n_views and name in (FORESIGHT, CEILING):
-            continue
         random = right[RIVALS[0], k]
         each = np.stack([hits.mean(0), hits.mean(0) - random.mean(0)], 1)
         low, high = interval(ratio(each, np.ones_like(each), weights))
         gap = right[CEILING, k].mean() - random.mean() if (CEILING, k) in right else np.nan
         ends = paths[name].travel[:, k - 1].reshape(-1, len(labels))[:, things]
         tested = name not in (RIVALS[0], FORESIGHT, CEILING) and k in n_views and k > 1
-        accuracy, lead = each.mean(0)
+        lead = each[:, 1].mean()
         rows.append({
-            "policy": name, "n_views": k, "accuracy": accuracy, "low": low[0], "high": high[0], "travel": ends.mean(),
-            "lead": lead, "lead_low": low[1], "lead_high": high[1], "p": mcnemar(hits, random) if tested else np.nan,
-            "of_ceiling": lead / gap if gap > 0 and k > 1 else np.nan,
+            "policy": name, "n_views": k, "accuracy": hits.mean(), "low": low[0], "high": high[0], "lead": lead,
+            "travel": ends.mean(), "lead_low": low[1], "lead_high": high[1],
+            "p": mcnemar(hits, random) if tested else np.nan, "of_ceiling": lead / gap if gap > 0 and k > 1 else np.nan,
         })  # fmt: skip
     return rows
 
 
 def markdown(table: pd.DataFrame, n_views: Sequence[int]) -> str:
     """The table as text."""
-    lines = [
-        "| things | policy | " + " | ".join(f"{k} view{'s' * (k > 1)}" for k in n_views) + f" | {ENOUGH:.0%} right |"
-    ]
-    lines.append("|---" * (len(n_views) + 3) + "|")
+    head = ["things", "policy", *(f"{k} view{'s' * (k > 1)}" for k in n_views), f"{ENOUGH:.0%} right"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for (things, name), rows in table.groupby(["things", "policy"], sort=False):
         cells, by_views = [], rows.set_index("n_views")
         for k in n_views:
@@ -193,19 +175,18 @@ def main(
         by_shape: as if sizes were not known.
         runs: random first views of each thing in each draw.
         n_views: after how many the policies are compared.
-        seed: decides first views, random policies and the bootstrap.
+        seed: decides first views and random policies.
     """
-    draws = [Predictions.load(path) for path in predictions]
-    draws = [draw.by_shape() for draw in draws] if by_shape else draws
+    draws = [draw.by_shape() if by_shape else draw for draw in map(Predictions.load, predictions)]
     recogniser = TaughtRecogniser(card)
     if recogniser.classes != draws[0].classes:
         raise UsageError(f"{card}: knows other things than the predictions")
     margin = margins(recogniser, by_shape)[draws[0].labels]
     half = np.sort(np.argsort(margin, kind="stable")[: len(margin) // 2])
     paths = run(draws, card, runs, seed, max(n_views))
-    rows = []
+    rows: list[dict] = []
     for name, things in (("all", np.arange(len(margin))), ("the confusable half", half)):
-        rows += [{"things": name} | row for row in measured(paths, draws[0].labels, things, n_views, seed)]
+        rows += [{"things": name} | row for row in measured(paths, draws[0].labels, things, n_views)]
     table = pd.DataFrame(rows)
     table["p_holm"] = holm(table["p"].to_numpy())
     out.mkdir(parents=True, exist_ok=True)

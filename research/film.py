@@ -290,7 +290,7 @@ def main(folder: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path], se
         start = [get_ffmpeg_exe(), "-y", "-loglevel", "error", "-framerate", str(RATE), "-i", f"{part}/%04d.png"]
         h264 = ["-c:v", "libx264", "-crf", "20", "-preset", "slow", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
         subprocess.run([*start, *h264, str(out / "things.mp4")], check=True)
-        use = "paletteuse=dither=bayer:bayer_scale=4:diff_mode=rectangle"
+        use = "paletteuse=dither=sierra2_4a:diff_mode=rectangle"
         palette = f"split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]{use}"
         subprocess.run([*start, "-filter_complex", palette, str(out / "things.gif")], check=True)
 

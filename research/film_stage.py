@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import trimesh
@@ -190,7 +190,7 @@ def scene(shot: Shot, colour: Colour, looks: list[Look], at: int, progress: floa
     picture = Image.fromarray(toned(shot.sky + lamp))
     draw = ImageDraw.Draw(picture, "RGBA")
     dots(draw, shot, before if progress < 1 else look, colour)
-    stood = [great_circle(a.direction, b.direction) for a, b in itertools.pairwise(looks)]
+    stood = [great_circle(a.direction, b.direction) for a, b in pairwise(looks[:at])]
     path = np.concatenate([*stood, way[: round(24 * progress) + 1]])[::2] * REACH * shot.radius + shot.centre
     draw.line([tuple(p) for p in shot.place(path)[0]], (*colour, 230), 5, "curve")
     for past in looks[: at + (progress == 1)]:
