@@ -74,7 +74,8 @@ def together(draws: Sequence[Predictions]) -> Predictions:
     """All draws as one: object = draw * things + thing."""
     if len({(draw.names, draw.models["recogniser"][1]) for draw in draws}) > 1:
         raise UsageError("the predictions are of other things, or by another memory")
-    fields = ("logits", "depth_entropy", "labels", "splits", "conflicting", "azimuth_bins")
+    fields = ["logits", "depth_entropy", "labels", "splits", "conflicting"]
+    fields += ["azimuth_bins"] * (draws[0].azimuth_bins is not None)
     arrays = {name: np.concatenate([getattr(draw, name) for draw in draws]) for name in fields}
     names = tuple(f"{name} {k}" for k, draw in enumerate(draws) for name in draw.names)
     return replace(draws[0], **arrays, names=names, maps={}, of_size=None)
@@ -117,7 +118,7 @@ def measured(paths: dict[str, Trajectories], labels: Whole, things: Whole, n_vie
     weights = resample(len(things), SAMPLES, np.random.default_rng(1))
     right: dict[tuple[str, int], NDArray[np.bool_]] = {}
     for name, path in paths.items():
-        for k in range(1, path.answers.shape[1] + 1):
+        for k in range(1, (max(n_views) if name in (FORESIGHT, CEILING) else MOST) + 1):
             answer = path.answers[np.arange(len(path.views)), np.minimum(k, (path.views >= 0).sum(1)) - 1]
             right[name, k] = (answer.reshape(-1, len(labels)) == labels)[:, things]
     rows = []
@@ -126,7 +127,7 @@ def measured(paths: dict[str, Trajectories], labels: Whole, things: Whole, n_vie
         each = np.stack([hits.mean(0), hits.mean(0) - random.mean(0)], 1)
         low, high = interval(ratio(each, np.ones_like(each), weights))
         gap = right[CEILING, k].mean() - random.mean() if (CEILING, k) in right else np.nan
-        ends = paths[name].travel[:, k - 1].reshape(-1, len(labels))[:, things]
+        ends = paths[name].travel[:, :k][:, -1].reshape(-1, len(labels))[:, things]
         tested = name not in (RIVALS[0], FORESIGHT, CEILING) and k in n_views and k > 1
         lead = each[:, 1].mean()
         rows.append({

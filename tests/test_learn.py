@@ -33,17 +33,6 @@ THINGS = ("chair", "monitor", "table")
 FORTY = ViewSphere.named("40")
 
 
-@pytest.fixture(scope="module")
-def scans(shared) -> Path:
-    """Three meshes in one folder, centimetres."""
-    return shared("scans", lambda folder: [write_off(folder / f"{name}.off", sample_mesh(name)) for name in THINGS])
-
-
-@pytest.fixture(scope="module")
-def taught(shared, scans) -> Path:
-    return shared("taught", lambda folder: learn(scans, folder / "mine", upright=True, workers=0)) / "mine"
-
-
 def files_of(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
