@@ -6,7 +6,7 @@ What is shown are runs of ``nextview.load(models="ycb")``: depth frames through 
 other things around, and candidate views only where no other thing stands. Light and shadow are cast by Embree. The
 camera is drawn nearer to the thing than it stands. Scans have no colours: those of the film are given here, and nothing
 that recognises sees them. The seed was chosen before any run. It is one run: what holds on average is in
-docs/your_objects.md. Needs ``pip install imageio-ffmpeg``.
+docs/your_objects.md. Needs ``pip install './research[film]'``.
 """
 
 from __future__ import annotations
@@ -257,7 +257,7 @@ def pages(stage: Stage, placed: list, sides: tuple[Side, Side], thumbs: Thumbs) 
                     drawn[state] = half(still, side, name, thumbs, *state[1:])
                 page.paste(drawn[state].crop((0, 0, SIZE[0] - 2, 2 * SIZE[1])), (n * (SIZE[0] + 2), 0))
             yield page
-    card = Image.blend(page, Image.new("RGB", page.size, PAPER), 0.82)
+    card = Image.blend(page, Image.new("RGB", page.size, PAPER), 0.94)
     draw = ImageDraw.Draw(card)
     for n, side in enumerate(sides):
         middle, (right, views, travel) = SIZE[0] * n + SIZE[0] // 2, side.stands
@@ -265,7 +265,7 @@ def pages(stage: Stage, placed: list, sides: tuple[Side, Side], thumbs: Thumbs) 
         draw.text((middle, 470), f"{right} of {len(SHOWN)} right", INK, font(64, True), anchor="mm")
         draw.text((middle, 560), f"{views} views, {travel:.0f} cells of travel", INK, font(38), anchor="mm")
     said = "12 of 78 things known from scans, by depth alone, through a simulated wrist camera"
-    draw.text((SIZE[0], 760), said, GREY, font(32), anchor="mm")
+    draw.text((SIZE[0], 700), said, GREY, font(32), anchor="mm")
     yield from [card] * round(END * RATE)
 
 
