@@ -14,7 +14,10 @@ import numpy as np
 import pytest
 from filelock import FileLock
 from hypothesis import settings
-from pipeline import FURNITURE, SPHERE, make_map_network, make_recogniser, some_predictions, write_furniture
+from pipeline import FURNITURE, SPHERE, make_map_network, make_recogniser, some_predictions, write_furniture, write_off
+
+from nextview.data.samples import sample_mesh
+from nextview.learning.learn import learn
 
 LONG = ("test_workflow.py", "test_training.py")
 """Files that take longest: begun first, no process is left alone with one at the end."""
@@ -48,6 +51,19 @@ def shared(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
         return root / name
 
     return folder
+
+
+@pytest.fixture(scope="session")
+def scans(shared) -> Path:
+    """Three meshes in one folder, centimetres."""
+    names = ("chair", "monitor", "table")
+    return shared("scans", lambda folder: [write_off(folder / f"{name}.off", sample_mesh(name)) for name in names])
+
+
+@pytest.fixture(scope="session")
+def taught(shared, scans) -> Path:
+    """The models that know them."""
+    return shared("taught", lambda folder: learn(scans, folder / "mine", upright=True, workers=0)) / "mine"
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.geometry.mesh import UNITS, load_mesh, make_mesh
 from nextview.geometry.resting import resting_poses, rotated
-from nextview.geometry.viewsphere import ViewSphere
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.learning.learn import learn
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate import Discriminate
@@ -25,20 +25,12 @@ from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, 
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.memory import AZIMUTHS, RINGS, by_ring, read_memory, similarities
 from nextview.recognition.model_card import read_card
+from nextview.simulation.simulated import SimulatedCamera
+from nextview.viewers.card import preview_card, walk_card
+from nextview.viewers.exploration import Exploration, remembered_picture, shown_objects
 
 THINGS = ("chair", "monitor", "table")
 FORTY = ViewSphere.named("40")
-
-
-@pytest.fixture(scope="module")
-def scans(shared) -> Path:
-    """Three meshes in one folder, centimetres."""
-    return shared("scans", lambda folder: [write_off(folder / f"{name}.off", sample_mesh(name)) for name in THINGS])
-
-
-@pytest.fixture(scope="module")
-def taught(shared, scans) -> Path:
-    return shared("taught", lambda folder: learn(scans, folder / "mine", upright=True, workers=0)) / "mine"
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
@@ -53,6 +45,29 @@ def test_taught_things_are_recognised_through_a_sensor(taught, scans):
         result = system.recognise(scans / f"{name}.off", sensor="wrist", seed=1)
         assert (result.answer, result.confident) == (name, True)
         np.testing.assert_allclose(result.views[-1].belief.sum(), 1)
+
+
+def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans):
+    exploration = Exploration(shown_objects(scans / "chair.off"), models=taught, start=11, threads=1)
+    walk = exploration.walks[0]
+    assert walk.rivals is None
+    walk.step()
+    rivals, belief = walk.rivals, walk.views[0].belief
+    np.testing.assert_array_equal(rivals.classes, np.argsort(-belief)[:2])
+    view = 33
+    assert FORTY.azimuth[view] == pytest.approx(2 * np.pi / AZIMUTHS * rivals.azimuths[0, view])
+    (name, picture), (other, _) = walk.remembered(rivals, view)
+    assert (name, other) == tuple(walk.system.classes[c] for c in rivals.classes)
+    pose = look_at_origin(np.radians(RINGS[rivals.rings[view]]), FORTY.azimuth[view])
+    seen = SimulatedCamera(load_mesh(scans / "chair.off"), 64).observe(pose)
+    np.testing.assert_array_equal(picture, seen.picture)
+    shown = walk_card(walk)
+    assert f"From view {walk.next_view} these two" in shown
+    assert f"differ by {1 - rivals.alike[walk.next_view]:.2f}" in shown
+    assert f"From view {view} these two" in preview_card(seen, walk)
+    bundled = nextview.load(models="ycb", threads=1).models.recogniser  # its meshes are not here
+    kept = bundled.memory.pictures[bundled.memory.thing[100]]
+    np.testing.assert_array_equal(remembered_picture(bundled, 100, 0, 0), kept)
 
 
 def test_predictions_of_taught_things_replay_with_their_policy(tmp_path, taught, scans, capsys):
@@ -184,6 +199,9 @@ def test_the_policy_goes_where_two_things_differ(place):
     evidence = Evidence(np.zeros((1, 2)))
     state = EpisodeState(np.array([current]), visited, np.full((1, 2), 0.5), evidence, 1, joint=joint)
     assert policy.next_views(state, np.random.default_rng(0)).tolist() == [place]
+    rivals = policy.rivals(joint[0], FORTY.azimuth[current])
+    np.testing.assert_array_equal(rivals.classes, [0, 1])
+    np.testing.assert_array_equal(rivals.alike, np.arange(40) != place)
 
 
 def test_a_box_rests_on_its_faces_and_keeps_its_size():

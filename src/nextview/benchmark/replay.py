@@ -80,19 +80,19 @@ def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int, beliefs: b
     views = fixed_views(name, specs, rng)
     if views is None:
         to_the_end = FixedLength(max_views=max_views) if beliefs else Stopping(1.0, max_views)
-        return _run(name, entry_policy(name, specs), specs, to_the_end, rng, beliefs)
+        return replay_policy(name, entry_policy(name, specs), specs, to_the_end, rng, beliefs)
     # Fixed views draw nothing more and may be long: in parts, whose steps are not all held at once.
     parts = []
     for start in range(0, len(views), PART):
         part = slice(start, start + PART)
         here = replace(specs, objects=specs.objects[part], starts=views[part, 0])
-        parts.append(_run(name, ViewList(views[part]), here, FixedLength(max_views=views.shape[1]), rng))
+        parts.append(replay_policy(name, ViewList(views[part]), here, FixedLength(max_views=views.shape[1]), rng))
     names = [f.name for f in fields(Trajectories) if f.name not in ("fixed", "beliefs")]
     whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     return replace(parts[0], **whole, fixed=True)
 
 
-def _run(
+def replay_policy(
     name: str,
     policy: Policy,
     specs: EpisodeSpecs,
@@ -100,6 +100,7 @@ def _run(
     rng: np.random.Generator,
     beliefs: bool = False,
 ) -> Trajectories:
+    """Run a policy of any kind through all episodes, until a rule ends them; ``name`` is for messages."""
     p, objects = specs.predictions, specs.objects
     maps = {
         name: true_map(p, name.removeprefix(TRUE)) if name.startswith(TRUE) else p.maps[name]

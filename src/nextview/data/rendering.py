@@ -79,6 +79,7 @@ class RenderOptions:
     """What is rendered, and how."""
 
     seed: int = 0  # decides deformations and errors of a sensor: those of an object by its name alone
+    noise_seed: int | None = None  # decides the errors of a sensor instead: the same objects, with other errors
     deform: Deform = Deform()  # how to make a new object of each mesh
     # look through it with all its errors: NAME or NAME:STRENGTH (docs/your_camera.md); clean by default
     sensor: str | None = None
@@ -116,6 +117,7 @@ def render(
             hashes = list(pool.map(_hash, [e.path for e in entries]))
         recipe = {
             "seed": options.seed,
+            "noise_seed": options.noise_seed,
             "stretch": options.deform.stretch,
             "rotated": options.deform.rotated,
             "sha256": hashes,
@@ -148,6 +150,7 @@ def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) ->
     """Refuse settings that make no views; the sensor, if there is one."""
     whole(size, f"the size of {len(sphere)} views in pixels", 1, int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere))))
     whole(options.seed, "the seed", 0, 2**63 - 1)
+    whole(options.noise_seed or 0, "the seed of the noise", 0, 2**63 - 1)
     number(options.deform.stretch, "a stretch", 0)
     if options.unit not in (None, *UNITS):
         raise UsageError(f"the unit is one of {', '.join(UNITS)}, not {options.unit}")
@@ -237,7 +240,8 @@ def _rendered(
     store: ViewStore, options: RenderOptions, sensor: Sensor | SensorMix | None, entry: Entry
 ) -> dict[str, NDArray]:
     sphere, size = store.sphere, store.attributes.size
-    rng = np.random.default_rng([options.seed, SENSING, *entry.name.encode()])
+    seed = options.seed if options.noise_seed is None else options.noise_seed
+    rng = np.random.default_rng([seed, SENSING, *entry.name.encode()])
     camera: Camera
     if options.meshes is None:
         mesh = deformed(store, load_mesh(entry.path, max_faces=options.max_faces), entry.name)

@@ -49,6 +49,7 @@ class Attributes(msgspec.Struct, omit_defaults=True):
     distance: Annotated[float, Meta(gt=1, lt=1e300)]
     size: Pixels
     seed: Annotated[int, Meta(ge=0)] = 0
+    noise_seed: Annotated[int, Meta(ge=0)] | None = None
     stretch: Annotated[float, Meta(ge=0, lt=1e300)] = 0.0
     rotated: bool = False
     sensor: dict[str, Any] | None = None

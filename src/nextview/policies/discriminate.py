@@ -21,6 +21,23 @@ LEADING = 24
 """Pairs of a thing, in a resting pose, and an azimuth that are weighed against each other: those believed most."""
 
 
+@dataclass(frozen=True)
+class Rivals:
+    """The two classes believed most, and the remembered view of each that is nearest to each of V candidate views.
+
+    Attributes:
+        classes: (2,), that believed most first; ``hypotheses`` the likeliest of each.
+        rings, azimuths: of the remembered views, indices, (V,) and (2, V).
+        alike: cosine of the two views, (V,); NaN where one of them is not remembered.
+    """
+
+    classes: NDArray[np.int64]
+    hypotheses: NDArray[np.int64]
+    rings: NDArray[np.int64]
+    azimuths: NDArray[np.int64]
+    alike: Float
+
+
 @dataclass(frozen=True, eq=False)
 class Discriminate:
     """Goes where the view is expected to tell most of which thing it is, less the weighted travel.
@@ -74,13 +91,34 @@ class Discriminate:
         leading = np.argpartition(-flat, LEADING - 1)[:LEADING] if len(flat) > LEADING else np.arange(len(flat))
         hypothesis, azimuth = np.divmod(leading, AZIMUTHS)
         belief = flat[leading] / flat[leading].sum()
-        ahead = np.rint((self.viewpoints.azimuth - here) / (2 * np.pi) * AZIMUTHS).astype(np.int64)
-        ring = np.abs(np.degrees(self.viewpoints.elevation)[:, None] - RINGS).argmin(1)
-        shown = self.views[hypothesis[:, None], ring, (azimuth[:, None] + ahead) % AZIMUTHS].astype(np.float32)
+        ring, bins = self._remembered(azimuth, here)
+        shown = self.views[hypothesis[:, None], ring, bins].astype(np.float32)
         shown = shown.swapaxes(0, 1)
         alike = shown @ shown.swapaxes(1, 2)  # (V, leading, leading)
-        known = shown.any(2)
+        known: NDArray[np.bool_] = np.asarray(shown.any(2))
         alike = np.where(known[:, :, None] & known[:, None], alike, 1)  # what is not known tells nothing
         kept = np.exp(-WEIGHT * (1 - alike.astype(np.float64))) * belief
         same = self.classes[hypothesis][:, None] == self.classes[hypothesis]
         return np.log((kept * same).sum(2) / kept.sum(2)) @ belief
+
+    def _remembered(self, azimuth: NDArray[np.int64], here: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Ring (V,) and azimuth bin (n, V) of the remembered views nearest to each view, by the bins seen from here."""
+        ahead = np.rint((self.viewpoints.azimuth - here) / (2 * np.pi) * AZIMUTHS).astype(np.int64)
+        ring = np.abs(np.degrees(self.viewpoints.elevation)[:, None] - RINGS).argmin(1)
+        return ring, (azimuth[:, None] + ahead) % AZIMUTHS
+
+    def rivals(self, joint: Float, here: float) -> Rivals | None:
+        """The two classes believed most, as remembered from every view; None if all hypotheses are of one class.
+
+        From the belief (H, azimuths) seen from an azimuth, radians.
+        """
+        of_class = np.bincount(self.classes, joint.sum(1))
+        if len(of_class) < 2:
+            return None
+        two = np.argsort(-of_class, kind="stable")[:2]
+        of_two = np.where((self.classes == two[:, None])[..., None], joint, -1)
+        hypothesis, azimuth = np.divmod(of_two.reshape(2, -1).argmax(1), AZIMUTHS)
+        ring, bins = self._remembered(azimuth, here)
+        shown = self.views[hypothesis[:, None], ring, bins].astype(np.float64)
+        alike = np.where(shown.any(2).all(0), (shown[0] * shown[1]).sum(1), np.nan)
+        return Rivals(two, hypothesis, ring, bins, alike)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from nextview.geometry.observation import Observation
-from nextview.geometry.viewsphere import ViewSphere
+from nextview.geometry.viewsphere import ViewSphere, direction_of
 from nextview.session.style import ACCENT, FAINT, INK, heat
 from nextview.session.view import View
 from nextview.viewers.exploration import Walk
@@ -40,13 +40,16 @@ def walk_card(walk: Walk) -> str:
     best = int(view.belief.argmax())
     believed = f"{escape(classes[best])} {view.belief[best]:.3f}" if view.observation.seen else "nothing is seen"
     goes_on = "the rule would stop here" if walk.stopped else "the rule would look on"
-    parts = [f"<h3>{believed}</h3><p>{goes_on}</p>", _figures(walk, view), _beliefs(walk), _steps(walk)]
+    parts = [f"<h3>{believed}</h3><p>{goes_on}</p>", _figures(walk, view), _beliefs(walk), rivals_card(walk)]
+    parts.append(_steps(walk))
     return f'{STYLE}<div class="nv">{"".join(parts)}</div>'
 
 
-def preview_card(observation: Observation) -> str:
-    """What a camera that is being dragged would see."""
-    return f'{STYLE}<div class="nv"><h3>from here</h3>{_image(observation.picture, 200)}</div>'
+def preview_card(observation: Observation, walk: Walk) -> str:
+    """What a camera that is being dragged would see, and the leading things as remembered from nearest there."""
+    nearest, _ = walk.sphere.nearest(direction_of(observation.pose))
+    parts = f"<h3>from here</h3>{_image(observation.picture, 200)}{rivals_card(walk, nearest)}"
+    return f'{STYLE}<div class="nv">{parts}</div>'
 
 
 def class_card(label: str) -> str:
@@ -77,6 +80,23 @@ def _figures(walk: Walk, view: View) -> str:
 def _table(rows: Iterable[Iterable[str]]) -> str:
     cells = ("".join(f"<td>{cell}</td>" for cell in row) for row in rows)
     return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
+
+
+def rivals_card(walk: Walk, view: int | None = None) -> str:
+    """The two taught things believed most, as remembered from a view, by default the next; nothing for other models."""
+    rivals, at = walk.rivals, walk.next_view if view is None else view
+    if rivals is None or at is None:
+        return ""
+    both = [(name, _image(picture, 96)) for name, picture in walk.remembered(rivals, at)]
+    differ = 1 - rivals.alike
+    if isinstance(walk.sphere, ViewSphere):
+        grid = differ.reshape(walk.sphere.rings, walk.sphere.azimuths)[np.argsort(walk.sphere.elevations)[::-1]]
+        both.append(("how much from each view", _image(heat(grid), CELL * grid.shape[1])))
+    said = (
+        "not remembered" if np.isnan(differ[at]) else f"differ by {differ[at]:.2f} of {np.nanmax(differ):.2f} at most"
+    )
+    pictures = "".join(f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>" for below, image in both)
+    return f"<p>From view {at} these two, as remembered, {said}:</p>{pictures}"
 
 
 def _beliefs(walk: Walk) -> str:

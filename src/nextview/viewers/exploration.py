@@ -13,14 +13,18 @@ from nextview.checks import whole
 from nextview.data.folders import list_dataset
 from nextview.data.samples import SAMPLES, sample_mesh
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, UsageError
+from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.geometry.mesh import FORMATS, Mesh, load_mesh
 from nextview.geometry.observation import Camera, Observation
-from nextview.geometry.viewsphere import direction_of, level_pose
-from nextview.recognition.belief import FixedLength
+from nextview.geometry.resting import rotated
+from nextview.geometry.viewsphere import azimuth_of, direction_of, level_pose, look_at_origin
+from nextview.policies.discriminate import Discriminate, Rivals
+from nextview.recognition.belief import FixedLength, log_evidence_of
+from nextview.recognition.memory import AZIMUTHS, RINGS, TaughtRecogniser
 from nextview.session.session import Session
 from nextview.session.system import System, load, simulated
 from nextview.session.view import View
+from nextview.simulation.simulated import SimulatedCamera
 
 Float = NDArray[np.float64]
 
@@ -105,6 +109,27 @@ class Walk:
         return self.views[-1].values if self.views else None
 
     @property
+    def rivals(self) -> Rivals | None:
+        """The two taught things believed most, and how they differ from each view; None before a view, or untaught."""
+        recogniser, seen = self.session.models.recogniser, [view for view in self.views if view.observation.seen]
+        if not isinstance(recogniser, TaughtRecogniser) or not seen:
+            return None
+        evidence = recogniser([view.observation for view in seen])
+        azimuths = azimuth_of(np.stack([view.direction for view in [*seen, self.views[-1]]]))
+        total = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths[:-1]).sum(0, keepdims=True)
+        joint = recogniser.calibration.joint(total, len(seen), len(recogniser.classes), azimuths[-1:])
+        things = Discriminate(self.sphere, recogniser.memory.views, np.array(recogniser.calibration.hypotheses))
+        return things.rivals(joint[0], float(azimuths[-1]))
+
+    def remembered(self, rivals: Rivals, view: int) -> list[tuple[str, NDArray[np.uint8]]]:
+        """Name and picture of both rivals as remembered from a candidate view."""
+        recogniser = self.session.models.recogniser
+        assert isinstance(recogniser, TaughtRecogniser)
+        seen_from = zip(rivals.classes, rivals.hypotheses, rivals.azimuths[:, view], strict=True)
+        ring = int(rivals.rings[view])
+        return [(recogniser.classes[c], remembered_picture(recogniser, int(h), ring, int(a))) for c, h, a in seen_from]
+
+    @property
     def visited(self) -> list[int]:
         """The candidate views that were taken, or are nearest to a pose that was taken."""
         return [view.index for view in self.views]
@@ -132,6 +157,23 @@ class Walk:
         for view in self.views:
             other.session.update(view.observation)
         return other
+
+
+@lru_cache(maxsize=256)
+def remembered_picture(recogniser: TaughtRecogniser, hypothesis: int, ring: int, azimuth: int) -> NDArray[np.uint8]:
+    """A thing in a resting pose as it was taught from a ring and an azimuth bin, (64, 64).
+
+    Where its mesh is no longer there, the one picture that the memory keeps of it.
+    """
+    memory, about = recogniser.memory, recogniser.card.memory
+    assert about is not None
+    thing = int(memory.thing[hypothesis])
+    try:
+        mesh = rotated(load_mesh(about.things[thing].source), memory.rotations[hypothesis].astype(np.float64))
+    except MeshError:
+        return memory.pictures[thing]
+    pose = look_at_origin(np.radians(RINGS[ring]), 2 * np.pi / AZIMUTHS * azimuth)
+    return SimulatedCamera(mesh, memory.pictures.shape[1]).observe(pose).picture
 
 
 class Exploration:

@@ -154,7 +154,7 @@ class Page:
             self._look(walk, self.exploration.pose_towards(place))
         elif self._lock.acquire(blocking=False):
             try:
-                self._preview.content = preview_card(self.exploration.preview(place))
+                self._preview.content = preview_card(self.exploration.preview(place), self.exploration.walks[walk])
                 self._preview.visible = True
             finally:
                 self._lock.release()
