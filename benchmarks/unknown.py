@@ -26,7 +26,7 @@ from nextview.benchmark.statistics import interval, resample
 from nextview.cli.progress import track
 from nextview.data.store import ViewStore
 from nextview.recognition.belief import log_evidence_of
-from nextview.recognition.inference import Recogniser
+from nextview.recognition.inference import Features, Recogniser
 from nextview.recognition.model_card import RECOGNISER
 from nextview.recognition.network_input import from_store
 
@@ -59,12 +59,14 @@ def judge(store: Path, split: str | None, objects: int | None, recogniser: Recog
     chosen = np.flatnonzero(views.done & ((views.splits == split) if split else True))
     chosen = np.sort(rng.permutation(chosen)[:objects])
     drawn = np.array([rng.permutation(len(views.sphere))[: 2 * max(VIEWS)] for _ in chosen])
-    scores, evidence = [], []
+    scores, evidence, features, exact = [], [], Features(), views.attributes.sensor is None
 
     def work() -> Iterator[int]:
         for k, i in enumerate(chosen):
-            found = recogniser.from_inputs(from_store(recogniser.card.input, views, int(i), drawn[k]))
-            scores.append(found.novelty)
+            inputs = from_store(recogniser.card.input, views, int(i), drawn[k])
+            found, known = recogniser.from_inputs(inputs), features.card.input == recogniser.card.input
+            seen = features(inputs if known else from_store(features.card.input, views, int(i), drawn[k]))
+            scores.append(recogniser.novelty.scores(seen, exact))
             evidence.append(log_evidence_of(found.logits, found.azimuth_bins, views.sphere.azimuth[drawn[k]]))
             yield k + 1
 

@@ -74,13 +74,20 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float) -> Footpri
     i, j = ij[0] - low[0], ij[1] - low[1]
     within = (i >= 0) & (i < side) & (j >= 0) & (j < side)
     rows, columns, z = rows[within], columns[within], z[within]
-    keys = (pieces.label[rows, columns].astype(np.int64) * side + i[within]) * side + j[within]
-    used, pair, pixels = np.unique(keys, return_inverse=True, return_counts=True)
-    area = np.bincount(pair, z * z, len(used)) / (frame.intrinsics[0, 0] * frame.intrinsics[1, 1])
+    place = i[within] * side + j[within]
+    used = np.flatnonzero(np.bincount(place, minlength=side**2))
+    number, many = np.zeros(side**2, np.int64), len(pieces.stands)
+    number[used] = many * np.arange(len(used))
+    key = number[place] + pieces.label[rows, columns]
+    count = np.bincount(key, minlength=many * len(used))
+    pairs = np.flatnonzero(count)
+    area = np.bincount(key, z * z, len(count))[pairs] / (frame.intrinsics[0, 0] * frame.intrinsics[1, 1])
+    order = np.zeros(len(count), np.int64)
+    order[pairs] = np.arange(len(pairs))
     pair_of = np.full(frame.shape, -1, np.int32)
-    pair_of[rows, columns] = pair
-    piece, place = np.divmod(used, side**2)
-    cells = np.stack(np.divmod(place, side), 1) + low
+    pair_of[rows, columns] = order[key]
+    at, piece = np.divmod(pairs, many)
+    cells, pixels = np.stack(np.divmod(used[at], side), 1) + low, count[pairs]
     return Footprint(cells, piece, pieces.stands, pieces.touch, pieces.inside, area, pixels, pair_of)
 
 

@@ -37,7 +37,7 @@ ENCLOSED = 0.7
 NEXT: Any = ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))
 """All pairs of pixels side by side: the first of each, and the second."""
 LOWEST = 5
-"""This pixel of a piece from below counts: fewer may be noise."""
+"""Pixels of a piece that may be so low by noise."""
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,12 @@ def cut(depth: NDArray[np.float32], above: Mask, height: NDArray[np.float32], no
     with np.errstate(invalid="ignore"):
         joins = mask & close & (np.abs(inverse[tuple(nearest)] - inverse) < 4 * tolerance)
     found = np.where(joins, found_near, 0)
-    heights = high / usual - 2 * error
-    lowest: Any = ndimage.labeled_comprehension(heights, found, range(1, kept.sum() + 1), _lowest, np.float64, 1.0)  # type: ignore[arg-type]
-    label[part] = np.where(
-        above[part] | _enlarged(bottom, step, above[part].shape), _enlarged(found, step, above[part].shape), 0
-    )
-    return Pieces(label, np.append(False, lowest < STANDS), _touching(found, inverse, tolerance), _enclosed(around))
+    low = found[high / usual - 2 * error < STANDS]
+    stands = np.bincount(low, minlength=kept.sum() + 1) > LOWEST
+    stands[0] = False
+    own, whole = (_enlarged(a, step, above[part].shape) for a in (bottom, found))
+    label[part] = np.where(above[part] | own, whole, 0)
+    return Pieces(label, stands, _touching(found, inverse, tolerance), _enclosed(around))
 
 
 def _enlarged(small: NDArray[Any], step: int, shape: tuple[int, ...]) -> NDArray[Any]:
@@ -158,8 +158,3 @@ def _borders(label: NDArray[np.int64], counted: list[Mask]) -> NDArray[np.int64]
         use = wanted & (a != b)
         count += np.bincount(a[use] * n + b[use], minlength=n * n).reshape(n, n)
     return count + count.T
-
-
-def _lowest(heights: NDArray[np.float32]) -> float:
-    place = min(LOWEST, len(heights) - 1)
-    return float(np.partition(heights, place)[place])
