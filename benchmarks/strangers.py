@@ -1,0 +1,57 @@
+"""What whole episodes say of objects: of known classes, or of none.
+
+    python benchmarks/strangers.py data/ModelNet10 --split test --objects 250 [--sensor wrist]
+    python benchmarks/strangers.py data/PSB --objects 300 [--sensor wrist] [--every-second]
+    python benchmarks/strangers.py YCB --unit m [--models mine]
+
+Each object is looked at by the bundled models, or those of a folder, from a random first view, with all defaults.
+"named" is the share that got an answer, "right" the share with the right class, "most
+like" the same whether it was called unknown or not.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+import nextview
+from nextview.cli.progress import track
+from nextview.data.folders import list_dataset
+from nextview.simulation.sensed_camera import SensedCamera
+
+
+def main(
+    meshes: tyro.conf.Positional[Path],
+    models: str = "modelnet10",
+    objects: int = 10**6,
+    split: str | None = None,
+    every_second: bool = False,
+    sensor: str | None = None,
+    unit: str | None = None,
+    seed: int = 0,
+) -> None:
+    system, rng = nextview.load(models=models), np.random.default_rng(seed)
+    entries = [e for e in list_dataset(meshes) if split in (None, e.split)]
+    if every_second:  # of the classes, by the alphabet: the others chose the score
+        judged = sorted({e.label for e in entries})[1::2]
+        entries = [e for e in entries if e.label in judged]
+    entries = [entries[i] for i in np.sort(rng.permutation(len(entries))[:objects])]
+    found = []
+
+    def work():
+        for done, entry in enumerate(entries, 1):
+            mesh, own = nextview.load_mesh(entry.path, unit=unit), np.random.default_rng([seed, done])
+            camera = nextview.SimulatedCamera(mesh) if sensor is None else SensedCamera(mesh, sensor, own)
+            result = system.session_with(camera, None, int(own.integers(2**32))).run(camera)
+            right = entry.label == result.most_like
+            found.append((not result.unknown, result.confident, right and not result.unknown, right, len(result.views)))
+            yield done
+
+    track(work(), len(entries), f"episodes of {meshes.name}")
+    names = ("named", "named and confident", "right", "most like", "views")
+    numbers = ", ".join(f"{name} {value:.3f}" for name, value in zip(names, np.mean(found, 0), strict=True))
+    print(f"{len(entries)} objects: {numbers}")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
