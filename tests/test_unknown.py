@@ -120,7 +120,7 @@ def test_an_object_more_novel_than_the_rate_allows_has_no_answer():
     assert novel.most_like == "chair"
     assert novel.confidence == 0.0
     assert repr(novel).startswith(
-        "none of the 10 classes it knows, most like a chair (3 % of known objects are as novel"
+        "none of the 10 classes it knows (most like a chair): 3 % of known objects are as novel"
     )
     assert "\n" not in repr(novel)
     told = json.loads(episode_as_json(novel, "chair"))
@@ -156,7 +156,7 @@ def test_the_command_says_that_it_does_not_know(tmp_path, capsys):
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / "heap.off")
     main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0.05"])
     said = " ".join(capsys.readouterr().out.split())
-    assert "It is none of the 10 classes it knows, most like a " in said
+    assert "It is none of the 10 classes it knows (most like a " in said
     assert "are at least as novel" in said
     main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0"])
     assert "It is a " in capsys.readouterr().out

@@ -51,8 +51,8 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
     views = f"{len(result.views)} view{'s' * (len(result.views) > 1)}"
     rest = f"{result.views[-1].belief.max():.3f}, after {views} and {result.travel:.2f} cells of travel ({reason})."
     if result.unknown:
-        console.print(Text.assemble("It is ", (printable(result.none_of_them), "bold"), ", belief ", rest))
-        console.print(f"Why: {printable(result.why_unknown)}.")
+        why = f": {printable(result.why_unknown)}, after {views} and {result.travel:.2f} cells of travel."
+        console.print(Text.assemble("It is ", (printable(result.none_of_them), "bold"), why))
     else:
         console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), ", belief ", rest))
     if result.novelty is not None:

@@ -61,9 +61,9 @@ class Recognition:
 
     @property
     def none_of_them(self) -> str:
-        """The answer for an unknown object: ``none of the 10 classes it knows, most like a toilet``."""
+        """The answer for an unknown object: ``none of the 10 classes it knows (most like a toilet)``."""
         a = "an" if str(self.most_like)[:1].lower() in "aeiou" else "a"
-        return f"none of the {len(self.classes)} classes it knows, most like {a} {self.most_like}"
+        return f"none of the {len(self.classes)} classes it knows (most like {a} {self.most_like})"
 
     @property
     def why_unknown(self) -> str:
@@ -108,7 +108,7 @@ class Recognition:
         if not self.seen:
             return f"nothing is seen ({views})"
         if self.unknown:
-            return f"{self.none_of_them} ({self.why_unknown}, {views})"
+            return f"{self.none_of_them}: {self.why_unknown} ({views})"
         sure = "confident" if self.confident else "not confident" + ", no other view in reach" * self.stranded
         names = dict.fromkeys(warning.name for view in self.views for warning in view.warnings)
         warnings = f", warnings: {', '.join(names)}" if names else ""
