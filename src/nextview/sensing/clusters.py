@@ -29,7 +29,7 @@ LIES_OVER = 0.5
 """Share of the cells of a piece that lie over, or beside, one of another frame, from which they are one thing."""
 BESIDE = 2
 """Cells up to which two pieces stand side by side."""
-TWO = 0.1
+TWO = 0.25
 """Share of the cells of an object that a part of it has which may be another thing."""
 REACH, FAR = 250, 1000
 """Cells to each side of the middle of what is seen above the plane: farther things are left out. And cells from those

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion, binary_fill_holes, minimum_filter
+from scipy.ndimage import binary_erosion, binary_fill_holes, label, minimum_filter
 
 EDGE = 6
 """A segmenter's edge may be off by so many pixels."""
@@ -15,16 +15,18 @@ THICK = 0.004
 Mask = NDArray[np.bool_]
 
 
-def trimmed(depth: NDArray[np.float32], mask: Mask) -> Mask:
+def trimmed(depth: NDArray[np.float32], mask: Mask, high: Mask | None = None) -> Mask:
     """The pixels of a mask that hang together with its inside without a step in depth, (H, W) bool.
 
     Up to EDGE pixels at the edge of a mask may show the background, or hang in the air before it. The inside is what is
     farther from the edge; of a thing that is too thin for that, as much farther as leaves a third of it. From there the
-    mask grows back over pixels as near as their neighbours.
+    mask grows back over pixels as near as their neighbours: EDGE pixels, and as far as they are ``high`` over the
+    support plane, for the legs of a chair are as thin as an edge.
 
     Args:
         depth: metres, (H, W), 0 where nothing was measured.
         mask: (H, W) bool.
+        high: pixels that show no edge of what lies on the plane, (H, W) bool.
     """
     measured = mask & (depth > 0)
     rows, columns = np.flatnonzero(measured.any(1)), np.flatnonzero(measured.any(0))
@@ -40,6 +42,12 @@ def trimmed(depth: NDArray[np.float32], mask: Mask) -> Mask:
     else:
         return mask
     found = inside
+    if high is not None:
+        far = z - minimum_filter(np.where(own, z, np.inf), 3, mode="constant", cval=np.inf) > STEP * z + THICK
+        part_of, count = label(own & high[part] & ~far | inside)
+        reached = np.zeros(count + 1, bool)
+        reached[part_of[inside]] = True
+        found = reached[part_of]
     for _ in range(EDGE):
         nearest = minimum_filter(np.where(found, z, np.inf), 3, mode="constant", cval=np.inf)
         found |= own & (np.abs(z - nearest) < STEP * z + THICK)

@@ -21,7 +21,7 @@ from nextview.sensing.facets import ROWS, Facets, Noise, estimate_noise, fit_fac
 from nextview.sensing.frame import Frame
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
-from nextview.sensing.pieces import cut
+from nextview.sensing.pieces import STANDS, cut
 from nextview.sensing.plausibility import (
     ViewWarning,
     check_frame,
@@ -251,7 +251,8 @@ class ObservedObject:
         if frame.mask is not None:
             mask = frame.mask
             if self.known is None:  # else its size does not hang on pixels at the edge
-                mask = trimmed(frame.depth, mask)
+                high = None if plane is None else frame.along(plane.normal, plane.offset) > STANDS * frame.depth
+                mask = trimmed(frame.depth, mask, high)
                 above = mask if plane is None else mask & segmentation.above_plane(frame, plane, noise)
                 mask = above if 2 * above.sum() > mask.sum() else mask  # a plane may lie above what is hidden or flat
         elif self.known is not None:
@@ -289,13 +290,14 @@ class ObservedObject:
                 points = points[clusters.on_ground(points @ axes[:2].T, ground)]
                 distance = float(np.median(np.linalg.norm(points - camera, axis=1))) if len(points) else 1.0
             cell = clusters.CELL * distance
-        pieces = cut(frame.depth, above, frame.along(plane.normal, plane.offset), noise)
+        height = frame.along(plane.normal, plane.offset)
+        pieces = cut(frame.depth, above, height, noise)
         foot = clusters.footprint(frame, pieces, axes, cell)
         footprints = [*(s.footprint for s in earlier if s.footprint is not None), foot]
         labels, two = clusters.clusters(footprints)
         target = self._target(labels, footprints, ground / cell, axes[:2] / cell)
         chosen = labels[-1] == target
-        mask = trimmed(frame.depth, foot.pixels_over(chosen))
+        mask = trimmed(frame.depth, foot.pixels_over(chosen), height > STANDS * frame.depth)
         if target == 0 or mask.sum() < FEWEST:
             where = "of the object known so far" if earlier else "on the support plane"
             raise ObservationError(f"this frame shows nothing {where}: check its pose, or aim the camera at the object")
@@ -320,7 +322,10 @@ class ObservedObject:
     ) -> int:
         """The object's label: by the point; else that of most cells that were the object's before; else the largest."""
         if self.point is not None:
-            return clusters.nearest(footprints, labels, to_cells @ self.point)
+            asked = clusters.nearest(footprints, labels, to_cells @ self.point)
+            return (
+                asked if asked in labels[-1] else clusters.nearest(footprints[-1:], labels[-1:], to_cells @ self.point)
+            )
         before = [s.chosen for s in self.sightings if s.chosen is not None]
         votes = np.concatenate([[0], *(now[then] for now, then in zip(labels[:-1], before, strict=True))]).astype(int)
         count = np.bincount(votes)

@@ -174,26 +174,35 @@ def check_views(first: Observation, second: Observation) -> list[ViewWarning]:
 
 
 def _seen_through(first: Observation, second: Observation) -> float:
-    """Share of the surface in the first view, within the second's picture, through which the second looks."""
+    """Share of the surface in the first view, within the second's picture, through which the second looks.
+
+    Where all that the second camera saw is known, it has to have measured something behind: a hole is no contradiction.
+    """
     seen = np.flatnonzero(first.depth)
     if len(seen) == 0 or not second.depth.any():
         return 0.0
+    scene = second.scene
+    depth, pose, k = (
+        (second.depth, second.pose, second.intrinsics)
+        if scene is None
+        else (np.where(scene.depth > 0, scene.depth, -np.inf), scene.pose, scene.intrinsics)
+    )
     points = _surface(first, seen) @ first.pose[:3, :3].T + first.pose[:3, 3]
-    points = (points - second.pose[:3, 3]) @ second.pose[:3, :3]
+    points = (points - pose[:3, 3]) @ pose[:3, :3]
     points = points[points[:, 2] > 0.1]
     if len(points) == 0:
         return 1.0
-    k, (height, width) = second.intrinsics, second.depth.shape
+    height, width = depth.shape
     at = points[:, :2] / points[:, 2:] * k[[0, 1], [0, 1]] + k[:2, 2]
     column, row = np.floor(at).astype(np.int64).T
-    margin = max(2, width // 50)  # what the object frame may be off
+    margin = max(2, width // 50) if scene is None else 2  # what the object frame may be off
     inside = (column >= margin) & (column < width - margin) & (row >= margin) & (row < height - margin)
     if not inside.any():
         return 0.0
-    column, row, depth = column[inside], row[inside], points[inside, 2]
-    missing = np.ones(len(depth), bool)
+    column, row, away = column[inside], row[inside], points[inside, 2]
+    missing = np.ones(len(away), bool)
     for dy in (-margin, 0, margin):
         for dx in (-margin, 0, margin):
-            there = second.depth[row + dy, column + dx]
-            missing &= (there == 0) | (there > depth + 0.1)
+            there = depth[row + dy, column + dx]
+            missing &= (there == 0) | (there > away + 0.1)
     return float(missing.mean())
