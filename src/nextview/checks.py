@@ -1,7 +1,5 @@
 """What users hand in, checked once at the door: numbers, points, and plugins, which are code of their own."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import sys
@@ -20,8 +18,7 @@ from numpy.typing import NDArray
 
 from nextview.errors import NextviewError, UsageError
 
-TRACEBACK = "NEXTVIEW_TRACEBACK"
-"""An environment variable: set, the whole traceback of a plugin's error is printed too."""
+TRACEBACK = "NEXTVIEW_TRACEBACK"  # an environment variable: set, the whole traceback of a plugin's error is printed too
 _NOT_PLUGINS = (f"{Path(__file__).parent}{os.sep}", "<frozen ", *map(sysconfig.get_path, ("stdlib", "purelib")))
 
 

@@ -4,8 +4,6 @@ Each message is one sentence: what is wrong, in which file, what to do. The comm
 2. Any other exception is a bug of nextview and keeps its traceback.
 """
 
-from __future__ import annotations
-
 
 class NextviewError(ValueError):
     """The base of all errors that nextview raises on purpose."""

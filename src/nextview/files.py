@@ -5,8 +5,6 @@ replaced. A file is written under a temporary name beside its place and then ren
 what was there before.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os
@@ -25,12 +23,9 @@ import numpy as np
 from nextview.errors import DatasetError, ModelError, NextviewError, ResultsError
 
 T = TypeVar("T")
-Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
-"""A field of a record: a hash in hexadecimal digits."""
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Errors of a full disk."""
-LARGEST_RECORD = 64 * 2**20
-"""Bytes of a JSON record; a card takes some hundred thousand."""
+Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]  # a field of a record: a hash in hexadecimal digits
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a full disk
+LARGEST_RECORD = 64 * 2**20  # bytes of a JSON record; a card takes some hundred thousand
 
 
 def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None:

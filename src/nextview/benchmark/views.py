@@ -3,8 +3,6 @@
 A policy chooses without knowing how many views there will be, so it is run once and its path cut after each number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product

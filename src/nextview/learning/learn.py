@@ -1,7 +1,5 @@
 """Teach things: from a folder of meshes or captured frames to a memory that recognises them, without PyTorch."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -34,12 +32,9 @@ from nextview.recognition.model_card import (
     write_card,
 )
 
-NAME = "memory"
-"""Of the card in a folder of taught things, and of the file beside it."""
-Pair = tuple[Source, Arrays]
-"""A thing, and what is remembered of it."""
-ODD_SIZE = 300
-"""A thing so many times larger or smaller than the median of the others is asked about."""
+NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
+Pair = tuple[Source, Arrays]  # a thing, and what is remembered of it
+ODD_SIZE = 300  # a thing so many times larger or smaller than the median of the others is asked about
 
 
 @dataclass(frozen=True)

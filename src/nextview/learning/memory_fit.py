@@ -1,7 +1,5 @@
 """What is fitted to a memory as a whole: how much a likeness weighs, a head for classes, sizes, and novelty."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,19 +10,14 @@ from nextview.recognition.belief import Calibration, SizeEvidence, log_evidence_
 from nextview.recognition.memory import AZIMUTHS, by_ring, similarities
 
 Float = NDArray[np.floating]
-WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)
-"""Of a cosine, as a log-likelihood."""
-CORRELATIONS = (0.1, 0.3, 0.6)
-"""Of two views, see ``Calibration.bin_correlation``."""
-HEADS = (0.0, 5.0, 15.0)
-"""Weights of the head beside the nearest views."""
+WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)  # of a cosine, as a log-likelihood
+CORRELATIONS = (0.1, 0.3, 0.6)  # of two views, see ``Calibration.bin_correlation``
+HEADS = (0.0, 5.0, 15.0)  # weights of the head beside the nearest views
 RIDGE = 1.0
-MOST_THINGS = 150
-"""Things whose held-out views are judged: a drawn part of more."""
+MOST_THINGS = 150  # things whose held-out views are judged: a drawn part of more
 DRAWS, VIEWS, FOLDS = 4, (1, 2, 3, 5), 5
 LEVELS = 101
-SIZE_ERROR = 0.05
-"""Deviation of the logarithm of a radius that a sensor measures."""
+SIZE_ERROR = 0.05  # deviation of the logarithm of a radius that a sensor measures
 FAR = -1e3
 
 

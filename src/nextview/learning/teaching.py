@@ -1,7 +1,5 @@
 """Look at one thing from everywhere, without and with a sensor's errors, and note what its views are like."""
 
-from __future__ import annotations
-
 import zlib
 from functools import lru_cache
 from pathlib import Path
@@ -24,13 +22,10 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 
 Arrays = dict[str, NDArray]
-HELD_OUT = 8
-"""Views of each thing that are not remembered."""
-SETUP = 8
-"""Views that share the errors of one setup: a wrong centre, a wrong size."""
+HELD_OUT = 8  # views of each thing that are not remembered
+SETUP = 8  # views that share the errors of one setup: a wrong centre, a wrong size
 BATCH = 20
-NEAR = np.radians(30)
-"""A captured view teaches what the thing looks like from no farther than this."""
+NEAR = np.radians(30)  # a captured view teaches what the thing looks like from no farther than this
 GRID = ViewSphere(RINGS, AZIMUTHS)
 
 

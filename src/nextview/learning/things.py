@@ -1,7 +1,5 @@
 """Which things a folder teaches: mesh files, class folders of them, and folders of captured depth frames."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The policy that tells taught things apart: it looks where the things that are believed most look least alike."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +13,7 @@ from nextview.recognition.memory import AZIMUTHS, RINGS, read_memory
 from nextview.recognition.model_card import read_card
 
 Float = NDArray[np.float64]
-WEIGHT = 40.0
-"""Of a cosine, as a log-likelihood: for one view whose noise is not known yet."""
+WEIGHT = 40.0  # of a cosine, as a log-likelihood: for one view whose noise is not known yet
 LEADING = 24
 """Pairs of a thing, in a resting pose, and an azimuth that are weighed against each other: those believed most."""
 
@@ -64,7 +61,7 @@ class Discriminate:
         check_weight(self.travel_weight)
 
     @classmethod
-    def from_card(cls, path: Path, viewpoints: Viewpoints, classes: tuple[str, ...] | None = None) -> Discriminate:
+    def from_card(cls, path: Path, viewpoints: Viewpoints, classes: tuple[str, ...] | None = None) -> "Discriminate":
         """For the things of a memory, by its card; OtherUseError if ``classes`` are not those of its things."""
         card = read_card(path)
         if card.memory is None:

@@ -1,7 +1,5 @@
 """Fuse the evidence of several views: belief over classes, calibration, size, and when to stop."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -223,8 +221,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 
 RARE, MUCH = 0.05, 2.0
 """Share of the objects of a class that are smaller than usual, and larger; and times beyond that which none has."""
-PLAIN_SUM = Calibration()
-"""Trusts the sum of the logits as it stands, as the thesis did."""
+PLAIN_SUM = Calibration()  # trusts the sum of the logits as it stands, as the thesis did
 
 
 class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
@@ -244,7 +241,7 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
             raise ModelError("sizes that do not fit together")
 
     @classmethod
-    def from_arrays(cls, radii: Float, log_density: Float, weight: float) -> SizeEvidence:
+    def from_arrays(cls, radii: Float, log_density: Float, weight: float) -> "SizeEvidence":
         """From arrays (R,) and (C, R)."""
         return cls(tuple(radii.tolist()), tuple(map(tuple, log_density.tolist())), float(weight))
 
@@ -299,7 +296,7 @@ class Stopping:
     @classmethod
     def of(
         cls, calibration: Calibration, threshold: float = 0.97, risk: float | None = None, max_views: int = 5
-    ) -> Stopping:
+    ) -> "Stopping":
         """The rule that goes with a recogniser's calibration: the threshold decays with its correlation.
 
         With a ``risk`` instead, the lowest threshold at which at most this share of those who stop early is wrong; it

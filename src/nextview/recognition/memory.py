@@ -1,7 +1,5 @@
 """The memory of taught things: what each looks like from around, and how likely a view is given each of them."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -20,10 +18,8 @@ from nextview.recognition.inference import Features, Recogniser
 from nextview.recognition.model_card import MEMORY_SUFFIX, find_card
 from nextview.recognition.novelty import Quantiles, unit
 
-RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)
-"""Elevations of the remembered views, degrees."""
-AZIMUTHS = 16
-"""Remembered views on a ring: the azimuth bins of a memory."""
+RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the remembered views, degrees
+AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
 Float = NDArray[np.floating]
 
 

@@ -1,7 +1,5 @@
 """The card of a model: what it is, how it was made, how good it is, and which file holds its weights."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,15 +16,12 @@ from nextview.recognition.network_input import InputSpec
 
 BUNDLED = Path(__file__).parent / "bundled"
 RECOGNISER = "recogniser-modelnet10"
-FEATURES = "features"
-"""The bundled network that knows no classes: what taught things are remembered by."""
+FEATURES = "features"  # the bundled network that knows no classes: what taught things are remembered by
 MEMORY_SUFFIX = ".safetensors"
-DISCRIMINATE = "discriminate"
-"""The policy of a memory of things; its card is that of the memory."""
+DISCRIMINATE = "discriminate"  # the policy of a memory of things; its card is that of the memory
 COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}
 """Recognisers that are bundled, by the name of the models they belong to."""
-MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}
-"""The map networks that are bundled, by the name of the map."""
+MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}  # the map networks that are bundled, by the name of the map
 NOWHERE = Path()
 
 
@@ -142,7 +137,7 @@ class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
         """The classes for which the valley of its map is the better view: as was fitted, or else all or none."""
         return tuple(classes) if self.good == "valley" and not self.valley_gain else self.valley_classes
 
-    def made_by(self, *commands: str) -> ModelCard:
+    def made_by(self, *commands: str) -> "ModelCard":
         """The same with further commands; one that it names already is not named again."""
         commands = tuple(dict.fromkeys((*self.training.commands, *commands)))
         return replace(self, training=replace(self.training, commands=commands))

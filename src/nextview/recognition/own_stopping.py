@@ -1,7 +1,5 @@
 """A stopping rule of your own: a function of what is believed, in live use and in the benchmark."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

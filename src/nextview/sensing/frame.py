@@ -1,7 +1,5 @@
 """One frame of a depth camera, in the units and axes of nextview, or refused in words."""
 
-from __future__ import annotations
-
 from dataclasses import InitVar, dataclass
 
 import numpy as np
@@ -11,10 +9,8 @@ from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.observation import LARGEST, array_of, numbers
 
-FARTHEST = 65.0
-"""Metres: float depth beyond is nothing; uint16 millimetres reach as far."""
-LARGEST_MEDIAN = 20.0
-"""Metres: beyond it a depth image is of another unit. Inches are 39 times as many as metres."""
+FARTHEST = 65.0  # metres: float depth beyond is nothing; uint16 millimetres reach as far
+LARGEST_MEDIAN = 20.0  # metres; a depth image beyond is of another unit: inches are 39 times as many
 ASPECTS = (4 / 3, 16 / 9, 16 / 10, 512 / 424, 640 / 576)
 """Width over height of what sensors give, as against parts that were cut out of it."""
 AXES = {
@@ -24,8 +20,7 @@ AXES = {
 }
 """Of a camera pose: OpenCV's (x right, y down, z forward), OpenGL's (x right, y up, z backward) and those of a robot's
 body (x forward, y left, z up; ROS REP 103). Columns: OpenCV's axes in the named ones."""
-LUMA = np.array([0.299, 0.587, 0.114])
-"""Weights of red, green and blue in a grey image (ITU-R BT.601)."""
+LUMA = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue in a grey image (ITU-R BT.601)
 
 
 @dataclass(frozen=True)

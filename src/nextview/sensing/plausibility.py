@@ -1,7 +1,5 @@
 """Refuse what cannot be right in a frame, and name the likely mistake behind an observation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,27 +12,22 @@ from nextview.sensing.frame import AXES, Frame
 
 Float = NDArray[np.float64]
 
-SAMPLE = 500
-"""Pixels that are looked at."""
-FEWEST = 20
-"""Pixels with a depth below which nothing is seen."""
+SAMPLE = 500  # pixels that are looked at
+FEWEST = 20  # pixels with a depth below which nothing is seen
 OUTERMOST = 1.15
 """How far from the origin a surface may be, object radii: 1, and what an estimated centre and radius may be off."""
-INNERMOST = 0.4
-"""How far from the origin the outermost of what is seen has to be."""
+INNERMOST = 0.4  # how far from the origin the outermost of what is seen has to be
 CONTRADICTION = 0.2
 """Share of the surface seen in one view of which another view says that it is not there, from which they contradict."""
 OFF_CENTRE = 0.25
 """How far a principal point is from the middle of a picture that is no part of a larger one, half sides of it."""
 FAR_DEPTH = 10.0
 """Metres: few depth cameras measure farther, and no object that stands on something fills a picture from there."""
-TOO_FAR = 2.5
-"""So many times as far as a frame shows anything an object cannot be: of a near one only the front shows."""
+TOO_FAR = 2.5  # so many times as far as a frame shows anything an object cannot be: of a near one only the front shows
 STILL, CHANGED, CHANGED_SHARE = 1e-3, 0.04, 0.03
 """Metres, and parts of a rotation, up to which a pose is the same; and the part of the distance by which a pixel has
 changed, and the share of pixels that have to."""
-FAR_ORIGIN = 30.0
-"""Metres from the origin of the world, within which robots work; where positions in millimetres begin."""
+FAR_ORIGIN = 30.0  # metres from the origin of the world, within which robots work; where positions in millimetres begin
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """The loop: observe, believe, stop or choose, move. One for a robot and for a hundred thousand replays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
