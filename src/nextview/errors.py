@@ -42,12 +42,7 @@ class RiskError(NextviewError):
 
 
 class PolicyError(NextviewError):
-    """A policy that cannot be made, or that failed.
-
-    Args:
-        message: names the policy.
-        episode: where it failed, if it is known.
-    """
+    """A policy that cannot be made, or that failed, in an episode that may be known."""
 
     def __init__(self, message: str, episode: int | None = None) -> None:
         super().__init__(message)

@@ -93,12 +93,7 @@ def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int, beliefs: b
 
 
 def replay_policy(
-    name: str,
-    policy: Policy,
-    specs: EpisodeSpecs,
-    stopping: Stopping,
-    rng: np.random.Generator,
-    beliefs: bool = False,
+    name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng: np.random.Generator, beliefs: bool = False
 ) -> Trajectories:
     """Run a policy of any kind through all episodes, until a rule ends them; ``name`` is for messages."""
     p, objects = specs.predictions, specs.objects

@@ -51,10 +51,7 @@ def pixel_order(pixels: int, seed: int) -> NDArray[np.int32]:
 
 
 def visible_points(
-    depth: NDArray[np.float32],
-    pose: NDArray[np.float64],
-    intrinsics: NDArray[np.float64],
-    seed: int = 0,
+    depth: NDArray[np.float32], pose: NDArray[np.float64], intrinsics: NDArray[np.float64], seed: int = 0
 ) -> NDArray[np.float32]:
     """Points on the visible surface, (1024, 3) float32, object frame; all zero if nothing is visible.
 

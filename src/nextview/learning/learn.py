@@ -39,25 +39,18 @@ ODD_SIZE = 300  # a thing so many times larger or smaller than the median of the
 
 @dataclass(frozen=True)
 class Learned:
-    """What was learned.
+    """What was learned."""
 
-    Attributes:
-        out: the folder.
-        things: how many, of so many ``classes``.
-        accuracy: share of the cases in which held-out views are named right after 1, 2, 3 and 5 of them; things of a
-            class of several by the others of that class.
-        confused: pairs of things that are most often taken for each other, with the share of the cases.
-        notes: what there is to know, a sentence each.
-        left_out: what could not be learned and why, a phrase each.
-    """
-
-    out: Path
-    things: int
+    out: Path  # the folder
+    things: int  # how many, of so many ``classes``
     classes: int
+    # share of the cases in which held-out views are named right after 1, 2, 3 and 5 of them; things of a class of
+    # several by the others of that class
     accuracy: tuple[float, ...]
+    # pairs of things that are most often taken for each other, with the share of the cases
     confused: tuple[tuple[str, str, float], ...]
-    notes: tuple[str, ...]
-    left_out: tuple[str, ...]
+    notes: tuple[str, ...]  # what there is to know, a sentence each
+    left_out: tuple[str, ...]  # what could not be learned and why, a phrase each
 
     def __str__(self) -> str:
         """In words."""
@@ -72,23 +65,14 @@ class Learned:
 
 @dataclass(frozen=True)
 class How:
-    """How things are looked at.
+    """How things are looked at."""
 
-    Attributes:
-        unit: of the mesh files; then size counts as evidence.
-        up: the up axis of the mesh files; z by default, but y for GLB.
-        upright: the things only ever stand as their files have them; by default they may also lie.
-        sensor: the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help.
-        any_size: take things of very different sizes as they are.
-        seed: of all random draws.
-    """
-
-    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None
-    up: Literal["y", "z"] | None = None
-    upright: bool = False
-    sensor: str = "wrist"
-    any_size: bool = False
-    seed: int = 0
+    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None  # of the mesh files; then size counts as evidence
+    up: Literal["y", "z"] | None = None  # the up axis of the mesh files; z by default, but y for GLB
+    upright: bool = False  # the things only ever stand as their files have them; by default they may also lie
+    sensor: str = "wrist"  # the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help
+    any_size: bool = False  # take things of very different sizes as they are
+    seed: int = 0  # of all random draws
 
 
 def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
@@ -98,32 +82,23 @@ def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
 
 
 def learn_things(
-    folder: Path,
-    out: Path,
-    how: How = How(),
-    add: bool = False,
+    folder: Path,  # what is to be taught
+    out: Path,  # folder to write
+    how: How = How(),  # how things are looked at
+    add: bool = False,  # put the things beside those that ``out`` knows; the old ones are not looked at again
+    # forget the things of these names in ``out``; nothing is added where ``folder`` is ``out``, too
     remove: tuple[str, ...] = (),
-    workers: int | None = None,
+    workers: int | None = None,  # processes; one for each core by default; 0 to work in this one
+    # address of a dask.distributed scheduler whose workers see the same files, to use instead
     scheduler: str | None = None,
-    overwrite: bool = False,
-    track: Track = silently,
+    overwrite: bool = False,  # replace what ``out`` knows
+    track: Track = silently,  # follows the things
 ) -> Learned:
     """Teach the things in a folder, and write a folder of models that recognises them.
 
     Each mesh in the folder is a thing of its own name, as is each folder of captured depth frames with poses (BOP, TUM
     RGB-D or 7-Scenes); any other folder is a class, and the meshes in it are its things. A run that was stopped goes on
     where it was. Use what it writes with --models OUT, or ``nextview.load(models=OUT)``.
-
-    Args:
-        folder: what is to be taught.
-        out: folder to write.
-        how: how things are looked at.
-        add: put the things beside those that ``out`` knows; the old ones are not looked at again.
-        remove: forget the things of these names in ``out``; nothing is added where ``folder`` is ``out``, too.
-        workers: processes; one for each core by default; 0 to work in this one.
-        scheduler: address of a dask.distributed scheduler whose workers see the same files, to use instead.
-        overwrite: replace what ``out`` knows.
-        track: follows the things.
 
     Raises:
         DatasetError: nothing can be taught; what is wrong, in one sentence.

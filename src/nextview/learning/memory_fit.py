@@ -35,25 +35,17 @@ class Fit:
 
 
 def fit_memory(
-    views: Float,
-    thing: NDArray[np.int64],
-    label: NDArray[np.int64],
-    held_out: Float,
-    held_out_views: Float,
-    radii: Float,
+    views: Float,  # (H, rings, azimuths, F), remembered, unit vectors
+    thing: NDArray[np.int64],  # of each resting pose, (H,)
+    label: NDArray[np.int64],  # class of each thing, ascending, (T,)
+    held_out: Float,  # embeddings of views that are not remembered, (T, K, F)
+    held_out_views: Float,  # their elevations and azimuths, radians, (T, K, 2)
+    radii: Float,  # object radius of each thing, metres, (T,); NaN where it is not known
 ) -> Fit:
     """Fit by the held-out views of the things, most likely after 1, 2, 3 and 5 of them.
 
     A thing that has others of its class is judged by these alone, in folds over things: whoever teaches a class will
     meet other things of it. A thing that is a class of its own is judged by what is remembered of itself.
-
-    Args:
-        views: (H, rings, azimuths, F), remembered, unit vectors.
-        thing: of each resting pose, (H,).
-        label: class of each thing, ascending, (T,).
-        held_out: embeddings of views that are not remembered, (T, K, F).
-        held_out_views: their elevations and azimuths, radians, (T, K, 2).
-        radii: object radius of each thing, metres, (T,); NaN where it is not known.
     """
     views, held_out = np.asarray(views, np.float32), np.asarray(held_out, np.float32)
     rng = np.random.default_rng(0)

@@ -32,17 +32,8 @@ GRID = ViewSphere(RINGS, AZIMUTHS)
 def teach(path: Path, name: str, unit: str | None, up: str | None, upright: bool, sensor: str, seed: int) -> Arrays:
     """What is to be remembered of one thing, by the names of the fields of ``recognition.memory.Memory``.
 
-    Args:
-        path: a mesh file, or a folder of captured frames.
-        name: decides all random draws, with the seed.
-        unit: of a mesh file, one of ``mesh.UNITS``; None if it is not known.
-        up: the up axis of a mesh file, "y" or "z".
-        upright: whether it only ever stands as its file has it.
-        sensor: through which it is looked at, see ``sensor.sensor_named``.
-        seed: of all random draws.
-
-    Raises:
-        MeshError, DatasetError, ObservationError: it cannot be looked at; why, in one sentence.
+    Of a mesh file or a folder of captured frames; name and seed decide all random draws, the others are as of
+    ``learn.How``. MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
     """
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     if path.is_dir() and is_capture(path):

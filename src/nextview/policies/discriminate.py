@@ -43,18 +43,13 @@ class Discriminate:
     show there. If one of them is true, the others keep the likelihood of their likeness to it. A view is worth the
     expected logarithm of the belief in the true class (expected information: Denzler and Brown, IEEE TPAMI 2002;
     Borotschnig et al., Image and Vision Computing 2000).
-
-    Attributes:
-        viewpoints: the candidates, anywhere.
-        views: remembered views of each hypothesis, (H, rings, azimuths, F), unit vectors; zero where nothing is known.
-        classes: class of each hypothesis, (H,).
-        travel_weight: of a grid cell of travel.
     """
 
-    viewpoints: Viewpoints
+    viewpoints: Viewpoints  # the candidates, anywhere
+    # remembered views of each hypothesis, (H, rings, azimuths, F), unit vectors; zero where nothing is known
     views: NDArray[np.floating]
-    classes: NDArray[np.int64]
-    travel_weight: float = 0.0
+    classes: NDArray[np.int64]  # class of each hypothesis, (H,)
+    travel_weight: float = 0.0  # of a grid cell of travel
     needs: tuple[str, ...] = ("joint",)
 
     def __post_init__(self) -> None:

@@ -123,22 +123,17 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     to agree on where its azimuth bin 0 points. The belief in a class is multiplied by the likelihood of that agreement,
     summed over all azimuths.
 
-    Attributes:
-        temperature: of a single view.
-        correlation: of the evidence of two views, 0 .. 1.
-        risk: for stopping with a promise; None if not known.
-        bin_correlation: of the azimuth bins of two views, 0 .. 1; None where these shall not count for the class.
-        hypotheses: what the azimuth bins are given, by the class of each, ascending: things, each in every resting pose
-            that it was taught in. () where they are given the classes.
-
     Raises:
         ModelError: a temperature that is not positive, a negative number, or hypotheses that are not of every class.
     """
 
-    temperature: float = 1.0
-    correlation: float = 0.0
-    risk: RiskBounds | None = None
+    temperature: float = 1.0  # of a single view
+    correlation: float = 0.0  # of the evidence of two views, 0 .. 1
+    risk: RiskBounds | None = None  # for stopping with a promise; None if not known
+    # of the azimuth bins of two views, 0 .. 1; None where these shall not count for the class
     bin_correlation: float | None = None
+    # what the azimuth bins are given, by the class of each, ascending: things, each in every resting pose that it was
+    # taught in. () where they are given the classes.
     hypotheses: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:

@@ -60,58 +60,36 @@ class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
 
     That is an ONNX file; of a memory of taught things, which is a recogniser too, a safetensors file.
 
-    Attributes:
-        name: what users call it.
-        kind: "recogniser" or the name of the map that it predicts ("lem").
-        input: what it takes of a view.
-        sha256: of that file.
-        path: of that file; it does not stand in the card.
-        network: which architecture, in words.
-        classes: of a recogniser, unique, in the order of its logits.
-        azimuth_bins: of an object that a recogniser discriminates; 0 for none.
-        calibration: of a recogniser.
-        size: what a recogniser knows of the sizes of objects; None if nothing.
-        novelty_sha256: of the novelty score beside the card; "" if there is none.
-        measure: of which a map network predicts the map.
-        good: where such a map has the better views.
-        output: of a map network: the local window, or the whole sphere, of which the window is a part.
-        valley_classes: for which the valley of its map was found to be the better view.
-        valley_gain: by how much, for each class.
-        training: how it was made.
-        scores: on each set of objects.
-        largest_difference_to_torch: of the file's answers; None if it was not measured.
-        note: what else is to be said.
-        held_out: objects of the training split that it was not trained on; () if it does not say.
-        fitted_to: what calibration, size, novelty and valleys were fitted to, in words, by their names.
-        memory: of a recogniser that was taught things; None for a network.
-
     Raises:
         ModelError: a recogniser without classes, sizes of other classes than these, or a network of no input.
     """
 
-    name: str
-    kind: str
-    input: InputSpec
-    sha256: Sha256
-    path: Path = NOWHERE
-    network: str = ""
-    classes: tuple[str, ...] = ()
-    azimuth_bins: int = 0
-    calibration: Calibration = PLAIN_SUM
-    size: SizeEvidence | None = None
+    name: str  # what users call it
+    kind: str  # "recogniser" or the name of the map that it predicts ("lem")
+    input: InputSpec  # what it takes of a view
+    sha256: Sha256  # of that file
+    path: Path = NOWHERE  # of that file; it does not stand in the card
+    network: str = ""  # which architecture, in words
+    classes: tuple[str, ...] = ()  # of a recogniser, unique, in the order of its logits
+    azimuth_bins: int = 0  # of an object that a recogniser discriminates; 0 for none
+    calibration: Calibration = PLAIN_SUM  # of a recogniser
+    size: SizeEvidence | None = None  # what a recogniser knows of the sizes of objects; None if nothing
+    # of the novelty score beside the card; "" if there is none
     novelty_sha256: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")] = ""
-    measure: str = ""
-    good: Good = "peak"
+    measure: str = ""  # of which a map network predicts the map
+    good: Good = "peak"  # where such a map has the better views
+    # of a map network: the local window, or the whole sphere, of which the window is a part
     output: Literal["window", "sphere"] = "window"
-    valley_classes: tuple[str, ...] = ()
-    valley_gain: dict[str, float] = {}
-    training: Training = Training()
-    scores: dict[str, Any] = {}
-    largest_difference_to_torch: float | None = None
-    note: str = ""
-    held_out: tuple[str, ...] = ()
+    valley_classes: tuple[str, ...] = ()  # for which the valley of its map was found to be the better view
+    valley_gain: dict[str, float] = {}  # by how much, for each class
+    training: Training = Training()  # how it was made
+    scores: dict[str, Any] = {}  # on each set of objects
+    largest_difference_to_torch: float | None = None  # of the file's answers; None if it was not measured
+    note: str = ""  # what else is to be said
+    held_out: tuple[str, ...] = ()  # objects of the training split that it was not trained on; () if it does not say
+    # what calibration, size, novelty and valleys were fitted to, in words, by their names
     fitted_to: dict[str, str] = {}
-    memory: Taught | None = None
+    memory: Taught | None = None  # of a recogniser that was taught things; None for a network
 
     def __post_init__(self) -> None:
         if not self.name or not self.kind:

@@ -11,15 +11,11 @@ Mask = NDArray[np.bool_]
 
 
 def trimmed(depth: NDArray[np.float32], mask: Mask) -> Mask:
-    """The pixels of a mask that hang together with its inside without a step in depth, (H, W) bool.
+    """The pixels of a mask, (H, W) bool, that hang together with its inside without a step in depth, metres.
 
     Up to EDGE pixels at the edge of a mask may show the background, or hang in the air before it. The inside is what is
     farther from the edge; of a thing that is too thin for that, as much farther as leaves a third of it. From there the
     mask grows back over pixels as near as their neighbours.
-
-    Args:
-        depth: metres, (H, W), 0 where nothing was measured.
-        mask: (H, W) bool.
     """
     measured = mask & (depth > 0)
     rows, columns = np.flatnonzero(measured.any(1)), np.flatnonzero(measured.any(0))

@@ -71,26 +71,17 @@ def unconstrained(state: EpisodeState) -> EpisodeState:
 
 
 class Episodes:
-    """B episodes side by side. Give ``update`` what was seen from ``current``, until ``running`` is empty.
-
-    Args:
-        sphere: the viewpoints.
-        policy: chooses where to go.
-        starts: first view of each episode, (B,).
-        stopping: when an episode ends; a sphere with fewer views than ``max_views`` ends it too.
-        rng: for policies that draw.
-        calibration: how far to trust the sum of the logits; fully by default.
-        visibility: for policies that need it; by default from the scenes in the observations, see ``SeenScene``.
-    """
+    """B episodes side by side. Give ``update`` what was seen from ``current``, until ``running`` is empty."""
 
     def __init__(
         self,
         sphere: Viewpoints,
-        policy: Policy,
-        starts: NDArray[np.int64],
-        stopping: Stopping,
-        rng: np.random.Generator,
-        calibration: Calibration = PLAIN_SUM,
+        policy: Policy,  # chooses where to go
+        starts: NDArray[np.int64],  # first view of each episode, (B,)
+        stopping: Stopping,  # when an episode ends; a sphere with fewer views than ``max_views`` ends it too
+        rng: np.random.Generator,  # for policies that draw
+        calibration: Calibration = PLAIN_SUM,  # how far to trust the sum of the logits; fully by default
+        # for policies that need it; by default from the scenes in the observations, see ``SeenScene``
         visibility: Visible | None = None,
     ) -> None:
         self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
@@ -107,14 +98,10 @@ class Episodes:
         """Take in the evidence of one view in every running episode; stop or choose its next view.
 
         A view in which nothing was seen is taken, but changes no belief and ends no episode as a confident one. Where
-        this raises, nothing is taken in: the same view can be handed in again.
-
-        Args:
-            evidence: of the A running episodes.
-            directions: unit vectors towards where the cameras really stood, (A, 3); in all updates or in none. The
-                nearest views then count as taken, those within VISITED as visited too, and azimuths and travel are
-                measured from the places. By default the cameras stood at ``current``.
-            constrain: asked before the policy. An episode without a free view ends.
+        this raises, nothing is taken in: the same view can be handed in again. ``directions`` are unit vectors towards
+        where the cameras really stood, (A, 3), in all updates or in none; by default they stood at ``current``. The
+        nearest views then count as taken, those within VISITED as visited too, and azimuths and travel are measured
+        from the places. ``constrain`` is asked before the policy. An episode without a free view ends.
         """
         taken = self.next_step(evidence, directions, constrain)
         self.keep(taken)
