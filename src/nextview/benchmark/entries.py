@@ -41,7 +41,7 @@ class EpisodeSpecs:
         return tuple(classes.index(name) for name in named if name in classes)
 
 
-MAP_ORACLES = {
+MAP_ORACLES = {  # the thesis's oracles, under its names
     "oracle-valley": ("", LEM, "-oracle-valley"),
     f"{TRUE}{LEM}": (TRUE, LEM, ""),
     f"{TRUE}{LEM}-peak": (TRUE, LEM, "-peak"),
@@ -49,7 +49,6 @@ MAP_ORACLES = {
     f"{LCM}-oracle-valley": ("", LCM, "-oracle-valley"),
     f"{TRUE}{LCM}": (TRUE, LCM, "-peak"),
 }
-"""The thesis's oracles, under its names."""
 GAINS: dict[str, Scope] = {"oracle-gain": "local", "oracle-gain-all": "global"}
 """One step of perfect foresight: the ceiling."""
 ORACLES = (*MAP_ORACLES, *GAINS)

@@ -22,8 +22,7 @@ COLOURS = {
     f"true-{LEM}": BLUE, f"true-{LEM}-peak": "#7a6fd0", "true-oracle-valley": ACCENT, f"true-{LCM}": "#00805a",
     "oracle-gain": "#111111", "oracle-gain-all": "#777777",
 }  # fmt: skip
-OWN = ("#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff7043", "#5c6bc0")
-"""For all others, in turn."""
+OWN = ("#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff7043", "#5c6bc0")  # all others, in turn
 MOST = 8  # curves of policies that a robot could follow, at most
 
 

@@ -9,8 +9,7 @@ from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.summary import Tables
 
 SIGNIFICANT = 0.05  # a difference is called one when its p-value after Holm's correction is below this
-FEW_OBJECTS, WIDE = 200, 0.03
-"""With fewer objects, or intervals of differences in accuracy that reach farther to either side, little can be told."""
+FEW_OBJECTS, WIDE = 200, 0.03  # with fewer objects, or wider intervals of differences in accuracy, little can be told
 
 
 def headline_threshold(thresholds: Sequence[float]) -> float:

@@ -5,8 +5,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-FARTHEST = 50.0
-"""Depth at which nothing counts as an object any more, object radii: depth cameras have large numbers for "nothing"."""
+FARTHEST = 50.0  # object radii; what is farther is no object: depth cameras have large numbers for "nothing"
 AMBIENT = 0.15  # brightness of a surface seen edge-on, so that it stays apart from the black background
 POINTS = 1024  # points in the partial cloud of one view (thesis, section 4.1.2)
 

@@ -24,8 +24,7 @@ from nextview.recognition.model_card import ModelCard
 
 Float = NDArray[np.float64]
 
-THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
-"""Of the belief, from 0.5 to 0.998: those for which error rates are promised."""
+THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())  # of promised error rates
 
 
 @dataclass(frozen=True)

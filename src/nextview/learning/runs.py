@@ -285,14 +285,13 @@ def load_run(network: N, run: Path) -> N:
     return network.eval()
 
 
-LITE_NAMES = {
+LITE_NAMES = {  # names of parts in ports of EfficientNet to PyTorch, as patterns, and in a ``LiteNet``
     r"^_conv_": "",
     "^_blocks": "stages",
     r"\._(expand|depthwise|project)_conv": r".\1",
     "_bn": "norm",
     "^_fc": "fc",
 }
-"""Names of the parts in ports of EfficientNet to PyTorch, as patterns, and in a ``LiteNet``."""
 
 
 def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> None:

@@ -74,5 +74,4 @@ def find_things(folder: Path) -> Found:
     return Found(things, left_out)
 
 
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".bmp")
-"""Files that somebody may take for views; without depth and a pose they teach nothing."""
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".bmp")  # no views: without depth and a pose they teach nothing

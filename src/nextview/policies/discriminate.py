@@ -14,8 +14,7 @@ from nextview.recognition.model_card import read_card
 
 Float = NDArray[np.float64]
 WEIGHT = 40.0  # of a cosine, as a log-likelihood: for one view whose noise is not known yet
-LEADING = 24
-"""Pairs of a thing, in a resting pose, and an azimuth that are weighed against each other: those believed most."""
+LEADING = 24  # pairs of a thing, in a resting pose, and an azimuth that are weighed: those believed most
 
 
 @dataclass(frozen=True)

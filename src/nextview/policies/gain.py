@@ -27,8 +27,7 @@ Float = NDArray[np.float64]
 INPUTS = ("belief", "view", "place", "azimuth_bin")
 """What a network may take: the belief over all views; that by the last view alone; the ring and the views visited; and
 the azimuth bin that is seen, of the class believed most and over all classes. Any other name is that of a map."""
-VISIBILITY = "visibility"
-"""One more input, for cluttered scenes: the share of the object that is expected to show from each view."""
+VISIBILITY = "visibility"  # one more, for scenes: the share of the object that is expected to show from each view
 Frame = Literal["camera", "object"]
 """From where azimuths of cells are counted: the camera's, or that at which the object, if of the class believed most,
 most likely shows its azimuth bin 0."""

@@ -214,8 +214,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return self.risk.threshold(risk, max_views)
 
 
-RARE, MUCH = 0.05, 2.0
-"""Share of the objects of a class that are smaller than usual, and larger; and times beyond that which none has."""
+RARE, MUCH = 0.05, 2.0  # share of a class that is smaller than usual, and larger; times beyond that which none has
 PLAIN_SUM = Calibration()  # trusts the sum of the logits as it stands, as the thesis did
 
 

@@ -19,8 +19,7 @@ RECOGNISER = "recogniser-modelnet10"
 FEATURES = "features"  # the bundled network that knows no classes: what taught things are remembered by
 MEMORY_SUFFIX = ".safetensors"
 DISCRIMINATE = "discriminate"  # the policy of a memory of things; its card is that of the memory
-COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}
-"""Recognisers that are bundled, by the name of the models they belong to."""
+COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}  # bundled recognisers, by the name of their models
 MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}  # the map networks that are bundled, by the name of the map
 NOWHERE = Path()
 

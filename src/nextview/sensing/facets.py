@@ -27,8 +27,7 @@ BINS = 4  # ranges of depth in which the noise is measured, with equally many pi
 ROWS = 20  # about so many rows of a picture are enough to measure it
 LAGS = (1, 2, 4, 6)  # distances of the pixels that are compared: in many sensors neighbours err together
 NEAREST, FARTHEST = 0.5, 100.0  # depth of what can be shown, object radii; all of the object is between 2 and 4
-WIDEST = 1 / 16
-"""Half the width of what one sensor pixel covers here at most, as a part of the image: it bounds the time."""
+WIDEST = 1 / 16  # half of what one sensor pixel covers here at most, as a part of the image: it bounds the time
 LAYER = 0.03  # object radii of depth within which facets are of one surface; the nearest to a pixel is shown
 
 

@@ -11,8 +11,7 @@ from nextview.geometry.observation import LARGEST, array_of, numbers
 
 FARTHEST = 65.0  # metres: float depth beyond is nothing; uint16 millimetres reach as far
 LARGEST_MEDIAN = 20.0  # metres; a depth image beyond is of another unit: inches are 39 times as many
-ASPECTS = (4 / 3, 16 / 9, 16 / 10, 512 / 424, 640 / 576)
-"""Width over height of what sensors give, as against parts that were cut out of it."""
+ASPECTS = (4 / 3, 16 / 9, 16 / 10, 512 / 424, 640 / 576)  # width over height of whole pictures
 AXES = {
     "opencv": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),

@@ -14,15 +14,11 @@ Float = NDArray[np.float64]
 
 SAMPLE = 500  # pixels that are looked at
 FEWEST = 20  # pixels with a depth below which nothing is seen
-OUTERMOST = 1.15
-"""How far from the origin a surface may be, object radii: 1, and what an estimated centre and radius may be off."""
+OUTERMOST = 1.15  # how far from the origin a surface may be, object radii: centre and radius are estimates
 INNERMOST = 0.4  # how far from the origin the outermost of what is seen has to be
-CONTRADICTION = 0.2
-"""Share of the surface seen in one view of which another view says that it is not there, from which they contradict."""
-OFF_CENTRE = 0.25
-"""How far a principal point is from the middle of a picture that is no part of a larger one, half sides of it."""
-FAR_DEPTH = 10.0
-"""Metres: few depth cameras measure farther, and no object that stands on something fills a picture from there."""
+CONTRADICTION = 0.2  # views contradict if one misses this share of the surface that the other saw
+OFF_CENTRE = 0.25  # how far a principal point is from the middle of an uncropped picture, at most, half sides of it
+FAR_DEPTH = 10.0  # metres: few depth cameras measure farther, and nothing fills a picture from there
 TOO_FAR = 2.5  # so many times as far as a frame shows anything an object cannot be: of a near one only the front shows
 STILL, CHANGED, CHANGED_SHARE = 1e-3, 0.04, 0.03
 """Metres, and parts of a rotation, up to which a pose is the same; and the part of the distance by which a pixel has

@@ -15,12 +15,10 @@ Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 TRIALS = 200  # planes that are tried: with one point in ten on the plane, 0.8 of all draws hit it at least once
-TILT = np.cos(np.radians(12.0))
-"""Cosine of the lean of a support plane against gravity, at most: errors of a calibration."""
+TILT = np.cos(np.radians(12.0))  # cosine of the lean of a support plane, at most: errors of a calibration
 LEAST = 0.04  # share of what is seen that lies on a support plane, at least; more if gravity is not known
 LEAST_ALONE = 0.15
-RANGE = 1.05
-"""Times as much of a frame lies on a plane as range, if it is range: wide lenses show it, narrow ones hardly bend."""
+RANGE = 1.05  # times as much of a frame lies on a plane as range, if it is range: narrow lenses hardly bend one
 SAMPLES = 1500  # pixels in which planes are searched
 
 

@@ -16,8 +16,7 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration, Stopping, log_ev
 from nextview.sensing.expected_visibility import SeenScene, expected_visibility
 
 Float = NDArray[np.float64]
-VISITED = np.radians(6.0)
-"""Views within this angle of where a camera stood count as visited, beside the nearest one: it saw what they show."""
+VISITED = np.radians(6.0)  # views within this angle of where a camera stood count as visited: it saw what they show
 
 
 @dataclass(frozen=True)
@@ -59,10 +58,8 @@ class Taken:
     places: Float | None  # where they stood so far, (A, step, 3); None where these are the views themselves
 
 
-Visible = Callable[[EpisodeState], Float]
-"""Expected share of the object that shows from each view in the episodes of a state, (B, V)."""
-Constrain = Callable[[EpisodeState], EpisodeState]
-"""The state with where robots can go (``reachable``) and what that costs them (``travel``)."""
+Visible = Callable[[EpisodeState], Float]  # expected share of the object that shows from each view, (B, V)
+Constrain = Callable[[EpisodeState], EpisodeState]  # with where robots can go, and what it costs
 
 
 def unconstrained(state: EpisodeState) -> EpisodeState:
