@@ -98,11 +98,8 @@ def plugin_errors(error: Callable[[str], NextviewError]) -> Iterator[None]:
     except BaseException as raised:
         if os.environ.get(TRACEBACK):
             traceback.print_exception(raised)
-        raise error(_sentence(raised)) from raised
-
-
-def _sentence(raised: BaseException) -> str:
-    message = one_line(str(raised), 300)
-    text = f"{type(raised).__name__}: {message}" if message else type(raised).__name__
-    frames = [f for f in traceback.extract_tb(raised.__traceback__) if not f.filename.startswith(_NOT_PLUGINS)]
-    return f"{text}, at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else text
+        message, text = one_line(str(raised), 300), type(raised).__name__
+        text += f": {message}" if message else ""
+        frames = [f for f in traceback.extract_tb(raised.__traceback__) if not f.filename.startswith(_NOT_PLUGINS)]
+        text += f", at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
+        raise error(text) from raised

@@ -148,10 +148,6 @@ class Predictions:
             return self
         return replace(self, logits=self.logits - self.of_size[:, None], of_size=None)
 
-    def with_size(self, of_size: NDArray[np.float32] | None) -> "Predictions":
-        """The inverse of ``by_shape``: logits by size, (N, C), are added."""
-        return self if of_size is None else replace(self, logits=self.logits + of_size[:, None], of_size=of_size)
-
     @classmethod
     def from_logits(
         cls,

@@ -26,10 +26,7 @@ def slope(before: NDArray, here: NDArray, after: NDArray) -> NDArray[np.float32]
 
 
 def headlight(depth: NDArray[np.float32], intrinsics: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """The surface as a lamp at the camera lights it, (H, W) uint8: as bright as the cosine of ray and surface normal.
-
-    Normals come from differences between neighbouring pixels.
-    """
+    """The surface as lit by a lamp at the camera, (H, W) uint8: as bright as the cosine of ray and surface normal."""
     height, width = depth.shape
     padded = np.pad(depth, 1)
     (fx, _, cx), (_, fy, cy) = intrinsics[:2]

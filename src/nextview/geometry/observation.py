@@ -139,10 +139,7 @@ class Camera(Protocol):
 
 
 def checked_pose(pose: Any) -> NDArray[np.float64]:
-    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii.
-
-    ObservationError if it is no rigid motion, or leads to a place from which no object can be seen.
-    """
+    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii; ObservationError if no camera has it."""
     pose = numbers(pose, "the pose").astype(np.float64, copy=False)
     if pose.shape != (4, 4):
         raise ObservationError(f"the pose is a camera-to-world matrix of the shape (4, 4), not {pose.shape}")

@@ -49,9 +49,6 @@ def fit_calibration(
 
     Both go into its card; nextview predict takes them into predictions made before, without predicting again. The size
     of the objects is not used.
-
-    Raises:
-        UsageError, ModelError, PredictionsError: the arguments make no sense, or do not fit together.
     """
     if not 0 < number(delta, "--delta") < 1:
         raise UsageError(f"delta is a probability between 0 and 1, not {delta}")
@@ -221,9 +218,6 @@ def fit_size(
     """Learn how large the objects of each class are, for stores and cameras that know the scale.
 
     It goes into the card; nextview predict takes it into predictions made before, without predicting again.
-
-    Raises:
-        DatasetError, ModelError, PredictionsError: the arguments do not fit together.
     """
     views, predicted = ViewStore.open(store), Predictions.load(predictions)
     table = predicted.deduplicate().by_shape()
@@ -293,9 +287,6 @@ def fit_valleys(
     """Choose the classes for which the valley of a predicted map is the better view than its peak.
 
     They go into the network's card; nextview predict takes them into predictions made before, without predicting again.
-
-    Raises:
-        ModelError, PredictionsError: the arguments do not fit together.
     """
     table = Predictions.load(predictions)
     with card_to_fit(card, recogniser=False) as (model, write):

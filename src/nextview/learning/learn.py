@@ -114,11 +114,14 @@ def learn_things(
     else:
         check_new(out, overwrite, folder=True)
     found = Found([], []) if remove and folder.resolve() == out.resolve() else find_things(folder)
-    sources, left_out = _new(found.things, known), list(found.left_out)
+    names, left_out = {source.name for source, _ in known}, list(found.left_out)
+    for thing in found.things:
+        if thing.name in names:
+            raise UsageError(f"{thing.path}: something called {thing.name} is known already; --remove it, or rename it")
     part = out.with_name(f".{out.name}.part")
     with only_one(out):
         taught = known
-        track(_teach(sources, how, part, taught, left_out, workers, scheduler), len(sources), "things")
+        track(_teach(found.things, how, part, taught, left_out, workers, scheduler), len(found.things), "things")
         if not taught:
             raise DatasetError(f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})")
         taught.sort(key=lambda pair: (pair[0].label, pair[0].name))
@@ -148,14 +151,6 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
 
 
 PER_THING = ("held_out", "held_out_views", "radii", "pictures")
-
-
-def _new(things: Sequence[Source], known: Sequence[Pair]) -> list[Source]:
-    names = {source.name for source, _ in known}
-    for thing in things:
-        if thing.name in names:
-            raise UsageError(f"{thing.path}: something called {thing.name} is known already; --remove it, or rename it")
-    return list(things)
 
 
 def _teach(

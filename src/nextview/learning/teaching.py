@@ -54,14 +54,12 @@ def teach(path: Path, name: str, unit: str | None, up: str | None, upright: bool
 
 
 def _around(mesh: Mesh, sensor: str, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Embeddings of the views of the grid, (rings, azimuths, F): the mean without and with a sensor's errors.
-
-    Every other azimuth is looked at through the sensor; between them the embeddings are interpolated.
-    """
+    """Embeddings of the views of the grid, (rings, azimuths, F): the mean without and with a sensor's errors."""
     clean = SimulatedCamera(mesh)
     ideal = embeddings([clean.observe(pose) for pose in GRID.poses])
     sensed = _sensed(mesh, GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[:, ::2].reshape(-1, 4, 4), sensor, rng)
     sensed = sensed.reshape(len(RINGS), AZIMUTHS // 2, -1)
+    # Every other azimuth is looked at through the sensor; between them the embeddings are interpolated.
     whole = np.stack([sensed, unit(sensed + np.roll(sensed, -1, 1))], 2).reshape(len(RINGS), AZIMUTHS, -1)
     return joined(ideal.reshape(whole.shape), whole)
 

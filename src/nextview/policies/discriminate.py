@@ -19,19 +19,13 @@ LEADING = 24  # pairs of a thing, in a resting pose, and an azimuth that are wei
 
 @dataclass(frozen=True)
 class Rivals:
-    """The two classes believed most, and the remembered view of each that is nearest to each of V candidate views.
+    """The two classes believed most, and the remembered view of each that is nearest to each of V candidate views."""
 
-    Attributes:
-        classes: (2,), that believed most first; ``hypotheses`` the likeliest of each.
-        rings, azimuths: of the remembered views, indices, (V,) and (2, V).
-        alike: cosine of the two views, (V,); NaN where one of them is not remembered.
-    """
-
-    classes: NDArray[np.int64]
-    hypotheses: NDArray[np.int64]
-    rings: NDArray[np.int64]
-    azimuths: NDArray[np.int64]
-    alike: Float
+    classes: NDArray[np.int64]  # that believed most first, (2,)
+    hypotheses: NDArray[np.int64]  # the likeliest of each, (2,)
+    rings: NDArray[np.int64]  # of the remembered views, indices, (V,)
+    azimuths: NDArray[np.int64]  # likewise, (2, V)
+    alike: Float  # cosine of the two views, (V,); NaN where one of them is not remembered
 
 
 @dataclass(frozen=True, eq=False)

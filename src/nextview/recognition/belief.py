@@ -16,10 +16,7 @@ Floating = NDArray[np.floating]
 
 
 def fuse(logits: Floating, temperature: float = 1.0) -> Float:
-    """Belief after several views: softmax of the sum of their logits (thesis, section 4.4), over a temperature.
-
-    From logits (..., views, classes), finite; (..., classes) float64, sums to 1.
-    """
+    """Belief, (..., classes), by logits (..., views, classes): softmax of their sum (thesis, section 4.4)."""
     logits = np.asarray(logits, np.float64)
     if not np.isfinite(logits).all():
         raise ModelError("the recogniser gave a logit that is not a finite number")
@@ -83,15 +80,11 @@ def of_true_class(logs: Float, labels: NDArray[np.int64]) -> Float:
 
 
 class RiskBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Upper bounds of the error rate of those who stop at a threshold, from validation objects.
+    """Upper bounds of the error rate of those who stop at a threshold, from validation objects."""
 
-    Of T ascending ``thresholds``, by the views that may be taken (1, 2, ...), (views, T); such a promise fails with the
-    probability ``delta``.
-    """
-
-    thresholds: tuple[float, ...]
-    bounds: tuple[tuple[float, ...], ...]
-    delta: float
+    thresholds: tuple[float, ...]  # ascending, (T,)
+    bounds: tuple[tuple[float, ...], ...]  # by the views that may be taken, 1, 2, ..., (views, T)
+    delta: float  # how often such a promise fails
 
     def __post_init__(self) -> None:
         ascending = all(a < b for a, b in zip(self.thresholds, self.thresholds[1:], strict=False))
@@ -156,10 +149,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return self.temperature * (1 + self.correlation * (n_views - 1))
 
     def log_belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
-        """Logarithm of the belief in each class, up to a constant for all classes, (..., classes) float64.
-
-        ``total`` is the sum over ``n_views`` views, one number or (...), of ``log_evidence_of``.
-        """
+        """Log-belief in each class up to a constant, (..., classes), by a sum of ``log_evidence_of`` so many views."""
         if not np.isfinite(total).all():
             raise ModelError("the recogniser said something that is not a finite number")
         more = np.asarray(n_views)[..., None] - 1
@@ -184,10 +174,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return pointing / (1 + correlation * (np.asarray(n_views)[..., None, None] - 1))
 
     def joint(self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating) -> Float:
-        """Belief in each hypothesis seen from each azimuth bin, jointly, (..., hypotheses, azimuth bins), sums to 1.
-
-        From an azimuth, radians, (...); other arguments as for ``log_belief``.
-        """
+        """Belief in each hypothesis seen from each azimuth bin, jointly, (..., hypotheses, azimuth bins), sums to 1."""
         total = np.asarray(total, np.float64)
         logs = reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth)
         of_class = total[..., :classes] / self.temperature_after(np.asarray(n_views)[..., None])
@@ -199,10 +186,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return _softmax(self.log_belief(total, n_views, classes))
 
     def azimuth_bins(self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating) -> Float | None:
-        """Belief in the azimuth bin seen from an azimuth, radians, given each hypothesis, (..., hypotheses, bins).
-
-        None without azimuth bins; ``total`` as for ``log_belief``.
-        """
+        """Belief in the bin seen from an azimuth, given each hypothesis, (..., hypotheses, bins); None without bins."""
         if total.shape[-1] == classes:
             return None
         return _softmax(reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth))
@@ -219,15 +203,11 @@ PLAIN_SUM = Calibration()  # trusts the sum of the logits as it stands, as the t
 
 
 class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """How likely each size is for an object of each class; it is added to the logits of views whose scale is known.
+    """How likely each size is for an object of each class; it is added to the logits of views whose scale is known."""
 
-    ``radii_m`` are object radii, metres, ascending, (R,); ``log_density`` that of their logarithm, (C, R); ``weight``
-    that of it beside the logits.
-    """
-
-    radii_m: tuple[float, ...]
-    log_density: tuple[tuple[float, ...], ...]
-    weight: float
+    radii_m: tuple[float, ...]  # object radii, metres, ascending, (R,)
+    log_density: tuple[tuple[float, ...], ...]  # that of their logarithm, (C, R)
+    weight: float  # beside the logits
 
     def __post_init__(self) -> None:
         radii, fits = np.array(self.radii_m), {len(row) for row in self.log_density} == {len(self.radii_m)}

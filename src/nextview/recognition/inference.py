@@ -150,10 +150,7 @@ class Recogniser:
         return replace(evidence, logits=evidence.logits + self.card.size.logits(radii))
 
     def from_inputs(self, inputs: NDArray[Any], elevations: NDArray[np.floating] | None = None) -> Evidence:
-        """Evidence by shape alone, from what the network takes, see ``network_input``.
-
-        ``elevations`` of the cameras, radians, (B,), are for memories of things.
-        """
+        """Evidence by shape alone, from what the network takes; a memory needs elevations too, radians, (B,)."""
         names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins)
         outputs = dict(zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True))
         return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT))

@@ -31,8 +31,8 @@ class Memory:
     views: Float
     thing: NDArray[np.int64]  # which thing each resting pose is of, (H,) int64
     rotations: Float  # of each resting pose, from the file's axes, (H, 3, 3) float32
-    # embeddings of views through a sensor that are not remembered, (T, K, F), K of each thing in its first resting pose:
-    # what calibration and reports are made of
+    # embeddings of views through a sensor that are not remembered, K of each thing in its first resting pose, (T, K,
+    # F): what calibration and reports are made of
     held_out: Float
     held_out_views: Float  # elevation and azimuth of each, radians, (T, K, 2) float32
     radii: Float  # object radius of each thing, metres, (T,) float32; NaN where it is not known

@@ -41,16 +41,14 @@ class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a memory of things is of: the things in order, the features it is made of, and the weight of a cosine.
+    """What a memory of things is of."""
 
-    ``novelty`` are quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative log-likelihood of known
-    things, given the class that explains them best.
-    """
-
-    things: tuple[Thing, ...]
-    features_sha256: Sha256
-    weight: float
+    things: tuple[Thing, ...]  # in order
+    features_sha256: Sha256  # of the features that it is made of
+    weight: float  # of a cosine
     attribution: str = ""
+    # quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative log-likelihood of known things, given
+    # the class that explains them best
     novelty: tuple[tuple[float, ...], ...] = ()
 
 

@@ -18,13 +18,10 @@ CHANNELS_OF = {"geometry": len(CHANNELS), "image": 1}  # channels of the kinds o
 
 
 class InputSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a network takes of a view: a kind, see ``geometry_input``, ``image_input`` and ``cloud_input``.
+    """What a network takes of a view."""
 
-    ``size`` is the side of the image, pixels; 0 for a cloud.
-    """
-
-    kind: InputKind
-    size: int = 0
+    kind: InputKind  # see ``geometry_input``, ``image_input`` and ``cloud_input``
+    size: int = 0  # side of the image, pixels; 0 for a cloud
 
     def __post_init__(self) -> None:
         if self.size < 0 or (self.kind == "cloud") != (self.size == 0):

@@ -177,14 +177,11 @@ class SeenScene:
 
 @dataclass(frozen=True)
 class Visibility:
-    """Share of an object that shows from V positions, (V,) float64, 0 to 1, by what unseen space is.
+    """Share of an object that shows from V positions, (V,) float64, 0 to 1, by what unseen space is."""
 
-    All of it solid for ``least``, as often filled as on the average for ``expected``, all of it free for ``most``.
-    """
-
-    least: NDArray[np.float64]
-    expected: NDArray[np.float64]
-    most: NDArray[np.float64]
+    least: NDArray[np.float64]  # all of it solid
+    expected: NDArray[np.float64]  # as often filled as on the average
+    most: NDArray[np.float64]  # all of it free
 
 
 def expected_visibility(

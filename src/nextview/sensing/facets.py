@@ -75,17 +75,13 @@ def _sigma(second: NDArray[np.floating]) -> float:
 
 @dataclass(frozen=True)
 class Facets:
-    """Planes of the N pixels of an object, in the camera's frame.
+    """Planes of the N pixels of an object, in the camera's frame."""
 
-    ``planes`` are n of each, with n . P = 1 for points P of the plane, (N, 3), 1/metres; ``rays`` (x, y, 1) through the
-    pixels' centres, (N, 3); ``pitch`` the distance between neighbouring ones along x and y at depth 1, (2,).
-    """
-
-    planes: Float
-    rays: Float
+    planes: Float  # n of each, with n . P = 1 for points P of the plane, (N, 3), 1/metres
+    rays: Float  # (x, y, 1) through the pixels' centres, (N, 3)
     rows: Index
     columns: Index
-    pitch: Float
+    pitch: Float  # distance between neighbouring rays along x and y at depth 1, (2,)
 
     @property
     def points(self) -> Float:
@@ -271,10 +267,7 @@ def _deviation(planes: Float, here: Float, own: Float) -> Float:
 
 
 def virtual_pose(pose: Float) -> Float:
-    """Where the networks would have looked from: in the camera's direction, at their distance, horizon level.
-
-    From and to camera-to-world, (4, 4), OpenCV axes, object frame, object radii.
-    """
+    """The pose, (4, 4), that the networks would have looked from: in a camera's direction, at their distance, level."""
     position = pose[:3, 3]
     outward = position / np.linalg.norm(position) if position.any() else -pose[:3, 2]
     right = np.array([-outward[1], outward[0], 0.0])

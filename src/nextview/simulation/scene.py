@@ -64,10 +64,7 @@ class Scene:
         return Mesh(*square(TABLE, self.floor), np.zeros(3), 1.0, "table")
 
     def clearance(self, positions: Float) -> Float:
-        """Distance of cameras, (V, 3), from the nearest item, as a prism on its footprint, or the table, object radii.
-
-        (V,) float64; 0 inside of an item, negative below the table.
-        """
+        """Distance of cameras, (V, 3), from the nearest item or the table, (V,); 0 inside, negative below."""
         found = positions[:, 2] - self.floor
         for item in self.items:
             above = np.maximum(positions[:, 2] - item.vertices[:, 2].max(), 0)

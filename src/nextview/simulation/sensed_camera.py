@@ -65,10 +65,7 @@ class SensedCamera:
         return SimulatedCamera(mesh, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)
 
     def observe(self, pose: Float) -> Observation:
-        """Look from the direction of a pose, (4, 4), object frame, at the sensor's own distance.
-
-        A frame in which too little of the object is found is a view in which nothing is seen.
-        """
+        """Look from the direction of a pose, (4, 4), at the sensor's own distance; too little found is nothing seen."""
         frame = self.frame(pose)
         try:
             thing = ObservedObject(known=self.object_frame, support=False, denoise=self.denoise, life_size=False)

@@ -161,10 +161,7 @@ class Walk:
 
 @lru_cache(maxsize=256)
 def remembered_picture(recogniser: TaughtRecogniser, hypothesis: int, ring: int, azimuth: int) -> NDArray[np.uint8]:
-    """A thing in a resting pose as it was taught from a ring and an azimuth bin, (64, 64).
-
-    Where its mesh is no longer there, the one picture that the memory keeps of it.
-    """
+    """A thing in a pose as taught from a ring and an azimuth bin, (64, 64); without its mesh, its one picture."""
     memory, about = recogniser.memory, recogniser.card.memory
     assert about is not None
     thing = int(memory.thing[hypothesis])
