@@ -4,6 +4,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -69,9 +70,7 @@ class Plane:
         return samples.points[on & (part == np.bincount(part[on]).argmax())]
 
 
-def find_plane(
-    samples: Samples, rng: np.random.Generator, up: Float | None = None, above: Float | None = None
-) -> Plane | None:
+def find_plane(samples: Samples, rng: Generator, up: Float | None = None, above: Float | None = None) -> Plane | None:
     """The plane with most samples on it, by RANSAC (Fischler and Bolles 1981), with all trials in one product.
 
     The camera and a point ``above``, (3,), lie above it, and it is level against ``up``, (3,), where these are given.
@@ -120,9 +119,7 @@ def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
     return plane
 
 
-def lies_better_as_range(
-    frame: Frame, plane: Plane | None, samples: Samples, rng: np.random.Generator, up: Float | None
-) -> bool:
+def lies_better_as_range(frame: Frame, plane: Plane | None, samples: Samples, rng: Generator, up: Float | None) -> bool:
     """Whether more of a frame lies on a plane if its depth is taken for the distance along each ray."""
     along = samples.points - samples.camera
     depth = along @ frame.camera_to_world[:3, 2]
