@@ -19,9 +19,7 @@ from nextview.recognition.map_names import CONFIDENCE, measure_of
 from nextview.recognition.model_card import ModelCard
 
 Index = NDArray[np.int64]
-
 Float = NDArray[np.float64]
-
 RELIABILITY_LOOKS = (1, 2, 5)  # views after which confidence is compared with accuracy, beside all of them
 
 

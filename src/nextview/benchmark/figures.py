@@ -46,10 +46,8 @@ def look_of(policy: str, results: Results) -> dict:
     """Colour and line of a policy, the same in all figures; no two of those ``compared`` share both."""
     own = [name for name in (*compared(results), *results.tables.sweep["policy"].unique()) if name not in COLOURS]
     colour = COLOURS.get(policy) or OWN[list(dict.fromkeys(own)).index(policy) % len(OWN)]
-    return {
-        "color": colour,
-        "linestyle": ":" if policy.startswith("oracle-gain") else "--" if is_oracle(policy) else "-",
-    }
+    line = ":" if policy.startswith("oracle-gain") else "--" if is_oracle(policy) else "-"
+    return {"color": colour, "linestyle": line}
 
 
 def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure:

@@ -134,9 +134,8 @@ def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcomes:
         reached = stopping.reached(beliefs[:, :last], np.maximum(seen, 1)) & there
         confident = np.asarray(reached.any(1))
         at = np.where(confident, reached.argmax(1), np.minimum(count, last) - 1)
-    return Outcomes(
-        paths.answers[e, at], paths.confidences[e, at], at + 1, confident, paths.travel[e, at], paths.arc[e, at]
-    )
+    moved = paths.travel[e, at], paths.arc[e, at]
+    return Outcomes(paths.answers[e, at], paths.confidences[e, at], at + 1, confident, *moved)
 
 
 @dataclass(frozen=True)

@@ -172,9 +172,8 @@ def _failures(results: Results, best: str, at: float, store: ViewStore | None) -
         views = [int(v) for v in episode["views"]]
         images = _images(store, name, views) if store is not None and name in store.names else {}
         conflicting = bool(p.conflicting[p.names.index(name)])
-        found.append(
-            failure | {"answer": episode["answer"], "views": views, "images": images, "conflicting": conflicting}
-        )
+        shown = {"answer": episode["answer"], "views": views, "images": images}
+        found.append(failure | shown | {"conflicting": conflicting})
     return found
 
 

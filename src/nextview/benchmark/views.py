@@ -43,9 +43,8 @@ def measured(grid: Grid, n_views: Sequence[int], samples: int, references: Seque
         ends = [after(grid.paths[name], k) for name in names]
         right = dict(zip(names, (grid.right(e.answer) for e in ends), strict=True))
         columns = {(name, "accuracy"): r.mean(0) for name, r in right.items()}
-        columns |= {
-            (name, "travel"): e.travel.reshape(grid.runs, -1).mean(0) for name, e in zip(names, ends, strict=True)
-        }
+        travel = (e.travel.reshape(grid.runs, -1).mean(0) for e in ends)
+        columns |= {(name, "travel"): mean for name, mean in zip(names, travel, strict=True)}
         for name, reference in product(names, references):
             columns[name, f"to_{reference}"] = columns[name, "accuracy"] - columns[reference, "accuracy"]
         top = np.stack(list(columns.values()), 1)

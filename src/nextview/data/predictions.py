@@ -245,9 +245,9 @@ class Predictions:
 
         if "format" not in f or f["format"].tolist() != FORMAT:
             raise PredictionsError(f"not a predictions file of format {FORMAT}; make it again")
-        arrays: dict[str, Any] = {
-            name: f[name] for name in ("logits", "depth_entropy", "labels", "splits", "conflicting")
-        }
+        needed = ("logits", "depth_entropy", "labels", "splits", "conflicting")
+        arrays: dict[str, Any] = {name: f[name] for name in needed}
+        trust = str(f.get("calibration", "{}")).encode()
         return cls(
             **arrays,
             azimuth_bins=f.get("azimuth_bins"),
@@ -258,9 +258,7 @@ class Predictions:
             sphere=ViewSphere(tuple(f["elevations"].tolist()), int(f["azimuths"]), float(f["distance"])),
             models={kind: (name, sha) for kind, name, sha in f["models"].tolist()},
             valley_classes={name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
-            calibration=decode_record(
-                str(f.get("calibration", "{}")).encode(), Calibration, "not a calibration", PredictionsError
-            ),
+            calibration=decode_record(trust, Calibration, "not a calibration", PredictionsError),
             store=str(f.get("store", "")),
             commands=tuple(f["commands"].tolist()) if "commands" in f else (),
         )

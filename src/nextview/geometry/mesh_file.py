@@ -11,7 +11,6 @@ import warnings
 from array import array
 from collections.abc import Iterator
 from itertools import islice, pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -206,19 +205,16 @@ def _guard_glb(data: bytes) -> bytes:
         raise MeshError(f"a node is in its scene twice, or there are more than {GLB_NODES:,}")
     for part in (part for mesh in gltf.get("meshes", []) for part in mesh["primitives"]):
         used = [accessors[part[key]] for key in ("indices",) if key in part]
-        _guard_part(part, [*used, accessors[part["attributes"]["POSITION"]]])
+        used.append(accessors[part["attributes"]["POSITION"]])
+        if part.get("mode", GLB_TRIANGLES) == GLB_FAN:
+            raise MeshError("it has fans of triangles, which are not read here")
+        if any("bufferView" not in accessor or "sparse" in accessor for accessor in used):
+            raise MeshError("its positions or faces are compressed, sparse or without data, which is not read here")
+        if any(accessor.get("normalized") for accessor in used):
+            raise MeshError("its positions are fractions of whole numbers, which are not read here")
+        if min(accessor["count"] for accessor in used) < 0:
+            raise MeshError("it announces fewer than no numbers")
     return data
-
-
-def _guard_part(part: dict[str, Any], used: list[dict[str, Any]]) -> None:
-    if part.get("mode", GLB_TRIANGLES) == GLB_FAN:
-        raise MeshError("it has fans of triangles, which are not read here")
-    if any("bufferView" not in accessor or "sparse" in accessor for accessor in used):
-        raise MeshError("its positions or faces are compressed, sparse or without data, which is not read here")
-    if any(accessor.get("normalized") for accessor in used):
-        raise MeshError("its positions are fractions of whole numbers, which are not read here")
-    if min(accessor["count"] for accessor in used) < 0:
-        raise MeshError("it announces fewer than no numbers")
 
 
 _GUARDS = {"ply": _guard_ply, "stl": _guard_stl, "glb": _guard_glb}

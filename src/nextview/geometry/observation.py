@@ -169,9 +169,8 @@ def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.fl
     if not (np.abs(intrinsics) < LARGEST).all():  # not so if there is a NaN
         raise ObservationError("the intrinsics hold NaN, infinity or a number that no camera has")
     if np.abs(intrinsics[2] - (0, 0, 1)).max() > RIGID:
-        raise ObservationError(
-            f"the last row of the intrinsics is {intrinsics[2].tolist()}, not 0 0 1: are they transposed?"
-        )
+        last = intrinsics[2].tolist()
+        raise ObservationError(f"the last row of the intrinsics is {last}, not 0 0 1: are they transposed?")
     focal = intrinsics[0, 0], intrinsics[1, 1]
     if not min(focal) > 0.01 * max(shape):  # less would show all that lies ahead: metres, say
         raise ObservationError(

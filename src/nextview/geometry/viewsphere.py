@@ -18,7 +18,6 @@ from nextview.errors import UsageError
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
-
 DISTANCE = 3.0  # distance of the camera from the object's centre, in object radii
 CELL = np.radians((18.0, 45.0))
 """Elevation and azimuth of a cell of the 40 views: travel between directions that are on no grid is counted in it."""

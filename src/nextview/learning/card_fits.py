@@ -24,7 +24,6 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration, RiskBounds, Size
 from nextview.recognition.model_card import ModelCard
 
 Float = NDArray[np.float64]
-
 THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())  # of promised error rates
 
 

@@ -173,10 +173,9 @@ def _teach(
             taught.append((source, arrays))
         else:
             waiting.append((source, stamp))
-    yield len(sources) - len(waiting)
-    for count, ((source, _), result) in enumerate(
-        each(partial(_teach_one, how, part), waiting, workers, scheduler), len(sources) - len(waiting) + 1
-    ):
+    before, results = len(sources) - len(waiting), each(partial(_teach_one, how, part), waiting, workers, scheduler)
+    yield before
+    for count, ((source, _), result) in enumerate(results, before + 1):
         if isinstance(result, WorkerDied | str):
             left_out.append(f"{source.name}: {result}")
         else:
@@ -214,9 +213,8 @@ def _check_sizes(taught: Sequence[Pair]) -> None:
     for (source, _), times in zip(taught, ratio, strict=True):
         if times > ODD_SIZE or times < 1 / ODD_SIZE:
             how = f"{times:,.0f} times larger" if times > 1 else f"{1 / times:,.0f} times smaller"
-            raise DatasetError(
-                f"{source.path}: is {how} than most others; is it in another unit? --any-size takes it as it is"
-            )
+            hint = "is it in another unit? --any-size takes it as it is"
+            raise DatasetError(f"{source.path}: is {how} than most others; {hint}")
 
 
 def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: ModelCard | None) -> Learned:
@@ -233,6 +231,7 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
     things = tuple(Thing(source.name, str(source.path), n) for (source, _), n in zip(taught, poses, strict=True))
     features = find_card(FEATURES)
     calibration = Calibration(1.0, 1.0, None, fit.correlation, tuple(label[thing].tolist()))
+    novelty = tuple(map(tuple, np.round(fit.quantiles, 4).tolist()))
     card = ModelCard(
         NAME,
         "recogniser",
@@ -245,9 +244,7 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
         size=size_evidence(stacked["radii"], label),
         training=Training(f"{len(taught)} things", commands=() if old is None else old.training.commands),
         scores={"held-out views": {str(k): round(a, 4) for k, a in zip(VIEWS, fit.accuracy, strict=True)}},
-        memory=Taught(
-            things, features.sha256, fit.weight, novelty=tuple(map(tuple, np.round(fit.quantiles, 4).tolist()))
-        ),
+        memory=Taught(things, features.sha256, fit.weight, novelty=novelty),
     ).made_by(command())
     with new_folder(out, overwrite=True) as part:
         sha256 = memory.save(part / f"{NAME}.safetensors")

@@ -10,7 +10,6 @@ from nextview.recognition.belief import Calibration, SizeEvidence, log_evidence_
 from nextview.recognition.memory import AZIMUTHS, by_ring, similarities
 
 Index = NDArray[np.int64]
-
 Float = NDArray[np.floating]
 WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)  # of a cosine, as a log-likelihood
 CORRELATIONS = (0.1, 0.3, 0.6)  # of two views, see ``Calibration.bin_correlation``

@@ -24,7 +24,6 @@ from nextview.learning.recipes import Hardware, RecogniserRecipe
 from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, refuse_seen, start_from, train_once
 
 Float = NDArray[np.float64]
-
 Indices = NDArray[np.int64]
 
 

@@ -42,17 +42,15 @@ def find_things(folder: Path) -> Found:
     captures = [path for path in inside if path.is_dir() and is_capture(path)]
     things = [Source(path.name, path.name, path) for path in captures]
     things += [Source(path.stem, path.stem, path) for path in inside if path.suffix.lower() in FORMATS]
-    left_out = [
-        f"{p.name}: neither a mesh nor a folder" for p in inside if p.is_file() and p.suffix.lower() in PICTURES
-    ]
+    pictures = [path for path in inside if path.is_file() and path.suffix.lower() in PICTURES]
+    left_out = [f"{path.name}: neither a mesh nor a folder" for path in pictures]
+    nothing = f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with poses"
     if any(path.is_dir() and path not in captures for path in inside):
         try:
             listing = scan_dataset(folder)
         except DatasetError:
             if not things:
-                raise DatasetError(
-                    f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with poses"
-                ) from None
+                raise DatasetError(nothing) from None
         else:
             splits = {entry.split for entry in listing.entries}
             for entry in listing.entries:
@@ -63,14 +61,13 @@ def find_things(folder: Path) -> Found:
                 else:
                     things.append(Source(entry.name, entry.label, entry.path))
     if not things:
-        raise DatasetError(f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with poses")
+        raise DatasetError(nothing)
     things.sort(key=lambda thing: (thing.label, thing.name))
     first: dict[str, Source] = {}
     for thing in things:
         if first.setdefault(thing.name, thing) is not thing:
-            raise DatasetError(
-                f"{first[thing.name].path} and {thing.path} would both be called {thing.name}; rename one of them"
-            )
+            both = f"{first[thing.name].path} and {thing.path}"
+            raise DatasetError(f"{both} would both be called {thing.name}; rename one of them")
     return Found(things, left_out)
 
 

@@ -23,7 +23,6 @@ from nextview.recognition.inference import OnnxFile, check_end, open_onnx, run_o
 from nextview.recognition.map_names import SPHERE, in_order, maps_among
 
 Float = NDArray[np.float64]
-
 INPUTS = ("belief", "view", "place", "azimuth_bin")
 """What a network may take: the belief over all views; that by the last view alone; the ring and the views visited; and
 the azimuth bin that is seen, of the class believed most and over all classes. Any other name is that of a map."""

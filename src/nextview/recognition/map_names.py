@@ -4,12 +4,9 @@ from collections.abc import Iterable, Sequence
 from typing import Literal
 
 Good = Literal["peak", "valley"]  # where a measure's map has the better views: at its highest values or its lowest
-
 CONFIDENCE = "confidence"  # a measure of views: that of the recogniser where it is right; of predictions
-
 LEM, LCM = "lem", "lcm"
 MAP_NAMES = {"depth_entropy": LEM, CONFIDENCE: LCM}  # the thesis's; all others are called as their measure
-
 SPHERE = "-sphere"  # how the name of a map of the whole sphere ends; without this it is the map of the local window
 
 

@@ -18,7 +18,6 @@ from nextview.geometry.viewsphere import DISTANCE
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]
-
 CLOSE_ENOUGH = 1.5  # standard deviations of noise that a window may deviate from its plane
 STEEPEST_ERROR = 0.1  # error of the slope (tangent) that noise may leave: six degrees of the normal
 FINEST = 2e-4  # relative noise of depth that even the best frame is taken to have

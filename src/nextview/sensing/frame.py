@@ -64,19 +64,16 @@ class Frame:
         if self.mask is not None:
             mask = array_of(self.mask, "the mask")
             if mask.shape != depth.shape or mask.dtype != bool:
-                raise ObservationError(
-                    f"a mask is (H, W) bool as the depth, {depth.shape}, not {mask.shape} {mask.dtype}"
-                )
+                given = f"{mask.shape} {mask.dtype}"
+                raise ObservationError(f"a mask is (H, W) bool as the depth, {depth.shape}, not {given}")
             if not (mask & (depth > 0)).any():
                 raise ObservationError("no pixel of the mask has a depth: a mask of another image, or empty")
             object.__setattr__(self, "mask", mask.copy())
         if self.image is not None:
             image = array_of(self.image, "the image")
             if image.dtype != np.uint8 or image.shape not in (depth.shape, (*depth.shape, 3)):
-                raise ObservationError(
-                    f"an image is (H, W) or (H, W, 3) uint8 registered to the depth, {depth.shape}, not {image.shape} "
-                    f"{image.dtype}"
-                )
+                wanted = f"(H, W) or (H, W, 3) uint8 registered to the depth, {depth.shape}"
+                raise ObservationError(f"an image is {wanted}, not {image.shape} {image.dtype}")
             object.__setattr__(self, "image", image if image.ndim == 2 else np.rint(image @ LUMA).astype(np.uint8))
 
     @property

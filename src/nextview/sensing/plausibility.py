@@ -11,7 +11,6 @@ from nextview.geometry.observation import Observation
 from nextview.sensing.frame import AXES, Frame
 
 Float = NDArray[np.float64]
-
 SAMPLE = 500  # pixels that are looked at
 FEWEST = 20  # pixels with a depth below which nothing is seen
 OUTERMOST = 1.15  # how far from the origin a surface may be, object radii: centre and radius are estimates

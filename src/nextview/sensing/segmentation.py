@@ -14,7 +14,6 @@ from nextview.sensing.object_frame import Box
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
 TRIALS = 200  # planes that are tried: with one point in ten on the plane, 0.8 of all draws hit it at least once
 TILT = np.cos(np.radians(12.0))  # cosine of the lean of a support plane, at most: errors of a calibration
 LEAST = 0.04  # share of what is seen that lies on a support plane, at least; more if gravity is not known

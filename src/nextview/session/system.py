@@ -220,9 +220,8 @@ def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
     for grid in (sphere, *LAYOUTS.values()):
         if network.rings in (None, grid.rings):
             return grid
-    raise PolicyError(
-        f"the map {network.card.name} has {network.rings} rings, and the {len(sphere)} viewpoints {sphere.rings}"
-    )
+    there = f"the {len(sphere)} viewpoints {sphere.rings}"
+    raise PolicyError(f"the map {network.card.name} has {network.rings} rings, and {there}")
 
 
 def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> "CapturedCamera":

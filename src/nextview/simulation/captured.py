@@ -27,7 +27,6 @@ MILLIMETRES = 0.001
 TUM_STEP = 1 / 5000  # metres that one step of TUM's depth images stands for
 TOGETHER = 0.02  # seconds that an image and its pose, or depth and colour, may be apart
 KINECT = (585.0, 585.0, 320.0, 240.0)  # fx, fy, cx, cy of the depth camera of 7-Scenes, for all of its scenes
-
 Float = NDArray[np.float64]
 Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
 Nine = Annotated[list[float], Meta(min_length=9, max_length=9)]

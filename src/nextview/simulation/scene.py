@@ -15,10 +15,8 @@ from nextview.geometry.mesh import MAX_FACES, Mesh, load_mesh
 from nextview.simulation.scene_layout import Block, Placement, SceneLayout
 
 Float = NDArray[np.float64]
-
 TABLE = 3.4  # half the side of the square table, object radii: what stands around the target stands on it
 CLEARANCE = 0.2  # what a camera needs to each side, object radii
-
 GAP, FOOTPRINT, HEIGHT = (0.02, 0.3), (0.3, 0.9), (0.6, 2.6)  # of a box: from the object's circle, sides, height
 _CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 _FACES = np.reshape([int(i) for i in "021123456576014154263367042246135375"], (-1, 3))

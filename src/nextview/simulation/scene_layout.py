@@ -13,7 +13,6 @@ LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}  # mean share of the tar
 NAMED = re.compile(r".*@(\w+)-\d+")  # names of scenes that were drawn: target, level and number
 SUFFIX = ".json"
 VIEWS = 40
-
 Length = Annotated[float, Meta(ge=-1000, le=1000)]  # or radians: what is computed with more has no precision left
 Size = Annotated[float, Meta(gt=0, le=1000)]
 Hash = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]

@@ -19,7 +19,6 @@ from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, uniform_
 from nextview.simulation.simulated import SimulatedCamera
 
 Float = NDArray[np.float64]
-
 TABLE = 1.5  # radius of the table that the object stands on, if nothing else is said, object radii
 REACH = 1.3  # the object is looked for in a sphere so many radii large: with a wrong pose it sticks out of its own
 LEFTOVER = 4.0  # size of the patches of the table that are taken for the object, pixels

@@ -14,7 +14,6 @@ from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import DISTANCE
 
 Index = NDArray[np.int64]
-
 Image = NDArray[np.float64]
 
 EDGE = 0.02  # two surfaces differ so much from pixel to pixel, as a part of q, beyond the surface's own slope
