@@ -76,10 +76,8 @@ def too_few(tables: Tables, threshold: float, objects: int) -> str | None:
     if objects >= FEW_OBJECTS and not half > WIDE:
         return None
     unclear = "" if half != half else f" and differences in accuracy are known to ±{100 * half:.1f} points"
-    return (
-        f"Too few objects to tell: there are {objects:,}{unclear}. Take no order of the policies from this; it wants "
-        f"at least {FEW_OBJECTS} objects and ±{100 * WIDE:g} points."
-    )
+    what = f"Too few objects to tell: there are {objects:,}{unclear}. Take no order of the policies from this"
+    return f"{what}; it wants at least {FEW_OBJECTS} objects and ±{100 * WIDE:g} points."
 
 
 def _tests(tables: Tables, threshold: float) -> pd.DataFrame:

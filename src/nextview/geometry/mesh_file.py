@@ -72,10 +72,8 @@ def _off_by_lines(body: bytes, n_vertices: int, n_faces: int) -> Shape:
         corners.extend(_fan(polygon))
         found += 1
     if (len(positions), found) != (3 * n_vertices, n_faces):
-        raise MeshError(
-            f"the file is cut short, {n_vertices} vertices and {n_faces} faces announced, "
-            f"{len(positions) // 3} and {found} found"
-        )
+        what = f"the file is cut short, {n_vertices} vertices and {n_faces} faces announced"
+        raise MeshError(f"{what}, {len(positions) // 3} and {found} found")
     return np.array(positions).reshape(-1, 3), np.array(corners).reshape(-1, 3)
 
 

@@ -37,9 +37,9 @@ class SceneView:
 
     def __post_init__(self) -> None:
         if self.depth.ndim != 2 or self.target.shape != self.depth.shape:
+            shapes = f"{self.depth.shape} and {self.target.shape}"
             raise ObservationError(
-                f"the depth of a scene and the object's pixels are images of one shape, not {self.depth.shape} and "
-                f"{self.target.shape}"
+                f"the depth of a scene and the object's pixels are images of one shape, not {shapes}"
             )
 
 
@@ -154,10 +154,8 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
         raise ObservationError("the pose is mirrored: an axis is reversed (OpenCV axes are x right, y down, z forward)")
     distance = float(np.sqrt((pose[:3, 3] ** 2).sum()))
     if distance > 2 * FARTHEST:
-        raise ObservationError(
-            f"the camera stands {distance:.4g} object radii from the object: is its position in millimetres? "
-            "Divide it by the object radius"
-        )
+        what = f"the camera stands {distance:.4g} object radii from the object"
+        raise ObservationError(f"{what}: is its position in millimetres? Divide it by the object radius")
     return pose
 
 
@@ -173,10 +171,8 @@ def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.fl
         raise ObservationError(f"the last row of the intrinsics is {last}, not 0 0 1: are they transposed?")
     focal = intrinsics[0, 0], intrinsics[1, 1]
     if not min(focal) > 0.01 * max(shape):  # less would show all that lies ahead: metres, say
-        raise ObservationError(
-            f"the focal lengths are positive numbers of pixels, about as many as the image has a side ({max(shape)}), "
-            f"not {focal[0]:g} and {focal[1]:g}"
-        )
+        wanted = f"positive numbers of pixels, about as many as the image has a side ({max(shape)})"
+        raise ObservationError(f"the focal lengths are {wanted}, not {focal[0]:g} and {focal[1]:g}")
     return intrinsics
 
 

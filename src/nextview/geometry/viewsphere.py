@@ -309,8 +309,6 @@ def viewpoints_of(what: str | Viewpoints | Any) -> Viewpoints:
     if rings := re.fullmatch(r"rings:(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?)*)x(\d{1,4})", what):
         return ViewSphere(tuple(map(float, rings[1].split(","))), int(rings[2]))
     if what not in LAYOUTS:
-        raise UsageError(
-            f"no viewpoints are called {what!r}; there are {', '.join(LAYOUTS)}, rings:ELEVATIONSxAZIMUTHS such as "
-            "rings:0,30,60x12, and fibonacci:N"
-        )
+        others = "rings:ELEVATIONSxAZIMUTHS such as rings:0,30,60x12, and fibonacci:N"
+        raise UsageError(f"no viewpoints are called {what!r}; there are {', '.join(LAYOUTS)}, {others}")
     return LAYOUTS[what]

@@ -349,7 +349,6 @@ def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
     if VISIBILITY in recipe.inputs and scenes_of(p) is None:
         raise PredictionsError(f"{path}: is of no scenes, in which all would show; choose other --inputs")
     if p.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
-        raise PredictionsError(
-            f"{path}: holds no azimuth bins; train the recogniser with --azimuth-bins-weight, or give --frame camera "
-            "and --inputs without azimuth_bin"
-        )
+        other = "give --frame camera and --inputs without azimuth_bin"
+        hint = f"train the recogniser with --azimuth-bins-weight, or {other}"
+        raise PredictionsError(f"{path}: holds no azimuth bins; {hint}")

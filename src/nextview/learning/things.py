@@ -31,10 +31,8 @@ def find_things(folder: Path) -> Found:
 
     A mesh in the folder itself, and a folder of captured frames, is a thing and a class of its own name. All else is a
     class folder, as in a dataset (``data.folders``): each of its meshes is a thing of that class; where there are
-    splits, those of "train".
-
-    Raises:
-        DatasetError: there is no such folder, nothing in it can be taught, or two things have one name.
+    splits, those of "train". DatasetError: there is no such folder, nothing in it can be taught, or two things have one
+    name.
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: there is no such folder")

@@ -166,7 +166,6 @@ class Gain:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The maps that the features are made of, the azimuth bins, and what shows."""
         azimuth_bins = "azimuth_bin" in self.inputs or self.frame == "object"
         others = {"azimuth_bins": azimuth_bins, VISIBILITY: VISIBILITY in self.inputs}
         return (*maps_of(self.inputs), *(name for name, taken in others.items() if taken))
@@ -211,7 +210,6 @@ class VisibleGain:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Those of the gain policy, and what shows."""
         return (*(name for name in self.gain.needs if name != "visibility"), "visibility")
 
     def scores(self, state: EpisodeState) -> Float:

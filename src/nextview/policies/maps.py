@@ -42,7 +42,6 @@ class MapPeak:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The map that is climbed."""
         return (self.map_name,)
 
     def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
@@ -82,7 +81,6 @@ class SpherePeak:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The map that is climbed."""
         return (self.map_name,)
 
     def view_values(self, state: EpisodeState) -> NDArray[np.float64]:

@@ -22,7 +22,6 @@ class OracleValley:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The map."""
         return (self.map_name,)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:

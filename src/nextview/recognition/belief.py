@@ -114,10 +114,8 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 
     Azimuth bins count too, if the recogniser knows them: an object stands still, so views from different azimuths have
     to agree on where its azimuth bin 0 points. The belief in a class is multiplied by the likelihood of that agreement,
-    summed over all azimuths.
-
-    Raises:
-        ModelError: a temperature that is not positive, a negative number, or hypotheses that are not of every class.
+    summed over all azimuths. ModelError: a temperature that is not positive, a negative number, or hypotheses that are
+    not of every class.
     """
 
     temperature: float = 1.0  # of a single view
@@ -132,10 +130,9 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     def __post_init__(self) -> None:
         numbers = (self.correlation, self.bin_correlation or 0.0)
         if not 0 < self.temperature < np.inf or not all(0 <= x < np.inf for x in numbers):
-            raise ModelError(
-                f"no calibration: temperature {self.temperature}, correlation {self.correlation}, of azimuth bins "
-                f"{self.bin_correlation}"
-            )
+            of_bins = f"of azimuth bins {self.bin_correlation}"
+            given = f"temperature {self.temperature}, correlation {self.correlation}, {of_bins}"
+            raise ModelError(f"no calibration: {given}")
         if self.hypotheses and not (set(np.diff((-1, *self.hypotheses)).tolist()) <= {0, 1}):
             raise ModelError("no calibration: the hypotheses are not of every class in order")
 
@@ -250,10 +247,8 @@ class Stopping:
 
     The threshold is ``threshold`` at the first view. With a ``threshold_decay`` its log-odds are then divided by
     ``1 + threshold_decay * (views - 1)``: what is unclear after several views is seldom cleared up by another one. A
-    calibrated belief whose threshold decay is its correlation stops where the plain sum of logits does.
-
-    Raises:
-        UsageError: a threshold outside 0 .. 1, fewer than one view, or a negative threshold decay.
+    calibrated belief whose threshold decay is its correlation stops where the plain sum of logits does. UsageError: a
+    threshold outside 0 .. 1, fewer than one view, or a negative threshold decay.
     """
 
     threshold: float = 0.97

@@ -55,10 +55,8 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="schema", tag=2):
     """One model; as a file, a JSON object of these fields beside the file of the same name with its weights.
 
-    That is an ONNX file; of a memory of taught things, which is a recogniser too, a safetensors file.
-
-    Raises:
-        ModelError: a recogniser without classes, sizes of other classes than these, or a network of no input.
+    That is an ONNX file; of a memory of taught things, which is a recogniser too, a safetensors file. ModelError: a
+    recogniser without classes, sizes of other classes than these, or a network of no input.
     """
 
     name: str  # what users call it

@@ -152,20 +152,16 @@ def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[
         raise ObservationError("the focal lengths have to be positive: an image that is flipped?")
     focal = min(k[0, 0], k[1, 1])
     if focal < 0.1 * max(shape):
-        raise ObservationError(
-            f"a focal length of {focal:.3g} is too short for an image of {width} x {height}: it is expected in "
-            "pixels, not in millimetres or parts of the image"
-        )
+        short = f"a focal length of {focal:.3g} is too short for an image of {width} x {height}"
+        raise ObservationError(f"{short}: it is expected in pixels, not in millimetres or parts of the image")
     point = f"the principal point ({k[0, 2]:.0f}, {k[1, 2]:.0f}) is"
     if not (-width < k[0, 2] < 2 * width and -height < k[1, 2] < 2 * height):
         raise ObservationError(f"{point} far off an image of {width} x {height}: intrinsics of another resolution?")
     across, down = 2 * k[0, 2] / width, 2 * k[1, 2] / height  # 1 in the middle
     scale, whole = (across + down) / 2, min(abs(width / height / aspect - 1) for aspect in ASPECTS) < 0.01
     if whole and abs(scale - 1) > 0.2 and abs(across - down) < 0.08 * scale:
-        raise ObservationError(
-            f"{point} the middle of an image of {scale * width:.0f} x {scale * height:.0f}, and the depth is {width} x "
-            f"{height}: intrinsics of another resolution"
-        )
+        sizes = f"{scale * width:.0f} x {scale * height:.0f}, and the depth is {width} x {height}"
+        raise ObservationError(f"{point} the middle of an image of {sizes}: intrinsics of another resolution")
     return k
 
 
