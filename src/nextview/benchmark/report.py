@@ -30,8 +30,7 @@ from nextview.policies.registry import DEFAULT
 from nextview.recognition.map_names import LEM
 
 PICTURE = 112  # side of a view's picture, pixels
-OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])
-"""Colours of nothing, the target, other things and the table in a scene."""
+OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])  # nothing, target, others, table
 
 
 def report(

@@ -17,8 +17,7 @@ from nextview.data.metrics import ratio
 
 CEILING = "oracle-gain"
 COLUMNS = ["policy", "n_views", "measure", "value", "low", "high", "p", "p_holm"]
-Numbers = dict[tuple[str, int, str], tuple[float, float, float, float, float]]
-"""Value, low, high, p and p after Holm's correction, by policy, number of views and measure."""
+Numbers = dict[tuple[str, int, str], tuple[float, float, float, float, float]]  # value, low, high, p, Holm's p
 
 
 def after(paths: Trajectories, n_views: int) -> Outcomes:

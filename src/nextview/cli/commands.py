@@ -95,5 +95,4 @@ COMMANDS = {  # by name, in the order in which they are listed
     ),
     "report": Command("nextview.benchmark.report:report", "write one HTML page of a benchmark's results", "{found}"),
 }
-RESUMES = ("render", "measure", "predict", "train recogniser", "train map", "learn", "scenes")
-"""Beginnings of the commands that go on where an interrupted run was stopped."""
+RESUMES = ("render", "measure", "predict", "train recogniser", "train map", "learn", "scenes")  # resumable

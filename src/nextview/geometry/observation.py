@@ -37,10 +37,8 @@ class SceneView:
 
     def __post_init__(self) -> None:
         if self.depth.ndim != 2 or self.target.shape != self.depth.shape:
-            shapes = f"{self.depth.shape} and {self.target.shape}"
-            raise ObservationError(
-                f"the depth of a scene and the object's pixels are images of one shape, not {shapes}"
-            )
+            what = "the depth of a scene and the object's pixels are images of one shape"
+            raise ObservationError(f"{what}, not {self.depth.shape} and {self.target.shape}")
 
 
 @dataclass(frozen=True, eq=False)  # each is itself, and can be the key of what is made of it
@@ -135,7 +133,6 @@ class Camera(Protocol):
 
     def observe(self, pose: NDArray[np.float64]) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""
-        ...
 
 
 def checked_pose(pose: Any) -> NDArray[np.float64]:

@@ -19,8 +19,7 @@ from nextview.errors import UsageError
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 DISTANCE = 3.0  # distance of the camera from the object's centre, in object radii
-CELL = np.radians((18.0, 45.0))
-"""Elevation and azimuth of a cell of the 40 views: travel between directions that are on no grid is counted in it."""
+CELL = np.radians((18.0, 45.0))  # elevation and azimuth of a cell, in which travel off any grid is counted
 MOST = 99_999  # viewpoints that there may be, and views on a ring
 SNAP = 1e-6  # radians within which a camera stands at a candidate. What is more is a place of its own
 

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
 Floating = NDArray[np.floating]
 Float32 = NDArray[np.float32]
-UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)
-"""What a voxel can be. Of what several frames say of it the largest counts, in whatever order they come."""
+UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)  # of a voxel; of several frames the largest counts
 
 
 @dataclass(frozen=True)

@@ -182,8 +182,7 @@ SENSORS = {sensor.name: sensor for sensor in _ALL}
 
 _SIDE, _RADIUS = 224, SENSORS["none"].radius
 _FOCAL = float(pinhole(_SIDE, DISTANCE)[0, 0])
-RENDER = Sensor("render", _SIDE, _SIDE, _FOCAL, distance=DISTANCE * _RADIUS, radius=_RADIUS)
-"""The camera that the networks take for granted, without errors: noise of its own kind may be added."""
+RENDER = Sensor("render", _SIDE, _SIDE, _FOCAL, distance=DISTANCE * _RADIUS, radius=_RADIUS)  # the networks' own camera
 
 
 @dataclass(frozen=True)

@@ -233,13 +233,13 @@ class Exploration:
 
     def step(self) -> None:
         """Let each policy take its next view, if there is one."""
-        self._take([walk for walk in self.walks if not walk.session.done])
+        for walk in self.walks:
+            if not walk.session.done:
+                walk.step()
 
     def walk_on(self) -> bool:
         """Let each policy that has not stopped take its next view. Returns whether any did."""
-        return self._take([walk for walk in self.walks if not walk.stopped and not walk.session.done])
-
-    def _take(self, walks: Sequence[Walk]) -> bool:
+        walks = [walk for walk in self.walks if not walk.stopped and not walk.session.done]
         for walk in walks:
             walk.step()
         return bool(walks)
