@@ -84,14 +84,14 @@ def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
 def learn_things(
     folder: Path,  # what is to be taught
     out: Path,  # folder to write
-    how: How = How(),  # how things are looked at
-    add: bool = False,  # put the things beside those that ``out`` knows; the old ones are not looked at again
-    # forget the things of these names in ``out``; nothing is added where ``folder`` is ``out``, too
+    how: How = How(),
+    add: bool = False,  # put the things beside those that OUT knows; the old ones are not looked at again
+    # forget the things of these names in OUT; nothing is added where FOLDER is OUT, too
     remove: tuple[str, ...] = (),
     workers: int | None = None,  # processes; one for each core by default; 0 to work in this one
     # address of a dask.distributed scheduler whose workers see the same files, to use instead
     scheduler: str | None = None,
-    overwrite: bool = False,  # replace what ``out`` knows
+    overwrite: bool = False,  # replace what OUT knows
     track: Track = silently,  # follows the things
 ) -> Learned:
     """Teach the things in a folder, and write a folder of models that recognises them.
