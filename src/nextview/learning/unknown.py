@@ -38,7 +38,12 @@ class FittedUnknown:
 
 
 def fit_unknown(
-    meshes: Path, card: Path, sensor: str = "wrist", seed: int = 0, workers: int | None = None, track: Track = silently
+    meshes: Path,
+    card: Path,
+    sensor: str = "wrist",
+    seed: int = 0,
+    workers: int | None = None,
+    track: Track = silently,
 ) -> FittedUnknown:
     """Teach a recogniser to notice objects of no class that it knows, at a false-alarm rate that can be chosen.
 
