@@ -1,7 +1,5 @@
 """What users hand in, checked once at the door: numbers, points, and plugins, which are code of their own."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import sys
@@ -20,8 +18,7 @@ from numpy.typing import NDArray
 
 from nextview.errors import NextviewError, UsageError
 
-TRACEBACK = "NEXTVIEW_TRACEBACK"
-"""An environment variable: set, the whole traceback of a plugin's error is printed too."""
+TRACEBACK = "NEXTVIEW_TRACEBACK"  # an environment variable: set, the whole traceback of a plugin's error is printed too
 _NOT_PLUGINS = (f"{Path(__file__).parent}{os.sep}", "<frozen ", *map(sysconfig.get_path, ("stdlib", "purelib")))
 
 
@@ -43,11 +40,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def whole(value: Any, what: str, least: int = 0, most: int = 2**31 - 1) -> int:
-    """A whole number within limits.
-
-    Raises:
-        UsageError: it is none.
-    """
+    """A whole number within limits; UsageError if it is none."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, Integral) or not least <= int(value) <= most:
         reach = f"from {least} on" if most == 2**31 - 1 else f"from {least} to {most}"
         raise UsageError(f"{what} is a whole number {reach}, not {one_line(repr(value))}")
@@ -55,11 +48,7 @@ def whole(value: Any, what: str, least: int = 0, most: int = 2**31 - 1) -> int:
 
 
 def number(value: Any, what: str, least: float = -np.inf, most: float = np.inf, above: float = -np.inf) -> float:
-    """A finite number within limits, ``above`` the last excluded.
-
-    Raises:
-        UsageError: it is none.
-    """
+    """A finite number within limits, ``above`` the last excluded; UsageError if it is none."""
     fits = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
     if not fits or not np.isfinite(float(value)) or not (least <= value <= most and value > above):
         reach = [f"of at least {least:g}"] * (least > -np.inf) + [f"above {above:g}"] * (above > -np.inf)
@@ -69,11 +58,7 @@ def number(value: Any, what: str, least: float = -np.inf, most: float = np.inf, 
 
 
 def points(value: Any, what: str) -> NDArray[np.float64]:
-    """Points in space, (N, 3) float64.
-
-    Raises:
-        UsageError: they are none.
-    """
+    """Points in space, (N, 3) float64; UsageError if they are none."""
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError):
@@ -104,11 +89,7 @@ def plugins(group: str) -> dict[str, str]:
 def plugin_errors(error: Callable[[str], NextviewError]) -> Iterator[None]:
     """Run a plugin: what it raises, an exit too, becomes one sentence. A Ctrl-C passes.
 
-    Args:
-        error: makes the error from what is said of the exception: its kind, its message, and the plugin's last line.
-
-    Raises:
-        NextviewError: what ``error`` makes; its cause is the plugin's exception.
+    ``error`` makes the error from what is said of the exception: its kind, its message, and the plugin's last line.
     """
     try:
         yield
@@ -117,11 +98,8 @@ def plugin_errors(error: Callable[[str], NextviewError]) -> Iterator[None]:
     except BaseException as raised:
         if os.environ.get(TRACEBACK):
             traceback.print_exception(raised)
-        raise error(_sentence(raised)) from raised
-
-
-def _sentence(raised: BaseException) -> str:
-    message = one_line(str(raised), 300)
-    text = f"{type(raised).__name__}: {message}" if message else type(raised).__name__
-    frames = [f for f in traceback.extract_tb(raised.__traceback__) if not f.filename.startswith(_NOT_PLUGINS)]
-    return f"{text}, at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else text
+        message, text = one_line(str(raised), 300), type(raised).__name__
+        text += f": {message}" if message else ""
+        frames = [f for f in traceback.extract_tb(raised.__traceback__) if not f.filename.startswith(_NOT_PLUGINS)]
+        text += f", at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
+        raise error(text) from raised

@@ -4,8 +4,6 @@ Each message is one sentence: what is wrong, in which file, what to do. The comm
 2. Any other exception is a bug of nextview and keeps its traceback.
 """
 
-from __future__ import annotations
-
 
 class NextviewError(ValueError):
     """The base of all errors that nextview raises on purpose."""
@@ -44,12 +42,7 @@ class RiskError(NextviewError):
 
 
 class PolicyError(NextviewError):
-    """A policy that cannot be made, or that failed.
-
-    Args:
-        message: names the policy.
-        episode: where it failed, if it is known.
-    """
+    """A policy that cannot be made, or that failed, in an episode that may be known."""
 
     def __init__(self, message: str, episode: int | None = None) -> None:
         super().__init__(message)

@@ -1,11 +1,8 @@
 """Files that nextview writes and reads: outputs whole or not at all, typed JSON records, checked weights.
 
-One rule holds for every output. What exists is refused; with ``overwrite`` exactly the files that are written are
-replaced. A file is written under a temporary name beside its place and then renamed, so a run that is killed leaves
-what was there before.
+What exists is refused; with ``overwrite`` exactly the files that are written are replaced. A file is written under a
+temporary name beside its place and then renamed, so a run that is killed leaves what was there before.
 """
-
-from __future__ import annotations
 
 import errno
 import hashlib
@@ -25,24 +22,15 @@ import numpy as np
 from nextview.errors import DatasetError, ModelError, NextviewError, ResultsError
 
 T = TypeVar("T")
-Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
-"""A field of a record: a hash in hexadecimal digits."""
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Errors of a full disk."""
-LARGEST_RECORD = 64 * 2**20
-"""Bytes of a JSON record; a card takes some hundred thousand."""
+Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]  # a field of a record: a hash in hexadecimal digits
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a full disk
+LARGEST_RECORD = 64 * 2**20  # bytes of a JSON record; a card takes some hundred thousand
 
 
 def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None:
     """Refuse, before any work is done, an output that cannot be written or must not be replaced.
 
-    Args:
-        path: of the output.
-        overwrite: whether it may replace what is there.
-        folder: whether the output is a folder; an empty one may be there.
-
-    Raises:
-        ResultsError: it exists, is a link, or its place cannot be written.
+    A ``folder`` may be there if it is empty. ResultsError: it exists, is a link, or its place cannot be written.
     """
     if path.is_symlink():
         raise ResultsError(f"{path}: is a link; give what it points to")
@@ -60,11 +48,7 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
 
 @contextmanager
 def new_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
-    """Write a file whole or not at all: yields a temporary path beside it, of the same suffix.
-
-    Raises:
-        ResultsError: see ``check_new``; or the disk is full. What was at ``path`` is still there.
-    """
+    """Write a file whole or not at all: yields a temporary path beside it, of the same suffix; see ``check_new``."""
     check_new(path, overwrite)
     with _beside(path) as temporary:
         part = temporary / path.name
@@ -79,10 +63,7 @@ def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
     """Write a folder of files: yields a temporary folder beside it.
 
     An existing folder with files in it is refused. With ``overwrite`` each file that was written replaces the one of
-    its name, and all others stay.
-
-    Raises:
-        ResultsError: see ``check_new``; or the disk is full.
+    its name, and all others stay. ResultsError: see ``check_new``; or the disk is full.
     """
     check_new(path, overwrite, folder=True)
     there = path.is_dir()
@@ -131,11 +112,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def only_one(path: Path) -> Iterator[None]:
-    """One writer of ``path`` at a time, among processes. The lock file beside it is removed at the end.
-
-    Raises:
-        DatasetError: another run is writing it, or its folder cannot be written.
-    """
+    """One writer of ``path`` at a time, among processes; DatasetError if another is at it, or it cannot be written."""
     from filelock import FileLock, Timeout  # here, as whoever only recognises needs none
 
     place = path.absolute()
@@ -158,14 +135,7 @@ def only_one(path: Path) -> Iterator[None]:
 def regular_file(path: Path, what: str, error: type[NextviewError], largest: int | None = None) -> None:
     """See that a path names a regular file: a pipe would wait for its writer, a device might never end.
 
-    Args:
-        path: of the file.
-        what: it should be, "a model card".
-        error: to raise.
-        largest: size in bytes.
-
-    Raises:
-        NextviewError: an ``error``: it does not exist, is something else, or is too large.
+    Else it is an ``error``, which says ``what`` it should be ("a model card"); ``largest`` is a size in bytes.
     """
     if not path.exists():
         raise error(f"{path}: no such file")
@@ -176,11 +146,7 @@ def regular_file(path: Path, what: str, error: type[NextviewError], largest: int
 
 
 def read_record(path: Path, record: type[T], what: str, error: type[NextviewError] = ModelError) -> T:
-    """A typed record from a JSON file; see ``decode_record``.
-
-    Raises:
-        NextviewError: an ``error``: the file is missing, too large, or no such record.
-    """
+    """A typed record from a JSON file; an ``error`` if the file is missing, too large, or no such record."""
     regular_file(path, what, error, LARGEST_RECORD)
     try:
         content = path.read_bytes()
@@ -192,14 +158,7 @@ def read_record(path: Path, record: type[T], what: str, error: type[NextviewErro
 def decode_record(content: bytes | dict[str, Any], record: type[T], where: str, error: type[NextviewError]) -> T:
     """A typed record from JSON, or from the objects that JSON was read to.
 
-    Args:
-        content: JSON, or a dictionary of plain values.
-        record: a ``msgspec.Struct``; forbid its unknown fields with ``forbid_unknown_fields=True``.
-        where: the beginning of the sentence that is raised.
-        error: to raise.
-
-    Raises:
-        NextviewError: an ``error`` that names the field.
+    Where it is none, an ``error`` names the field; its sentence begins with ``where``.
     """
     try:
         if isinstance(content, bytes):
@@ -210,11 +169,7 @@ def decode_record(content: bytes | dict[str, Any], record: type[T], where: str, 
 
 
 def write_record(path: Path, record: Any, overwrite: bool = False) -> None:
-    """Write a record as indented JSON, whole or not at all.
-
-    Raises:
-        ResultsError: see ``new_file``.
-    """
+    """Write a record as indented JSON, whole or not at all; see ``new_file``."""
     with new_file(path, overwrite) as part:
         part.write_bytes(msgspec.json.format(msgspec.json.encode(record, enc_hook=_plain), indent=1) + b"\n")
 
@@ -232,11 +187,7 @@ def sha256_of(path: Path) -> str:
 
 
 def checked_bytes(path: Path, sha256: str, what: str = "weights") -> bytes:
-    """The content of a file whose hash a card holds.
-
-    Raises:
-        ModelError: the file is missing, or is not the one that the card describes.
-    """
+    """The content of a file whose hash a card holds; ModelError if it is missing, or not that file."""
     regular_file(path, what, ModelError)
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != sha256:

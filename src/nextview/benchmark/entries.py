@@ -41,7 +41,7 @@ class EpisodeSpecs:
         return tuple(classes.index(name) for name in named if name in classes)
 
 
-MAP_ORACLES = {
+MAP_ORACLES = {  # the thesis's oracles, under its names
     "oracle-valley": ("", LEM, "-oracle-valley"),
     f"{TRUE}{LEM}": (TRUE, LEM, ""),
     f"{TRUE}{LEM}-peak": (TRUE, LEM, "-peak"),
@@ -49,16 +49,12 @@ MAP_ORACLES = {
     f"{LCM}-oracle-valley": ("", LCM, "-oracle-valley"),
     f"{TRUE}{LCM}": (TRUE, LCM, "-peak"),
 }
-"""The thesis's oracles, under its names."""
-GAINS: dict[str, Scope] = {"oracle-gain": "local", "oracle-gain-all": "global"}
-"""One step of perfect foresight: the ceiling."""
-ORACLES = (*MAP_ORACLES, *GAINS)
-"""Policies that take what a robot cannot know, and are always compared. Every map has such, see ``MAP_ORACLE``."""
+GAINS: dict[str, Scope] = {"oracle-gain": "local", "oracle-gain-all": "global"}  # the ceiling: one step of foresight
+ORACLES = (*MAP_ORACLES, *GAINS)  # by what a robot cannot know; always compared. Every map has such, see MAP_ORACLE
 MAP_ORACLE = re.compile(r"(true-)?(.+?)(-peak|-oracle-valley)?")
 """Oracles by a map. "true-MAP" climbs the true one: to its peaks, or to its valleys for some classes, by the belief;
 "true-MAP-peak" always to its peaks. With "-oracle-valley" the true class decides, also on the predicted map."""
-MORE = f"{LEM}{SPHERE}-peak"
-"""By Parisotto et al., see ``maps.SpherePeak``: the only one by a map of the whole sphere that is always compared."""
+MORE = f"{LEM}{SPHERE}-peak"  # by Parisotto et al., see ``maps.SpherePeak``; always compared
 FIXED = ("best", "worst", "high-entropy", "low-entropy", "random-fixed", "orbit")
 """Fixed views by name, followed by their number: "best-5", "orbit-8". They go on to the end whatever is believed.
 
@@ -79,8 +75,7 @@ def knows_truth(entry: str) -> bool:
     return is_oracle(entry) or entry.split("-")[0] in ("best", "worst", "high", "low")
 
 
-IN_SCENES = ("visibility", f"{VISIBLE}{DEFAULT}", "true-visible_share-all")
-"""Entries that make a difference only where things hide an object."""
+IN_SCENES = ("visibility", f"{VISIBLE}{DEFAULT}", "true-visible_share-all")  # where things hide an object
 
 
 def default_entries(specs: EpisodeSpecs) -> list[str]:

@@ -168,7 +168,6 @@ class Asked:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Rows:
-        """See ``Policy.next_views``."""
         return np.where(state.free, self.sphere.travel[self.views[state.episodes]], np.inf).argmin(1)
 
 
@@ -249,13 +248,11 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self._cohort: Cohort | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """See ``gymnasium.Env.reset``."""
         super().reset(seed=seed)
         self._cohort = self.task.begin(1, self.np_random, options)
         return self.observed(self._cohort.first), info_of(self._cohort.first)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """See ``gymnasium.Env.step``."""
         seen = self.go(action)
         return self.observed(seen), float((seen.change - seen.price)[0]), bool(seen.ended[0]), False, info_of(seen)
 
@@ -302,7 +299,6 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """See ``gymnasium.vector.VectorEnv.reset``."""
         super().reset(seed=seed)
         cohort = self.task.begin(self.num_envs, self.np_random, options)
         self._cohorts = [(cohort, np.arange(self.num_envs))]
@@ -311,7 +307,6 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     def step(
         self, actions: Any
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """See ``gymnasium.vector.VectorEnv.step``."""
         seen, info = self.go(actions)
         return seen.observation, seen.change - seen.price, seen.ended, np.zeros(self.num_envs, bool), info
 

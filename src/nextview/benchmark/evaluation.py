@@ -18,8 +18,8 @@ from nextview.recognition.belief import Calibration
 from nextview.recognition.map_names import CONFIDENCE, measure_of
 from nextview.recognition.model_card import ModelCard
 
+Index = NDArray[np.int64]
 Float = NDArray[np.float64]
-
 RELIABILITY_LOOKS = (1, 2, 5)  # views after which confidence is compared with accuracy, beside all of them
 
 
@@ -64,11 +64,7 @@ def _judged(p: Predictions) -> dict[int, NDArray]:
 
 
 def fused_views(
-    log_evidence: NDArray[np.floating],
-    labels: NDArray[np.int64],
-    calibration: Calibration,
-    rng: np.random.Generator,
-    classes: int,
+    log_evidence: NDArray[np.floating], labels: Index, calibration: Calibration, rng: np.random.Generator, classes: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations."""
     n, v, _ = log_evidence.shape
@@ -84,7 +80,7 @@ def fused_views(
 
 
 def _means(
-    top: Float, bottom: Float, labels: NDArray[np.int64], classes: tuple[str, ...], weights: Float | None
+    top: Float, bottom: Float, labels: Index, classes: tuple[str, ...], weights: Float | None
 ) -> Iterator[tuple[str, str, Float, Float, Float]]:
     """Ratios of sums over objects (N, M): over all of them, as the mean over classes ("class_"), and in each class."""
     every = np.ones(len(labels), bool)
@@ -151,13 +147,13 @@ def _reliability(right: NDArray[np.bool_], confidence: NDArray[np.float32]) -> p
     return pd.DataFrame(rows, columns=["n_views", "bin", "confidence", "accuracy", "answers"])
 
 
-def judged_objects(p: Predictions, name: str) -> NDArray[np.int64]:
+def judged_objects(p: Predictions, name: str) -> Index:
     """The objects whose true map can be told: of the confidence those that are right from any view (section 4.1.3)."""
     right = p.logits.argmax(2) == p.labels[:, None]
     return np.flatnonzero(right.any(1)) if measure_of(name) == CONFIDENCE else np.arange(len(p))
 
 
-def baselines(true: NDArray[np.floating], labels: NDArray[np.int64]) -> dict[str, NDArray[np.floating]]:
+def baselines(true: NDArray[np.floating], labels: Index) -> dict[str, NDArray[np.floating]]:
     """Maps to be measured against: the mean map, and the mean map of the class at the view, each as ``true`` is."""
     classes, row = np.unique(labels, return_inverse=True)
     of_class = np.stack([true[labels == index].mean(0) for index in classes])

@@ -22,8 +22,7 @@ COLOURS = {
     f"true-{LEM}": BLUE, f"true-{LEM}-peak": "#7a6fd0", "true-oracle-valley": ACCENT, f"true-{LCM}": "#00805a",
     "oracle-gain": "#111111", "oracle-gain-all": "#777777",
 }  # fmt: skip
-OWN = ("#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff7043", "#5c6bc0")
-"""For all others, in turn."""
+OWN = ("#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff7043", "#5c6bc0")  # all others, in turn
 MOST = 8  # curves of policies that a robot could follow, at most
 
 
@@ -47,10 +46,8 @@ def look_of(policy: str, results: Results) -> dict:
     """Colour and line of a policy, the same in all figures; no two of those ``compared`` share both."""
     own = [name for name in (*compared(results), *results.tables.sweep["policy"].unique()) if name not in COLOURS]
     colour = COLOURS.get(policy) or OWN[list(dict.fromkeys(own)).index(policy) % len(OWN)]
-    return {
-        "color": colour,
-        "linestyle": ":" if policy.startswith("oracle-gain") else "--" if is_oracle(policy) else "-",
-    }
+    line = ":" if policy.startswith("oracle-gain") else "--" if is_oracle(policy) else "-"
+    return {"color": colour, "linestyle": line}
 
 
 def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure:

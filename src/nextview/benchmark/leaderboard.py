@@ -9,8 +9,7 @@ from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.summary import Tables
 
 SIGNIFICANT = 0.05  # a difference is called one when its p-value after Holm's correction is below this
-FEW_OBJECTS, WIDE = 200, 0.03
-"""With fewer objects, or intervals of differences in accuracy that reach farther to either side, little can be told."""
+FEW_OBJECTS, WIDE = 200, 0.03  # with fewer objects, or wider intervals of differences in accuracy, little can be told
 
 
 def headline_threshold(thresholds: Sequence[float]) -> float:
@@ -77,10 +76,8 @@ def too_few(tables: Tables, threshold: float, objects: int) -> str | None:
     if objects >= FEW_OBJECTS and not half > WIDE:
         return None
     unclear = "" if half != half else f" and differences in accuracy are known to ±{100 * half:.1f} points"
-    return (
-        f"Too few objects to tell: there are {objects:,}{unclear}. Take no order of the policies from this; it wants "
-        f"at least {FEW_OBJECTS} objects and ±{100 * WIDE:g} points."
-    )
+    what = f"Too few objects to tell: there are {objects:,}{unclear}. Take no order of the policies from this"
+    return f"{what}; it wants at least {FEW_OBJECTS} objects and ±{100 * WIDE:g} points."
 
 
 def _tests(tables: Tables, threshold: float) -> pd.DataFrame:

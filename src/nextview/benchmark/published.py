@@ -10,21 +10,19 @@ from nextview.data.predictions import Predictions
 from nextview.recognition.map_names import LCM, LEM
 from nextview.simulation.scene_layout import clutter_level
 
-COLUMNS = {
+COLUMNS = {  # policies of tables 5, 8 to 11 under their published names
     "random": "random",
     "furthest": "furthest",
     "unidirectional": "unidirectional",
     "oracle-valley": "LEM10",  # the thesis takes peak or valley by the true class
     f"{LCM}-peak": "LCM10",
 }
-"""Policies of tables 5, 8 to 11 under their published names."""
-FIVE_VIEWS = {
+FIVE_VIEWS = {  # fixed views of tables 3 and 12, both of a network for 40 classes
     "low-entropy-5": "low_entropy",
     "high-entropy-5": "high_entropy",
     "best-5": "best",
     "random-fixed-5": "random",
 }
-"""Fixed views of tables 3 and 12. Both are of a network for 40 classes."""
 ACCURACY = {10: "table8_accuracy_per_class_modelnet10", 40: "table10_accuracy_per_class_modelnet40"}
 TRAVEL = {10: "table9_travel_per_class_modelnet10", 40: "table11_travel_per_class_modelnet40"}
 

@@ -1,8 +1,7 @@
 """Replay: run policies through all episodes at once, from predictions instead of a camera.
 
 A policy does not know the threshold, so every policy is run once, to the last view, through the same loop as live use;
-``truncate`` ends the episodes where a ``Stopping`` rule does. So a random policy draws once for all thresholds, which
-also pairs its episodes. A path ends early only where the belief is exactly 1 in double precision.
+``truncate`` ends the episodes where a ``Stopping`` rule does. A path ends early only where the belief is exactly 1.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +15,6 @@ from nextview.benchmark.true_maps import TRUE, true_map
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import scenes_of, sight_of
 from nextview.errors import EntryError, NextviewError, PolicyError, UsageError
-from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence, Policy
 from nextview.policies.baselines import ViewList
 from nextview.recognition.belief import FixedLength, Stopping
@@ -30,19 +28,16 @@ PART = 4096  # episodes of fixed views that are run at once
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Where E episodes went, up to K views, and what was believed after each; ``seen``: views that showed anything.
-
-    ``beliefs`` are in all classes, (E, K, classes), for rules that look at more than the highest; kept if asked for.
-    """
+    """Where E episodes went, up to K views, and what was believed after each."""
 
     views: NDArray[np.int64]
     answers: NDArray[np.int64]
     confidences: NDArray[np.float64]
     travel: NDArray[np.float64]
     arc: NDArray[np.float64]
-    seen: NDArray[np.int64]
+    seen: NDArray[np.int64]  # views so far that showed anything
     fixed: bool
-    beliefs: NDArray[np.float64] | None = None
+    beliefs: NDArray[np.float64] | None = None  # in all classes, (E, K, classes), for rules that look at more than one
 
 
 @dataclass(frozen=True)
@@ -58,11 +53,7 @@ class Outcomes:
 
 
 def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
-    """Every object from ``runs`` random first views: episode = run * objects + object.
-
-    The seed decides the first views, the same for every policy and threshold; in scenes among those that can be
-    reached.
-    """
+    """Every object from ``runs`` first views in reach, which the seed draws: episode = run * objects + object."""
     if runs < 1:
         raise UsageError(f"at least one run is needed, not {runs}")
     n, rng, scenes = len(predictions), np.random.default_rng([seed]), scenes_of(predictions)
@@ -93,12 +84,7 @@ def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int, beliefs: b
 
 
 def replay_policy(
-    name: str,
-    policy: Policy,
-    specs: EpisodeSpecs,
-    stopping: Stopping,
-    rng: np.random.Generator,
-    beliefs: bool = False,
+    name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng: np.random.Generator, beliefs: bool = False
 ) -> Trajectories:
     """Run a policy of any kind through all episodes, until a rule ends them; ``name`` is for messages."""
     p, objects = specs.predictions, specs.objects
@@ -127,14 +113,9 @@ def replay_policy(
         if kept is not None:
             kept[step.episodes, k] = step.belief
     views = done.outcome.views
-    return Trajectories(views, answers, confidences, *_moved(p.sphere, views), seen, fixed=False, beliefs=kept)
-
-
-def _moved(sphere: ViewSphere, views: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    legs, going = (views[:, :-1], views[:, 1:]), views[:, 1:] >= 0
-    still = np.zeros((len(views), 1))
-    travel, arc = (np.hstack([still, np.cumsum(d[legs] * going, axis=1)]) for d in (sphere.travel, sphere.arc))
-    return travel, arc
+    legs, going, still = (views[:, :-1], views[:, 1:]), views[:, 1:] >= 0, np.zeros((len(views), 1))
+    travel, arc = (np.hstack([still, np.cumsum(d[legs] * going, axis=1)]) for d in (p.sphere.travel, p.sphere.arc))
+    return Trajectories(views, answers, confidences, travel, arc, seen, fixed=False, beliefs=kept)
 
 
 def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcomes:
@@ -153,9 +134,8 @@ def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcomes:
         reached = stopping.reached(beliefs[:, :last], np.maximum(seen, 1)) & there
         confident = np.asarray(reached.any(1))
         at = np.where(confident, reached.argmax(1), np.minimum(count, last) - 1)
-    return Outcomes(
-        paths.answers[e, at], paths.confidences[e, at], at + 1, confident, paths.travel[e, at], paths.arc[e, at]
-    )
+    moved = paths.travel[e, at], paths.arc[e, at]
+    return Outcomes(paths.answers[e, at], paths.confidences[e, at], at + 1, confident, *moved)
 
 
 @dataclass(frozen=True)

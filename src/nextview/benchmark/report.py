@@ -30,8 +30,7 @@ from nextview.policies.registry import DEFAULT
 from nextview.recognition.map_names import LEM
 
 PICTURE = 112  # side of a view's picture, pixels
-OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])
-"""Colours of nothing, the target, other things and the table in a scene."""
+OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])  # nothing, target, others, table
 
 
 def report(
@@ -172,9 +171,8 @@ def _failures(results: Results, best: str, at: float, store: ViewStore | None) -
         views = [int(v) for v in episode["views"]]
         images = _images(store, name, views) if store is not None and name in store.names else {}
         conflicting = bool(p.conflicting[p.names.index(name)])
-        found.append(
-            failure | {"answer": episode["answer"], "views": views, "images": images, "conflicting": conflicting}
-        )
+        shown = {"answer": episode["answer"], "views": views, "images": images}
+        found.append(failure | shown | {"conflicting": conflicting})
     return found
 
 

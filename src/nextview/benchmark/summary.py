@@ -17,12 +17,9 @@ from nextview.data import metrics
 from nextview.simulation.scene_layout import LEVELS, clutter_level
 
 Float = NDArray[np.float64]
-
 Cell = tuple[str, float | None, Outcomes]
-
 TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
-SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)
-"""Thresholds of the curves of accuracy against views and travel: from the first view for all to the last for most."""
+SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)  # from the first view for all to the last for most
 LEVEL_VIEWS = (2, 3, 5)  # after so many views the policies are compared
 LEVEL_COLUMNS = ["level", "scenes", "policy", "n_views", "accuracy", "low", "high", "travel", "difference"]
 LEVEL_COLUMNS += ["difference_low", "difference_high", "p"]

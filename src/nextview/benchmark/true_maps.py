@@ -12,11 +12,10 @@ from nextview.errors import DatasetError, EntryError
 from nextview.recognition.map_names import CONFIDENCE, map_name, measure_of
 
 TRUE = "true-"  # how the names of true maps begin
-IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {
+IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {  # (N, V); others: in the store
     "depth_entropy": lambda p: normalise_per_object(p.depth_entropy),
     CONFIDENCE: lambda p: confidence_maps(p.logits, p.labels),  # 0 where the recogniser is wrong (section 4.1.3)
 }
-"""True maps, (N, V), that predictions hold; those of other measures stand in the view store."""
 
 
 def true_map(p: Predictions, name: str) -> NDArray[np.float32]:

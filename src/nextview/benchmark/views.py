@@ -3,8 +3,6 @@
 A policy chooses without knowing how many views there will be, so it is run once and its path cut after each number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
@@ -19,8 +17,7 @@ from nextview.data.metrics import ratio
 
 CEILING = "oracle-gain"
 COLUMNS = ["policy", "n_views", "measure", "value", "low", "high", "p", "p_holm"]
-Numbers = dict[tuple[str, int, str], tuple[float, float, float, float, float]]
-"""Value, low, high, p and p after Holm's correction, by policy, number of views and measure."""
+Numbers = dict[tuple[str, int, str], tuple[float, float, float, float, float]]  # value, low, high, p, Holm's p
 
 
 def after(paths: Trajectories, n_views: int) -> Outcomes:
@@ -45,9 +42,8 @@ def measured(grid: Grid, n_views: Sequence[int], samples: int, references: Seque
         ends = [after(grid.paths[name], k) for name in names]
         right = dict(zip(names, (grid.right(e.answer) for e in ends), strict=True))
         columns = {(name, "accuracy"): r.mean(0) for name, r in right.items()}
-        columns |= {
-            (name, "travel"): e.travel.reshape(grid.runs, -1).mean(0) for name, e in zip(names, ends, strict=True)
-        }
+        travel = (e.travel.reshape(grid.runs, -1).mean(0) for e in ends)
+        columns |= {(name, "travel"): mean for name, mean in zip(names, travel, strict=True)}
         for name, reference in product(names, references):
             columns[name, f"to_{reference}"] = columns[name, "accuracy"] - columns[reference, "accuracy"]
         top = np.stack(list(columns.values()), 1)

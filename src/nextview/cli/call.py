@@ -44,9 +44,8 @@ def call(name: str, command: Command, arguments: Sequence[str], track: Callable[
         if re.search(r"(^| )--preset[ =]thesis( |$)", " ".join(arguments)):
             parameters = [p.replace(default=find(command.thesis)) if p.name == "recipe" else p for p in parameters]
         kind = Annotated[Literal["default", "thesis"], tyro.conf.arg(help=PRESET)]
-        parameters.append(
-            inspect.Parameter("preset", inspect.Parameter.KEYWORD_ONLY, default="default", annotation=kind)
-        )
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter("preset", keyword, default="default", annotation=kind))
     called: dict[str, Any] = {}
 
     def run(*positional: Any, preset: str = "default", **options: Any) -> Any:

@@ -17,7 +17,7 @@ class Command:
 CLI, LEARNING = "nextview.cli", "nextview.learning"
 THESIS = f"{LEARNING}.recipes:THESIS"
 EXPORTED = "{found.card}: largest difference between torch and ONNX on real views {found.difference:.2g}"
-COMMANDS = {
+COMMANDS = {  # by name, in the order in which they are listed
     "recognise": Command(f"{CLI}.recognise:recognise", "say what an object is: a mesh file, or captured views"),
     "demo": Command(f"{CLI}.recognise:demo", "recognise a sample object, and draw the episode"),
     "learn": Command(
@@ -95,6 +95,4 @@ COMMANDS = {
     ),
     "report": Command("nextview.benchmark.report:report", "write one HTML page of a benchmark's results", "{found}"),
 }
-"""By name, in the order in which they are listed."""
-RESUMES = ("render", "measure", "predict", "train recogniser", "train map", "learn", "scenes")
-"""Beginnings of the commands that go on where an interrupted run was stopped."""
+RESUMES = ("render", "measure", "predict", "train recogniser", "train map", "learn", "scenes")  # resumable

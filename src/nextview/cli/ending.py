@@ -10,7 +10,7 @@ from typing import Any
 
 from nextview.errors import NextviewError
 
-EXTRAS = {
+EXTRAS = {  # packages by the optional part of the installation that brings them
     "benchmark": ("jinja2", "pandas", "pyarrow"),
     "cluster": ("dask", "distributed"),
     "explore": ("viser",),
@@ -18,7 +18,6 @@ EXTRAS = {
     "envs": ("gymnasium",),
     "train": ("lightning", "numcodecs", "onnx", "onnxscript", "torch", "torchmetrics"),
 }
-"""Packages by the optional part of the installation that brings them."""
 
 
 def printable(text: str) -> str:

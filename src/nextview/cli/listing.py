@@ -38,14 +38,12 @@ def show(
         for split, scores in card.scores.items():
             if split.startswith("test"):
                 tested.append(split)
-                tested += [f"  {score.replace('_', ' ')} {_score(value)}" for score, value in scores.items()]
+                for score, value in scores.items():
+                    mean = f"{value['instance']}\n    class mean {value['class']}" if isinstance(value, dict) else value
+                    tested.append(f"  {score.replace('_', ' ')} {mean}")
         intact = "intact" if sha256_of(card.path) == card.sha256 else "DAMAGED"
         table.add_row(card.name, card.kind, f"{card.path.stat().st_size / 1e6:.1f}", "\n".join(tested), intact)
     return Terminal().print(table)
-
-
-def _score(value: float | dict[str, float]) -> str:
-    return f"{value['instance']}\n    class mean {value['class']}" if isinstance(value, dict) else f"{value}"
 
 
 def download(

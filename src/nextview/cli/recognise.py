@@ -73,13 +73,7 @@ def demo(
 
 
 def show(
-    camera: Any,
-    name: str,
-    system: System,
-    output: Output,
-    start: int | None,
-    seed: int = 0,
-    indent: int | None = 1,
+    camera: Any, name: str, system: System, output: Output, start: int | None, seed: int = 0, indent: int | None = 1
 ) -> None:
     """Recognise what a camera sees, print the episode and write what is asked for."""
     session = system.session_with(camera, start, seed)

@@ -151,6 +151,5 @@ def _named(entries: list[Entry], root: Path) -> list[Entry]:
             return named
     first: dict[str, Entry] = {}
     twice = next(entry for entry in named if first.setdefault(entry.name, entry) is not entry)
-    raise DatasetError(
-        f"{first[twice.name].path} and {twice.path} would both be called {twice.name}; rename one of them"
-    )
+    both = f"{first[twice.name].path} and {twice.path}"
+    raise DatasetError(f"{both} would both be called {twice.name}; rename one of them")

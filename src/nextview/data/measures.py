@@ -72,10 +72,9 @@ class Measure:
         return self.function(view)
 
 
-MEASURES: dict[str, Measure] = {
+MEASURES: dict[str, Measure] = {  # the thesis's own; packages add theirs by entry points of GROUP
     "depth_entropy": Measure(lambda view: depth_entropy(view.depth), "depth", "Parisotto et al.; eq. 3")
 }
-"""The thesis's own. Packages add theirs by entry points of the group GROUP."""
 GROUP = "nextview.measures"
 
 

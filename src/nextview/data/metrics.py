@@ -62,8 +62,7 @@ def calibration_error(confidence: Float, right: NDArray[np.bool_]) -> float:
     return float((count * np.abs(sure - accuracy)).sum() / max(1, count.sum()))
 
 
-MAP_DIGITS = {"mse": 5, "d0": 4, "d_le_1": 4, "d_lt_2": 4, "regret": 4}
-"""Scores of a map, and the digits of them on a card."""
+MAP_DIGITS = {"mse": 5, "d0": 4, "d_le_1": 4, "d_lt_2": 4, "regret": 4}  # scores of a map, and their digits on a card
 
 
 def map_errors(predicted: NDArray[np.floating], true: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:

@@ -67,8 +67,9 @@ def predict(
         yield from counted(work, items, len(objects), lambda it: f"{path}: {store.names[it[0]]}", workers, scheduler)
         arrays = _together(files)
         maps_found = {name.removeprefix("map/"): found for name, found in arrays.items() if name.startswith("map/")}
-        made = replace(plan, logits=arrays["logits"], azimuth_bins=arrays.get("azimuth_bins"), maps=maps_found)
-        made.with_size(of_size).save(out, overwrite)
+        logits = arrays["logits"] if of_size is None else arrays["logits"] + of_size[:, None]
+        bins = arrays.get("azimuth_bins")
+        replace(plan, logits=logits, of_size=of_size, azimuth_bins=bins, maps=maps_found).save(out, overwrite)
         shutil.rmtree(place)
 
 
@@ -100,10 +101,7 @@ def _open(files: str) -> tuple[ViewStore, Recogniser, dict[str, MapNetwork]]:
 
 
 def _predict_object(files: str, item: tuple[int, Path]) -> None:
-    """Write maps, azimuth bins and logits of all views of one object, whole or not at all.
-
-    A view in which nothing is seen is no evidence: its logits are all the same.
-    """
+    """Write maps, azimuth bins and logits of all views of one object, whole or not at all; zeros if nothing is seen."""
     i, file = item
     store, recogniser, maps = _open(files)
     specs = {recogniser.card.input} | {network.card.input for network in maps.values()}

@@ -148,10 +148,6 @@ class Predictions:
             return self
         return replace(self, logits=self.logits - self.of_size[:, None], of_size=None)
 
-    def with_size(self, of_size: NDArray[np.float32] | None) -> "Predictions":
-        """The inverse of ``by_shape``: logits by size, (N, C), are added."""
-        return self if of_size is None else replace(self, logits=self.logits + of_size[:, None], of_size=of_size)
-
     @classmethod
     def from_logits(
         cls,
@@ -249,9 +245,9 @@ class Predictions:
 
         if "format" not in f or f["format"].tolist() != FORMAT:
             raise PredictionsError(f"not a predictions file of format {FORMAT}; make it again")
-        arrays: dict[str, Any] = {
-            name: f[name] for name in ("logits", "depth_entropy", "labels", "splits", "conflicting")
-        }
+        needed = ("logits", "depth_entropy", "labels", "splits", "conflicting")
+        arrays: dict[str, Any] = {name: f[name] for name in needed}
+        trust = str(f.get("calibration", "{}")).encode()
         return cls(
             **arrays,
             azimuth_bins=f.get("azimuth_bins"),
@@ -262,9 +258,7 @@ class Predictions:
             sphere=ViewSphere(tuple(f["elevations"].tolist()), int(f["azimuths"]), float(f["distance"])),
             models={kind: (name, sha) for kind, name, sha in f["models"].tolist()},
             valley_classes={name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
-            calibration=decode_record(
-                str(f.get("calibration", "{}")).encode(), Calibration, "not a calibration", PredictionsError
-            ),
+            calibration=decode_record(trust, Calibration, "not a calibration", PredictionsError),
             store=str(f.get("store", "")),
             commands=tuple(f["commands"].tolist()) if "commands" in f else (),
         )

@@ -29,8 +29,7 @@ DEPTH_UNIT = 1e-4  # depth is stored as uint16 in steps of this many object radi
 POINT_UNIT = 1 / 32767  # points are stored as int16 in steps of this many object radii
 PENDING, DONE, FAILED = 0, 1, 2
 PLANNED = 5  # views of a plan: the thesis's longest episode
-RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
-"""The arrays that rendering makes; others are added later. Those of cluttered scenes, see ``data.scene_views``:"""
+RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")  # by rendering; more in scenes:
 SCENE = ("scene/depth", "scene/owner", "scene/reachable", "measures/visible_share", "measures/clearance")
 Name = Annotated[str, Meta(min_length=1)]
 Split = Literal["train", "test", "val", ""]

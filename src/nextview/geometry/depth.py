@@ -5,8 +5,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-FARTHEST = 50.0
-"""Depth at which nothing counts as an object any more, object radii: depth cameras have large numbers for "nothing"."""
+FARTHEST = 50.0  # object radii; what is farther is no object: depth cameras have large numbers for "nothing"
 AMBIENT = 0.15  # brightness of a surface seen edge-on, so that it stays apart from the black background
 POINTS = 1024  # points in the partial cloud of one view (thesis, section 4.1.2)
 
@@ -27,10 +26,7 @@ def slope(before: NDArray, here: NDArray, after: NDArray) -> NDArray[np.float32]
 
 
 def headlight(depth: NDArray[np.float32], intrinsics: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """The surface as a lamp at the camera lights it, (H, W) uint8: as bright as the cosine of ray and surface normal.
-
-    Normals come from differences between neighbouring pixels.
-    """
+    """The surface as lit by a lamp at the camera, (H, W) uint8: as bright as the cosine of ray and surface normal."""
     height, width = depth.shape
     padded = np.pad(depth, 1)
     (fx, _, cx), (_, fy, cy) = intrinsics[:2]
@@ -51,10 +47,7 @@ def pixel_order(pixels: int, seed: int) -> NDArray[np.int32]:
 
 
 def visible_points(
-    depth: NDArray[np.float32],
-    pose: NDArray[np.float64],
-    intrinsics: NDArray[np.float64],
-    seed: int = 0,
+    depth: NDArray[np.float32], pose: NDArray[np.float64], intrinsics: NDArray[np.float64], seed: int = 0
 ) -> NDArray[np.float32]:
     """Points on the visible surface, (1024, 3) float32, object frame; all zero if nothing is visible.
 

@@ -14,10 +14,8 @@ from nextview.geometry.mesh_file import check_faces, read_by_trimesh, read_obj, 
 MAX_FACES = 10_000_000  # triangles that a mesh may have if nothing else is asked for
 BYTES_PER_FACE = 60  # how many bytes a mesh file may have for each triangle that it may have
 FORMATS = (".off", ".obj", ".ply", ".stl", ".glb")
-UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}
-"""What a file's unit of length may be, and how many metres it is."""
-FLAT = 1e-12
-"""Twice the area of a face below which it counts as a line, square object radii: rounding makes up to 1e-15."""
+UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}  # of length, metres
+FLAT = 1e-12  # twice the area, square object radii, below which a face counts as a line: rounding makes up to 1e-15
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ import warnings
 from array import array
 from collections.abc import Iterator
 from itertools import islice, pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,10 +72,8 @@ def _off_by_lines(body: bytes, n_vertices: int, n_faces: int) -> Shape:
         corners.extend(_fan(polygon))
         found += 1
     if (len(positions), found) != (3 * n_vertices, n_faces):
-        raise MeshError(
-            f"the file is cut short, {n_vertices} vertices and {n_faces} faces announced, "
-            f"{len(positions) // 3} and {found} found"
-        )
+        what = f"the file is cut short, {n_vertices} vertices and {n_faces} faces announced"
+        raise MeshError(f"{what}, {len(positions) // 3} and {found} found")
     return np.array(positions).reshape(-1, 3), np.array(corners).reshape(-1, 3)
 
 
@@ -206,19 +203,16 @@ def _guard_glb(data: bytes) -> bytes:
         raise MeshError(f"a node is in its scene twice, or there are more than {GLB_NODES:,}")
     for part in (part for mesh in gltf.get("meshes", []) for part in mesh["primitives"]):
         used = [accessors[part[key]] for key in ("indices",) if key in part]
-        _guard_part(part, [*used, accessors[part["attributes"]["POSITION"]]])
+        used.append(accessors[part["attributes"]["POSITION"]])
+        if part.get("mode", GLB_TRIANGLES) == GLB_FAN:
+            raise MeshError("it has fans of triangles, which are not read here")
+        if any("bufferView" not in accessor or "sparse" in accessor for accessor in used):
+            raise MeshError("its positions or faces are compressed, sparse or without data, which is not read here")
+        if any(accessor.get("normalized") for accessor in used):
+            raise MeshError("its positions are fractions of whole numbers, which are not read here")
+        if min(accessor["count"] for accessor in used) < 0:
+            raise MeshError("it announces fewer than no numbers")
     return data
-
-
-def _guard_part(part: dict[str, Any], used: list[dict[str, Any]]) -> None:
-    if part.get("mode", GLB_TRIANGLES) == GLB_FAN:
-        raise MeshError("it has fans of triangles, which are not read here")
-    if any("bufferView" not in accessor or "sparse" in accessor for accessor in used):
-        raise MeshError("its positions or faces are compressed, sparse or without data, which is not read here")
-    if any(accessor.get("normalized") for accessor in used):
-        raise MeshError("its positions are fractions of whole numbers, which are not read here")
-    if min(accessor["count"] for accessor in used) < 0:
-        raise MeshError("it announces fewer than no numbers")
 
 
 _GUARDS = {"ply": _guard_ply, "stl": _guard_stl, "glb": _guard_glb}

@@ -37,10 +37,8 @@ class SceneView:
 
     def __post_init__(self) -> None:
         if self.depth.ndim != 2 or self.target.shape != self.depth.shape:
-            raise ObservationError(
-                f"the depth of a scene and the object's pixels are images of one shape, not {self.depth.shape} and "
-                f"{self.target.shape}"
-            )
+            what = "the depth of a scene and the object's pixels are images of one shape"
+            raise ObservationError(f"{what}, not {self.depth.shape} and {self.target.shape}")
 
 
 @dataclass(frozen=True, eq=False)  # each is itself, and can be the key of what is made of it
@@ -135,14 +133,10 @@ class Camera(Protocol):
 
     def observe(self, pose: NDArray[np.float64]) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""
-        ...
 
 
 def checked_pose(pose: Any) -> NDArray[np.float64]:
-    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii.
-
-    ObservationError if it is no rigid motion, or leads to a place from which no object can be seen.
-    """
+    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii; ObservationError if no camera has it."""
     pose = numbers(pose, "the pose").astype(np.float64, copy=False)
     if pose.shape != (4, 4):
         raise ObservationError(f"the pose is a camera-to-world matrix of the shape (4, 4), not {pose.shape}")
@@ -157,10 +151,8 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
         raise ObservationError("the pose is mirrored: an axis is reversed (OpenCV axes are x right, y down, z forward)")
     distance = float(np.sqrt((pose[:3, 3] ** 2).sum()))
     if distance > 2 * FARTHEST:
-        raise ObservationError(
-            f"the camera stands {distance:.4g} object radii from the object: is its position in millimetres? "
-            "Divide it by the object radius"
-        )
+        what = f"the camera stands {distance:.4g} object radii from the object"
+        raise ObservationError(f"{what}: is its position in millimetres? Divide it by the object radius")
     return pose
 
 
@@ -172,15 +164,12 @@ def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.fl
     if not (np.abs(intrinsics) < LARGEST).all():  # not so if there is a NaN
         raise ObservationError("the intrinsics hold NaN, infinity or a number that no camera has")
     if np.abs(intrinsics[2] - (0, 0, 1)).max() > RIGID:
-        raise ObservationError(
-            f"the last row of the intrinsics is {intrinsics[2].tolist()}, not 0 0 1: are they transposed?"
-        )
+        last = intrinsics[2].tolist()
+        raise ObservationError(f"the last row of the intrinsics is {last}, not 0 0 1: are they transposed?")
     focal = intrinsics[0, 0], intrinsics[1, 1]
     if not min(focal) > 0.01 * max(shape):  # less would show all that lies ahead: metres, say
-        raise ObservationError(
-            f"the focal lengths are positive numbers of pixels, about as many as the image has a side ({max(shape)}), "
-            f"not {focal[0]:g} and {focal[1]:g}"
-        )
+        wanted = f"positive numbers of pixels, about as many as the image has a side ({max(shape)})"
+        raise ObservationError(f"the focal lengths are {wanted}, not {focal[0]:g} and {focal[1]:g}")
     return intrinsics
 
 

@@ -18,10 +18,8 @@ from nextview.errors import UsageError
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
-
 DISTANCE = 3.0  # distance of the camera from the object's centre, in object radii
-CELL = np.radians((18.0, 45.0))
-"""Elevation and azimuth of a cell of the 40 views: travel between directions that are on no grid is counted in it."""
+CELL = np.radians((18.0, 45.0))  # elevation and azimuth of a cell, in which travel off any grid is counted
 MOST = 99_999  # viewpoints that there may be, and views on a ring
 SNAP = 1e-6  # radians within which a camera stands at a candidate. What is more is a place of its own
 
@@ -310,8 +308,6 @@ def viewpoints_of(what: str | Viewpoints | Any) -> Viewpoints:
     if rings := re.fullmatch(r"rings:(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?)*)x(\d{1,4})", what):
         return ViewSphere(tuple(map(float, rings[1].split(","))), int(rings[2]))
     if what not in LAYOUTS:
-        raise UsageError(
-            f"no viewpoints are called {what!r}; there are {', '.join(LAYOUTS)}, rings:ELEVATIONSxAZIMUTHS such as "
-            "rings:0,30,60x12, and fibonacci:N"
-        )
+        others = "rings:ELEVATIONSxAZIMUTHS such as rings:0,30,60x12, and fibonacci:N"
+        raise UsageError(f"no viewpoints are called {what!r}; there are {', '.join(LAYOUTS)}, {others}")
     return LAYOUTS[what]

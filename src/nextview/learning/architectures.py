@@ -8,7 +8,7 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.inputs import CHANNELS_OF
 from nextview.learning.recipes import MapRecipe, RecogniserRecipe
 
-STAGES = (
+STAGES = (  # expansion, width, kernel, stride and blocks (Tan and Le, EfficientNet, ICML 2019, table 1)
     (1, 16, 3, 1, 1),
     (6, 24, 3, 2, 2),
     (6, 40, 5, 2, 2),
@@ -17,7 +17,6 @@ STAGES = (
     (6, 192, 5, 2, 4),
     (6, 320, 3, 1, 1),
 )
-"""Expansion, width, kernel, stride and blocks of the seven stages (Tan and Le, EfficientNet, ICML 2019, table 1)."""
 BLOCKS = sum(length for *_, length in STAGES)
 FEATURES = 1280
 

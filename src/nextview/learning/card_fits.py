@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
+from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import beta, gaussian_kde
@@ -23,9 +24,7 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration, RiskBounds, Size
 from nextview.recognition.model_card import ModelCard
 
 Float = NDArray[np.float64]
-
-THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
-"""Of the belief, from 0.5 to 0.998: those for which error rates are promised."""
+THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())  # of promised error rates
 
 
 @dataclass(frozen=True)
@@ -50,9 +49,6 @@ def fit_calibration(
 
     Both go into its card; nextview predict takes them into predictions made before, without predicting again. The size
     of the objects is not used.
-
-    Raises:
-        UsageError, ModelError, PredictionsError: the arguments make no sense, or do not fit together.
     """
     if not 0 < number(delta, "--delta") < 1:
         raise UsageError(f"delta is a probability between 0 and 1, not {delta}")
@@ -97,7 +93,7 @@ class Walks:
     totals: Float  # log-evidence summed over the views so far, (walks, views, D)
 
     @classmethod
-    def draw(cls, data: Predictions, rng: np.random.Generator, n_views: int, walks: int) -> "Walks":
+    def draw(cls, data: Predictions, rng: Generator, n_views: int, walks: int) -> "Walks":
         """So many walks of each kind over every object."""
         objects, views, n_views = np.tile(np.arange(len(data)), 2 * walks), [], min(n_views, len(data.sphere))
         for policy in (Random(data.sphere), RandomAll(data.sphere)):
@@ -119,7 +115,7 @@ class Walks:
         return -float((weights / weights.sum() / len(self.numbers)) @ of_truth.sum(1))
 
 
-def fit_temperature(data: Predictions, rng: np.random.Generator, n_views: int = 5, walks: int = 4) -> Calibration:
+def fit_temperature(data: Predictions, rng: Generator, n_views: int = 5, walks: int = 4) -> Calibration:
     """Temperature of one view and correlations of several, by maximum likelihood over 1 to ``n_views`` views."""
     walked = Walks.draw(data, rng, n_views, walks)
 
@@ -136,25 +132,18 @@ def fit_temperature(data: Predictions, rng: np.random.Generator, n_views: int = 
     return calibration(np.round(fitted.x, 4))
 
 
-def calibration_of(data: Predictions, rng: np.random.Generator, walks: int = 4) -> Calibration:
+def calibration_of(data: Predictions, rng: Generator, walks: int = 4) -> Calibration:
     """The calibration of predictions; fitted to them where their recogniser was not calibrated."""
     return data.calibration if data.calibration != PLAIN_SUM else fit_temperature(data, rng, walks=walks)
 
 
-def loss(
-    data: Predictions, calibration: Calibration, rng: np.random.Generator, n_views: int = 5, walks: int = 4
-) -> float:
+def loss(data: Predictions, calibration: Calibration, rng: Generator, n_views: int = 5, walks: int = 4) -> float:
     """Mean negative log-likelihood of the true class over 1 to ``n_views`` views; see ``fit_temperature``."""
     return Walks.draw(data, rng, n_views, walks).loss(calibration)
 
 
 def fit_risk(
-    data: Predictions,
-    calibration: Calibration,
-    rng: np.random.Generator,
-    delta: float = 0.1,
-    n_views: int = 8,
-    walks: int = 4,
+    data: Predictions, calibration: Calibration, rng: Generator, delta: float = 0.1, n_views: int = 8, walks: int = 4
 ) -> RiskBounds:
     """Error rates that can be promised among those who stop at a threshold, on either half of the walks."""
     walked = Walks.draw(data, rng, n_views, walks)
@@ -222,9 +211,6 @@ def fit_size(
     """Learn how large the objects of each class are, for stores and cameras that know the scale.
 
     It goes into the card; nextview predict takes it into predictions made before, without predicting again.
-
-    Raises:
-        DatasetError, ModelError, PredictionsError: the arguments do not fit together.
     """
     views, predicted = ViewStore.open(store), Predictions.load(predictions)
     table = predicted.deduplicate().by_shape()
@@ -294,9 +280,6 @@ def fit_valleys(
     """Choose the classes for which the valley of a predicted map is the better view than its peak.
 
     They go into the network's card; nextview predict takes them into predictions made before, without predicting again.
-
-    Raises:
-        ModelError, PredictionsError: the arguments do not fit together.
     """
     table = Predictions.load(predictions)
     with card_to_fit(card, recogniser=False) as (model, write):

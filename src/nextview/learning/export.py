@@ -227,11 +227,7 @@ def export_map(
     overwrite: bool = False,  # replace a model of this name
     track: Track = silently,
 ) -> Exported:
-    """Export a trained map network: ONNX, with a card of its validation scores.
-
-    Raises:
-        ModelError, ResultsError: the run is not finished, the file's answers differ, or the model exists.
-    """
+    """Export a trained map network: ONNX, with a card of its validation scores."""
     return _export(_map(run, store, predictions, name, note), out, bits, overwrite, track)
 
 

@@ -18,8 +18,7 @@ from nextview.errors import DatasetError
 from nextview.files import new_folder, only_one
 from nextview.recognition.network_input import CHANNELS_OF, InputKind, InputSpec, from_store
 
-PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)
-"""Views of objects are mostly background and flat faces: a sixth is left or less, which fits into memory."""
+PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)  # views are mostly background and flat faces: a sixth is left, or less
 AGAIN = "delete it, and it is made again"
 
 

@@ -1,7 +1,5 @@
 """Teach things: from a folder of meshes or captured frames to a memory that recognises them, without PyTorch."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -34,35 +32,25 @@ from nextview.recognition.model_card import (
     write_card,
 )
 
-NAME = "memory"
-"""Of the card in a folder of taught things, and of the file beside it."""
-Pair = tuple[Source, Arrays]
-"""A thing, and what is remembered of it."""
-ODD_SIZE = 300
-"""A thing so many times larger or smaller than the median of the others is asked about."""
+NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
+Pair = tuple[Source, Arrays]  # a thing, and what is remembered of it
+ODD_SIZE = 300  # a thing so many times larger or smaller than the median of the others is asked about
 
 
 @dataclass(frozen=True)
 class Learned:
-    """What was learned.
+    """What was learned."""
 
-    Attributes:
-        out: the folder.
-        things: how many, of so many ``classes``.
-        accuracy: share of the cases in which held-out views are named right after 1, 2, 3 and 5 of them; things of a
-            class of several by the others of that class.
-        confused: pairs of things that are most often taken for each other, with the share of the cases.
-        notes: what there is to know, a sentence each.
-        left_out: what could not be learned and why, a phrase each.
-    """
-
-    out: Path
-    things: int
+    out: Path  # the folder
+    things: int  # how many, of so many ``classes``
     classes: int
+    # share of the cases in which held-out views are named right after 1, 2, 3 and 5 of them; things of a class of
+    # several by the others of that class
     accuracy: tuple[float, ...]
+    # pairs of things that are most often taken for each other, with the share of the cases
     confused: tuple[tuple[str, str, float], ...]
-    notes: tuple[str, ...]
-    left_out: tuple[str, ...]
+    notes: tuple[str, ...]  # what there is to know, a sentence each
+    left_out: tuple[str, ...]  # what could not be learned and why, a phrase each
 
     def __str__(self) -> str:
         """In words."""
@@ -77,23 +65,14 @@ class Learned:
 
 @dataclass(frozen=True)
 class How:
-    """How things are looked at.
+    """How things are looked at."""
 
-    Attributes:
-        unit: of the mesh files; then size counts as evidence.
-        up: the up axis of the mesh files; z by default, but y for GLB.
-        upright: the things only ever stand as their files have them; by default they may also lie.
-        sensor: the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help.
-        any_size: take things of very different sizes as they are.
-        seed: of all random draws.
-    """
-
-    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None
-    up: Literal["y", "z"] | None = None
-    upright: bool = False
-    sensor: str = "wrist"
-    any_size: bool = False
-    seed: int = 0
+    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None  # of the mesh files; then size counts as evidence
+    up: Literal["y", "z"] | None = None  # the up axis of the mesh files; z by default, but y for GLB
+    upright: bool = False  # the things only ever stand as their files have them; by default they may also lie
+    sensor: str = "wrist"  # the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help
+    any_size: bool = False  # take things of very different sizes as they are
+    seed: int = 0  # of all random draws
 
 
 def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
@@ -103,32 +82,23 @@ def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
 
 
 def learn_things(
-    folder: Path,
-    out: Path,
+    folder: Path,  # what is to be taught
+    out: Path,  # folder to write
     how: How = How(),
-    add: bool = False,
+    add: bool = False,  # put the things beside those that OUT knows; the old ones are not looked at again
+    # forget the things of these names in OUT; nothing is added where FOLDER is OUT, too
     remove: tuple[str, ...] = (),
-    workers: int | None = None,
+    workers: int | None = None,  # processes; one for each core by default; 0 to work in this one
+    # address of a dask.distributed scheduler whose workers see the same files, to use instead
     scheduler: str | None = None,
-    overwrite: bool = False,
-    track: Track = silently,
+    overwrite: bool = False,  # replace what OUT knows
+    track: Track = silently,  # follows the things
 ) -> Learned:
     """Teach the things in a folder, and write a folder of models that recognises them.
 
     Each mesh in the folder is a thing of its own name, as is each folder of captured depth frames with poses (BOP, TUM
     RGB-D or 7-Scenes); any other folder is a class, and the meshes in it are its things. A run that was stopped goes on
     where it was. Use what it writes with --models OUT, or ``nextview.load(models=OUT)``.
-
-    Args:
-        folder: what is to be taught.
-        out: folder to write.
-        how: how things are looked at.
-        add: put the things beside those that ``out`` knows; the old ones are not looked at again.
-        remove: forget the things of these names in ``out``; nothing is added where ``folder`` is ``out``, too.
-        workers: processes; one for each core by default; 0 to work in this one.
-        scheduler: address of a dask.distributed scheduler whose workers see the same files, to use instead.
-        overwrite: replace what ``out`` knows.
-        track: follows the things.
 
     Raises:
         DatasetError: nothing can be taught; what is wrong, in one sentence.
@@ -144,11 +114,14 @@ def learn_things(
     else:
         check_new(out, overwrite, folder=True)
     found = Found([], []) if remove and folder.resolve() == out.resolve() else find_things(folder)
-    sources, left_out = _new(found.things, known), list(found.left_out)
+    names, left_out = {source.name for source, _ in known}, list(found.left_out)
+    for thing in found.things:
+        if thing.name in names:
+            raise UsageError(f"{thing.path}: something called {thing.name} is known already; --remove it, or rename it")
     part = out.with_name(f".{out.name}.part")
     with only_one(out):
         taught = known
-        track(_teach(sources, how, part, taught, left_out, workers, scheduler), len(sources), "things")
+        track(_teach(found.things, how, part, taught, left_out, workers, scheduler), len(found.things), "things")
         if not taught:
             raise DatasetError(f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})")
         taught.sort(key=lambda pair: (pair[0].label, pair[0].name))
@@ -180,14 +153,6 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
 PER_THING = ("held_out", "held_out_views", "radii", "pictures")
 
 
-def _new(things: Sequence[Source], known: Sequence[Pair]) -> list[Source]:
-    names = {source.name for source, _ in known}
-    for thing in things:
-        if thing.name in names:
-            raise UsageError(f"{thing.path}: something called {thing.name} is known already; --remove it, or rename it")
-    return list(things)
-
-
 def _teach(
     sources: Sequence[Source],
     how: How,
@@ -208,10 +173,9 @@ def _teach(
             taught.append((source, arrays))
         else:
             waiting.append((source, stamp))
-    yield len(sources) - len(waiting)
-    for count, ((source, _), result) in enumerate(
-        each(partial(_teach_one, how, part), waiting, workers, scheduler), len(sources) - len(waiting) + 1
-    ):
+    before, results = len(sources) - len(waiting), each(partial(_teach_one, how, part), waiting, workers, scheduler)
+    yield before
+    for count, ((source, _), result) in enumerate(results, before + 1):
         if isinstance(result, WorkerDied | str):
             left_out.append(f"{source.name}: {result}")
         else:
@@ -249,9 +213,8 @@ def _check_sizes(taught: Sequence[Pair]) -> None:
     for (source, _), times in zip(taught, ratio, strict=True):
         if times > ODD_SIZE or times < 1 / ODD_SIZE:
             how = f"{times:,.0f} times larger" if times > 1 else f"{1 / times:,.0f} times smaller"
-            raise DatasetError(
-                f"{source.path}: is {how} than most others; is it in another unit? --any-size takes it as it is"
-            )
+            hint = "is it in another unit? --any-size takes it as it is"
+            raise DatasetError(f"{source.path}: is {how} than most others; {hint}")
 
 
 def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: ModelCard | None) -> Learned:
@@ -268,6 +231,7 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
     things = tuple(Thing(source.name, str(source.path), n) for (source, _), n in zip(taught, poses, strict=True))
     features = find_card(FEATURES)
     calibration = Calibration(1.0, 1.0, None, fit.correlation, tuple(label[thing].tolist()))
+    novelty = tuple(map(tuple, np.round(fit.quantiles, 4).tolist()))
     card = ModelCard(
         NAME,
         "recogniser",
@@ -280,9 +244,7 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
         size=size_evidence(stacked["radii"], label),
         training=Training(f"{len(taught)} things", commands=() if old is None else old.training.commands),
         scores={"held-out views": {str(k): round(a, 4) for k, a in zip(VIEWS, fit.accuracy, strict=True)}},
-        memory=Taught(
-            things, features.sha256, fit.weight, novelty=tuple(map(tuple, np.round(fit.quantiles, 4).tolist()))
-        ),
+        memory=Taught(things, features.sha256, fit.weight, novelty=novelty),
     ).made_by(command())
     with new_folder(out, overwrite=True) as part:
         sha256 = memory.save(part / f"{NAME}.safetensors")

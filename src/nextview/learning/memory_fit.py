@@ -1,7 +1,5 @@
 """What is fitted to a memory as a whole: how much a likeness weighs, a head for classes, sizes, and novelty."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,20 +9,16 @@ from numpy.typing import NDArray
 from nextview.recognition.belief import Calibration, SizeEvidence, log_evidence_of, of_true_class
 from nextview.recognition.memory import AZIMUTHS, by_ring, similarities
 
+Index = NDArray[np.int64]
 Float = NDArray[np.floating]
-WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)
-"""Of a cosine, as a log-likelihood."""
-CORRELATIONS = (0.1, 0.3, 0.6)
-"""Of two views, see ``Calibration.bin_correlation``."""
-HEADS = (0.0, 5.0, 15.0)
-"""Weights of the head beside the nearest views."""
+WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)  # of a cosine, as a log-likelihood
+CORRELATIONS = (0.1, 0.3, 0.6)  # of two views, see ``Calibration.bin_correlation``
+HEADS = (0.0, 5.0, 15.0)  # weights of the head beside the nearest views
 RIDGE = 1.0
-MOST_THINGS = 150
-"""Things whose held-out views are judged: a drawn part of more."""
+MOST_THINGS = 150  # things whose held-out views are judged: a drawn part of more
 DRAWS, VIEWS, FOLDS = 4, (1, 2, 3, 5), 5
 LEVELS = 101
-SIZE_ERROR = 0.05
-"""Deviation of the logarithm of a radius that a sensor measures."""
+SIZE_ERROR = 0.05  # deviation of the logarithm of a radius that a sensor measures
 FAR = -1e3
 
 
@@ -42,25 +36,17 @@ class Fit:
 
 
 def fit_memory(
-    views: Float,
-    thing: NDArray[np.int64],
-    label: NDArray[np.int64],
-    held_out: Float,
-    held_out_views: Float,
-    radii: Float,
+    views: Float,  # (H, rings, azimuths, F), remembered, unit vectors
+    thing: Index,  # of each resting pose, (H,)
+    label: Index,  # class of each thing, ascending, (T,)
+    held_out: Float,  # embeddings of views that are not remembered, (T, K, F)
+    held_out_views: Float,  # their elevations and azimuths, radians, (T, K, 2)
+    radii: Float,  # object radius of each thing, metres, (T,); NaN where it is not known
 ) -> Fit:
     """Fit by the held-out views of the things, most likely after 1, 2, 3 and 5 of them.
 
     A thing that has others of its class is judged by these alone, in folds over things: whoever teaches a class will
     meet other things of it. A thing that is a class of its own is judged by what is remembered of itself.
-
-    Args:
-        views: (H, rings, azimuths, F), remembered, unit vectors.
-        thing: of each resting pose, (H,).
-        label: class of each thing, ascending, (T,).
-        held_out: embeddings of views that are not remembered, (T, K, F).
-        held_out_views: their elevations and azimuths, radians, (T, K, 2).
-        radii: object radius of each thing, metres, (T,); NaN where it is not known.
     """
     views, held_out = np.asarray(views, np.float32), np.asarray(held_out, np.float32)
     rng = np.random.default_rng(0)
@@ -96,20 +82,14 @@ def fit_memory(
     )
 
 
-def _judged(views: Float, thing: NDArray[np.int64], held_out: Float, where: Float) -> NDArray[np.float32]:
+def _judged(views: Float, thing: Index, held_out: Float, where: Float) -> NDArray[np.float32]:
     """How alike each held-out view is to each resting pose and azimuth, (T, K, H, azimuths)."""
     flat = similarities(by_ring(views), held_out.reshape(-1, held_out.shape[-1]), where[..., 0].ravel())
     return flat.reshape(*held_out.shape[:2], len(thing), AZIMUTHS)
 
 
 def _heads(
-    views: Float,
-    thing: NDArray[np.int64],
-    label: NDArray[np.int64],
-    several: NDArray[np.bool_],
-    fold: NDArray[np.int64],
-    held_out: Float,
-    judged: NDArray[np.int64],
+    views: Float, thing: Index, label: Index, several: NDArray[np.bool_], fold: Index, held_out: Float, judged: Index
 ) -> tuple[NDArray[np.float32], tuple[Float, Float]]:
     """What heads that have not seen a thing say of its held-out views, (T, K, C); and the head of all things."""
     classes, f = int(label.max()) + 1, views.shape[-1]
@@ -128,7 +108,7 @@ def _heads(
     return found, _ridge(x, y, classes)
 
 
-def _ridge(x: Float, y: NDArray[np.int64], classes: int) -> tuple[Float, Float]:
+def _ridge(x: Float, y: Index, classes: int) -> tuple[Float, Float]:
     """Ridge regression from views, (H, n, F), of classes (H,), to one-hot classes, each class weighted evenly."""
     h, n, f = x.shape
     rows, target = x.reshape(h * n, f), np.repeat(np.eye(classes, dtype=np.float32)[y], n, 0)
@@ -144,8 +124,8 @@ def _belief(
     alike: Float,
     logits: Float,
     where: Float,
-    drawn: NDArray[np.int64],
-    hypotheses: NDArray[np.int64],
+    drawn: Index,
+    hypotheses: Index,
     correlation: float,
     after: Sequence[int] = VIEWS,
 ) -> list[NDArray[np.float64]]:
@@ -159,9 +139,7 @@ def _belief(
     return found
 
 
-def _confused(
-    logs: Float, truth: NDArray[np.int64], judged: NDArray[np.int64], label: NDArray[np.int64]
-) -> tuple[tuple[int, int, float], ...]:
+def _confused(logs: Float, truth: Index, judged: Index, label: Index) -> tuple[tuple[int, int, float], ...]:
     """Pairs of things by the share of the cases in which one is named as the class of the other, the worst first."""
     answers, pairs = logs.argmax(-1), dict[tuple[int, int], float]()
     first = {int(c): int(np.flatnonzero(label == c)[0]) for c in np.unique(label)}
@@ -173,7 +151,7 @@ def _confused(
     return tuple((a, b, share) for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1]))
 
 
-def size_evidence(radii: Float, label: NDArray[np.int64]) -> SizeEvidence | None:
+def size_evidence(radii: Float, label: Index) -> SizeEvidence | None:
     """How likely each size is for the things of each class; None where no size is known.
 
     Each thing of a class adds a normal distribution of the logarithm of its radius, and a tenth of a wide one: half

@@ -15,8 +15,7 @@ class Hardware:
     precision: Literal["bf16-mixed", "16-mixed", "32-true"] = "bf16-mixed"  # 16-mixed on GPUs older than Ampere
 
 
-POLICY_INPUTS = ("belief", "view", "place", "lem-sphere", "azimuth_bin")
-"""Features of the bundled gain policy; see ``policies.gain.INPUTS``."""
+POLICY_INPUTS = ("belief", "view", "place", "lem-sphere", "azimuth_bin")  # of the bundled policy
 Depth = Literal[18, 34, 50, 101, 152]
 
 

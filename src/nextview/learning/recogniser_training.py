@@ -23,6 +23,7 @@ from nextview.learning.inputs import PackedViews, ready_inputs
 from nextview.learning.recipes import Hardware, RecogniserRecipe
 from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, refuse_seen, start_from, train_once
 
+Float = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
@@ -182,7 +183,7 @@ def fit_recogniser(
     return best.net.eval()
 
 
-def mirror_planes(store: ViewStore, objects: Indices) -> NDArray[np.float64]:
+def mirror_planes(store: ViewStore, objects: Indices) -> Float:
     """Azimuth of the plane of symmetry of each class, steps of the store's viewpoints, (classes,)."""
     n = store.sphere.azimuths
     measured = store.measure()[objects].reshape(len(objects), -1, n).astype(np.float64)
@@ -194,7 +195,7 @@ def mirror_planes(store: ViewStore, objects: Indices) -> NDArray[np.float64]:
     return np.argmax(of_class, 1).astype(np.float64)
 
 
-def azimuth_bins(store: ViewStore, azimuths: int, planes: NDArray[np.float64]) -> NDArray[np.float32]:
+def azimuth_bins(store: ViewStore, azimuths: int, planes: Float) -> NDArray[np.float32]:
     """The azimuth bin, 0 .. azimuths, from which each view sees its object, (N, V), given the ``mirror_planes``."""
     sphere = store.sphere
     steps = sphere.azimuth_index * (azimuths / sphere.azimuths)
@@ -246,12 +247,7 @@ def train_recogniser(
 
 
 def _source(
-    store: ViewStore,
-    views: ViewStore,
-    needed: Indices,
-    recipe: RecogniserRecipe,
-    planes: NDArray[np.float64] | None,
-    track: Track,
+    store: ViewStore, views: ViewStore, needed: Indices, recipe: RecogniserRecipe, planes: Float | None, track: Track
 ) -> Source:
     """Inputs of a store, and the row of each object of ``views`` in them, -1 for none."""
     row = {name: i for i, name in enumerate(store.names)}

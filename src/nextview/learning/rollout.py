@@ -18,9 +18,7 @@ from nextview.recognition.belief import FixedLength, of_true_class
 from nextview.session.episode import run_episodes
 
 Float = NDArray[np.float64]
-
-OBJECTIVES = ("belief", "log-belief", "right")
-"""Value of the views so far: the belief in the true class, its logarithm, or whether the answer is right."""
+OBJECTIVES = ("belief", "log-belief", "right")  # belief in the truth, its logarithm, or whether the answer is right
 
 
 @dataclass(frozen=True)

@@ -285,14 +285,13 @@ def load_run(network: N, run: Path) -> N:
     return network.eval()
 
 
-LITE_NAMES = {
+LITE_NAMES = {  # names of parts in ports of EfficientNet to PyTorch, as patterns, and in a ``LiteNet``
     r"^_conv_": "",
     "^_blocks": "stages",
     r"\._(expand|depthwise|project)_conv": r".\1",
     "_bn": "norm",
     "^_fc": "fc",
 }
-"""Names of the parts in ports of EfficientNet to PyTorch, as patterns, and in a ``LiteNet``."""
 
 
 def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> None:
@@ -341,10 +340,8 @@ def refuse_seen(weights: Path | None, held_out: list[str]) -> None:
         return
     seen = sorted(set(held_out) - set(read_run(weights).held_out))
     if 0 < len(seen) < len(set(held_out)):
-        raise ModelError(
-            f"{weights}: was trained on {len(seen)} of the {len(set(held_out))} objects that this network must not "
-            f"have seen, {seen[0]} among them; take its --seed and --validation"
-        )
+        what = f"{len(seen)} of the {len(set(held_out))} objects that this network must not have seen"
+        raise ModelError(f"{weights}: was trained on {what}, {seen[0]} among them; take its --seed and --validation")
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:

@@ -1,7 +1,5 @@
 """Look at one thing from everywhere, without and with a sensor's errors, and note what its views are like."""
 
-from __future__ import annotations
-
 import zlib
 from functools import lru_cache
 from pathlib import Path
@@ -24,30 +22,18 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 
 Arrays = dict[str, NDArray]
-HELD_OUT = 8
-"""Views of each thing that are not remembered."""
-SETUP = 8
-"""Views that share the errors of one setup: a wrong centre, a wrong size."""
+HELD_OUT = 8  # views of each thing that are not remembered
+SETUP = 8  # views that share the errors of one setup: a wrong centre, a wrong size
 BATCH = 20
-NEAR = np.radians(30)
-"""A captured view teaches what the thing looks like from no farther than this."""
+NEAR = np.radians(30)  # a captured view teaches what the thing looks like from no farther than this
 GRID = ViewSphere(RINGS, AZIMUTHS)
 
 
 def teach(path: Path, name: str, unit: str | None, up: str | None, upright: bool, sensor: str, seed: int) -> Arrays:
     """What is to be remembered of one thing, by the names of the fields of ``recognition.memory.Memory``.
 
-    Args:
-        path: a mesh file, or a folder of captured frames.
-        name: decides all random draws, with the seed.
-        unit: of a mesh file, one of ``mesh.UNITS``; None if it is not known.
-        up: the up axis of a mesh file, "y" or "z".
-        upright: whether it only ever stands as its file has it.
-        sensor: through which it is looked at, see ``sensor.sensor_named``.
-        seed: of all random draws.
-
-    Raises:
-        MeshError, DatasetError, ObservationError: it cannot be looked at; why, in one sentence.
+    Of a mesh file or a folder of captured frames; name and seed decide all random draws, the others are as of
+    ``learn.How``. MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
     """
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     if path.is_dir() and is_capture(path):
@@ -68,14 +54,12 @@ def teach(path: Path, name: str, unit: str | None, up: str | None, upright: bool
 
 
 def _around(mesh: Mesh, sensor: str, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Embeddings of the views of the grid, (rings, azimuths, F): the mean without and with a sensor's errors.
-
-    Every other azimuth is looked at through the sensor; between them the embeddings are interpolated.
-    """
+    """Embeddings of the views of the grid, (rings, azimuths, F): the mean without and with a sensor's errors."""
     clean = SimulatedCamera(mesh)
     ideal = embeddings([clean.observe(pose) for pose in GRID.poses])
     sensed = _sensed(mesh, GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[:, ::2].reshape(-1, 4, 4), sensor, rng)
     sensed = sensed.reshape(len(RINGS), AZIMUTHS // 2, -1)
+    # Every other azimuth is looked at through the sensor; between them the embeddings are interpolated.
     whole = np.stack([sensed, unit(sensed + np.roll(sensed, -1, 1))], 2).reshape(len(RINGS), AZIMUTHS, -1)
     return joined(ideal.reshape(whole.shape), whole)
 

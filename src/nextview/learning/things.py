@@ -1,7 +1,5 @@
 """Which things a folder teaches: mesh files, class folders of them, and folders of captured depth frames."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,10 +31,8 @@ def find_things(folder: Path) -> Found:
 
     A mesh in the folder itself, and a folder of captured frames, is a thing and a class of its own name. All else is a
     class folder, as in a dataset (``data.folders``): each of its meshes is a thing of that class; where there are
-    splits, those of "train".
-
-    Raises:
-        DatasetError: there is no such folder, nothing in it can be taught, or two things have one name.
+    splits, those of "train". DatasetError: there is no such folder, nothing in it can be taught, or two things have one
+    name.
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: there is no such folder")
@@ -44,17 +40,15 @@ def find_things(folder: Path) -> Found:
     captures = [path for path in inside if path.is_dir() and is_capture(path)]
     things = [Source(path.name, path.name, path) for path in captures]
     things += [Source(path.stem, path.stem, path) for path in inside if path.suffix.lower() in FORMATS]
-    left_out = [
-        f"{p.name}: neither a mesh nor a folder" for p in inside if p.is_file() and p.suffix.lower() in PICTURES
-    ]
+    pictures = [path for path in inside if path.is_file() and path.suffix.lower() in PICTURES]
+    left_out = [f"{path.name}: neither a mesh nor a folder" for path in pictures]
+    nothing = f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with poses"
     if any(path.is_dir() and path not in captures for path in inside):
         try:
             listing = scan_dataset(folder)
         except DatasetError:
             if not things:
-                raise DatasetError(
-                    f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with poses"
-                ) from None
+                raise DatasetError(nothing) from None
         else:
             splits = {entry.split for entry in listing.entries}
             for entry in listing.entries:
@@ -65,16 +59,14 @@ def find_things(folder: Path) -> Found:
                 else:
                     things.append(Source(entry.name, entry.label, entry.path))
     if not things:
-        raise DatasetError(f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with poses")
+        raise DatasetError(nothing)
     things.sort(key=lambda thing: (thing.label, thing.name))
     first: dict[str, Source] = {}
     for thing in things:
         if first.setdefault(thing.name, thing) is not thing:
-            raise DatasetError(
-                f"{first[thing.name].path} and {thing.path} would both be called {thing.name}; rename one of them"
-            )
+            both = f"{first[thing.name].path} and {thing.path}"
+            raise DatasetError(f"{both} would both be called {thing.name}; rename one of them")
     return Found(things, left_out)
 
 
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".bmp")
-"""Files that somebody may take for views; without depth and a pose they teach nothing."""
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".bmp")  # no views: without depth and a pose they teach nothing

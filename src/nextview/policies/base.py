@@ -74,11 +74,9 @@ class Policy(Protocol):
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of maps that it wants in the evidence, "azimuth_bins", "joint", "observations", "visibility"."""
-        ...
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """The next view of each episode, (B,) int64: one of ``state.free``, of which each episode has at least one."""
-        ...
 
 
 @runtime_checkable
@@ -87,7 +85,6 @@ class ValuesViews(Protocol):
 
     def view_values(self, state: EpisodeState) -> Float:
         """What each candidate view is valued at, (B, V) float64; NaN for those that are not considered."""
-        ...
 
 
 @runtime_checkable
@@ -97,11 +94,9 @@ class ScoresViews(Protocol):
     @property
     def travel_weight(self) -> float:
         """Of a grid cell of travel."""
-        ...
 
     def scores(self, state: EpisodeState) -> Float:
         """The score of each view before travel counts, (B, V) float64; NaN for those that are not considered."""
-        ...
 
 
 def travel_from(sphere: Viewpoints, state: EpisodeState) -> Float:

@@ -1,7 +1,5 @@
 """The policy that tells taught things apart: it looks where the things that are believed most look least alike."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,27 +13,19 @@ from nextview.recognition.memory import AZIMUTHS, RINGS, read_memory
 from nextview.recognition.model_card import read_card
 
 Float = NDArray[np.float64]
-WEIGHT = 40.0
-"""Of a cosine, as a log-likelihood: for one view whose noise is not known yet."""
-LEADING = 24
-"""Pairs of a thing, in a resting pose, and an azimuth that are weighed against each other: those believed most."""
+WEIGHT = 40.0  # of a cosine, as a log-likelihood: for one view whose noise is not known yet
+LEADING = 24  # pairs of a thing, in a resting pose, and an azimuth that are weighed: those believed most
 
 
 @dataclass(frozen=True)
 class Rivals:
-    """The two classes believed most, and the remembered view of each that is nearest to each of V candidate views.
+    """The two classes believed most, and the remembered view of each that is nearest to each of V candidate views."""
 
-    Attributes:
-        classes: (2,), that believed most first; ``hypotheses`` the likeliest of each.
-        rings, azimuths: of the remembered views, indices, (V,) and (2, V).
-        alike: cosine of the two views, (V,); NaN where one of them is not remembered.
-    """
-
-    classes: NDArray[np.int64]
-    hypotheses: NDArray[np.int64]
-    rings: NDArray[np.int64]
-    azimuths: NDArray[np.int64]
-    alike: Float
+    classes: NDArray[np.int64]  # that believed most first, (2,)
+    hypotheses: NDArray[np.int64]  # the likeliest of each, (2,)
+    rings: NDArray[np.int64]  # of the remembered views, indices, (V,)
+    azimuths: NDArray[np.int64]  # likewise, (2, V)
+    alike: Float  # cosine of the two views, (V,); NaN where one of them is not remembered
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,25 +36,20 @@ class Discriminate:
     show there. If one of them is true, the others keep the likelihood of their likeness to it. A view is worth the
     expected logarithm of the belief in the true class (expected information: Denzler and Brown, IEEE TPAMI 2002;
     Borotschnig et al., Image and Vision Computing 2000).
-
-    Attributes:
-        viewpoints: the candidates, anywhere.
-        views: remembered views of each hypothesis, (H, rings, azimuths, F), unit vectors; zero where nothing is known.
-        classes: class of each hypothesis, (H,).
-        travel_weight: of a grid cell of travel.
     """
 
-    viewpoints: Viewpoints
+    viewpoints: Viewpoints  # the candidates, anywhere
+    # remembered views of each hypothesis, (H, rings, azimuths, F), unit vectors; zero where nothing is known
     views: NDArray[np.floating]
-    classes: NDArray[np.int64]
-    travel_weight: float = 0.0
+    classes: NDArray[np.int64]  # class of each hypothesis, (H,)
+    travel_weight: float = 0.0  # of a grid cell of travel
     needs: tuple[str, ...] = ("joint",)
 
     def __post_init__(self) -> None:
         check_weight(self.travel_weight)
 
     @classmethod
-    def from_card(cls, path: Path, viewpoints: Viewpoints, classes: tuple[str, ...] | None = None) -> Discriminate:
+    def from_card(cls, path: Path, viewpoints: Viewpoints, classes: tuple[str, ...] | None = None) -> "Discriminate":
         """For the things of a memory, by its card; OtherUseError if ``classes`` are not those of its things."""
         card = read_card(path)
         if card.memory is None:

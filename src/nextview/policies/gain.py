@@ -23,12 +23,10 @@ from nextview.recognition.inference import OnnxFile, check_end, open_onnx, run_o
 from nextview.recognition.map_names import SPHERE, in_order, maps_among
 
 Float = NDArray[np.float64]
-
 INPUTS = ("belief", "view", "place", "azimuth_bin")
 """What a network may take: the belief over all views; that by the last view alone; the ring and the views visited; and
 the azimuth bin that is seen, of the class believed most and over all classes. Any other name is that of a map."""
-VISIBILITY = "visibility"
-"""One more input, for cluttered scenes: the share of the object that is expected to show from each view."""
+VISIBILITY = "visibility"  # one more, for scenes: the share of the object that is expected to show from each view
 Frame = Literal["camera", "object"]
 """From where azimuths of cells are counted: the camera's, or that at which the object, if of the class believed most,
 most likely shows its azimuth bin 0."""
@@ -168,7 +166,6 @@ class Gain:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The maps that the features are made of, the azimuth bins, and what shows."""
         azimuth_bins = "azimuth_bin" in self.inputs or self.frame == "object"
         others = {"azimuth_bins": azimuth_bins, VISIBILITY: VISIBILITY in self.inputs}
         return (*maps_of(self.inputs), *(name for name, taken in others.items() if taken))
@@ -213,7 +210,6 @@ class VisibleGain:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Those of the gain policy, and what shows."""
         return (*(name for name in self.gain.needs if name != "visibility"), "visibility")
 
     def scores(self, state: EpisodeState) -> Float:

@@ -42,7 +42,6 @@ class MapPeak:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The map that is climbed."""
         return (self.map_name,)
 
     def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
@@ -62,9 +61,8 @@ class MapPeak:
         """What makes each cell of the window a better view, (B, rings, 3)."""
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
         if maps.shape[1:] != (self.sphere.rings, 3):
-            raise PolicyError(
-                f"the map {self.map_name!r} is {maps.shape[1:]}, but the sphere has {self.sphere.rings} rings"
-            )
+            there = f"the sphere has {self.sphere.rings} rings"
+            raise PolicyError(f"the map {self.map_name!r} is {maps.shape[1:]}, but {there}")
         valley = np.isin(state.belief.argmax(1), self.valley_classes)
         return peaks_first(np.where(valley[:, None, None], -maps, maps))
 
@@ -83,7 +81,6 @@ class SpherePeak:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The map that is climbed."""
         return (self.map_name,)
 
     def view_values(self, state: EpisodeState) -> NDArray[np.float64]:

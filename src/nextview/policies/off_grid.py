@@ -39,7 +39,6 @@ class OffGrid:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Those of the policy."""
         return self.policy.needs
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:

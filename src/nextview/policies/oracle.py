@@ -22,7 +22,6 @@ class OracleValley:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The map."""
         return (self.map_name,)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -82,8 +81,7 @@ class OracleGain:
         log_evidence = self.log_evidence[objects].astype(np.float64)
         so_far = np.matmul(state.visited[rows, None].astype(np.float64), log_evidence)[:, 0]
         if self.scope == "local":
-            log_evidence = log_evidence[
-                np.arange(len(rows))[:, None], self.sphere.windows[current].reshape(len(rows), -1)
-            ]
+            window = self.sphere.windows[current].reshape(len(rows), -1)
+            log_evidence = log_evidence[np.arange(len(rows))[:, None], window]
         logs = self.calibration.log_belief(so_far[:, None] + log_evidence, state.step + 1, self.classes)
         return of_true_class(logs, self.labels[objects])

@@ -29,13 +29,12 @@ def _table(**fields: Any) -> type:
     return msgspec.defstruct("Table", fields.items(), frozen=True, forbid_unknown_fields=True)
 
 
-TABLES = {
+TABLES = {  # what a card's table holds, by its kind
     "fixed-sequence": _table(moves=list[list[int]]),
     "fixed-ring": _table(ring=int, steps=int),
     "class-table": _table(values=list[list[list[float]]]),
     "gain": GainTable,
 }
-"""What a card's table holds, by its kind."""
 
 
 class PolicyCard(

@@ -17,7 +17,7 @@ from nextview.policies.policy_card import bundled_policies, read_policy, read_po
 from nextview.recognition.map_names import SPHERE, in_order
 from nextview.recognition.model_card import MAPS, MEMORY_SUFFIX
 
-POLICIES: dict[str, Callable[[Any], Policy]] = {
+POLICIES: dict[str, Callable[[Any], Policy]] = {  # those of no map; each map has its own, see ``map_policy``
     "random": Random,
     "random-all": RandomAll,
     "furthest": Furthest,
@@ -26,11 +26,9 @@ POLICIES: dict[str, Callable[[Any], Policy]] = {
     "spread-local": lambda sphere: Spread(sphere, "local"),
     "visibility": Visibility,
 }
-"""Those that follow no map; every predicted map has its own, see ``map_policy``."""
 GROUP = "nextview.policies"  # entry points by which packages add policies of their own
 ANYWHERE = ("random-all", "spread", "visibility")  # those that need no grid
-VISIBLE = "visible-"
-"""Before the name of a gain policy: its values times the share of the object that is expected to show."""
+VISIBLE = "visible-"  # before a gain policy's name: its values times the share that is expected to show
 DEFAULT = "gain"  # the policy where none is named
 
 

@@ -1,7 +1,5 @@
 """Fuse the evidence of several views: belief over classes, calibration, size, and when to stop."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -18,10 +16,7 @@ Floating = NDArray[np.floating]
 
 
 def fuse(logits: Floating, temperature: float = 1.0) -> Float:
-    """Belief after several views: softmax of the sum of their logits (thesis, section 4.4), over a temperature.
-
-    From logits (..., views, classes), finite; (..., classes) float64, sums to 1.
-    """
+    """Belief, (..., classes), by logits (..., views, classes): softmax of their sum (thesis, section 4.4)."""
     logits = np.asarray(logits, np.float64)
     if not np.isfinite(logits).all():
         raise ModelError("the recogniser gave a logit that is not a finite number")
@@ -85,15 +80,11 @@ def of_true_class(logs: Float, labels: NDArray[np.int64]) -> Float:
 
 
 class RiskBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Upper bounds of the error rate of those who stop at a threshold, from validation objects.
+    """Upper bounds of the error rate of those who stop at a threshold, from validation objects."""
 
-    Of T ascending ``thresholds``, by the views that may be taken (1, 2, ...), (views, T); such a promise fails with the
-    probability ``delta``.
-    """
-
-    thresholds: tuple[float, ...]
-    bounds: tuple[tuple[float, ...], ...]
-    delta: float
+    thresholds: tuple[float, ...]  # ascending, (T,)
+    bounds: tuple[tuple[float, ...], ...]  # by the views that may be taken, 1, 2, ..., (views, T)
+    delta: float  # how often such a promise fails
 
     def __post_init__(self) -> None:
         ascending = all(a < b for a, b in zip(self.thresholds, self.thresholds[1:], strict=False))
@@ -123,33 +114,25 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 
     Azimuth bins count too, if the recogniser knows them: an object stands still, so views from different azimuths have
     to agree on where its azimuth bin 0 points. The belief in a class is multiplied by the likelihood of that agreement,
-    summed over all azimuths.
-
-    Attributes:
-        temperature: of a single view.
-        correlation: of the evidence of two views, 0 .. 1.
-        risk: for stopping with a promise; None if not known.
-        bin_correlation: of the azimuth bins of two views, 0 .. 1; None where these shall not count for the class.
-        hypotheses: what the azimuth bins are given, by the class of each, ascending: things, each in every resting pose
-            that it was taught in. () where they are given the classes.
-
-    Raises:
-        ModelError: a temperature that is not positive, a negative number, or hypotheses that are not of every class.
+    summed over all azimuths. ModelError: a temperature that is not positive, a negative number, or hypotheses that are
+    not of every class.
     """
 
-    temperature: float = 1.0
-    correlation: float = 0.0
-    risk: RiskBounds | None = None
+    temperature: float = 1.0  # of a single view
+    correlation: float = 0.0  # of the evidence of two views, 0 .. 1
+    risk: RiskBounds | None = None  # for stopping with a promise; None if not known
+    # of the azimuth bins of two views, 0 .. 1; None where these shall not count for the class
     bin_correlation: float | None = None
+    # what the azimuth bins are given, by the class of each, ascending: things, each in every resting pose that it was
+    # taught in. () where they are given the classes.
     hypotheses: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         numbers = (self.correlation, self.bin_correlation or 0.0)
         if not 0 < self.temperature < np.inf or not all(0 <= x < np.inf for x in numbers):
-            raise ModelError(
-                f"no calibration: temperature {self.temperature}, correlation {self.correlation}, of azimuth bins "
-                f"{self.bin_correlation}"
-            )
+            of_bins = f"of azimuth bins {self.bin_correlation}"
+            given = f"temperature {self.temperature}, correlation {self.correlation}, {of_bins}"
+            raise ModelError(f"no calibration: {given}")
         if self.hypotheses and not (set(np.diff((-1, *self.hypotheses)).tolist()) <= {0, 1}):
             raise ModelError("no calibration: the hypotheses are not of every class in order")
 
@@ -163,10 +146,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return self.temperature * (1 + self.correlation * (n_views - 1))
 
     def log_belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
-        """Logarithm of the belief in each class, up to a constant for all classes, (..., classes) float64.
-
-        ``total`` is the sum over ``n_views`` views, one number or (...), of ``log_evidence_of``.
-        """
+        """Log-belief in each class up to a constant, (..., classes), by a sum of ``log_evidence_of`` so many views."""
         if not np.isfinite(total).all():
             raise ModelError("the recogniser said something that is not a finite number")
         more = np.asarray(n_views)[..., None] - 1
@@ -191,10 +171,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return pointing / (1 + correlation * (np.asarray(n_views)[..., None, None] - 1))
 
     def joint(self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating) -> Float:
-        """Belief in each hypothesis seen from each azimuth bin, jointly, (..., hypotheses, azimuth bins), sums to 1.
-
-        From an azimuth, radians, (...); other arguments as for ``log_belief``.
-        """
+        """Belief in each hypothesis seen from each azimuth bin, jointly, (..., hypotheses, azimuth bins), sums to 1."""
         total = np.asarray(total, np.float64)
         logs = reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth)
         of_class = total[..., :classes] / self.temperature_after(np.asarray(n_views)[..., None])
@@ -206,10 +183,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return _softmax(self.log_belief(total, n_views, classes))
 
     def azimuth_bins(self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating) -> Float | None:
-        """Belief in the azimuth bin seen from an azimuth, radians, given each hypothesis, (..., hypotheses, bins).
-
-        None without azimuth bins; ``total`` as for ``log_belief``.
-        """
+        """Belief in the bin seen from an azimuth, given each hypothesis, (..., hypotheses, bins); None without bins."""
         if total.shape[-1] == classes:
             return None
         return _softmax(reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth))
@@ -221,22 +195,16 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return self.risk.threshold(risk, max_views)
 
 
-RARE, MUCH = 0.05, 2.0
-"""Share of the objects of a class that are smaller than usual, and larger; and times beyond that which none has."""
-PLAIN_SUM = Calibration()
-"""Trusts the sum of the logits as it stands, as the thesis did."""
+RARE, MUCH = 0.05, 2.0  # share of a class that is smaller than usual, and larger; times beyond that which none has
+PLAIN_SUM = Calibration()  # trusts the sum of the logits as it stands, as the thesis did
 
 
 class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """How likely each size is for an object of each class; it is added to the logits of views whose scale is known.
+    """How likely each size is for an object of each class; it is added to the logits of views whose scale is known."""
 
-    ``radii_m`` are object radii, metres, ascending, (R,); ``log_density`` that of their logarithm, (C, R); ``weight``
-    that of it beside the logits.
-    """
-
-    radii_m: tuple[float, ...]
-    log_density: tuple[tuple[float, ...], ...]
-    weight: float
+    radii_m: tuple[float, ...]  # object radii, metres, ascending, (R,)
+    log_density: tuple[tuple[float, ...], ...]  # that of their logarithm, (C, R)
+    weight: float  # beside the logits
 
     def __post_init__(self) -> None:
         radii, fits = np.array(self.radii_m), {len(row) for row in self.log_density} == {len(self.radii_m)}
@@ -244,7 +212,7 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
             raise ModelError("sizes that do not fit together")
 
     @classmethod
-    def from_arrays(cls, radii: Float, log_density: Float, weight: float) -> SizeEvidence:
+    def from_arrays(cls, radii: Float, log_density: Float, weight: float) -> "SizeEvidence":
         """From arrays (R,) and (C, R)."""
         return cls(tuple(radii.tolist()), tuple(map(tuple, log_density.tolist())), float(weight))
 
@@ -279,10 +247,8 @@ class Stopping:
 
     The threshold is ``threshold`` at the first view. With a ``threshold_decay`` its log-odds are then divided by
     ``1 + threshold_decay * (views - 1)``: what is unclear after several views is seldom cleared up by another one. A
-    calibrated belief whose threshold decay is its correlation stops where the plain sum of logits does.
-
-    Raises:
-        UsageError: a threshold outside 0 .. 1, fewer than one view, or a negative threshold decay.
+    calibrated belief whose threshold decay is its correlation stops where the plain sum of logits does. UsageError: a
+    threshold outside 0 .. 1, fewer than one view, or a negative threshold decay.
     """
 
     threshold: float = 0.97
@@ -299,7 +265,7 @@ class Stopping:
     @classmethod
     def of(
         cls, calibration: Calibration, threshold: float = 0.97, risk: float | None = None, max_views: int = 5
-    ) -> Stopping:
+    ) -> "Stopping":
         """The rule that goes with a recogniser's calibration: the threshold decays with its correlation.
 
         With a ``risk`` instead, the lowest threshold at which at most this share of those who stop early is wrong; it

@@ -1,7 +1,5 @@
 """What the models say of views: the evidence that belief and policies work with."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -35,7 +33,7 @@ class Evidence:
     novelty: NDArray[np.floating] | None = None
     observations: Sequence[Observation] | None = None
 
-    def select(self, rows: Any) -> Evidence:
+    def select(self, rows: Any) -> "Evidence":
         """Evidence of some of the episodes, by index or mask."""
 
         def some(values: Any) -> Any:

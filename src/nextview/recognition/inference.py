@@ -1,7 +1,5 @@
 """Run the networks with ONNX Runtime: the recogniser, map networks, and any file that a card describes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,10 +25,8 @@ BINS_OUTPUT = "sides"
 FEATURES_OUTPUT = "features"
 EMBEDDING_OUTPUT = "embedding"
 """Ends of a recogniser's ONNX file: the last is what its last layers make the logits of, (B, F)."""
-LONGEST = 300
-"""Letters of what the runtime says."""
-Shape = tuple[int | None, ...]
-"""Without the batch; None for a size that is free."""
+LONGEST = 300  # letters of what the runtime says
+Shape = tuple[int | None, ...]  # without the batch; None for a size that is free
 
 
 class OnnxFile(ort.InferenceSession):
@@ -43,7 +39,7 @@ class OnnxFile(ort.InferenceSession):
     def __reduce__(self) -> tuple[Any, tuple[Path, str, int]]:
         return open_onnx, self._opened
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> OnnxFile:
+    def __deepcopy__(self, memo: dict[int, Any]) -> "OnnxFile":
         return self
 
 
@@ -154,10 +150,7 @@ class Recogniser:
         return replace(evidence, logits=evidence.logits + self.card.size.logits(radii))
 
     def from_inputs(self, inputs: NDArray[Any], elevations: NDArray[np.floating] | None = None) -> Evidence:
-        """Evidence by shape alone, from what the network takes, see ``network_input``.
-
-        ``elevations`` of the cameras, radians, (B,), are for memories of things.
-        """
+        """Evidence by shape alone, from what the network takes; a memory needs elevations too, radians, (B,)."""
         names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins)
         outputs = dict(zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True))
         return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT))

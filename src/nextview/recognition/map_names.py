@@ -1,22 +1,13 @@
 """Names of the maps of measures, in cards, predictions and policies."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
-Good = Literal["peak", "valley"]
-"""Where a measure's map has the better views: at its highest values or its lowest."""
-
-CONFIDENCE = "confidence"
-"""The recogniser's confidence where it is right, as a measure of views; it takes predictions instead of views."""
-
+Good = Literal["peak", "valley"]  # where a measure's map has the better views: at its highest values or its lowest
+CONFIDENCE = "confidence"  # a measure of views: that of the recogniser where it is right; of predictions
 LEM, LCM = "lem", "lcm"
-MAP_NAMES = {"depth_entropy": LEM, CONFIDENCE: LCM}
-"""The maps of two measures have the thesis's names; those of all others are called as the measure."""
-
-SPHERE = "-sphere"
-"""How the name of a map of the whole sphere ends; without this it is the map of the local window."""
+MAP_NAMES = {"depth_entropy": LEM, CONFIDENCE: LCM}  # the thesis's; all others are called as their measure
+SPHERE = "-sphere"  # how the name of a map of the whole sphere ends; without this it is the map of the local window
 
 
 def map_name(measure: str) -> str:

@@ -1,7 +1,5 @@
 """The memory of taught things: what each looks like from around, and how likely a view is given each of them."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -20,38 +18,26 @@ from nextview.recognition.inference import Features, Recogniser
 from nextview.recognition.model_card import MEMORY_SUFFIX, find_card
 from nextview.recognition.novelty import Quantiles, unit
 
-RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)
-"""Elevations of the remembered views, degrees."""
-AZIMUTHS = 16
-"""Remembered views on a ring: the azimuth bins of a memory."""
+RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the remembered views, degrees
+AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
 Float = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What T things look like, each in one or more resting poses: H of these in all, sorted by the class of the thing.
+    """What T things look like, each in one or more resting poses: H of these in all, sorted by class."""
 
-    Attributes:
-        views: embedding of each remembered view, unit vectors, (H, rings, azimuths, F); zero where nothing is
-            remembered.
-        thing: which thing each resting pose is of, (H,) int64.
-        rotations: of each resting pose, from the file's axes, (H, 3, 3) float32.
-        held_out: embeddings of views through a sensor that are not remembered, K of each thing in its first resting
-            pose, (T, K, F): what calibration and reports are made of.
-        held_out_views: elevation and azimuth of each, radians, (T, K, 2) float32.
-        radii: object radius of each thing, metres, (T,) float32; NaN where it is not known.
-        pictures: a picture of each thing, (T, 64, 64) uint8.
-        head, head_bias: a linear classifier of embeddings for classes of several things, (F, C) and (C,).
-    """
-
+    # embedding of each remembered view, unit vectors, (H, rings, azimuths, F); zero where nothing is remembered
     views: Float
-    thing: NDArray[np.int64]
-    rotations: Float
+    thing: NDArray[np.int64]  # which thing each resting pose is of, (H,) int64
+    rotations: Float  # of each resting pose, from the file's axes, (H, 3, 3) float32
+    # embeddings of views through a sensor that are not remembered, K of each thing in its first resting pose, (T, K,
+    # F): what calibration and reports are made of
     held_out: Float
-    held_out_views: Float
-    radii: Float
-    pictures: NDArray[np.uint8]
-    head: Float
+    held_out_views: Float  # elevation and azimuth of each, radians, (T, K, 2) float32
+    radii: Float  # object radius of each thing, metres, (T,) float32; NaN where it is not known
+    pictures: NDArray[np.uint8]  # a picture of each thing, (T, 64, 64) uint8
+    head: Float  # a linear classifier of embeddings for classes of several things, (F, C) and (C,)
     head_bias: Float
 
     def __post_init__(self) -> None:
@@ -89,10 +75,8 @@ def read_memory(path: Path, sha256: str) -> Memory:
 def similarities(views: Float, embeddings: Float, elevations: Float) -> NDArray[np.float32]:
     """How alike views are to what is remembered, between two rings interpolated: cosines, (B, H, azimuths) float32.
 
-    Args:
-        views: of the memory, ring by ring, (rings, H * azimuths, F) float32.
-        embeddings: of the views, unit vectors, (B, F) float32.
-        elevations: from which they were taken, radians, (B,).
+    The memory's ``views`` are ring by ring, (rings, H * azimuths, F) float32; ``embeddings`` unit vectors, (B, F)
+    float32; ``elevations`` those from which the views were taken, radians, (B,).
     """
     place = np.interp(elevations, np.radians(RINGS), np.arange(len(RINGS)))
     found = np.zeros((len(embeddings), views.shape[1]), np.float32)

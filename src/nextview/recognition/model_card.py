@@ -1,7 +1,5 @@
 """The card of a model: what it is, how it was made, how good it is, and which file holds its weights."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,15 +16,11 @@ from nextview.recognition.network_input import InputSpec
 
 BUNDLED = Path(__file__).parent / "bundled"
 RECOGNISER = "recogniser-modelnet10"
-FEATURES = "features"
-"""The bundled network that knows no classes: what taught things are remembered by."""
+FEATURES = "features"  # the bundled network that knows no classes: what taught things are remembered by
 MEMORY_SUFFIX = ".safetensors"
-DISCRIMINATE = "discriminate"
-"""The policy of a memory of things; its card is that of the memory."""
-COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}
-"""Recognisers that are bundled, by the name of the models they belong to."""
-MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}
-"""The map networks that are bundled, by the name of the map."""
+DISCRIMINATE = "discriminate"  # the policy of a memory of things; its card is that of the memory
+COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}  # bundled recognisers, by the name of their models
+MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}  # the map networks that are bundled, by the name of the map
 NOWHERE = Path()
 
 
@@ -47,76 +41,50 @@ class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a memory of things is of: the things in order, the features it is made of, and the weight of a cosine.
+    """What a memory of things is of."""
 
-    ``novelty`` are quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative log-likelihood of known
-    things, given the class that explains them best.
-    """
-
-    things: tuple[Thing, ...]
-    features_sha256: Sha256
-    weight: float
+    things: tuple[Thing, ...]  # in order
+    features_sha256: Sha256  # of the features that it is made of
+    weight: float  # of a cosine
     attribution: str = ""
+    # quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative log-likelihood of known things, given
+    # the class that explains them best
     novelty: tuple[tuple[float, ...], ...] = ()
 
 
 class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="schema", tag=2):
     """One model; as a file, a JSON object of these fields beside the file of the same name with its weights.
 
-    That is an ONNX file; of a memory of taught things, which is a recogniser too, a safetensors file.
-
-    Attributes:
-        name: what users call it.
-        kind: "recogniser" or the name of the map that it predicts ("lem").
-        input: what it takes of a view.
-        sha256: of that file.
-        path: of that file; it does not stand in the card.
-        network: which architecture, in words.
-        classes: of a recogniser, unique, in the order of its logits.
-        azimuth_bins: of an object that a recogniser discriminates; 0 for none.
-        calibration: of a recogniser.
-        size: what a recogniser knows of the sizes of objects; None if nothing.
-        novelty_sha256: of the novelty score beside the card; "" if there is none.
-        measure: of which a map network predicts the map.
-        good: where such a map has the better views.
-        output: of a map network: the local window, or the whole sphere, of which the window is a part.
-        valley_classes: for which the valley of its map was found to be the better view.
-        valley_gain: by how much, for each class.
-        training: how it was made.
-        scores: on each set of objects.
-        largest_difference_to_torch: of the file's answers; None if it was not measured.
-        note: what else is to be said.
-        held_out: objects of the training split that it was not trained on; () if it does not say.
-        fitted_to: what calibration, size, novelty and valleys were fitted to, in words, by their names.
-        memory: of a recogniser that was taught things; None for a network.
-
-    Raises:
-        ModelError: a recogniser without classes, sizes of other classes than these, or a network of no input.
+    That is an ONNX file; of a memory of taught things, which is a recogniser too, a safetensors file. ModelError: a
+    recogniser without classes, sizes of other classes than these, or a network of no input.
     """
 
-    name: str
-    kind: str
-    input: InputSpec
-    sha256: Sha256
-    path: Path = NOWHERE
-    network: str = ""
-    classes: tuple[str, ...] = ()
-    azimuth_bins: int = 0
-    calibration: Calibration = PLAIN_SUM
-    size: SizeEvidence | None = None
+    name: str  # what users call it
+    kind: str  # "recogniser" or the name of the map that it predicts ("lem")
+    input: InputSpec  # what it takes of a view
+    sha256: Sha256  # of that file
+    path: Path = NOWHERE  # of that file; it does not stand in the card
+    network: str = ""  # which architecture, in words
+    classes: tuple[str, ...] = ()  # of a recogniser, unique, in the order of its logits
+    azimuth_bins: int = 0  # of an object that a recogniser discriminates; 0 for none
+    calibration: Calibration = PLAIN_SUM  # of a recogniser
+    size: SizeEvidence | None = None  # what a recogniser knows of the sizes of objects; None if nothing
+    # of the novelty score beside the card; "" if there is none
     novelty_sha256: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")] = ""
-    measure: str = ""
-    good: Good = "peak"
+    measure: str = ""  # of which a map network predicts the map
+    good: Good = "peak"  # where such a map has the better views
+    # of a map network: the local window, or the whole sphere, of which the window is a part
     output: Literal["window", "sphere"] = "window"
-    valley_classes: tuple[str, ...] = ()
-    valley_gain: dict[str, float] = {}
-    training: Training = Training()
-    scores: dict[str, Any] = {}
-    largest_difference_to_torch: float | None = None
-    note: str = ""
-    held_out: tuple[str, ...] = ()
+    valley_classes: tuple[str, ...] = ()  # for which the valley of its map was found to be the better view
+    valley_gain: dict[str, float] = {}  # by how much, for each class
+    training: Training = Training()  # how it was made
+    scores: dict[str, Any] = {}  # on each set of objects
+    largest_difference_to_torch: float | None = None  # of the file's answers; None if it was not measured
+    note: str = ""  # what else is to be said
+    held_out: tuple[str, ...] = ()  # objects of the training split that it was not trained on; () if it does not say
+    # what calibration, size, novelty and valleys were fitted to, in words, by their names
     fitted_to: dict[str, str] = {}
-    memory: Taught | None = None
+    memory: Taught | None = None  # of a recogniser that was taught things; None for a network
 
     def __post_init__(self) -> None:
         if not self.name or not self.kind:
@@ -142,7 +110,7 @@ class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
         """The classes for which the valley of its map is the better view: as was fitted, or else all or none."""
         return tuple(classes) if self.good == "valley" and not self.valley_gain else self.valley_classes
 
-    def made_by(self, *commands: str) -> ModelCard:
+    def made_by(self, *commands: str) -> "ModelCard":
         """The same with further commands; one that it names already is not named again."""
         commands = tuple(dict.fromkeys((*self.training.commands, *commands)))
         return replace(self, training=replace(self.training, commands=commands))

@@ -1,7 +1,5 @@
 """What the networks take of a view: geometry, a grey image or a cloud, of live views and of those of a store."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -16,18 +14,14 @@ from nextview.geometry.observation import Observation
 Float = NDArray[np.float64]
 InputKind = Literal["geometry", "image", "cloud"]
 CHANNELS = ("facing", "up", "height", "nearness")
-CHANNELS_OF = {"geometry": len(CHANNELS), "image": 1}
-"""Channels of the kinds of input that are images."""
+CHANNELS_OF = {"geometry": len(CHANNELS), "image": 1}  # channels of the kinds of input that are images
 
 
 class InputSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a network takes of a view: a kind, see ``geometry_input``, ``image_input`` and ``cloud_input``.
+    """What a network takes of a view."""
 
-    ``size`` is the side of the image, pixels; 0 for a cloud.
-    """
-
-    kind: InputKind
-    size: int = 0
+    kind: InputKind  # see ``geometry_input``, ``image_input`` and ``cloud_input``
+    size: int = 0  # side of the image, pixels; 0 for a cloud
 
     def __post_init__(self) -> None:
         if self.size < 0 or (self.kind == "cloud") != (self.size == 0):

@@ -1,7 +1,5 @@
 """A stopping rule of your own: a function of what is believed, in live use and in the benchmark."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -40,8 +38,7 @@ class Believed:
         return -np.asarray((self.belief * np.log2(np.maximum(self.belief, 1e-300))).sum(-1), np.float64)
 
 
-Rule = Callable[[Believed, float], NDArray[np.bool_]]
-"""Whether to stop, (...) bool, by what is believed and by the threshold that was asked for."""
+Rule = Callable[[Believed, float], NDArray[np.bool_]]  # whether to stop, (...), by a threshold
 
 
 @dataclass(frozen=True)

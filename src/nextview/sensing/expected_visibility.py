@@ -1,7 +1,5 @@
 """What depth frames say of each voxel around an object, and the share of it that is expected to show from elsewhere."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
@@ -19,8 +17,7 @@ if TYPE_CHECKING:
 
 Floating = NDArray[np.floating]
 Float32 = NDArray[np.float32]
-UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)
-"""What a voxel can be. Of what several frames say of it the largest counts, in whatever order they come."""
+UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)  # of a voxel; of several frames the largest counts
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ class Occupancy:
     cells: NDArray[np.uint8]
 
     @classmethod
-    def unseen(cls, grid: VoxelGrid, region: NDArray[np.bool_] | None = None) -> Occupancy:
+    def unseen(cls, grid: VoxelGrid, region: NDArray[np.bool_] | None = None) -> "Occupancy":
         """Before the first frame; outside of a region, (n, n, n) bool, if one is given, all is known to be free."""
         return cls(grid, np.full((grid.n,) * 3, UNSEEN) if region is None else np.where(region, UNSEEN, FREE))
 
@@ -87,7 +84,7 @@ class Occupancy:
         intrinsics: Floating,
         object_mask: NDArray[np.bool_] | None = None,
         background_free: bool = True,
-    ) -> Occupancy:
+    ) -> "Occupancy":
         """With what one more depth frame says.
 
         The voxels that its points lie in are occupied. A voxel is free if its middle lies in front of what the pixel
@@ -111,7 +108,7 @@ class Occupancy:
             cells[hit] = np.maximum(cells[hit], what)
         return Occupancy(grid, cells.reshape(self.cells.shape))
 
-    def and_also(self, other: Occupancy) -> Occupancy:
+    def and_also(self, other: "Occupancy") -> "Occupancy":
         """What both say together, of one grid."""
         return Occupancy(self.grid, np.maximum(self.cells, other.cells))
 
@@ -128,21 +125,15 @@ def _in_front(points: Float32, reach: Float32, pose: Floating, intrinsics: Float
     return inside & (z < reach.reshape(-1).take(pixel))
 
 
-GRID = VoxelGrid(64, 2.0)
-"""Around the object, in object radii: what stands beside it has a place there."""
-BLOCK = 4
-"""Voxels along the side of the blocks that stand for parts of the object."""
+GRID = VoxelGrid(64, 2.0)  # around the object, in object radii: what stands beside it has a place there
+BLOCK = 4  # voxels along the side of the blocks that stand for parts of the object
 UNSEEN_PART = 0.01
 """Weight of an unseen voxel of the object's unit ball, where one of the object has 1: before anything of the object was
 seen they are all there is."""
-DENSITY = 0.2
-"""How often unseen space is filled, per object radius: between the two bounds."""
-SOLID = 1e3
-"""A density, per voxel, through which nothing is seen."""
-TOGETHER = 400
-"""Lines that are drawn at once."""
-LOWEST = 0.02
-"""Share of a frame's points that may lie below the height of the table: noise."""
+DENSITY = 0.2  # how often unseen space is filled, per object radius: between the two bounds
+SOLID = 1e3  # a density, per voxel, through which nothing is seen
+TOGETHER = 400  # lines that are drawn at once
+LOWEST = 0.02  # share of a frame's points that may lie below the height of the table: noise
 
 
 @dataclass(frozen=True)
@@ -178,21 +169,18 @@ class SeenScene:
         near = heights[np.abs(heights) <= 1.2]
         return type(self)(occupancy, min(self.floor, float(np.quantile(near, LOWEST)) if len(near) else np.inf))
 
-    def and_also(self, other: SeenScene) -> Self:
+    def and_also(self, other: "SeenScene") -> Self:
         """As if all frames of both had been seen, of one grid."""
         return type(self)(self.occupancy.and_also(other.occupancy), min(self.floor, other.floor))
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """Share of an object that shows from V positions, (V,) float64, 0 to 1, by what unseen space is.
+    """Share of an object that shows from V positions, (V,) float64, 0 to 1, by what unseen space is."""
 
-    All of it solid for ``least``, as often filled as on the average for ``expected``, all of it free for ``most``.
-    """
-
-    least: NDArray[np.float64]
-    expected: NDArray[np.float64]
-    most: NDArray[np.float64]
+    least: NDArray[np.float64]  # all of it solid
+    expected: NDArray[np.float64]  # as often filled as on the average
+    most: NDArray[np.float64]  # all of it free
 
 
 def expected_visibility(
@@ -209,7 +197,7 @@ def expected_visibility(
 
 
 @lru_cache(maxsize=64)
-def sight_lines(grid: VoxelGrid, positions: bytes) -> SightLines:
+def sight_lines(grid: VoxelGrid, positions: bytes) -> "SightLines":
     """Sight lines to the bytes of (V, 3) float64: the same ones are asked for again and again."""
     return SightLines(grid, np.frombuffer(positions).reshape(-1, 3))
 
@@ -238,7 +226,7 @@ class SightLines:
         return np.unique(self.blocks)
 
     @cached_property
-    def passed(self) -> csr_array:
+    def passed(self) -> "csr_array":
         """How often the line from each part to each camera, in steps of a voxel, is in each voxel, (P * V, n^3)."""
         from scipy.sparse import csr_array  # slow to import, and few sessions are about scenes
 

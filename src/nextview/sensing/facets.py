@@ -6,8 +6,6 @@ a pixel, so n . P = 1 for every point P of the plane. Noise is averaged, holes a
 edges stay sharp because a pixel may take the plane of a window beside it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,27 +18,16 @@ from nextview.geometry.viewsphere import DISTANCE
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]
-
-CLOSE_ENOUGH = 1.5
-"""Standard deviations of noise that a window may deviate from its plane."""
-STEEPEST_ERROR = 0.1
-"""Error of the slope (tangent) that noise may leave: six degrees of the normal."""
-FINEST = 2e-4
-"""Relative noise of depth that even the best frame is taken to have."""
-STEEPEST = np.tan(np.radians(85.0))
-"""Slope towards the ray beyond which neighbouring pixels are taken for two surfaces."""
-BINS = 4
-"""Ranges of depth in which the noise is measured, with equally many pixels."""
-ROWS = 20
-"""About so many rows of a picture are enough to measure it."""
-LAGS = (1, 2, 4, 6)
-"""Distances of the pixels that are compared: in many sensors neighbours err together."""
-NEAREST, FARTHEST = 0.5, 100.0
-"""Depth of what can be shown, object radii; all of the object is between 2 and 4."""
-WIDEST = 1 / 16
-"""Half the width of what one sensor pixel covers here at most, as a part of the image: it bounds the time."""
-LAYER = 0.03
-"""Object radii of depth within which facets are of one surface; the nearest to a pixel is shown."""
+CLOSE_ENOUGH = 1.5  # standard deviations of noise that a window may deviate from its plane
+STEEPEST_ERROR = 0.1  # error of the slope (tangent) that noise may leave: six degrees of the normal
+FINEST = 2e-4  # relative noise of depth that even the best frame is taken to have
+STEEPEST = np.tan(np.radians(85.0))  # slope towards the ray beyond which neighbouring pixels are taken for two surfaces
+BINS = 4  # ranges of depth in which the noise is measured, with equally many pixels
+ROWS = 20  # about so many rows of a picture are enough to measure it
+LAGS = (1, 2, 4, 6)  # distances of the pixels that are compared: in many sensors neighbours err together
+NEAREST, FARTHEST = 0.5, 100.0  # depth of what can be shown, object radii; all of the object is between 2 and 4
+WIDEST = 1 / 16  # half of what one sensor pixel covers here at most, as a part of the image: it bounds the time
+LAYER = 0.03  # object radii of depth within which facets are of one surface; the nearest to a pixel is shown
 
 
 @dataclass(frozen=True)
@@ -87,17 +74,13 @@ def _sigma(second: NDArray[np.floating]) -> float:
 
 @dataclass(frozen=True)
 class Facets:
-    """Planes of the N pixels of an object, in the camera's frame.
+    """Planes of the N pixels of an object, in the camera's frame."""
 
-    ``planes`` are n of each, with n . P = 1 for points P of the plane, (N, 3), 1/metres; ``rays`` (x, y, 1) through the
-    pixels' centres, (N, 3); ``pitch`` the distance between neighbouring ones along x and y at depth 1, (2,).
-    """
-
-    planes: Float
-    rays: Float
+    planes: Float  # n of each, with n . P = 1 for points P of the plane, (N, 3), 1/metres
+    rays: Float  # (x, y, 1) through the pixels' centres, (N, 3)
     rows: Index
     columns: Index
-    pitch: Float
+    pitch: Float  # distance between neighbouring rays along x and y at depth 1, (2,)
 
     @property
     def points(self) -> Float:
@@ -283,10 +266,7 @@ def _deviation(planes: Float, here: Float, own: Float) -> Float:
 
 
 def virtual_pose(pose: Float) -> Float:
-    """Where the networks would have looked from: in the camera's direction, at their distance, horizon level.
-
-    From and to camera-to-world, (4, 4), OpenCV axes, object frame, object radii.
-    """
+    """The pose, (4, 4), that the networks would have looked from: in a camera's direction, at their distance, level."""
     position = pose[:3, 3]
     outward = position / np.linalg.norm(position) if position.any() else -pose[:3, 2]
     right = np.array([-outward[1], outward[0], 0.0])

@@ -1,7 +1,5 @@
 """One frame of a depth camera, in the units and axes of nextview, or refused in words."""
 
-from __future__ import annotations
-
 from dataclasses import InitVar, dataclass
 
 import numpy as np
@@ -11,12 +9,9 @@ from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.observation import LARGEST, array_of, numbers
 
-FARTHEST = 65.0
-"""Metres: float depth beyond is nothing; uint16 millimetres reach as far."""
-LARGEST_MEDIAN = 20.0
-"""Metres: beyond it a depth image is of another unit. Inches are 39 times as many as metres."""
-ASPECTS = (4 / 3, 16 / 9, 16 / 10, 512 / 424, 640 / 576)
-"""Width over height of what sensors give, as against parts that were cut out of it."""
+FARTHEST = 65.0  # metres: float depth beyond is nothing; uint16 millimetres reach as far
+LARGEST_MEDIAN = 20.0  # metres; a depth image beyond is of another unit: inches are 39 times as many
+ASPECTS = (4 / 3, 16 / 9, 16 / 10, 512 / 424, 640 / 576)  # width over height of whole pictures
 AXES = {
     "opencv": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
@@ -24,8 +19,7 @@ AXES = {
 }
 """Of a camera pose: OpenCV's (x right, y down, z forward), OpenGL's (x right, y up, z backward) and those of a robot's
 body (x forward, y left, z up; ROS REP 103). Columns: OpenCV's axes in the named ones."""
-LUMA = np.array([0.299, 0.587, 0.114])
-"""Weights of red, green and blue in a grey image (ITU-R BT.601)."""
+LUMA = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue in a grey image (ITU-R BT.601)
 
 
 @dataclass(frozen=True)
@@ -70,19 +64,16 @@ class Frame:
         if self.mask is not None:
             mask = array_of(self.mask, "the mask")
             if mask.shape != depth.shape or mask.dtype != bool:
-                raise ObservationError(
-                    f"a mask is (H, W) bool as the depth, {depth.shape}, not {mask.shape} {mask.dtype}"
-                )
+                given = f"{mask.shape} {mask.dtype}"
+                raise ObservationError(f"a mask is (H, W) bool as the depth, {depth.shape}, not {given}")
             if not (mask & (depth > 0)).any():
                 raise ObservationError("no pixel of the mask has a depth: a mask of another image, or empty")
             object.__setattr__(self, "mask", mask.copy())
         if self.image is not None:
             image = array_of(self.image, "the image")
             if image.dtype != np.uint8 or image.shape not in (depth.shape, (*depth.shape, 3)):
-                raise ObservationError(
-                    f"an image is (H, W) or (H, W, 3) uint8 registered to the depth, {depth.shape}, not {image.shape} "
-                    f"{image.dtype}"
-                )
+                wanted = f"(H, W) or (H, W, 3) uint8 registered to the depth, {depth.shape}"
+                raise ObservationError(f"an image is {wanted}, not {image.shape} {image.dtype}")
             object.__setattr__(self, "image", image if image.ndim == 2 else np.rint(image @ LUMA).astype(np.uint8))
 
     @property
@@ -161,20 +152,16 @@ def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[
         raise ObservationError("the focal lengths have to be positive: an image that is flipped?")
     focal = min(k[0, 0], k[1, 1])
     if focal < 0.1 * max(shape):
-        raise ObservationError(
-            f"a focal length of {focal:.3g} is too short for an image of {width} x {height}: it is expected in "
-            "pixels, not in millimetres or parts of the image"
-        )
+        short = f"a focal length of {focal:.3g} is too short for an image of {width} x {height}"
+        raise ObservationError(f"{short}: it is expected in pixels, not in millimetres or parts of the image")
     point = f"the principal point ({k[0, 2]:.0f}, {k[1, 2]:.0f}) is"
     if not (-width < k[0, 2] < 2 * width and -height < k[1, 2] < 2 * height):
         raise ObservationError(f"{point} far off an image of {width} x {height}: intrinsics of another resolution?")
     across, down = 2 * k[0, 2] / width, 2 * k[1, 2] / height  # 1 in the middle
     scale, whole = (across + down) / 2, min(abs(width / height / aspect - 1) for aspect in ASPECTS) < 0.01
     if whole and abs(scale - 1) > 0.2 and abs(across - down) < 0.08 * scale:
-        raise ObservationError(
-            f"{point} the middle of an image of {scale * width:.0f} x {scale * height:.0f}, and the depth is {width} x "
-            f"{height}: intrinsics of another resolution"
-        )
+        sizes = f"{scale * width:.0f} x {scale * height:.0f}, and the depth is {width} x {height}"
+        raise ObservationError(f"{point} the middle of an image of {sizes}: intrinsics of another resolution")
     return k
 
 

@@ -1,17 +1,12 @@
 """Masks as segmenters give them: pixels at their edge that belong to what is behind are taken away."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, binary_fill_holes, label, minimum_filter
 
-EDGE = 6
-"""A segmenter's edge may be off by so many pixels."""
-STEP = 0.01
-"""Neighbouring pixels of one surface differ by at most this part of their depth, and THICK."""
-THICK = 0.004
-"""Metres."""
+EDGE = 6  # a segmenter's edge may be off by so many pixels
+STEP = 0.01  # neighbouring pixels of one surface differ by at most this part of their depth, and THICK
+THICK = 0.004  # metres
 Mask = NDArray[np.bool_]
 
 

@@ -1,7 +1,5 @@
 """Where the object is in the world: the frame in which nextview thinks of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from itertools import chain, combinations
 from typing import Any

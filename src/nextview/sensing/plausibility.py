@@ -1,7 +1,5 @@
 """Refuse what cannot be right in a frame, and name the likely mistake behind an observation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,28 +11,18 @@ from nextview.geometry.observation import Observation
 from nextview.sensing.frame import AXES, Frame
 
 Float = NDArray[np.float64]
-
-SAMPLE = 500
-"""Pixels that are looked at."""
-FEWEST = 20
-"""Pixels with a depth below which nothing is seen."""
-OUTERMOST = 1.15
-"""How far from the origin a surface may be, object radii: 1, and what an estimated centre and radius may be off."""
-INNERMOST = 0.4
-"""How far from the origin the outermost of what is seen has to be."""
-CONTRADICTION = 0.2
-"""Share of the surface seen in one view of which another view says that it is not there, from which they contradict."""
-OFF_CENTRE = 0.25
-"""How far a principal point is from the middle of a picture that is no part of a larger one, half sides of it."""
-FAR_DEPTH = 10.0
-"""Metres: few depth cameras measure farther, and no object that stands on something fills a picture from there."""
-TOO_FAR = 2.5
-"""So many times as far as a frame shows anything an object cannot be: of a near one only the front shows."""
+SAMPLE = 500  # pixels that are looked at
+FEWEST = 20  # pixels with a depth below which nothing is seen
+OUTERMOST = 1.15  # how far from the origin a surface may be, object radii: centre and radius are estimates
+INNERMOST = 0.4  # how far from the origin the outermost of what is seen has to be
+CONTRADICTION = 0.2  # views contradict if one misses this share of the surface that the other saw
+OFF_CENTRE = 0.25  # how far a principal point is from the middle of an uncropped picture, at most, half sides of it
+FAR_DEPTH = 10.0  # metres: few depth cameras measure farther, and nothing fills a picture from there
+TOO_FAR = 2.5  # so many times as far as a frame shows anything an object cannot be: of a near one only the front shows
 STILL, CHANGED, CHANGED_SHARE = 1e-3, 0.04, 0.03
 """Metres, and parts of a rotation, up to which a pose is the same; and the part of the distance by which a pixel has
 changed, and the share of pixels that have to."""
-FAR_ORIGIN = 30.0
-"""Metres from the origin of the world, within which robots work; where positions in millimetres begin."""
+FAR_ORIGIN = 30.0  # metres from the origin of the world, within which robots work; where positions in millimetres begin
 
 
 @dataclass(frozen=True)
@@ -55,10 +43,8 @@ def refuse_far(frame: Frame, last: Frame | None, target: Float | None, radius: f
     if last is not None:
         moved, reach = np.linalg.norm(camera - last.camera_to_world[:3, 3]), farthest + float(last.depth.max())
         if moved > TOO_FAR * reach:
-            raise ObservationError(
-                f"the camera is {moved:.0f} m from where it was, and what it sees is within {reach:.1f} m: is the pose "
-                "in millimetres?"
-            )
+            what = f"the camera is {moved:.0f} m from where it was, and what it sees is within {reach:.1f} m"
+            raise ObservationError(f"{what}: is the pose in millimetres?")
     distance = 0.0 if target is None or frame.mask is not None else np.linalg.norm(target - camera)
     if distance - radius > TOO_FAR * farthest:
         raise ObservationError(
@@ -134,18 +120,14 @@ def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
     """Name and message of the mistake without which the points would lie in the unit sphere."""
     reach, distance = _reach(points, pose), float(np.linalg.norm(pose[:3, 3]))
     if reach < INNERMOST:
-        return "scale", (
-            f"all that is seen lies within {reach:.2g} object radii of the object's centre: lengths in metres? Divide "
-            "depth and camera position by the object radius"
-        )
+        what = f"all that is seen lies within {reach:.2g} object radii of the object's centre"
+        return "scale", f"{what}: lengths in metres? Divide depth and camera position by the object radius"
     for name, said in (("opengl", "OpenGL's (x right, y up, z backward)"), ("ros", "a ROS body's (x forward, z up)")):
         turned = pose.copy()
         turned[:3, :3] = pose[:3, :3] @ AXES[name]
         if _plausible(points, turned):
-            return f"{name} axes", (
-                f"the view looks away from the object: the camera's axes are {said}, OpenCV's (x right, y down, z "
-                "forward) are expected"
-            )
+            wrong = f"the camera's axes are {said}, OpenCV's (x right, y down, z forward) are expected"
+            return f"{name} axes", f"the view looks away from the object: {wrong}"
     if _plausible(points, np.asarray(np.linalg.inv(pose), np.float64)):
         return "inverse pose", "the pose is inverse: camera-to-world is expected, this is world-to-camera"
     middle = float(np.median(np.linalg.norm(points, axis=1)))
@@ -154,14 +136,10 @@ def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
         scaled = pose.copy()
         scaled[:3, 3] /= scale
         if _plausible(points * scale, pose) or _plausible(points, scaled):
-            return "scale", (
-                f"depth and the camera's distance of {distance:.2g} do not fit, by a factor of {scale:.2g}: is one "
-                "in metres? Both are expected in object radii"
-            )
-    return "outside", (
-        f"the surface that is seen reaches {reach:.2g} object radii from the object's centre, more than 1: a wrong "
-        "pose, centre or radius, or more in the picture than the object?"
-    )
+            unfit = f"depth and the camera's distance of {distance:.2g} do not fit, by a factor of {scale:.2g}"
+            return "scale", f"{unfit}: is one in metres? Both are expected in object radii"
+    what = f"the surface that is seen reaches {reach:.2g} object radii from the object's centre, more than 1"
+    return "outside", f"{what}: a wrong pose, centre or radius, or more in the picture than the object?"
 
 
 def check_views(first: Observation, second: Observation) -> list[ViewWarning]:

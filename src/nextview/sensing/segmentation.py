@@ -1,11 +1,10 @@
 """The support plane, and which pixels lie above it, in a box or in a sphere."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -15,18 +14,12 @@ from nextview.sensing.object_frame import Box
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-TRIALS = 200
-"""Planes that are tried: with one point in ten on the plane, 0.8 of all draws hit it at least once."""
-TILT = np.cos(np.radians(12.0))
-"""Cosine of the lean of a support plane against gravity, at most: errors of a calibration."""
-LEAST = 0.04
-"""Share of what is seen that lies on a support plane, at least; more if gravity is not known."""
+TRIALS = 200  # planes that are tried: with one point in ten on the plane, 0.8 of all draws hit it at least once
+TILT = np.cos(np.radians(12.0))  # cosine of the lean of a support plane, at most: errors of a calibration
+LEAST = 0.04  # share of what is seen that lies on a support plane, at least; more if gravity is not known
 LEAST_ALONE = 0.15
-RANGE = 1.05
-"""Times as much of a frame lies on a plane as range, if it is range: wide lenses show it, narrow ones hardly bend."""
-SAMPLES = 1500
-"""Pixels in which planes are searched."""
+RANGE = 1.05  # times as much of a frame lies on a plane as range, if it is range: narrow lenses hardly bend one
+SAMPLES = 1500  # pixels in which planes are searched
 
 
 @dataclass(frozen=True)
@@ -76,9 +69,7 @@ class Plane:
         return samples.points[on & (part == np.bincount(part[on]).argmax())]
 
 
-def find_plane(
-    samples: Samples, rng: np.random.Generator, up: Float | None = None, above: Float | None = None
-) -> Plane | None:
+def find_plane(samples: Samples, rng: Generator, up: Float | None = None, above: Float | None = None) -> Plane | None:
     """The plane with most samples on it, by RANSAC (Fischler and Bolles 1981), with all trials in one product.
 
     The camera and a point ``above``, (3,), lie above it, and it is level against ``up``, (3,), where these are given.
@@ -127,9 +118,7 @@ def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
     return plane
 
 
-def lies_better_as_range(
-    frame: Frame, plane: Plane | None, samples: Samples, rng: np.random.Generator, up: Float | None
-) -> bool:
+def lies_better_as_range(frame: Frame, plane: Plane | None, samples: Samples, rng: Generator, up: Float | None) -> bool:
     """Whether more of a frame lies on a plane if its depth is taken for the distance along each ray."""
     along = samples.points - samples.camera
     depth = along @ frame.camera_to_world[:3, 2]

@@ -1,7 +1,5 @@
 """The loop: observe, believe, stop or choose, move. One for a robot and for a hundred thousand replays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -18,8 +16,7 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration, Stopping, log_ev
 from nextview.sensing.expected_visibility import SeenScene, expected_visibility
 
 Float = NDArray[np.float64]
-VISITED = np.radians(6.0)
-"""Views within this angle of where a camera stood count as visited, beside the nearest one: it saw what they show."""
+VISITED = np.radians(6.0)  # views within this angle of where a camera stood count as visited: it saw what they show
 
 
 @dataclass(frozen=True)
@@ -61,10 +58,8 @@ class Taken:
     places: Float | None  # where they stood so far, (A, step, 3); None where these are the views themselves
 
 
-Visible = Callable[[EpisodeState], Float]
-"""Expected share of the object that shows from each view in the episodes of a state, (B, V)."""
-Constrain = Callable[[EpisodeState], EpisodeState]
-"""The state with where robots can go (``reachable``) and what that costs them (``travel``)."""
+Visible = Callable[[EpisodeState], Float]  # expected share of the object that shows from each view, (B, V)
+Constrain = Callable[[EpisodeState], EpisodeState]  # with where robots can go, and what it costs
 
 
 def unconstrained(state: EpisodeState) -> EpisodeState:
@@ -73,26 +68,17 @@ def unconstrained(state: EpisodeState) -> EpisodeState:
 
 
 class Episodes:
-    """B episodes side by side. Give ``update`` what was seen from ``current``, until ``running`` is empty.
-
-    Args:
-        sphere: the viewpoints.
-        policy: chooses where to go.
-        starts: first view of each episode, (B,).
-        stopping: when an episode ends; a sphere with fewer views than ``max_views`` ends it too.
-        rng: for policies that draw.
-        calibration: how far to trust the sum of the logits; fully by default.
-        visibility: for policies that need it; by default from the scenes in the observations, see ``SeenScene``.
-    """
+    """B episodes side by side. Give ``update`` what was seen from ``current``, until ``running`` is empty."""
 
     def __init__(
         self,
         sphere: Viewpoints,
-        policy: Policy,
-        starts: NDArray[np.int64],
-        stopping: Stopping,
-        rng: np.random.Generator,
-        calibration: Calibration = PLAIN_SUM,
+        policy: Policy,  # chooses where to go
+        starts: NDArray[np.int64],  # first view of each episode, (B,)
+        stopping: Stopping,  # when an episode ends; a sphere with fewer views than ``max_views`` ends it too
+        rng: np.random.Generator,  # for policies that draw
+        calibration: Calibration = PLAIN_SUM,  # how far to trust the sum of the logits; fully by default
+        # for policies that need it; by default from the scenes in the observations, see ``SeenScene``
         visibility: Visible | None = None,
     ) -> None:
         self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
@@ -109,14 +95,10 @@ class Episodes:
         """Take in the evidence of one view in every running episode; stop or choose its next view.
 
         A view in which nothing was seen is taken, but changes no belief and ends no episode as a confident one. Where
-        this raises, nothing is taken in: the same view can be handed in again.
-
-        Args:
-            evidence: of the A running episodes.
-            directions: unit vectors towards where the cameras really stood, (A, 3); in all updates or in none. The
-                nearest views then count as taken, those within VISITED as visited too, and azimuths and travel are
-                measured from the places. By default the cameras stood at ``current``.
-            constrain: asked before the policy. An episode without a free view ends.
+        this raises, nothing is taken in: the same view can be handed in again. ``directions`` are unit vectors towards
+        where the cameras really stood, (A, 3), in all updates or in none; by default they stood at ``current``. The
+        nearest views then count as taken, those within VISITED as visited too, and azimuths and travel are measured
+        from the places. ``constrain`` is asked before the policy. An episode without a free view ends.
         """
         taken = self.next_step(evidence, directions, constrain)
         self.keep(taken)

@@ -1,7 +1,5 @@
 """A picture of one episode: what was seen, what the policy decided by, what was believed, and the path."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a robot can do: where it can bring the camera, and what that costs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,8 +18,7 @@ Reachable = NDArray[np.bool_] | Callable[[Float], bool]
 TravelCost = Float | Callable[[Float, Float], float]
 """What it costs to go from one view to another, in any unit: (V, V), row from, column to; or a function of two poses in
 the frame of ``Session.poses``, the first that where the camera stands. Infinity where there is no way."""
-Poses = Callable[[], Float]
-"""Gives the candidate poses, (V, 4, 4); called only where a function has to be asked."""
+Poses = Callable[[], Float]  # gives the candidate poses, (V, 4, 4); called only where a function has to be asked
 
 
 @dataclass(frozen=True)

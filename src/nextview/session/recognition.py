@@ -1,7 +1,5 @@
 """How an episode ended: the answer, how sure it is, and its picture."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +12,7 @@ from nextview.session.view import View
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SUSPICIOUS = 5.0
-"""An object as novel as so many times the share that may be called unknown gets no confident answer."""
+SUSPICIOUS = 5.0  # an object as novel as so many times the share that may be called unknown gets no confident answer
 
 
 @dataclass(frozen=True)
@@ -114,7 +111,7 @@ class Recognition:
         warnings = f", warnings: {', '.join(names)}" if names else ""
         return f"{self.answer} (belief {self.confidence:.3f}, {views}, {sure}{warnings})"
 
-    def plot(self, path: str | Path | None = None, title: str = "") -> Figure:
+    def plot(self, path: str | Path | None = None, title: str = "") -> "Figure":
         """Draw the episode: images, what the policy valued the views at, beliefs and the path on the sphere.
 
         With a path it is written to that file too, PNG, PDF or SVG; UsageError if it cannot be.

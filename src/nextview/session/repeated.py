@@ -1,7 +1,5 @@
 """A picture handed in twice, as a camera that hangs does: it is one piece of evidence, not two."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -20,8 +18,7 @@ if TYPE_CHECKING:
 REPEATED = ViewWarning(
     "repeated", "this picture was handed in before, to the last bit, and counts once: does the camera hang?"
 )
-LEVEL = 1e-4
-"""Difference of the third rows of two poses that differ by a turn about the vertical alone."""
+LEVEL = 1e-4  # difference of the third rows of two poses that differ by a turn about the vertical alone
 
 
 def is_repeated(seen: Observation, earlier: Sequence[Observation]) -> bool:
@@ -29,7 +26,7 @@ def is_repeated(seen: Observation, earlier: Sequence[Observation]) -> bool:
     return any(np.array_equal(one.depth, seen.depth) and _is_one_picture(one, seen) for one in earlier)
 
 
-def after_repeated(state: ObjectState, frame: Frame, first: int) -> ObjectState | None:
+def after_repeated(state: "ObjectState", frame: Frame, first: int) -> "ObjectState | None":
     """What is known of an object after a frame that is an earlier one, sightings from ``first`` on; None if not.
 
     From where it was really taken is not known, so the earlier sighting stands for it.

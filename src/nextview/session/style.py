@@ -1,7 +1,5 @@
 """How all figures of the reports look: narrow, so that they can be read on a phone."""
 
-from __future__ import annotations
-
 import re
 from io import StringIO
 from pathlib import Path
@@ -17,12 +15,9 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 INK, GREY, FAINT = "#1f2933", "#8a949e", "#d5dbe1"
-BLUE, LIGHT_BLUE, ACCENT = "#0b5fa5", "#38a0d9", "#d1495b"
-"""The colours of lines and texts, in all figures; policies have their own, ``curves.COLOURS``."""
-SERIES = ("#0b6e99", "#c4532d", "#4b8b3b", "#7a5195", "#b8860b", "#555555")
-"""Of several things of one kind, in turn."""
-UNKNOWN = 201, 210, 218
-"""The colour of what has no value."""
+BLUE, LIGHT_BLUE, ACCENT = "#0b5fa5", "#38a0d9", "#d1495b"  # of all figures; policies: ``figures.COLOURS``
+SERIES = ("#0b6e99", "#c4532d", "#4b8b3b", "#7a5195", "#b8860b", "#555555")  # of several things of one kind, in turn
+UNKNOWN = 201, 210, 218  # the colour of what has no value
 STYLE = {
     "font.family": "sans-serif",
     "font.sans-serif": ["Helvetica Neue", "Arial", "Liberation Sans", "DejaVu Sans"],

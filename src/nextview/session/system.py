@@ -5,8 +5,6 @@
 chair (belief 0.998, 2 views, 1.41 cells of travel, confident)
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -39,9 +37,7 @@ if TYPE_CHECKING:
     from nextview.simulation.sensor import Sensor
 
 MOST_THREADS = 1024
-DEFAULT = "modelnet10"
-UNKNOWN = 0.02
-"""The models that ship with the package."""
+DEFAULT, UNKNOWN = "modelnet10", 0.02  # the models that ship with the package, and their share of false alarms
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,7 +61,7 @@ class System:
         self,
         start: int | None = None,
         seed: int = 0,
-        object: ObservedObject | None = None,
+        object: "ObservedObject | None" = None,
         distance: float | None = None,
     ) -> Session:
         """One object under way, for whoever moves the camera. Those for a robot need no more than a distance.
@@ -92,7 +88,7 @@ class System:
         seed: int = 0,
         up: str | tuple[float, float, float] | None = None,
         unit: str | None = None,
-        sensor: str | Sensor | None = None,
+        sensor: "str | Sensor | None" = None,
     ) -> Recognition:
         """Look at an object until it is clear what it is, or the views run out.
 
@@ -132,11 +128,11 @@ class System:
         name, views = self.models.recogniser.card.name, len(self.sphere)
         return f"System({name}, policy {self.policy_name}, {views} viewpoints, {self.stopping})"
 
-    def __reduce__(self) -> tuple[Callable[[], System], tuple[()]]:
+    def __reduce__(self) -> "tuple[Callable[[], System], tuple[()]]":
         return partial(load, **self.loaded), ()
 
 
-def simulated(mesh: Mesh, sensor: str | Sensor | None = None, seed: int = 0) -> Camera:
+def simulated(mesh: Mesh, sensor: "str | Sensor | None" = None, seed: int = 0) -> Camera:
     """A simulated camera before a mesh, with the errors of a sensor, if any, drawn by the seed."""
     if sensor is None:
         from nextview.simulation.simulated import SimulatedCamera
@@ -224,12 +220,11 @@ def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
     for grid in (sphere, *LAYOUTS.values()):
         if network.rings in (None, grid.rings):
             return grid
-    raise PolicyError(
-        f"the map {network.card.name} has {network.rings} rings, and the {len(sphere)} viewpoints {sphere.rings}"
-    )
+    there = f"the {len(sphere)} viewpoints {sphere.rings}"
+    raise PolicyError(f"the map {network.card.name} has {network.rings} rings, and {there}")
 
 
-def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> CapturedCamera:
+def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> "CapturedCamera":
     from nextview.simulation.captured import read_capture
     from nextview.simulation.captured_camera import UP, CapturedCamera
 

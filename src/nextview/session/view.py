@@ -1,7 +1,5 @@
 """One view of a session, and what followed from it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

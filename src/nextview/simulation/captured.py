@@ -27,7 +27,6 @@ MILLIMETRES = 0.001
 TUM_STEP = 1 / 5000  # metres that one step of TUM's depth images stands for
 TOGETHER = 0.02  # seconds that an image and its pose, or depth and colour, may be apart
 KINECT = (585.0, 585.0, 320.0, 240.0)  # fx, fy, cx, cy of the depth camera of 7-Scenes, for all of its scenes
-
 Float = NDArray[np.float64]
 Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
 Nine = Annotated[list[float], Meta(min_length=9, max_length=9)]
@@ -180,10 +179,8 @@ def _read_bop(folder: Path, intrinsics: Float | None, object_id: int | None) -> 
             thing, from_model, where = objects[here[0]], True, f"image {number} of {truth}"
             rotation, translation = thing.cam_R_m2c, thing.cam_t_m2c
         if rotation is None or translation is None:
-            raise DatasetError(
-                f"{where}: lacks the camera's pose (cam_R_w2c, cam_t_w2c); an object's pose in scene_gt.json will do, "
-                "named with --object-id if there are several"
-            )
+            what = f"{where}: lacks the camera's pose (cam_R_w2c, cam_t_w2c); an object's pose in scene_gt.json will do"
+            raise DatasetError(f"{what}, named with --object-id if there are several")
         pose, turn = np.eye(4), np.reshape(rotation, (3, 3))
         pose[:3, :3], pose[:3, 3] = turn.T, -turn.T @ (np.array(translation) * MILLIMETRES)
         k = np.reshape(camera.cam_K, (3, 3)) if intrinsics is None else intrinsics
@@ -219,10 +216,8 @@ def _read_tum(folder: Path, intrinsics: Float | None, _: int | None) -> Frames:
             beside = mask if mask.exists() else None, None if colour is None else colours[colour]
             frames.append(CapturedFrame(depth.stem, depth, TUM_STEP, intrinsics, poses[at], *beside))
     if not frames:
-        raise DatasetError(
-            f"{folder}: no image of depth.txt has a pose in groundtruth.txt within {TOGETHER} s; are the times of one "
-            "clock, in seconds?"
-        )
+        what = f"{folder}: no image of depth.txt has a pose in groundtruth.txt within {TOGETHER} s"
+        raise DatasetError(f"{what}; are the times of one clock, in seconds?")
     lost = len(times) - len(frames)
     return frames, [f"{lost} depth images have no pose within {TOGETHER} s and are left out"] if lost else []
 

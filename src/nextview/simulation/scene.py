@@ -15,10 +15,8 @@ from nextview.geometry.mesh import MAX_FACES, Mesh, load_mesh
 from nextview.simulation.scene_layout import Block, Placement, SceneLayout
 
 Float = NDArray[np.float64]
-
 TABLE = 3.4  # half the side of the square table, object radii: what stands around the target stands on it
 CLEARANCE = 0.2  # what a camera needs to each side, object radii
-
 GAP, FOOTPRINT, HEIGHT = (0.02, 0.3), (0.3, 0.9), (0.6, 2.6)  # of a box: from the object's circle, sides, height
 _CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 _FACES = np.reshape([int(i) for i in "021123456576014154263367042246135375"], (-1, 3))
@@ -64,10 +62,7 @@ class Scene:
         return Mesh(*square(TABLE, self.floor), np.zeros(3), 1.0, "table")
 
     def clearance(self, positions: Float) -> Float:
-        """Distance of cameras, (V, 3), from the nearest item, as a prism on its footprint, or the table, object radii.
-
-        (V,) float64; 0 inside of an item, negative below the table.
-        """
+        """Distance of cameras, (V, 3), from the nearest item or the table, (V,); 0 inside, negative below."""
         found = positions[:, 2] - self.floor
         for item in self.items:
             above = np.maximum(positions[:, 2] - item.vertices[:, 2].max(), 0)

@@ -9,12 +9,10 @@ from msgspec import Meta, Struct
 from nextview.errors import DatasetError
 from nextview.files import read_record, write_record
 
-LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}
-"""Share of the target that shows, on the average over the 40 views."""
+LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}  # mean share of the target that shows
 NAMED = re.compile(r".*@(\w+)-\d+")  # names of scenes that were drawn: target, level and number
 SUFFIX = ".json"
 VIEWS = 40
-
 Length = Annotated[float, Meta(ge=-1000, le=1000)]  # or radians: what is computed with more has no precision left
 Size = Annotated[float, Meta(gt=0, le=1000)]
 Hash = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]

@@ -19,7 +19,6 @@ from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, uniform_
 from nextview.simulation.simulated import SimulatedCamera
 
 Float = NDArray[np.float64]
-
 TABLE = 1.5  # radius of the table that the object stands on, if nothing else is said, object radii
 REACH = 1.3  # the object is looked for in a sphere so many radii large: with a wrong pose it sticks out of its own
 LEFTOVER = 4.0  # size of the patches of the table that are taken for the object, pixels
@@ -65,10 +64,7 @@ class SensedCamera:
         return SimulatedCamera(mesh, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)
 
     def observe(self, pose: Float) -> Observation:
-        """Look from the direction of a pose, (4, 4), object frame, at the sensor's own distance.
-
-        A frame in which too little of the object is found is a view in which nothing is seen.
-        """
+        """Look from the direction of a pose, (4, 4), at the sensor's own distance; too little found is nothing seen."""
         frame = self.frame(pose)
         try:
             thing = ObservedObject(known=self.object_frame, support=False, denoise=self.denoise, life_size=False)

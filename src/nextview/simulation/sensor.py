@@ -13,6 +13,7 @@ from nextview.errors import UsageError
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import DISTANCE
 
+Index = NDArray[np.int64]
 Image = NDArray[np.float64]
 
 EDGE = 0.02  # two surfaces differ so much from pixel to pixel, as a part of q, beyond the surface's own slope
@@ -98,9 +99,7 @@ class Sensor:
         """Itself: what ``SensorMix`` draws anew for every object."""
         return self
 
-    def measure(
-        self, depth: NDArray[np.float32], rng: np.random.Generator
-    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    def measure(self, depth: NDArray[np.float32], rng: np.random.Generator) -> tuple[NDArray[np.float32], Index]:
         """What the sensor makes of a true depth image, (height, width) float32, metres, 0 where there is nothing.
 
         Errors of strength 0 change nothing, to the bit. Each error draws from a generator of its own.
@@ -183,8 +182,7 @@ SENSORS = {sensor.name: sensor for sensor in _ALL}
 
 _SIDE, _RADIUS = 224, SENSORS["none"].radius
 _FOCAL = float(pinhole(_SIDE, DISTANCE)[0, 0])
-RENDER = Sensor("render", _SIDE, _SIDE, _FOCAL, distance=DISTANCE * _RADIUS, radius=_RADIUS)
-"""The camera that the networks take for granted, without errors: noise of its own kind may be added."""
+RENDER = Sensor("render", _SIDE, _SIDE, _FOCAL, distance=DISTANCE * _RADIUS, radius=_RADIUS)  # the networks' own camera
 
 
 @dataclass(frozen=True)
@@ -261,9 +259,7 @@ def _slope(q: Image) -> Image:
     return np.where(np.isfinite(smaller), smaller, 0.0)
 
 
-def shifted(
-    q: Image, slope: tuple[Image, Image], right: NDArray[np.int64], down: NDArray[np.int64]
-) -> tuple[Image, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def shifted(q: Image, slope: tuple[Image, Image], right: Index, down: Index) -> tuple[Image, tuple[Index, Index]]:
     """Each pixel shows the surface of another one nearby where its own ray meets it: edges move and planes stay."""
     row, column = np.indices(q.shape)
     at = np.clip(row + down, 0, len(q) - 1), np.clip(column + right, 0, q.shape[1] - 1)

@@ -92,9 +92,8 @@ def rivals_card(walk: Walk, view: int | None = None) -> str:
     if isinstance(walk.sphere, ViewSphere):
         grid = differ.reshape(walk.sphere.rings, walk.sphere.azimuths)[np.argsort(walk.sphere.elevations)[::-1]]
         both.append(("how much from each view", _image(heat(grid), CELL * grid.shape[1])))
-    said = (
-        "not remembered" if np.isnan(differ[at]) else f"differ by {differ[at]:.2f} of {np.nanmax(differ):.2f} at most"
-    )
+    known = not np.isnan(differ[at])
+    said = f"differ by {differ[at]:.2f} of {np.nanmax(differ):.2f} at most" if known else "not remembered"
     pictures = "".join(f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>" for below, image in both)
     return f"<p>From view {at} these two, as remembered, {said}:</p>{pictures}"
 

@@ -161,10 +161,7 @@ class Walk:
 
 @lru_cache(maxsize=256)
 def remembered_picture(recogniser: TaughtRecogniser, hypothesis: int, ring: int, azimuth: int) -> NDArray[np.uint8]:
-    """A thing in a resting pose as it was taught from a ring and an azimuth bin, (64, 64).
-
-    Where its mesh is no longer there, the one picture that the memory keeps of it.
-    """
+    """A thing in a pose as taught from a ring and an azimuth bin, (64, 64); without its mesh, its one picture."""
     memory, about = recogniser.memory, recogniser.card.memory
     assert about is not None
     thing = int(memory.thing[hypothesis])
@@ -236,13 +233,13 @@ class Exploration:
 
     def step(self) -> None:
         """Let each policy take its next view, if there is one."""
-        self._take([walk for walk in self.walks if not walk.session.done])
+        for walk in self.walks:
+            if not walk.session.done:
+                walk.step()
 
     def walk_on(self) -> bool:
         """Let each policy that has not stopped take its next view. Returns whether any did."""
-        return self._take([walk for walk in self.walks if not walk.stopped and not walk.session.done])
-
-    def _take(self, walks: Sequence[Walk]) -> bool:
+        walks = [walk for walk in self.walks if not walk.stopped and not walk.session.done]
         for walk in walks:
             walk.step()
         return bool(walks)

@@ -14,7 +14,6 @@ from nextview.session.style import ACCENT, INK, heat, rgb
 from nextview.viewers.exploration import Walk
 
 Float = NDArray[np.float64]
-
 BALL = 0.12  # radius of a candidate view, object radii
 
 
