@@ -201,9 +201,9 @@ def comparison(stage: Path) -> Iterator[str]:
     robot = tests["policy"].map(lambda policy: not is_oracle(called(policy)))
     if not (tests["p_holm"][robot & (tests["measure"] == "accuracy")] < SIGNIFICANT).any():
         yield from wrap(
-            f"**No policy that a robot could follow differs significantly from {settings['reference']} in accuracy** at "
-            f"any threshold: every p after the correction is {SIGNIFICANT} or more. Policies called oracle or true know "
-            "what a robot cannot.",
+            f"**No policy that a robot could follow differs significantly from {settings['reference']} in accuracy** "
+            f"at any threshold: every p after the correction is {SIGNIFICANT} or more. Policies called oracle or true "
+            "know what a robot cannot.",
             WIDTH,
         )
         yield ""
@@ -233,8 +233,8 @@ def risk(stage: Path) -> Iterator[str]:
     settings = json.loads((stage / "benchmark.json").read_text())
     found = cells(pd.read_csv(stage / "summary.csv"), "policy", "threshold", "measure")
     yield from wrap(
-        "With `--risk` an episode stops at the lowest threshold at which, by the validation objects, at most that share "
-        "of the early stops is wrong. Test split:",
+        "With `--risk` an episode stops at the lowest threshold at which, by the validation objects, at most that "
+        "share of the early stops is wrong. Test split:",
         WIDTH,
     )
     yield ""
