@@ -126,7 +126,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         if leak in ran and honest in test:
             leaks.append(f"{leak} {test[honest][leak, AT].verdict} {honest}: {test[honest][leak, AT]}")
     if leaks:
-        out.append(f"- **The leak**: what knowing the true class changes (accuracy, points, at {AT}): {'; '.join(leaks)}.")
+        out.append(f"- **The leak**: what the true class changes (points, at {AT}): {'; '.join(leaks)}.")
     baselines = (
         f"{name} {test['random'][name, AT].verdict} random: {test['random'][name, AT]}" for name in BASELINES[1:]
     )
