@@ -135,7 +135,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         "## At the published thresholds",
         "",
-        "`nextview benchmark predictions.npz --uncalibrated`; `summary.csv`. Published: tables 5, 8 and 9.",
+        "`nextview benchmark predictions.npz results --uncalibrated`; `summary.csv`. Published: tables 5, 8 and 9.",
         "",
         "| policy | threshold | accuracy | published | class accuracy | published | travel of the moved | published |",
         "|---|---|---|---|---|---|---|---|",
@@ -152,7 +152,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         f"## Every policy at threshold {AT}",
         "",
-        "`nextview benchmark predictions.npz --uncalibrated`; `summary.csv`.",
+        "`nextview benchmark predictions.npz results --uncalibrated`; `summary.csv`.",
         "",
         "| policy | accuracy | without duplicates | views | travel, all episodes | arc, radians |",
         "|---|---|---|---|---|---|",
@@ -164,7 +164,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         f"## Accuracy against each baseline at threshold {AT}, points",
         "",
-        "`nextview benchmark predictions.npz --uncalibrated --reference BASELINE`; `tests.csv`.",
+        "`nextview benchmark predictions.npz results --uncalibrated --reference BASELINE`; `tests.csv`.",
         "",
         "| policy | what it knows | "
         + " | ".join(f"against {b}" for b in BASELINES)
