@@ -281,7 +281,6 @@ SECTIONS: list[tuple[str, str, Callable[[Path], Iterator[str]]]] = [
     ("evaluation", "Calibration", calibration),
     ("evaluation", "Map networks", maps),
     ("conditions.md", "Under every condition", conditions),
-    ("unseen.txt", "Classes that no network has seen", text_as_is),
     ("unknown.md", "Objects of no known class", page_as_is),
     ("latency.txt", "Latency", text_as_is),
 ]
