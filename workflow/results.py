@@ -1,4 +1,4 @@
-"""Write docs/results.md: every measurement on one page, each table beside the command that made it.
+"""Write docs/results.md: the measurements on one page, each table beside the command that made it.
 
     python workflow/results.py docs/results.md --stages evaluation benchmark ...
 
@@ -301,7 +301,7 @@ def page(stages: Iterable[str]) -> str:
         "# Results",
         "",
         *wrap(
-            "Every measurement, beside the commands that made it. `make reproduce` writes the page; nothing on it is "
+            "Measurements, each beside the commands that made it. `make reproduce` writes the page; nothing on it is "
             f"typed in. Of ModelNet10's {OFFICIAL['test']:,} test meshes {objects('test.npz'):,} were there, and "
             f"{training:,} of its {OFFICIAL['train']:,} training meshes. {objects('validation.npz'):,} of those, which "
             "no network was trained on, validate: all choices are made on them, and the test split chooses nothing. In "
