@@ -121,23 +121,21 @@ def page(predictions: Path, samples: int = 2000) -> str:
     ]
     if nothing := nothing_differs(tables["random"], AT, "random"):
         out.append(f"- {nothing}")
-    for name in ("oracle-valley", "lem", "lcm-oracle-valley", "lcm", "true-oracle-valley", "true-lem", "gain"):
-        if name in ran:
-            log_evidence = "; ".join(f"{test[b][name, AT].verdict} {b}: {test[b][name, AT]}" for b in BASELINES)
-            out.append(f"- **{name}** ({LEMS[name]}) at {AT}: {log_evidence}.")
+    leaks: list[str] = []
     for leak, honest in (("oracle-valley", "lem"), ("lcm-oracle-valley", "lcm"), ("true-oracle-valley", "true-lem")):
         if leak in ran and honest in test:
-            out.append(
-                f"- **The leak** ({LEMS[leak].split(',')[0]}): knowing the true class, {leak} "
-                f"{test[honest][leak, AT].verdict} {honest}: {test[honest][leak, AT]}."
-            )
-    for baseline in ("furthest", "unidirectional"):
-        out.append(f"- **{baseline}** {test['random'][baseline, AT].verdict} random: {test['random'][baseline, AT]}.")
+            leaks.append(f"{leak} {test[honest][leak, AT].verdict} {honest}: {test[honest][leak, AT]}")
+    if leaks:
+        out.append(f"- **The leak**: what the true class changes (points, at {AT}): {'; '.join(leaks)}.")
+    baselines = (
+        f"{name} {test['random'][name, AT].verdict} random: {test['random'][name, AT]}" for name in BASELINES[1:]
+    )
+    out.append(f"- **The baselines**: {'; '.join(baselines)}.")
     out += [
         "",
         "## At the published thresholds",
         "",
-        "`nextview benchmark predictions.npz --uncalibrated`; `summary.csv`. Published: tables 5, 8 and 9.",
+        "`nextview benchmark predictions.npz results --uncalibrated`; `summary.csv`. Published: tables 5, 8 and 9.",
         "",
         "| policy | threshold | accuracy | published | class accuracy | published | travel of the moved | published |",
         "|---|---|---|---|---|---|---|---|",
@@ -154,7 +152,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         f"## Every policy at threshold {AT}",
         "",
-        "`nextview benchmark predictions.npz --uncalibrated`; `summary.csv`.",
+        "`nextview benchmark predictions.npz results --uncalibrated`; `summary.csv`.",
         "",
         "| policy | accuracy | without duplicates | views | travel, all episodes | arc, radians |",
         "|---|---|---|---|---|---|",
@@ -166,7 +164,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         f"## Accuracy against each baseline at threshold {AT}, points",
         "",
-        "`nextview benchmark predictions.npz --uncalibrated --reference BASELINE`; `tests.csv`.",
+        "`nextview benchmark predictions.npz results --uncalibrated --reference BASELINE`; `tests.csv`.",
         "",
         "| policy | what it knows | "
         + " | ".join(f"against {b}" for b in BASELINES)

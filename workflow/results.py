@@ -1,4 +1,4 @@
-"""Write docs/results.md: every measurement on one page, each table beside the command that made it.
+"""Write docs/results.md: the measurements on one page, each table beside the command that made it.
 
     python workflow/results.py docs/results.md --stages evaluation benchmark ...
 
@@ -24,6 +24,9 @@ import pandas as pd
 from nextview.benchmark.leaderboard import SIGNIFICANT, is_oracle
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
+
+WIDTH = 150
+"""Columns of the page's prose."""
 
 THRESHOLD = 0.97
 """Of the belief, in the tables that are for one threshold."""
@@ -140,8 +143,11 @@ def maps(stage: Path) -> Iterator[str]:
     """Scores of the map networks."""
     measures = {"mse": "squared error", "d0": "peak exact", "d_le_1": "within one cell", "d_lt_2": "d < 2",
                 "regret": "regret"}  # fmt: skip
-    yield "Published: squared error over objects, peaks over classes (table 4). The baselines are made from the true"
-    yield "maps of these very objects, which flatters them. `maps.csv`."
+    yield from wrap(
+        "Published: squared error over objects, peaks over classes (table 4). The mean maps come from the true maps of "
+        "these very objects: too good. `maps.csv`.",
+        WIDTH,
+    )
     yield ""
     rows = []
     for split in ("validation", "test"):
@@ -171,11 +177,14 @@ def comparison(stage: Path) -> Iterator[str]:
     settings = json.loads((stage / "benchmark.json").read_text())
     summary, tests = pd.read_csv(stage / "summary.csv"), pd.read_csv(stage / "tests.csv")
     decay = settings["threshold_decay"]
-    yield f"{settings['runs']} first views an object, the same for every policy; threshold {THRESHOLD} at the first"
-    yield f"view, which comes down with the views (threshold decay {decay:g}); at most {settings['max_views']} views."
-    yield "Travel is the mean over all episodes, those that never moved included. p: bootstrap test of the accuracy"
-    yield f"against `{settings['reference']}`, corrected by Holm over all policies and thresholds."
-    yield "`summary.csv`, `tests.csv`."
+    yield from wrap(
+        f"{settings['runs']} first views an object, the same for every policy. The threshold is {THRESHOLD} at the "
+        f"first view and comes down with the views (decay {decay:g}); at most {settings['max_views']} views. Travel is "
+        "the mean over all episodes, those that never moved included. p: bootstrap test of the accuracy against "
+        f"`{settings['reference']}`, with Holm's correction over all policies and thresholds. `summary.csv`, "
+        "`tests.csv`.",
+        WIDTH,
+    )
     yield ""
     found = cells(summary[summary["threshold"] == THRESHOLD], "policy", "measure")
     at = tests[(tests["threshold"] == THRESHOLD) & (tests["measure"] == "accuracy")].set_index("policy")
@@ -191,9 +200,12 @@ def comparison(stage: Path) -> Iterator[str]:
          f"points over {settings['reference']}", "p"], rows)  # fmt: skip
     robot = tests["policy"].map(lambda policy: not is_oracle(called(policy)))
     if not (tests["p_holm"][robot & (tests["measure"] == "accuracy")] < SIGNIFICANT).any():
-        yield f"**No policy that a robot could follow differs significantly from {settings['reference']} in accuracy**"
-        yield f"at any threshold: every p after the correction is {SIGNIFICANT} or more. Those called oracle or true"
-        yield "know what a robot cannot."
+        yield from wrap(
+            f"**No policy that a robot could follow differs significantly from {settings['reference']} in accuracy** "
+            f"at any threshold: every p after the correction is {SIGNIFICANT} or more. Policies called oracle or true "
+            "know what a robot cannot.",
+            WIDTH,
+        )
         yield ""
 
 
@@ -220,8 +232,11 @@ def risk(stage: Path) -> Iterator[str]:
     """What became of the promised error rates."""
     settings = json.loads((stage / "benchmark.json").read_text())
     found = cells(pd.read_csv(stage / "summary.csv"), "policy", "threshold", "measure")
-    yield "With `--risk` an episode stops at the lowest threshold at which, by the calibration on validation objects,"
-    yield "at most that share of those who stop early is wrong. On the test split:"
+    yield from wrap(
+        "With `--risk` an episode stops at the lowest threshold at which, by the validation objects, at most that "
+        "share of the early stops is wrong. Test split:",
+        WIDTH,
+    )
     yield ""
     rows = []
     for policy in [name for name in settings["policies"] if called(name) in ("random", "gain")]:
@@ -265,10 +280,7 @@ SECTIONS: list[tuple[str, str, Callable[[Path], Iterator[str]]]] = [
     ("evaluation", "Recogniser", recogniser),
     ("evaluation", "Calibration", calibration),
     ("evaluation", "Map networks", maps),
-    ("agreement.md", "Views that agree on the azimuth bin", page_as_is),
-    ("size.md", "The size of the object", page_as_is),
     ("conditions.md", "Under every condition", conditions),
-    ("unseen.txt", "Classes that no network has seen", text_as_is),
     ("unknown.md", "Objects of no known class", page_as_is),
     ("latency.txt", "Latency", text_as_is),
 ]
@@ -289,13 +301,13 @@ def page(stages: Iterable[str]) -> str:
         "# Results",
         "",
         *wrap(
-            "Every measurement, beside the commands that made it. `make reproduce` writes the page; nothing on it is "
+            "Measurements, each beside the commands that made it. `make reproduce` writes the page; nothing on it is "
             f"typed in. Of ModelNet10's {OFFICIAL['test']:,} test meshes {objects('test.npz'):,} were there, and "
             f"{training:,} of its {OFFICIAL['train']:,} training meshes. {objects('validation.npz'):,} of those, which "
             "no network was trained on, validate: all choices are made on them, and the test split chooses nothing. In "
             "brackets stand 95 % bootstrap intervals over objects. The networks' predictions, from which most of it "
-            "comes, were made by",
-            120,
+            "comes, are made by",
+            WIDTH,
         ),
         "",
         "```",

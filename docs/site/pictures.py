@@ -1,4 +1,4 @@
-"""The pictures of the page on concepts, and the samples in the gallery, from real runs.
+"""The pictures of the page on concepts, and the sample objects, from real runs.
 
 python docs/site/pictures.py
 """

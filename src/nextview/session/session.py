@@ -475,8 +475,8 @@ class Session:
 
     def _impossible(self) -> tuple[str, ...]:
         """Classes whose objects have not the size of this one; none where it is not known."""
-        card, radius = self.models.recogniser.card, self.views[-1].observation.radius if self.views else None
-        sizes = card.size
+        card = getattr(self.models.recogniser, "card", None)  # a recogniser of your own has none
+        sizes, radius = card and card.size, self.views[-1].observation.radius if self.views else None
         if sizes is None or radius is None:
             return ()
         return tuple(name for name, off in zip(self.models.classes, sizes.impossible(radius), strict=True) if off)
