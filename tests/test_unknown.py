@@ -47,6 +47,12 @@ def test_the_score_is_what_brute_force_gives():
     np.testing.assert_allclose(score.scores(views, np.arange(20) > 9)[10:], (-tenth[10:] + 0.9) / 0.1, atol=1e-4)
 
 
+def test_a_score_that_was_fitted_to_other_features_is_refused():
+    score = some_score(np.random.default_rng(6))
+    with pytest.raises(ModelError, match="other features; run nextview fit unknown"):
+        score.scores(np.zeros((1, 8)))
+
+
 def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
     """Of 4,000 objects, each with a mean of its own around which its views scatter, at 400 held-out ones."""
     rng = np.random.default_rng(2)
