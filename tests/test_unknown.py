@@ -7,17 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from pipeline import INTRINSICS, TABLE, box, cast, pose_at
 from scipy.spatial.distance import cdist
 from scipy.stats import kstest
 
 import nextview
 from nextview import ModelError, SimulatedCamera, Stopping
-from nextview.cli.episode_table import episode_as_json
+from nextview.cli.episode_table import episode_as_json, print_episode
 from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
 from nextview.geometry.mesh import make_mesh
 from nextview.learning.unknown import quantiles
 from nextview.recognition.novelty import NEIGHBOUR, Novelty, read_novelty
+from nextview.sensing import Frame, ObservedObject
 
 
 def some_score(rng, f=7, neighbours=40, objects=50, levels=31, n_views=4) -> Novelty:
@@ -99,6 +101,8 @@ def test_a_score_that_is_missing_damaged_or_another_is_refused(tmp_path):
 class FixedNovelty:
     """A novelty score of which a test says what it is."""
 
+    joint = False
+
     def __init__(self, p):
         self.p = p
 
@@ -117,8 +121,10 @@ def recognised(p, unknown, camera=None):
         recogniser.novelty = before
 
 
-def test_an_object_more_novel_than_the_rate_allows_has_no_answer():
+def test_an_object_more_novel_than_the_rate_allows_has_no_answer(capsys):
     usual, novel = recognised(0.3, 0.05), recognised(0.03, 0.05)
+    print_episode(recognised(1.0, 0.05), "chair", "gain")
+    assert "known classes, 100 % are" in " ".join(capsys.readouterr().out.split())
     assert (usual.answer, usual.unknown, usual.novelty) == ("chair", False, 0.3)
     assert (novel.answer, novel.unknown, novel.novelty) == (None, True, 0.03)
     assert novel.most_like == "chair"
@@ -181,3 +187,19 @@ def test_a_suspicious_object_gets_no_confident_answer_and_is_looked_at_longer():
     usual, suspicious = recognised(0.5, 0.05), recognised(0.2, 0.05)
     assert (usual.confident, len(usual.views)) == (True, 1)
     assert (suspicious.answer, suspicious.confident, len(suspicious.views)) == ("chair", False, 2)
+
+
+def test_what_a_later_frame_shows_in_another_light_is_not_held_against_the_object(monkeypatch):
+    """From the front a long box is half as long: novel. The frame from the side corrects that, also of the first."""
+    scores = iter([9.0, 0.0])
+    monkeypatch.setattr(Novelty, "scores", lambda self, embeddings, exact: np.full(len(embeddings), next(scores)))
+    monkeypatch.setattr(Novelty, "of_views", lambda self, scores: float(np.mean(scores) < 1))
+    session = nextview.load(threshold=0.1).session(object=ObservedObject(life_size=False))
+    for k, pose in enumerate((pose_at(4, 0, 0.8, (0, 0, 0.06)), pose_at(45, 90, 0.8, (0, 0, 0.06)))):
+        assert not session.done
+        depth = cast([TABLE, box((0.4, 0.12, 0.12), (0, 0, 0.06))], pose)[0]
+        session.update(Frame(depth, INTRINSICS, pose, pixel_centre=0.5))
+        assert session.views[0].novelty == (9.0, 0.0)[k]
+    assert session.done
+    assert session.result.confident
+    assert not session.result.stranded

@@ -56,7 +56,7 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
     else:
         console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), ", belief ", rest))
     if result.novelty is not None:
-        console.print(f"Of objects of known classes, {100 * result.novelty:.2g} % are at least as novel.")
+        console.print(f"Of objects of known classes, {100 * result.novelty:.3g} % are at least as novel.")
 
 
 def episode_as_json(result: Recognition, name: str, frames: Sequence[str] = (), indent: int | None = 1) -> str:

@@ -345,9 +345,7 @@ class Session:
             evidence[last],
             directions[last][None],
             lambda state: self._constrained(state, reach, object, here),
-            hold=lambda step: (
-                bool(warnings) or self._suspicious([*self._scores(), *self._novelty(step, observations[last])])
-            ),
+            hold=lambda step: bool(warnings) or self._suspicious(self._scores([*episodes.steps, step], observations)),
         )
         steps, views = [*episodes.steps, taken.step], list(self.views)
         travel = self._travelled([int(step.views[0]) for step in steps], directions)
@@ -400,9 +398,9 @@ class Session:
             return [-float(calibration.log_belief(step.total, np.maximum(step.seen, 1), classes).max())]
         return [] if evidence.novelty is None else [float(evidence.novelty[0])]
 
-    def _scores(self) -> list[float]:
-        """The novelty scores of the views so far."""
-        return [view.novelty for view in self.views if view.novelty is not None]
+    def _scores(self, steps: Sequence[Step], observations: Sequence[Observation]) -> list[float]:
+        """The novelty scores of some steps, as their views are seen by now."""
+        return [score for step, seen in zip(steps, observations, strict=True) for score in self._novelty(step, seen)]
 
     def _suspicious(self, novelty: Sequence[float]) -> bool:
         """Whether an object with these scores is too novel for a confident answer."""
@@ -457,7 +455,8 @@ class Session:
         """How it ended; or what is believed so far, not confident, while it goes on."""
         with self._lock:
             reached = self.done and bool(self._episodes.outcome.confident[0])
-            reached = reached and not self.views[-1].warnings and not self._suspicious(self._scores())
+            scores = [view.novelty for view in self.views if view.novelty is not None]
+            reached = reached and not self.views[-1].warnings and not self._suspicious(scores)
             all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
             impossible = self._impossible()
             result = Recognition(
