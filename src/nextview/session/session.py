@@ -345,7 +345,11 @@ class Session:
             evidence[last],
             directions[last][None],
             lambda state: self._constrained(state, reach, object, here),
-            hold=lambda step: bool(warnings) or self._suspicious(self._scores([*episodes.steps, step], observations)),
+            hold=lambda step: (
+                bool(warnings)
+                or self._contradicted(last + 1)
+                or self._suspicious(self._scores([*episodes.steps, step], observations))
+            ),
         )
         steps, views = [*episodes.steps, taken.step], list(self.views)
         travel = self._travelled([int(step.views[0]) for step in steps], directions)
@@ -402,6 +406,10 @@ class Session:
         """The novelty scores of some steps, as their views are seen by now."""
         return [score for step, seen in zip(steps, observations, strict=True) for score in self._novelty(step, seen)]
 
+    def _contradicted(self, n_views: int) -> bool:
+        """Whether half of so many views or more contradict others: the object moved, or is another one by now."""
+        return 2 * sum(any(w.name == "contradiction" for w in view.warnings) for view in self.views) >= n_views > 0
+
     def _suspicious(self, novelty: Sequence[float]) -> bool:
         """Whether an object with these scores is too novel for a confident answer."""
         score = self.models.recogniser.novelty
@@ -456,7 +464,8 @@ class Session:
         with self._lock:
             reached = self.done and bool(self._episodes.outcome.confident[0])
             scores = [view.novelty for view in self.views if view.novelty is not None]
-            reached = reached and not self.views[-1].warnings and not self._suspicious(scores)
+            doubtful = self._contradicted(len(self.views)) or self._suspicious(scores)
+            reached = reached and not self.views[-1].warnings and not doubtful
             all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
             impossible = self._impossible()
             result = Recognition(
