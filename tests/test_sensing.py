@@ -305,6 +305,22 @@ def test_an_old_pose_and_a_missing_plane_are_warned_of():
     assert thing.warnings == []
 
 
+@pytest.mark.parametrize("height", [-0.01, 0.0, 0.003, 0.05])
+def test_a_point_may_lie_on_the_table_itself(height):
+    for azimuth in (0, 90):
+        thing = ObservedObject(point=(0, 0, height))
+        thing.add(frame([TABLE, WEDGE], pose_at(20, azimuth, 0.7)))
+        assert np.linalg.norm(thing.object_frame.centre - true_frame(WEDGE).centre) < true_frame(WEDGE).radius / 3
+        assert thing.warnings == []
+
+
+@pytest.mark.parametrize(("point", "warned"), [((0.2, 0, 0), False), ((0.6, -0.3, 0), True)])
+def test_a_point_far_from_all_that_is_seen_is_warned_of(point, warned):
+    thing = ObservedObject(point=point)
+    thing.add(frame([TABLE, WEDGE], pose_at(40, 25, 0.7)))
+    assert ["point"] * warned == [warning.name for warning in thing.warnings]
+
+
 def test_a_part_of_a_picture_is_warned_of_and_taken_in():
     seen = frame([TABLE, WEDGE], pose_at(40, 25, 0.7))
     k = seen.intrinsics.copy()
