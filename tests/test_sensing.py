@@ -307,8 +307,8 @@ def test_an_old_pose_and_a_missing_plane_are_warned_of():
 
 @pytest.mark.parametrize("wrong", [{"axes": np.eye(3)}, {"axes": ["opengl"]}, {"pixel_centre": None}])
 def test_axes_and_pixel_centres_of_another_kind_are_refused(wrong):
-    with pytest.raises(ObservationError, match="the axes of a pose are|the first pixel's centre has"):
-        Frame(np.ones((48, 64)), INTRINSICS, **wrong)
+    with pytest.raises(ObservationError, match=r"the axes of a pose are|the first pixel's centre has"):
+        Frame(np.ones(SHAPE), INTRINSICS, **wrong)
 
 
 @pytest.mark.parametrize("height", [-0.01, 0.0, 0.003, 0.05])
