@@ -311,6 +311,16 @@ def test_axes_and_pixel_centres_of_another_kind_are_refused(wrong):
         Frame(np.ones(SHAPE), INTRINSICS, **wrong)
 
 
+def test_the_thin_legs_of_a_thing_that_stands_alone_are_its_own():
+    legs = [box((0.01, 0.01, 0.16), (x, y, 0.08)) for x in (-0.09, 0.09) for y in (-0.09, 0.09)]
+    stool = trimesh.util.concatenate([box((0.2, 0.2, 0.02), (0, 0, 0.17)), *legs])
+    pose = pose_at(20, 35, 0.7, (0, 0, 0.08))
+    _, seen = cast([TABLE, stool], pose)
+    thing = ObservedObject()
+    thing.add(frame([TABLE, stool], pose))
+    assert (thing.sightings[0].mask & (seen == 1)).sum() > 0.9 * (seen == 1).sum()
+
+
 @pytest.mark.parametrize("height", [-0.01, 0.0, 0.003, 0.05])
 def test_a_point_may_lie_on_the_table_itself(height):
     for azimuth in (0, 90):

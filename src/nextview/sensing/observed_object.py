@@ -307,7 +307,9 @@ class ObservedObject:
         labels, two = clusters.clusters(footprints)
         target = self._target(labels, footprints, ground / cell, axes[:2] / cell)
         chosen = labels[-1] == target
-        mask = trimmed(frame.depth, foot.pixels_over(chosen))
+        mask = foot.pixels_over(chosen)
+        if (labels[-1][~chosen] > 0).any():  # cells at the border hold pixels of the neighbour; alone, thin legs count
+            mask = trimmed(frame.depth, mask)
         if target == 0 or mask.sum() < FEWEST:
             where = "of the object known so far" if earlier else "on the support plane"
             raise ObservationError(f"this frame shows nothing {where}: check its pose, or aim the camera at the object")
