@@ -207,12 +207,18 @@ def link_out(path):
     path.symlink_to(there)
 
 
+def link_to_itself(path):
+    path.unlink()
+    path.symlink_to(path.name)
+
+
 CAMERAS, TRAJECTORY = "scene_camera.json", "groundtruth.txt"
 POSE, DEPTH = "frame-000003.pose.txt", "frame-000003.depth.png"
 DAMAGE = {
     "a missing image": ("bop", "depth/000007.png", Path.unlink, "no such file"),
     "a truncated image": ("7scenes", DEPTH, lambda p: p.write_bytes(p.read_bytes()[:-40]), "damaged"),
     "a pipe for an image": ("7scenes", DEPTH, fifo, "is no file"),
+    "a link to itself": ("7scenes", DEPTH, link_to_itself, "no such file"),
     "a link to an image elsewhere": ("7scenes", DEPTH, link_out, "link out of this folder"),
     "a link to a list elsewhere": ("tum", TRAJECTORY, link_out, "link out of this folder"),
     "a link to a folder elsewhere": ("bop", "depth", link_out, "link out of this folder"),

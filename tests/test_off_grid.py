@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nextview.errors import UsageError
 from nextview.geometry.viewsphere import Directions, ViewSphere, look_at_origin, viewpoints_of
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.maps import MapPeak, SpherePeak
@@ -169,3 +170,9 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(da
         assert not episodes.outcome.confident[0]
         paths.append(path)
     assert paths[0] == paths[1]
+
+
+@pytest.mark.parametrize("layout", ["fibonacci:99999", "rings:0,10,20,30x2000", np.ones((5001, 3))])
+def test_more_views_than_their_distances_fit_into_memory_are_refused(layout):
+    with pytest.raises(UsageError, match="the number of viewpoints is a whole number from 1 to 5000"):
+        viewpoints_of(layout)

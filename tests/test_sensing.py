@@ -305,6 +305,38 @@ def test_an_old_pose_and_a_missing_plane_are_warned_of():
     assert thing.warnings == []
 
 
+@pytest.mark.parametrize("wrong", [{"axes": np.eye(3)}, {"axes": ["opengl"]}, {"pixel_centre": None}])
+def test_axes_and_pixel_centres_of_another_kind_are_refused(wrong):
+    with pytest.raises(ObservationError, match=r"the axes of a pose are|the first pixel's centre has"):
+        Frame(np.ones(SHAPE), INTRINSICS, **wrong)
+
+
+def test_the_thin_legs_of_a_thing_that_stands_alone_are_its_own():
+    legs = [box((0.01, 0.01, 0.16), (x, y, 0.08)) for x in (-0.09, 0.09) for y in (-0.09, 0.09)]
+    stool = trimesh.util.concatenate([box((0.2, 0.2, 0.02), (0, 0, 0.17)), *legs])
+    pose = pose_at(20, 35, 0.7, (0, 0, 0.08))
+    _, seen = cast([TABLE, stool], pose)
+    thing = ObservedObject()
+    thing.add(frame([TABLE, stool], pose))
+    assert (thing.sightings[0].mask & (seen == 1)).sum() > 0.9 * (seen == 1).sum()
+
+
+@pytest.mark.parametrize("height", [-0.01, 0.0, 0.003, 0.05])
+def test_a_point_may_lie_on_the_table_itself(height):
+    for azimuth in (0, 90):
+        thing = ObservedObject(point=(0, 0, height))
+        thing.add(frame([TABLE, WEDGE], pose_at(20, azimuth, 0.7)))
+        assert np.linalg.norm(thing.object_frame.centre - true_frame(WEDGE).centre) < true_frame(WEDGE).radius / 3
+        assert thing.warnings == []
+
+
+@pytest.mark.parametrize(("point", "warned"), [((0.2, 0, 0), False), ((0.6, -0.3, 0), True)])
+def test_a_point_far_from_all_that_is_seen_is_warned_of(point, warned):
+    thing = ObservedObject(point=point)
+    thing.add(frame([TABLE, WEDGE], pose_at(40, 25, 0.7)))
+    assert ["point"] * warned == [warning.name for warning in thing.warnings]
+
+
 def test_a_part_of_a_picture_is_warned_of_and_taken_in():
     seen = frame([TABLE, WEDGE], pose_at(40, 25, 0.7))
     k = seen.intrinsics.copy()

@@ -93,6 +93,16 @@ def test_a_picture_that_is_handed_in_again_counts_once(system, camera):
         assert not session.result.confident
 
 
+@pytest.mark.parametrize(("first", "confident", "n_views"), [("chair", True, 5), ("table", False, 6)])
+def test_an_object_that_is_swapped_after_the_first_view_gets_no_confident_answer(first, confident, n_views):
+    cameras = [SimulatedCamera(sample_mesh(name)) for name in (first, *["chair"] * 5)]
+    session = nextview.load(stopping=lambda seen, _: seen.n_views >= 5, max_views=6).session(start=9)
+    while not session.done:
+        session.update(cameras[len(session.views)].observe(session.pose))
+    assert not session.views[-1].warnings
+    assert (session.result.confident, len(session.views)) == (confident, n_views)
+
+
 def test_the_two_sides_of_a_symmetric_object_are_two_views(system, tmp_path):
     trimesh.creation.box((0.4, 0.2, 0.3)).export(tmp_path / "box.off")
     camera = SimulatedCamera(nextview.load_mesh(tmp_path / "box.off"))

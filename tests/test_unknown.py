@@ -7,17 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from pipeline import INTRINSICS, TABLE, box, cast, pose_at
 from scipy.spatial.distance import cdist
 from scipy.stats import kstest
 
 import nextview
 from nextview import ModelError, SimulatedCamera, Stopping
-from nextview.cli.episode_table import episode_as_json
+from nextview.cli.episode_table import episode_as_json, print_episode
 from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
 from nextview.geometry.mesh import make_mesh
 from nextview.learning.unknown import quantiles
 from nextview.recognition.novelty import NEIGHBOUR, Novelty, read_novelty
+from nextview.sensing import Frame, ObservedObject
 
 
 def some_score(rng, f=7, neighbours=40, objects=50, levels=31, n_views=4) -> Novelty:
@@ -45,6 +47,12 @@ def test_the_score_is_what_brute_force_gives():
     tenth = np.sort(products, 1)[:, -NEIGHBOUR]
     np.testing.assert_allclose(score.scores(views), (-tenth + 0.8) / 0.2, atol=1e-4)
     np.testing.assert_allclose(score.scores(views, np.arange(20) > 9)[10:], (-tenth[10:] + 0.9) / 0.1, atol=1e-4)
+
+
+def test_a_score_that_was_fitted_to_other_features_is_refused():
+    score = some_score(np.random.default_rng(6))
+    with pytest.raises(ModelError, match="other features; run nextview fit unknown"):
+        score.scores(np.zeros((1, 8)))
 
 
 def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
@@ -107,14 +115,16 @@ def recognised(p, unknown, camera=None):
     recogniser = system.models.recogniser
     before, recogniser.novelty = recogniser.novelty, FixedNovelty(p)
     try:
-        session = nextview.Session(system.models, system.policy, system.sphere, 3, Stopping(0.97, 3), unknown=unknown)
+        session = nextview.Session(system.models, system.policy, system.sphere, 3, Stopping(0.9, 2), unknown=unknown)
         return session.run(camera or SimulatedCamera(sample_mesh("chair")))
     finally:
         recogniser.novelty = before
 
 
-def test_an_object_more_novel_than_the_rate_allows_has_no_answer():
+def test_an_object_more_novel_than_the_rate_allows_has_no_answer(capsys):
     usual, novel = recognised(0.3, 0.05), recognised(0.03, 0.05)
+    print_episode(recognised(1.0, 0.05), "chair", "gain")
+    assert "known classes, 100 % are" in " ".join(capsys.readouterr().out.split())
     assert (usual.answer, usual.unknown, usual.novelty) == ("chair", False, 0.3)
     assert (novel.answer, novel.unknown, novel.novelty) == (None, True, 0.03)
     assert novel.most_like == "chair"
@@ -125,7 +135,7 @@ def test_an_object_more_novel_than_the_rate_allows_has_no_answer():
     assert "\n" not in repr(novel)
     told = json.loads(episode_as_json(novel, "chair"))
     assert (told["answer"], told["unknown"], told["novelty"], told["most_like"]) == (None, True, 0.03, "chair")
-    np.testing.assert_array_equal(usual.views[-1].belief, novel.views[1].belief)
+    np.testing.assert_array_equal(usual.views[0].belief, novel.views[0].belief)
 
 
 @pytest.fixture(scope="module")
@@ -175,5 +185,21 @@ def test_an_object_of_a_size_that_its_class_never_has_is_none_of_it():
 
 def test_a_suspicious_object_gets_no_confident_answer_and_is_looked_at_longer():
     usual, suspicious = recognised(0.5, 0.05), recognised(0.2, 0.05)
-    assert (usual.confident, len(usual.views)) == (True, 2)
-    assert (suspicious.answer, suspicious.confident, len(suspicious.views)) == ("chair", False, 3)
+    assert (usual.confident, len(usual.views)) == (True, 1)
+    assert (suspicious.answer, suspicious.confident, len(suspicious.views)) == ("chair", False, 2)
+
+
+def test_what_a_later_frame_shows_in_another_light_is_not_held_against_the_object(monkeypatch):
+    """From the front a long box is half as long: novel. The frame from the side corrects that, also of the first."""
+    scores = iter([9.0, 0.0])
+    monkeypatch.setattr(Novelty, "scores", lambda self, embeddings, exact: np.full(len(embeddings), next(scores)))
+    monkeypatch.setattr(Novelty, "of_views", lambda self, scores: float(np.mean(scores) < 1))
+    session = nextview.load(threshold=0.1).session(object=ObservedObject(life_size=False))
+    for k, pose in enumerate((pose_at(4, 0, 0.8, (0, 0, 0.06)), pose_at(45, 90, 0.8, (0, 0, 0.06)))):
+        assert not session.done
+        depth = cast([TABLE, box((0.4, 0.12, 0.12), (0, 0, 0.06))], pose)[0]
+        session.update(Frame(depth, INTRINSICS, pose, pixel_centre=0.5))
+        assert session.views[0].novelty == (9.0, 0.0)[k]
+    assert session.done
+    assert session.result.confident
+    assert not session.result.stranded

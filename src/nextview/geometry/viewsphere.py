@@ -20,7 +20,7 @@ Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 DISTANCE = 3.0  # distance of the camera from the object's centre, in object radii
 CELL = np.radians((18.0, 45.0))  # elevation and azimuth of a cell, in which travel off any grid is counted
-MOST = 99_999  # viewpoints that there may be, and views on a ring
+MOST = 5_000  # viewpoints that there may be: distances between all of them are kept, 200 MB at this number
 SNAP = 1e-6  # radians within which a camera stands at a candidate. What is more is a place of its own
 
 
@@ -171,6 +171,7 @@ class Directions(Viewpoints):
         length = np.linalg.norm(given, axis=1, keepdims=True)
         if not len(given) or not (length > 0).all():
             raise UsageError("there is no direction, or one of length zero")
+        whole(len(given), "the number of viewpoints", 1, MOST)
         number(self.distance, "the distance", above=0)
         object.__setattr__(self, "directions", _fixed(given / length))
 
@@ -205,6 +206,7 @@ class ViewSphere(Viewpoints):
         if not self.elevations:
             raise UsageError("a view sphere needs at least one ring")
         whole(self.azimuths, "the number of views on a ring", 3, MOST)
+        whole(len(self), "the number of viewpoints", 1, MOST)
         for elevation in self.elevations:
             number(elevation, "an elevation", -90, 90)
         number(self.distance, "the distance", above=0)

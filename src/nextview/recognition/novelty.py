@@ -94,8 +94,10 @@ class Novelty(Quantiles):
     def scores(self, embeddings: Float, exact: NDArray[np.bool_] | bool = False) -> NDArray[np.float64]:
         """The novelty score of each view, (B,) float64, from embeddings (B, F): the higher, the more novel.
 
-        ``exact`` views, (B,), are without a sensor's errors.
+        ``exact`` views, (B,), are without a sensor's errors. ModelError where the features are of another size.
         """
+        if embeddings.shape[1] != self.neighbours.shape[1]:
+            raise ModelError("the novelty score was fitted to other features; run nextview fit unknown again")
         nearness = np.asarray(embeddings, np.float32) @ self.neighbours.T
         distance = -np.partition(nearness, -NEIGHBOUR, axis=1)[:, -NEIGHBOUR].astype(np.float64)
         middle, deviation = self.standard[np.broadcast_to(exact, distance.shape).astype(int)].T

@@ -50,12 +50,12 @@ class Frame:
     def __post_init__(self, axes: str, pixel_centre: float) -> None:
         depth = _metres(self.depth)
         intrinsics = _check_intrinsics(self.intrinsics, depth.shape)
-        if not abs(pixel_centre) <= 1:
+        if not isinstance(pixel_centre, int | float) or not abs(pixel_centre) <= 1:
             raise ObservationError(f"the first pixel's centre has the coordinate 0 or 0.5, not {pixel_centre!r}")
         intrinsics[:2, 2] += 0.5 - pixel_centre
         object.__setattr__(self, "depth", depth)
         object.__setattr__(self, "intrinsics", intrinsics)
-        if axes not in AXES:
+        if not isinstance(axes, str) or axes not in AXES:
             raise ObservationError(f"the axes of a pose are {', '.join(AXES)}, not {one_line(repr(axes))}")
         if self.pose is not None:
             pose = check_pose(self.pose)

@@ -26,6 +26,7 @@ from nextview.sensing.plausibility import (
     ViewWarning,
     check_frame,
     check_observation,
+    check_point,
     check_pose_moved,
     check_views,
     refuse_far,
@@ -56,6 +57,8 @@ FINEST = 1 / 32
 SAME = 0.01
 """Change of the centre or the radius, in object radii, below which the object frame is left as it is."""
 
+BELOW = 0.02
+"""Metres below the support plane at which the point of an object may lie: on it, but for what a pose is off."""
 NO_PLANE = ViewWarning(
     "support", "no support plane is seen, so where the object ends below is guessed: support=False if it stands on none"
 )
@@ -215,6 +218,8 @@ class ObservedObject:
         made.append(self._observe(sightings[-1], latest))
         warnings = check_frame(frame) + check_observation(made[-1]) + [MAY_BE_TWO] * two
         warnings += check_pose_moved(frame, [s.frame for s in before.sightings])
+        if self.point is not None:
+            warnings += check_point(upright_axes(up)[:2] @ (self.point - latest.centre), latest.radius)
         warnings += [NO_PLANE] * (self.support and plane is None and self.known is None)
         for view in made[-4:-1]:
             warnings = warnings or check_views(view, made[-1])
@@ -224,12 +229,19 @@ class ObservedObject:
         """The support plane of the first frame."""
         plane = find_plane(samples, rng, up, self._above())
         share = 0.0 if plane is None else float(plane.holds(samples).mean())
+        if (
+            self.point is not None and up is not None and share < 1 / 3
+        ):  # the point may lie on the plane, or a little below
+            higher = self.point + (2 * np.median(samples.tolerance) + BELOW) * up
+            under = find_plane(samples, deepcopy(rng), up, higher)
+            if under is not None and (more := float(under.holds(samples).mean())) > 2 * share:
+                plane, share = under, more
         if up is not None and frame.mask is None and share < 1 / 3:  # else no other is twice as large
             largest = find_plane(samples, rng)
             mistake = None if largest is None else mistake_in_pose(largest, frame.camera_to_world, up)
             if largest is not None and mistake and largest.holds(samples).mean() > 2 * share:
                 raise ObservationError(f"the largest plane in view is not level: {mistake} Or up is another direction")
-        if lies_better_as_range(frame, plane, samples, rng, up):
+        if lies_better_as_range(frame, plane, samples, rng, up, self._above()):
             raise ObservationError("the depth is measured along the rays, a range: give it along the optical axis")
         return plane
 
@@ -297,7 +309,9 @@ class ObservedObject:
         labels, two = clusters.clusters(footprints)
         target = self._target(labels, footprints, ground / cell, axes[:2] / cell)
         chosen = labels[-1] == target
-        mask = trimmed(frame.depth, foot.pixels_over(chosen), height > STANDS * frame.depth)
+        mask = foot.pixels_over(chosen)
+        if (labels[-1][~chosen] > 0).any():  # cells at the border may hold pixels of a neighbour
+            mask = trimmed(frame.depth, mask, height > STANDS * frame.depth)
         if target == 0 or mask.sum() < FEWEST:
             where = "of the object known so far" if earlier else "on the support plane"
             raise ObservationError(f"this frame shows nothing {where}: check its pose, or aim the camera at the object")

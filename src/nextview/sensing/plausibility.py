@@ -18,6 +18,7 @@ INNERMOST = 0.4  # how far from the origin the outermost of what is seen has to 
 CONTRADICTION = 0.2  # views contradict if one misses this share of the surface that the other saw
 OFF_CENTRE = 0.25  # how far a principal point is from the middle of an uncropped picture, at most, half sides of it
 FAR_DEPTH = 10.0  # metres: few depth cameras measure farther, and nothing fills a picture from there
+ASIDE = 3.0  # how far from a thing, object radii, the point that asks for it may be, seen from above
 TOO_FAR = 2.5  # so many times as far as a frame shows anything an object cannot be: of a near one only the front shows
 STILL, CHANGED, CHANGED_SHARE = 1e-3, 0.04, 0.03
 """Metres, and parts of a rotation, up to which a pose is the same; and the part of the distance by which a pixel has
@@ -30,7 +31,7 @@ class ViewWarning:
     """Something that is likely to be wrong, in a sentence.
 
     Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside", "contradiction" and
-    "repeated"; of a frame "intrinsics", "unit", "far origin", "outline", "support" and "stale pose".
+    "repeated"; of a frame "intrinsics", "unit", "far origin", "outline", "support", "point" and "stale pose".
     """
 
     name: str
@@ -70,6 +71,15 @@ def check_frame(frame: Frame) -> list[ViewWarning]:
         message = f"the camera is {origin:.0f} m from the world's origin, and sees {middle:.2g} m far: is the"
         found.append(ViewWarning("far origin", message + " pose in millimetres?"))
     return found
+
+
+def check_point(aside: Float, radius: float) -> list[ViewWarning]:
+    """Whether what was found is far from the point that asked for it, by so much, metres, (2,); usually not."""
+    distance = float(np.linalg.norm(aside))
+    if distance <= ASIDE * radius:
+        return []
+    message = f"the thing nearest to the point is {distance:.2g} m away from it, of {radius:.2g} m radius"
+    return [ViewWarning("point", f"{message}: is the point of another world, or what stands there out of view?")]
 
 
 def check_pose_moved(frame: Frame, earlier: Sequence[Frame]) -> list[ViewWarning]:

@@ -20,7 +20,7 @@ class Recognition:
     """The end of an episode, or how it stands; before the first view nothing is seen.
 
     It is confident where the threshold was reached in a view without warnings, by an object that is not suspiciously
-    novel (see ``SUSPICIOUS``) and may be of the class by its size.
+    novel (see ``SUSPICIOUS``) and may be of the class by its size, and fewer than half of the views contradict others.
     """
 
     views: tuple[View, ...]  # in order

@@ -346,7 +346,9 @@ class Session:
             directions[last][None],
             lambda state: self._constrained(state, reach, object, here),
             hold=lambda step: (
-                bool(warnings) or self._suspicious([*self._scores(), *self._novelty(step, observations[last])])
+                bool(warnings)
+                or self._contradicted(last + 1)
+                or self._suspicious(self._scores([*episodes.steps, step], observations))
             ),
         )
         steps, views = [*episodes.steps, taken.step], list(self.views)
@@ -400,9 +402,13 @@ class Session:
             return [-float(calibration.log_belief(step.total, np.maximum(step.seen, 1), classes).max())]
         return [] if evidence.novelty is None else [float(evidence.novelty[0])]
 
-    def _scores(self) -> list[float]:
-        """The novelty scores of the views so far."""
-        return [view.novelty for view in self.views if view.novelty is not None]
+    def _scores(self, steps: Sequence[Step], observations: Sequence[Observation]) -> list[float]:
+        """The novelty scores of some steps, as their views are seen by now."""
+        return [score for step, seen in zip(steps, observations, strict=True) for score in self._novelty(step, seen)]
+
+    def _contradicted(self, n_views: int) -> bool:
+        """Whether half of so many views or more contradict others: the object moved, or is another one by now."""
+        return 2 * sum(any(w.name == "contradiction" for w in view.warnings) for view in self.views) >= n_views > 0
 
     def _suspicious(self, novelty: Sequence[float]) -> bool:
         """Whether an object with these scores is too novel for a confident answer."""
@@ -457,7 +463,9 @@ class Session:
         """How it ended; or what is believed so far, not confident, while it goes on."""
         with self._lock:
             reached = self.done and bool(self._episodes.outcome.confident[0])
-            reached = reached and not self.views[-1].warnings and not self._suspicious(self._scores())
+            scores = [view.novelty for view in self.views if view.novelty is not None]
+            doubtful = self._contradicted(len(self.views)) or self._suspicious(scores)
+            reached = reached and not self.views[-1].warnings and not doubtful
             all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
             impossible = self._impossible()
             result = Recognition(

@@ -3,6 +3,7 @@
 BOP: Hodan et al., ECCV 2018. TUM RGB-D: Sturm et al., IROS 2012. 7-Scenes: Shotton et al., CVPR 2013.
 """
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -93,7 +94,8 @@ def read_capture(
     if not folder.is_dir():
         raise DatasetError(f"{folder}: there is no such folder")
     for path in folder.rglob("*"):  # a capture from elsewhere may not read other files of this machine
-        if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
+        # Not Path.resolve, which raises where links go round in a circle.
+        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
             raise DatasetError(f"{path}: is a link out of this folder; put what it points to in its place")
     found = [layout for layout, (files, _) in LAYOUTS.items() if next(folder.glob(files), None)]
     if len(found) > 1:
