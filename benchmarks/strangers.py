@@ -1,12 +1,9 @@
 """What whole episodes say of objects: of known classes, or of none.
 
     python benchmarks/strangers.py data/ModelNet10 --split test --objects 250 [--sensor wrist]
-    python benchmarks/strangers.py data/PSB --objects 300 [--sensor wrist] [--every-second]
-    python benchmarks/strangers.py YCB --unit m [--models mine]
+    python benchmarks/strangers.py data/PSB --objects 300 --every-second; YCB --unit m [--models mine]
 
-Each object is looked at by the bundled models, or those of a folder, from a random first view, with all defaults.
-"named" is the share that got an answer, "right" the share with the right class, "most
-like" the same whether it was called unknown or not.
+With all defaults, from a random first view. "most like" counts what was called unknown, too.
 """
 
 from pathlib import Path

@@ -2,7 +2,7 @@
 
     nextview render data/ModelNet10 views.zarr
     nextview render data/PSB unseen.zarr
-    python benchmarks/unknown.py views.zarr unseen.zarr [--split test] [--figure docs/images/unknown.png]
+    python benchmarks/unknown.py views.zarr unseen.zarr [--split test]
 
 The classes of the second store must not be among the recogniser's; that is up to you. Prints the area under the ROC
 curve of the novelty score after one, two, three and five random views, the share of known objects that are taken for
@@ -97,22 +97,10 @@ def main(
     split: str = "test",
     objects: int | None = None,
     recogniser: str = RECOGNISER,
-    figure: Path | None = None,
     samples: int = 1000,
     seed: int = 0,
 ) -> None:
-    """Print the tables.
-
-    Args:
-        known: store of objects of the recogniser's classes.
-        unknown: store of objects of none of them.
-        split: of the first store.
-        objects: at most so many of the second.
-        recogniser: by name or card.
-        figure: write the ROC curves to this file.
-        samples: of the bootstrap.
-        seed: of the views that are drawn, and of the bootstrap.
-    """
+    """Print the tables, for a store of known objects, and one of objects of no known class."""
     network = Recogniser(recogniser)
     if network.novelty is None:
         raise SystemExit(f"{recogniser} cannot tell unknown objects; nextview fit unknown teaches it")
@@ -159,29 +147,6 @@ def main(
         f"\nknown objects after 3 views: right {right.mean():.3f}; of those not taken for unknown at 5 %, "
         f"{right[kept].mean():.3f}; of those taken for unknown, {right[~kept].mean():.3f}"
     )
-    if figure:
-        draw(figure, ours, others, ones)
-
-
-def draw(path: Path, ours: Judged, others: Judged, ones: tuple[NDArray, NDArray]) -> None:
-    """ROC curves after one, two, three and five views."""
-    from matplotlib.figure import Figure
-
-    from nextview.session.episode_figure import save_figure
-    from nextview.session.style import INK
-
-    canvas = Figure(figsize=(5, 4.4), layout="constrained")
-    axis = canvas.add_subplot()
-    for n, shade in zip(VIEWS, ("#b8c4d6", "#8aa0c0", "#4f74a8", "#123a73"), strict=True):
-        a, b = ours.after(n), others.after(n)
-        thresholds = np.sort(np.concatenate([a.ravel(), b.ravel()]))[::-1]
-        rejected = [np.searchsorted(np.sort(-x.ravel()), -thresholds, "right") / x.size for x in (a, b)]
-        area = roc_area(a, b, *ones)
-        axis.plot(*rejected, color=shade, label=f"{n} view{'s' * (n > 1)}, area {area:.3f}")
-    axis.axvline(0.05, color=INK, linewidth=0.6, linestyle=":")
-    axis.set(xlabel="known objects taken for unknown", ylabel="unknown objects caught", xlim=(0, 1), ylim=(0, 1))
-    axis.legend(frameon=False, loc="lower right")
-    save_figure(canvas, path)
 
 
 if __name__ == "__main__":

@@ -49,9 +49,12 @@ def level_pose(direction: Float, distance: float = DISTANCE) -> Float:
 
 
 def great_circle(a: Float, b: Float, n: int = 25) -> Float:
-    """Unit vectors from one to another, (3,) each, along the circle through both, (n, 3)."""
-    line = a + np.linspace(0, 1, n)[:, None] * (b - a)
-    return line / np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
+    """Unit vectors from one to another, (3,) each, on the circle through both, (n, 3); opposite ones over the top."""
+    angle, side = angle_between(a, b), b - (a @ b) * a
+    for up in np.eye(3)[[2, 0]]:
+        side = side if np.linalg.norm(side) > SNAP else up - (up @ a) * a
+    turned = np.linspace(0, angle, n)[:, None]
+    return np.cos(turned) * a + np.sin(turned) * side / np.linalg.norm(side)
 
 
 def _fixed(array: NDArray) -> NDArray:

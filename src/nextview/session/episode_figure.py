@@ -1,126 +1,217 @@
-"""A picture of one episode: what was seen, what the policy decided by, what was believed, and the path."""
+"""A picture of one episode: what was seen, what was believed, what the policy decided by, and the path."""
 
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill, shorten
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d import Axes3D
+from matplotlib.patches import Circle, Wedge
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from nextview.errors import UsageError
-from nextview.geometry.viewsphere import Viewpoints, ViewSphere, great_circle
+from nextview.geometry.viewsphere import Viewpoints, ViewSphere, great_circle, look_at_origin
 from nextview.recognition.belief import Stopping
-from nextview.session.style import ACCENT, FAINT, INK, PlainFigure
+from nextview.session.soft_light import SoftLight
+from nextview.session.style import ACCENT, BLUE, FAINT, GREY, INK, PAPER, STYLE, PlainFigure
 from nextview.session.view import View
+
+WIDE, GAP, LARGE = 2.2, 0.3, 6.0  # inches: of a column, between two, and of the large picture at most
+SHOWN = 4  # classes
+RING, RIM = "#cdbfa6", "#a8977a"  # of the dome: its lines, its candidate views
+WORTH = LinearSegmentedColormap.from_list("worth", ["#f1e9da", "#9cc3dc", BLUE])
+DOME, AWAY = 1.35, 10.0  # how far from the object its candidate views are drawn, and the eye is, object radii
+NUMBER: dict[str, Any] = {"ha": "center", "va": "center_baseline", "color": "white", "weight": "bold"}
 
 
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure into a PNG, PDF or SVG file."""
     try:
-        figure.savefig(path, dpi=110, facecolor="white")
+        figure.savefig(path, dpi=120)
     except (OSError, ValueError) as error:
         raise UsageError(f"{path}: the figure cannot be written ({error})") from None
 
 
+@matplotlib.rc_context(STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER})
 def draw_episode(
     views: Sequence[View], classes: Sequence[str], sphere: Viewpoints, stopping: Stopping, heading: str
 ) -> Figure:
-    """One column for each view (image, what the policy valued the views at, belief), and the sphere beside them."""
+    """A column for each view (image, belief, what the policy valued the views at); beside them object and path."""
     valued = any(view.values is not None for view in views)
-    heights = [2.7, 2.6, 2.9] if valued else [2.7, 2.9]
-    figure = PlainFigure(figsize=(2.5 * len(views) + 5.2, sum(heights)), layout="constrained")
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.5 * len(views), 5.2])[0]
-    axes = left.subplots(len(heights), len(views), squeeze=False, gridspec_kw={"height_ratios": heights})
-    shown = np.argsort(-np.max([view.belief for view in views], axis=0))[:5]
-    names = [name.replace("_", " ") for name in classes]
-    for k, view in enumerate(views):
-        _draw_image(axes[0, k], view, k + 1)
-        if valued:
-            _draw_values(axes[1, k], view, sphere, [v.index for v in views[:k]], first=k == 0)
-        _draw_belief(axes[-1, k], view, k + 1, float(stopping.threshold_at(k + 1)), names, shown)
-    _draw_path(right.add_subplot(projection="3d"), views, sphere)
-    figure.suptitle(heading, color=INK, fontsize=13)
+    light, path = SoftLight([view.observation for view in views]), np.array([view.direction for view in views])
+    seen_from = _best_side(path)
+    rows = [("", WIDE), ("what it believes", 1.5), ("worth of each view, from above", WIDE)]
+    rows = rows if valued else rows[:2]
+    large = LARGE if valued else LARGE - 1
+    width = GAP + len(views) * (WIDE + GAP) + large + GAP
+    said, _, more = heading.rpartition(" (") if heading.endswith(")") else (heading, "", "")
+    said, more = fill(said, int(7.6 * width)), fill(more[:-1], int(11 * width))
+    top = 0.42 + 0.27 * said.count("\n") + 0.24 * (more.count("\n") + 1)
+    height = top + sum(0.42 + high for _, high in rows) + 0.2
+    figure = PlainFigure(figsize=(width, height))
+    figure.text(GAP / width, 1 - 0.2 / height, said, fontsize=16, weight="bold", color=BLUE, va="top")
+    figure.text(GAP / width, 1 - (top - 0.08) / height, more, fontsize=10, color=GREY, va="bottom")
+    shown = np.argsort(-np.max([view.belief for view in views], axis=0), kind="stable")[:SHOWN]
+
+    def axes(x: float, y: float, wide: float, high: float) -> Axes:
+        made = figure.add_axes((x / width, y / height, wide / width, high / height))
+        made.axis("off")
+        return made
+
+    y = height - top
+    for title, high in rows:
+        y -= 0.42 + high
+        figure.text(GAP / width, (y + high + 0.1) / height, title, fontsize=10, color=GREY)
+        for k, view in enumerate(views):
+            axis = axes(GAP + k * (WIDE + GAP), y, WIDE, high)
+            if title == rows[0][0]:
+                _draw_image(axis, view, k + 1, light)
+            elif title == rows[1][0]:
+                _draw_belief(axis, view, float(stopping.threshold_at(k + 1)), classes, shown)
+            else:
+                _draw_values(axis, views[: k + 1], sphere, seen_from)
+    x = GAP + len(views) * (WIDE + GAP)
+    figure.text(x / width, (height - top - 0.32) / height, "where it looked from", fontsize=10, color=GREY)
+    _draw_path(axes(x, y, large, height - top - 0.42 - y), path, sphere, light, seen_from)
     return figure
 
 
-def _draw_image(axis: Axes, view: View, step: int) -> None:
-    elevation, azimuth = view.angles
-    axis.imshow(view.observation.picture, cmap="gray", vmin=0, vmax=255)
-    where = f"{elevation:.0f}° up, {round(azimuth) % 360}° round"
-    axis.set_title(f"step {step}: view {view.index}\n{where}", color=INK, fontsize=10)
-    axis.axis("off")
+def _best_side(path: NDArray[np.float64]) -> float:
+    """The azimuth, radians, from which the way is seen best: before the eye, its places apart, and not straight on."""
+    found = []
+    for azimuth in np.radians(np.arange(20, 380, 45)):
+        pose = look_at_origin(np.radians(25), azimuth, AWAY)
+        facing, flat = path @ pose[:3, 3] / AWAY, path @ pose[:3, :2]
+        apart = [float(np.linalg.norm(a - b)) for a, b in itertools.combinations(flat, 2)]
+        found.append((min([*apart, 0.6]) - ((facing - 0.8) ** 2).mean(), azimuth))
+    return float(max(found)[1])
 
 
-def _draw_values(axis: Axes, view: View, sphere: Viewpoints, visited: list[int], first: bool) -> None:
-    """What the policy valued each candidate view at, elevation over azimuth, with here, next and the visited marked."""
-    if view.values is None:
-        axis.axis("off")
-        axis.text(0.5, 0.5, "no other view needed", ha="center", va="center", fontsize=9, color=INK)
+def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
+    """The object as this view shows it: by its picture if a camera took one, else by its depth."""
+    seen, (elevation, azimuth) = view.observation, view.angles
+    times = 1 if seen.image is not None and not seen.exact else max(1, round(400 / max(seen.depth.shape)))
+    height, width = seen.depth.shape
+    larger = seen.intrinsics * [[times], [times], [1]]
+    pixels, _ = light.picture([light.surfaces[step - 1]], seen.pose, larger, (times * height, times * width))
+    if times == 1 and seen.image is not None:
+        taken = seen.image[..., None] / 255 * (255, 250, 240)
+        pixels = np.where(seen.depth[..., None] > 0, taken, pixels).astype(np.uint8)
+    axis.imshow(pixels, interpolation="antialiased")
+    inside: dict[str, Any] = {"transform": axis.transAxes, "fontsize": 9}
+    axis.text(0.05, 1.08, str(step), **inside, **NUMBER, bbox={"boxstyle": "circle,pad=0.25", "color": BLUE})
+    where = f"view {view.index}: {elevation:.0f}° up, {round(azimuth) % 360}° round"
+    axis.text(0.13, 1.08, where, va="center_baseline", color=INK, **inside)
+    said = [] if seen.seen else ["nothing is seen"]
+    said += [warning.name for warning in view.warnings]
+    axis.text(0.04, 0.03, "\n".join(said), va="bottom", color=ACCENT, **inside)
+
+
+def _draw_belief(axis: Axes, view: View, threshold: float, classes: Sequence[str], shown: NDArray[np.int64]) -> None:
+    """Bars of the classes shown, with a mark where belief is enough."""
+    best, at = int(view.belief.argmax()), 0.015 + 0.97 * threshold
+    for row, c in enumerate([*shown, *[best][: best not in shown]]):
+        share, colour = float(view.belief[c]), BLUE if c == best else GREY
+        axis.text(0, row - 0.22, shorten(classes[c].replace("_", " "), 26, placeholder="…"), fontsize=10)
+        axis.text(1, row - 0.22, f"{100 * share:.0f} %", fontsize=10, ha="right")
+        axis.plot([0.015, 0.985], [row, row], color=FAINT, linewidth=5, solid_capstyle="round")
+        if share >= 0.005:
+            axis.plot([0.015, 0.015 + 0.97 * share], [row, row], color=colour, linewidth=5, solid_capstyle="round")
+        axis.plot([at, at], [row - 0.14, row + 0.14], color=INK, linewidth=1.6)
+    axis.text(min(at + 0.02, 1), row + 0.72, f"enough: {100 * threshold:.0f} %", fontsize=8.5, color=GREY, ha="right")
+    axis.set(xlim=(0, 1), ylim=(SHOWN - 0.2, -0.62))
+
+
+def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_from: float) -> None:
+    """The dome of candidate views from above, by what the policy valued each at; the eye of the large picture below."""
+    view, turned = views[-1], sphere.azimuth - seen_from - np.pi / 2
+    out = 90 - np.degrees(sphere.elevation)
+    values = np.full(len(sphere), np.nan) if view.values is None else view.values
+    known = np.isfinite(values)
+    low, high = (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)
+    colours = np.where(known[:, None], WORTH((values - low) / (high - low or 1)), to_rgba("#ece9e3"))
+    flat = np.stack([out * np.cos(turned), out * np.sin(turned)], 1)
+    limit = max(97.0, float(out.max()) + 10)
+    if isinstance(sphere, ViewSphere):
+        rings = np.sort(90 - np.asarray(sphere.elevations, float))
+        between = (rings[1:] + rings[:-1]) / 2
+        first, last = (between[0] - rings[0], rings[-1] - between[-1]) if len(rings) > 1 else (9.0, 9.0)
+        edges = np.array([max(rings[0] - first, 0), *between, rings[-1] + last])
+        half, limit = 180 / sphere.azimuths, max(limit, edges[-1] + 2)
+        for radius, angle, colour in zip(out, np.degrees(turned), colours, strict=True):
+            inner, outer = edges[np.searchsorted(edges, radius) - 1 :][:2]
+            shape: dict[str, Any] = {"width": outer - inner, "facecolor": colour, "edgecolor": PAPER, "linewidth": 1.2}
+            axis.add_patch(Wedge((0, 0), outer, angle - half, angle + half, **shape))
+    else:
+        axis.scatter(flat[:, 0], flat[:, 1], c=colours, s=float(np.clip(7000 / len(sphere), 6, 130)), edgecolor=PAPER)
+    for step, past in enumerate(views, 1):
+        axis.add_patch(Circle(flat[past.index], 8, facecolor=BLUE if past is view else GREY, edgecolor=PAPER))
+        axis.text(flat[past.index, 0], flat[past.index, 1], str(step), fontsize=8, **NUMBER)
+    axis.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
+    if view.next_view is None:
+        axis.text(0, 1.05, "the last view", fontsize=10, color=GREY, transform=axis.transAxes)
         return
-    axis.set_title("value of each view", fontsize=9)
-    azimuth, elevation = np.degrees(sphere.azimuth), np.degrees(sphere.elevation)
-    valued = np.isfinite(view.values)
-    shape: dict[str, Any] = {"marker": "s", "s": 120} if isinstance(sphere, ViewSphere) else {"marker": "o", "s": 34}
-    axis.scatter(azimuth[~valued], elevation[~valued], color=FAINT, **shape)
-    axis.scatter(azimuth[valued], elevation[valued], c=view.values[valued], cmap="viridis", **shape)
-    marks = [(index, INK, "x") for index in visited] + [(view.index, INK, "here")]
-    if view.next_view is not None:
-        marks.append((view.next_view, ACCENT, "next"))
-    for index, colour, label in marks:
-        if label != "x":
-            axis.scatter(azimuth[index], elevation[index], s=160, facecolor="none", edgecolor=colour, linewidth=2)
-        axis.text(azimuth[index], elevation[index] + 4, label, ha="center", fontsize=6, color=colour, weight="bold")
-    axis.set_xlabel("azimuth", fontsize=8)
-    axis.set_xticks([0, 90, 180, 270, 360], [f"{a}°" for a in (0, 90, 180, 270, 360)], fontsize=8)
-    axis.tick_params(axis="y", labelsize=8)
-    axis.yaxis.set_major_formatter("{x:.0f}°")
-    if first:
-        axis.set_ylabel("elevation")
+    here, there = flat[view.index], flat[view.next_view]
+    axis.add_patch(Circle(there, 8, facecolor=PAPER, edgecolor=ACCENT, linewidth=2.2))
+    side = 1 if there[1] >= here[1] else -1
+    for name, at, colour, off in (("here", here, BLUE, -17 * side), ("next", there, ACCENT, 17 * side)):
+        axis.text(at[0], at[1] + off, name, fontsize=9, weight="bold", color=colour, ha="center", va="center",
+                  path_effects=[withStroke(linewidth=3, foreground=PAPER)])  # fmt: skip
 
 
-def _draw_belief(
-    axis: Axes, view: View, step: int, threshold: float, names: Sequence[str], shown: NDArray[np.int64]
-) -> None:
-    """Bars of the classes shown: the belief so far, and by this view alone."""
-    rows = np.arange(len(shown))[::-1]
-    axis.barh(rows + 0.18, view.belief[shown], 0.36, color=ACCENT, label="belief after this view")
-    axis.barh(rows - 0.18, view.alone[shown], 0.36, color=FAINT, label="this view alone")
-    axis.axvline(threshold, color=INK, linewidth=1, linestyle=":", label="threshold")
-    axis.set_xlim(0, 1)
-    axis.set_yticks(rows, [names[c] for c in shown] if step == 1 else [])
-    axis.spines[["top", "right"]].set_visible(False)
-    best = int(view.belief.argmax())
-    believed = f"{names[best]} {view.belief[best]:.3f}"
-    axis.set_title(believed if view.observation.seen else "nothing is seen", fontsize=10, color=ACCENT)
-    axis.set_xlabel(f"threshold {threshold:.2f}", fontsize=8)
-    if step == 1:
-        axis.legend(fontsize=7, loc="lower right", frameon=False)
+def _draw_path(axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light: SoftLight, seen_from: float) -> None:
+    """The object, as far as it was seen, in the dome of candidate views, and the way over the dome."""
+    figure = axis.figure
+    assert isinstance(figure, Figure)
+    wide, high = axis.get_position().width * figure.get_figwidth(), axis.get_position().height * figure.get_figheight()
+    shape = round(130 * high), round(130 * wide)
+    pose, focal = look_at_origin(np.radians(25), seen_from, AWAY), 0.5 * AWAY / 1.5 * min(shape)
+    intrinsics = np.array([[focal, 0, shape[1] / 2], [0, focal, 0.56 * shape[0]], [0, 0, 1.0]])
+    pixels, far = light.picture(light.surfaces, pose, intrinsics, shape)
+    axis.imshow(pixels, interpolation="antialiased", aspect="auto")
 
+    def place(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pixels of points of the dome, and how plainly they are drawn there: behind the object or at the back less."""
+        inside = (DOME * points - pose[:3, 3]) @ pose[:3, :3]
+        flat = inside[:, :2] / inside[:, 2:] * focal + intrinsics[:2, 2]
+        row, column = np.clip(flat[:, ::-1].astype(int), 0, np.array(shape) - 1).T
+        back = np.where(points @ pose[:3, 3] < 0, 0.45, 1.0)
+        return flat, np.where(far[row, column] < inside[:, 2], 0.15, back)
 
-def _draw_path(axis: Axes3D, views: Sequence[View], sphere: Viewpoints) -> None:
-    d = sphere.directions
-    axis.scatter(*d.T, s=14, color=FAINT, depthshade=False)
-    for elevation in np.radians(sphere.elevations) if isinstance(sphere, ViewSphere) else ():
-        around = np.linspace(0, 2 * np.pi, 91)
-        ring = np.cos(elevation) * np.cos(around), np.cos(elevation) * np.sin(around), 0 * around + np.sin(elevation)
-        axis.plot(*ring, color=FAINT, linewidth=0.6)
-    seen = [view.observation.points[::3] for view in views if view.observation.seen]
-    cloud = np.concatenate([np.zeros((0, 3)), *seen])
-    axis.scatter(*cloud.T, s=1, color=INK, alpha=0.35, depthshade=False)
-    path = np.array([view.direction for view in views])
+    def line(points: NDArray[np.float64], colour: str, width: float) -> None:
+        flat, plain = place(points)
+        for share in np.unique(plain):
+            part = (plain == share) | np.append(False, plain[:-1] == share)
+            shown = np.where(part[:, None], flat, np.nan)
+            axis.plot(*shown.T, color=colour, linewidth=width, alpha=share, solid_capstyle="butt")
+
+    around = np.linspace(0, 2 * np.pi, 181)
+    rings = sphere.elevations if isinstance(sphere, ViewSphere) else (0, 30, 60)
+    for up in np.radians(rings):
+        line(
+            np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), 0 * around + np.sin(up)], 1), RING, 0.9
+        )
+    for turn in np.arange(8) * np.pi / 4:  # meridians
+        line(great_circle(np.array([np.cos(turn), np.sin(turn), 0]), np.array([0.0, 0, 1]), 61), RING, 0.5)
+    flat, plain = place(sphere.directions)
+    axis.scatter(
+        flat[:, 0],
+        flat[:, 1],
+        s=22,
+        color=PAPER,
+        edgecolor=[to_rgba(RIM, share) for share in plain],
+        linewidth=1.2,
+        zorder=3,
+    )
     for a, b in itertools.pairwise(path):
-        axis.plot(*great_circle(a, b).T, color=ACCENT, linewidth=2)
-    axis.scatter(*path.T, s=46, color=ACCENT, depthshade=False)
-    for step, place in enumerate(path, 1):
-        axis.text(*(place * 1.16), str(step), color=ACCENT, fontsize=12, weight="bold", ha="center")
-    # Look from the side where the path is, a little from above.
-    middle = path.sum(0)
-    axis.view_init(elev=24, azim=float(np.degrees(np.arctan2(middle[1], middle[0]))) - 25)
-    axis.set_box_aspect((1, 1, 0.75), zoom=1.2)  # room for the numbers at its rim
-    axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-0.5, 1))
-    axis.set_axis_off()
-    axis.set_title("where it looked from, and the points it saw", fontsize=10, color=INK)
+        line(great_circle(a, b, 61), BLUE, 2.6)
+    for step, at in enumerate(place(path)[0], 1):
+        axis.scatter([at[0]], [at[1]], s=230, color=BLUE, edgecolor=PAPER, linewidth=1.5, zorder=4)
+        axis.text(at[0], at[1], str(step), fontsize=10, zorder=5, **NUMBER)
+    axis.set(xlim=(-0.5, shape[1] - 0.5), ylim=(shape[0] - 0.5, -0.5))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 INK, GREY, FAINT = "#1f2933", "#8a949e", "#d5dbe1"
 BLUE, LIGHT_BLUE, ACCENT = "#0b5fa5", "#38a0d9", "#d1495b"  # of all figures; policies: ``figures.COLOURS``
+PAPER, GROUND, WOOD = "#fafaf8", "#f5efe4", "#e0ab6c"  # of pictures: the page, what things stand on, the things
 SERIES = ("#0b6e99", "#c4532d", "#4b8b3b", "#7a5195", "#b8860b", "#555555")  # of several things of one kind, in turn
 UNKNOWN = 201, 210, 218  # the colour of what has no value
 STYLE = {
