@@ -55,7 +55,7 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
         console.print(Text.assemble("It is ", (printable(result.none_of_them), "bold"), why))
     else:
         console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), ", belief ", rest))
-    if result.novelty is not None:
+    if result.novelty is not None and not result.unknown:
         console.print(f"Of objects of known classes, {100 * result.novelty:.3g} % are at least as novel.")
 
 

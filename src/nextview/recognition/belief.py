@@ -228,10 +228,10 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         low, high = (np.array([np.interp(at * row[-1], row, grid) for row in share]) for at in (RARE, 1 - RARE))
         return low, high
 
-    def impossible(self, radius: float) -> NDArray[np.bool_]:
+    def impossible(self, radius: float, much: float = MUCH) -> NDArray[np.bool_]:
         """Whether an object of this radius, metres, is much smaller or larger than nearly all of each class, (C,)."""
         low, high = self._usual
-        return (np.log(radius) < low - np.log(MUCH)) | (np.log(radius) > high + np.log(MUCH))
+        return (np.log(radius) < low - np.log(much)) | (np.log(radius) > high + np.log(much))
 
     def logits(self, radii: Floating) -> NDArray[np.float32]:
         """What is added to the logits, (B, C) float32, for object radii in metres, (B,); zero where these are NaN."""

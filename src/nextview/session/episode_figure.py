@@ -200,15 +200,8 @@ def _draw_path(axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light:
     for turn in np.arange(8) * np.pi / 4:  # meridians
         line(great_circle(np.array([np.cos(turn), np.sin(turn), 0]), np.array([0.0, 0, 1]), 61), RING, 0.5)
     flat, plain = place(sphere.directions)
-    axis.scatter(
-        flat[:, 0],
-        flat[:, 1],
-        s=22,
-        color=PAPER,
-        edgecolor=[to_rgba(RIM, share) for share in plain],
-        linewidth=1.2,
-        zorder=3,
-    )
+    rims = [to_rgba(RIM, share) for share in plain]
+    axis.scatter(flat[:, 0], flat[:, 1], s=22, color=PAPER, edgecolor=rims, linewidth=1.2, zorder=3)
     for a, b in itertools.pairwise(path):
         line(great_circle(a, b, 61), BLUE, 2.6)
     for step, at in enumerate(place(path)[0], 1):

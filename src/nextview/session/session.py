@@ -19,7 +19,7 @@ from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.viewsphere import Viewpoints, angle_between, azimuth_of, direction_of
 from nextview.policies.base import EpisodeState, Policy, ValuesViews
 from nextview.policies.off_grid import anywhere
-from nextview.recognition.belief import Stopping, log_evidence_of
+from nextview.recognition.belief import MUCH, Stopping, log_evidence_of
 from nextview.recognition.inference import Models
 from nextview.recognition.map_names import maps_among
 from nextview.sensing.frame import Frame
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
 Float = NDArray[np.float64]
+THING_SIZE = 1.3  # times that the size of a taught thing is off, half hidden say, which none has
 FARTHEST_TARGET = 20.0
 """Object radii: a depth camera measures from some 0.25 m on, and few objects have a radius below 0.02 m."""
 CONTRADICTABLE = 3
@@ -487,7 +488,9 @@ class Session:
         sizes, radius = card and card.size, self.views[-1].observation.radius if self.views else None
         if sizes is None or radius is None:
             return ()
-        return tuple(name for name, off in zip(self.models.classes, sizes.impossible(radius), strict=True) if off)
+        things = bool(self.models.recogniser.calibration.hypotheses)  # a thing has one size, a class has many
+        wrong = sizes.impossible(radius, THING_SIZE if things else MUCH)
+        return tuple(name for name, off in zip(self.models.classes, wrong, strict=True) if off)
 
 
 def _next_of(step: Step) -> int | None:
