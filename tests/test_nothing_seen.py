@@ -6,6 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.text import Text
 from pipeline import make_recogniser, refused
 from scipy.special import softmax
 
@@ -134,7 +135,8 @@ def test_nothing_seen_is_no_answer(tiny):
     result = session.result
     assert len(result.views) == 3
     assert (result.answer, result.confidence, result.confident, result.seen) == (None, 0.0, False, False)
-    assert "nothing is seen" in result.plot(title="air").get_suptitle()
+    drawn = result.plot(title="air")
+    assert any("nothing is seen" in text.get_text() for text in drawn.findobj(Text))
 
 
 # Meshes and the command line

@@ -79,8 +79,8 @@ class RenderOptions:
     """What is rendered, and how."""
 
     seed: int = 0  # decides deformations and errors of a sensor: those of an object by its name alone
-    noise_seed: int | None = None  # decides the errors of a sensor instead: the same objects, with other errors
     deform: Deform = Deform()  # how to make a new object of each mesh
+    noise_seed: int | None = None  # decides the errors of a sensor instead: the same objects, with other errors
     # look through it with all its errors: NAME or NAME:STRENGTH (docs/your_camera.md); clean by default
     sensor: str | None = None
     # of length in the mesh files (mm, cm, inch, foot, m), so that sizes are known (ModelNet: inch)
