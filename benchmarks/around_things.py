@@ -27,7 +27,7 @@ from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.recognition.belief import FixedLength
 from nextview.session.recognition import Recognition
 from nextview.session.session import Session
-from nextview.session.style import BLUE, STYLE
+from nextview.session.style import BLUE, GREY, PAPER, STYLE
 from nextview.simulation.robot_camera import RobotCamera
 from nextview.simulation.scene import Scene, build_scene, footprint
 from nextview.simulation.simulated import OTHER, TARGET
@@ -52,11 +52,13 @@ def from_above(axis: Axes, scene: Scene, directions: list[np.ndarray]) -> None:
     for outline, colour in [(footprint(scene.target.vertices), TARGET), *((i.footprint, OTHER) for i in scene.items)]:
         axis.add_patch(Polygon(outline, color=COLOURS[colour]))
     at = 3 * np.array(directions)
-    axis.plot(at[:, 0], at[:, 1], "-", color=BLUE, linewidth=1)
+    axis.plot(at[:, 0], at[:, 1], "-", color=BLUE, linewidth=2)
     for k, place in enumerate(at, 1):
-        axis.text(place[0], place[1], str(k), ha="center", va="center", fontsize=8, color="w",
+        axis.text(place[0], place[1], str(k), ha="center", va="center", fontsize=9, weight="bold", color="w",
                   bbox={"boxstyle": "circle,pad=0.15", "color": BLUE})  # fmt: skip
     axis.set(xlim=(-3.6, 3.6), ylim=(-3.6, 3.6), xticks=[], yticks=[], aspect="equal")
+    axis.set_title("from above", fontsize=10, loc="left", color=GREY)
+    axis.spines[:].set_visible(False)
 
 
 def main(
@@ -80,23 +82,25 @@ def main(
     scene, shows = build_scene(layout, dataset), np.array(layout.visible)
     may = (shows >= SHOWS) & ~np.isin(np.arange(len(shows)), layout.unreachable)
     start = int(np.where(may, shows, np.inf).argmin())
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = Figure((2.1 * (views + 1), 2.4 * len(policies)))
-        axes = figure.subplots(len(policies), views + 1, squeeze=False, gridspec_kw={"wspace": 0.05, "hspace": 0.2})
+    what = target.rpartition("_")[0].replace("_", " ")
+    with matplotlib.rc_context(STYLE | {"axes.grid": False, "axes.facecolor": PAPER}):
+        figure = Figure((3.1 * (views + 1), 3.5 * len(policies)))
+        axes = figure.subplots(len(policies), views + 1, squeeze=False, gridspec_kw={"wspace": 0.06, "hspace": 0.2})
         for row, policy in zip(axes, policies, strict=True):
             found = session(scene, policy, models, start, views, seed)
-            for axis, view in zip(row, found.views, strict=False):
+            for k, (axis, view) in enumerate(zip(row, found.views, strict=False), 1):
                 elevation, azimuth = np.radians(view.angles)
                 axis.imshow(picture(scene, look_at_origin(elevation, azimuth)))
                 best = int(view.belief.argmax())
-                axis.set_title(
-                    f"{shows[view.index]:.0%} shows: {found.classes[best]} {view.belief[best]:.2f}", fontsize=8, pad=3
-                )
+                believed = f"{found.classes[best].replace('_', ' ')} {100 * view.belief[best]:.0f} %"
+                after = f"after {k} view{'s' * (k > 1)}: {believed}"
+                axis.set_title(f"{after}\n{100 * shows[view.index]:.0f} % of the {what} shows", fontsize=10, loc="left")
             for axis in row[:-1]:
                 axis.set(xticks=[], yticks=[], xlim=(0, SIZE - 1), ylim=(SIZE - 1, 0))
-            row[0].set_ylabel(policy, fontsize=9)
+                axis.spines[:].set_visible(False)
+            row[0].set_ylabel(policy, fontsize=13, weight="bold", color=BLUE if policy != policies[0] else GREY)
             from_above(row[-1], scene, [view.direction for view in found.views])
-        figure.savefig(out, dpi=90, facecolor="white", bbox_inches="tight", pad_inches=0.05)
+        figure.savefig(out, dpi=125, facecolor=PAPER, bbox_inches="tight", pad_inches=0.15)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from nextview.simulation.simulated import OTHER, TABLE_TOP, TARGET, SceneCamera
 SIZE = 240
 WIDE = 0.55
 """Of the focal length with which the target fills the picture."""
-COLOURS = {TARGET: (0.95, 0.55, 0.15), OTHER: (0.45, 0.5, 0.58), TABLE_TOP: (0.93, 0.91, 0.87)}
+COLOURS = {TARGET: (0.95, 0.55, 0.15), OTHER: (0.62, 0.60, 0.58), TABLE_TOP: (0.95, 0.92, 0.86)}
 VIEWS = (10, 12, 14, 16, 18, 27)
 
 
@@ -38,7 +38,7 @@ def picture(scene: Scene, pose: np.ndarray) -> np.ndarray:
     intrinsics = pinhole(SIZE, 3.0) * [[WIDE, 1, 1], [1, WIDE, 1], [1, 1, 1]]
     depth, owner = SceneCamera(scene, intrinsics, (SIZE, SIZE)).look(pose)
     shade = headlight(depth, intrinsics)[..., None] / 255
-    image = np.ones((SIZE, SIZE, 3))
+    image = np.tile(np.array([0.98, 0.965, 0.94]), (SIZE, SIZE, 1))
     for which, colour in COLOURS.items():
         image = np.where((owner == which)[..., None], np.array(colour) * (0.35 + 0.65 * shade), image)
     return np.clip(image, 0, 1)
