@@ -46,9 +46,11 @@ from research.training_curves import read_log
 V = 5
 SPHERE = ViewSphere((0.0, 30.0), 8, 3.0)
 RECIPE = RecogniserRecipe(size=32, epochs=3, views=4, batch=8)
-SMALL = RecogniserRecipe(size=16, epochs=1, views=2, batch=4, validation=0.25, azimuth_bins_weight=0.3)
+# Of 16 pixels the last step of a ResNet is a strided convolution of one pixel, whose bfloat16 gradient on a CPU is not
+# always finite (torch 2.13).
+SMALL = RecogniserRecipe(size=32, epochs=1, views=2, batch=4, validation=0.25, azimuth_bins_weight=0.3)
 EXACT = Hardware(precision="32-true")
-SMALL_MAP = MapRecipe(size=16, epochs=1, views=2, batch=4, validation=0.25)
+SMALL_MAP = MapRecipe(size=32, epochs=1, views=2, batch=4, validation=0.25)
 
 
 # Batches
@@ -348,10 +350,10 @@ def test_trained_models_have_cards_and_run(trained, views):
     assert card.held_out == tuple(sorted(run.held_out))
     store = ViewStore.open(views)
     assert set(card.held_out) < {n for n, split in zip(store.names, store.splits, strict=True) if split == "train"}
-    evidence = Recogniser(trained / "models/tiny.json").from_inputs(np.zeros((3, 4, 16, 16), np.uint8))
+    evidence = Recogniser(trained / "models/tiny.json").from_inputs(np.zeros((3, 4, 32, 32), np.uint8))
     assert evidence.logits.shape == (3, 3)
     assert np.exp(evidence.azimuth_bins).sum(2) == pytest.approx(np.ones((3, 3)), abs=1e-4)
-    lem = MapNetwork(trained / "models/tiny-lem.json").from_inputs(np.zeros((2, 4, 16, 16), np.uint8))
+    lem = MapNetwork(trained / "models/tiny-lem.json").from_inputs(np.zeros((2, 4, 32, 32), np.uint8))
     assert (lem["lem"] == lem["lem-sphere"][:, :, [-1, 0, 1]]).all()
     assert lem["lem-sphere"].shape == (2, 5, 8)
     before = (trained / "models/tiny.onnx").read_bytes()
@@ -366,7 +368,7 @@ def test_several_runs_are_averaged(trained, views, tmp_path):
     run = trained / "runs/recogniser"
     train_recogniser(views, tmp_path / "on", weights=run, recipe=replace(SMALL, ensemble_seed=1))
     export_recogniser(run, views, tmp_path, also=(tmp_path / "on",), name="both")
-    x = load_inputs(views, 16)[0, :3]
+    x = load_inputs(views, 32)[0, :3]
     networks = [run_network(folder, SMALL, ViewStore.open(views)) for folder in (run, tmp_path / "on")]
     with torch.no_grad():
         outputs = [network(torch.from_numpy(x).float() / 255) for network in networks]
