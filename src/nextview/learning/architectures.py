@@ -5,8 +5,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning.inputs import CHANNELS_OF
 from nextview.learning.recipes import MapRecipe, RecogniserRecipe
+from nextview.recognition.network_input import CHANNELS_OF
 
 STAGES = (  # expansion, width, kernel, stride and blocks (Tan and Le, EfficientNet, ICML 2019, table 1)
     (1, 16, 3, 1, 1),
