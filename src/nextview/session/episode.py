@@ -27,6 +27,7 @@ class Step:
     views: NDArray[np.int64]  # the view taken, or the one nearest to where the camera stood, (A,)
     evidence: Evidence
     belief: Float  # fused after it, (A, classes)
+    enough: NDArray[np.bool_]  # whether belief is enough to stop, (A,)
     stopped: NDArray[np.bool_]  # whether the episode ended here, (A,)
     next_views: NDArray[np.int64]  # where it goes next, (A,); -1 where it ended
     total: Float  # sum of the log-evidence in it and before, (A, D), see ``belief.log_evidence_of``
@@ -114,7 +115,8 @@ class Episodes:
         """What ``update`` would take in. Nothing is changed; ``keep`` takes it in. No threshold stops on ``hold``."""
         taken = self._taken(evidence, directions)
         step, n_views = taken.step, len(self.steps) + 1
-        stopped = self.stopping.reached(step.belief, np.maximum(step.seen, 1)) & taken.counts & (not hold(step))
+        enough = self.stopping.reached(step.belief, np.maximum(step.seen, 1)) & (step.seen > 0) & (not hold(step))
+        stopped = enough & taken.counts
         if n_views >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
         if not stopped.all():
@@ -122,7 +124,7 @@ class Episodes:
             state, chosen = self._move(self._state(taken, going), constrain)
             step.next_views[going] = chosen
             step = replace(step, state=state)
-        return replace(taken, step=replace(step, stopped=step.next_views < 0))
+        return replace(taken, step=replace(step, enough=enough, stopped=step.next_views < 0))
 
     def take(self, evidence: Evidence, directions: Float | None = None) -> None:
         """Take in a view after which it is known that the episodes went on: neither stop nor choose."""
@@ -207,8 +209,8 @@ class Episodes:
         total, counted = before + seen[:, None] * said, counted + seen
         # Before anything is seen the total is zero, whatever it is divided by.
         belief = self.calibration.belief(total, np.maximum(counted, 1), evidence.logits.shape[1])
-        stopped, nowhere = np.zeros(len(now), bool), np.full(len(now), -1)
-        step = Step(now, views, evidence, belief, stopped, nowhere, total, counted)
+        no, nowhere = np.zeros(len(now), bool), np.full(len(now), -1)
+        step = Step(now, views, evidence, belief, no, no, nowhere, total, counted)
         return Taken(step, seen, visited, azimuth, places)
 
     def _visibility(self, last: Step, state: EpisodeState) -> Float:
@@ -321,8 +323,7 @@ class Episodes:
             answer[step.episodes] = step.belief.argmax(1)
             confidence[step.episodes] = step.belief.max(1)
             n_views[step.episodes] = k + 1
-            reached = self.stopping.reached(step.belief, np.maximum(step.seen, 1))
-            confident[step.episodes] = reached & (step.seen > 0)
+            confident[step.episodes] = step.enough
         moved, legs = views[:, 1:] >= 0, (views[:, :-1], views[:, 1:])
         travel, arc = ((ways[legs] * moved).sum(1) for ways in (self.sphere.travel, self.sphere.arc))
         return Outcome(answer, confidence, n_views, confident, travel, arc, views)

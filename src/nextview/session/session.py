@@ -463,24 +463,20 @@ class Session:
     def result(self) -> Recognition:
         """How it ended; or what is believed so far, not confident, while it goes on."""
         with self._lock:
-            reached = self.done and bool(self._episodes.outcome.confident[0])
-            scores = [view.novelty for view in self.views if view.novelty is not None]
-            doubtful = self._contradicted(len(self.views)) or self._suspicious(scores)
-            reached = reached and not self.views[-1].warnings and not doubtful
+            enough = self.done and bool(self._episodes.outcome.confident[0])
             all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
-            impossible = self._impossible()
             result = Recognition(
                 tuple(self.views),
                 self.models.classes,
-                reached,
+                enough,
                 self.sphere,
                 self.stopping,
-                stranded=self.done and not reached and not all_taken,
+                stranded=self.done and not enough and not all_taken,
                 score=self.models.recogniser.novelty,
                 unknown_rate=self.unknown,
-                impossible=impossible,
+                impossible=self._impossible(),
             )
-            return replace(result, confident=reached and not result.unknown)
+            return replace(result, confident=enough and not result.unknown)
 
     def _impossible(self) -> tuple[str, ...]:
         """Classes whose objects have not the size of this one; none where it is not known."""
