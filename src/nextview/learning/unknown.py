@@ -19,14 +19,13 @@ from nextview.geometry.mesh import load_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.fitting_set import card_to_fit
 from nextview.learning.teaching import embeddings
-from nextview.recognition.novelty import Novelty, in_half, novelty_path
+from nextview.recognition.novelty import Novelty, novelty_path
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 
 LEARNED_VIEWS, HELD_OUT_VIEWS = 2, 5
 """Views of each object without a sensor's errors, and as many through it."""
-LEVELS = 201
-"""Of the quantiles."""
+LEVELS = 201  # of the quantiles
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ def fit_novelty(
     ``known`` are embeddings of views through a sensor and without one, (2, rows, F), ``held_out`` those of N objects,
     (N, 2, views, F), ``labels`` the classes of these, (N,).
     """
-    rows = in_half(known.reshape(-1, known.shape[-1])).astype(np.float32)
+    rows = known.reshape(-1, known.shape[-1]).astype(np.float16).astype(np.float32)  # as they are stored
     raw = Novelty(np.zeros((1, 2), np.float32), np.array([len(held_out)]), rows, np.array([[0, 1], [0, 1]], np.float32))
     scores = np.stack([raw.scores(views.reshape(-1, rows.shape[1])).reshape(views.shape[:-1]) for views in held_out])
     standard = np.stack([scores.mean((0, 2)), scores.std((0, 2))], 1).astype(np.float32)

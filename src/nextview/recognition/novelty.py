@@ -105,16 +105,11 @@ class Novelty(Quantiles):
 
     def save(self, path: Path, overwrite: bool = False) -> str:
         """Write a .safetensors file, the known views in half precision; returns its SHA-256."""
-        arrays = {name: getattr(self, name) for name in ARRAYS} | {"neighbours": in_half(self.neighbours)}
+        arrays = {name: getattr(self, name) for name in ARRAYS} | {"neighbours": self.neighbours.astype(np.float16)}
         content = save({name: np.ascontiguousarray(values) for name, values in arrays.items()})
         with new_file(path, overwrite) as part:
             part.write_bytes(content)
         return hashlib.sha256(content).hexdigest()
-
-
-def in_half(table: Float) -> Float:
-    """A table in half precision; in single precision if it holds numbers too large for that."""
-    return table.astype(np.float16 if np.abs(table).max() < np.finfo(np.float16).max else np.float32)
 
 
 def unit(rows: Float) -> Float:
