@@ -21,16 +21,13 @@ from nextview.sensing.pieces import Pieces
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-CELL = 0.01
-"""Side of a cell of the footprint, in distances of the camera from the object."""
+CELL = 0.01  # side of a cell of the footprint, in distances of the camera from the object
 OVERLAP = 0.25
 """Share of the cells of a piece that lie over another one of the same frame, from which they are one thing."""
 LIES_OVER = 0.5
 """Share of the cells of a piece that lie over, or beside, one of another frame, from which they are one thing."""
-BESIDE = 2
-"""Cells up to which two pieces stand side by side."""
-TWO = 0.25
-"""Share of the cells of an object that a part of it has which may be another thing."""
+BESIDE = 2  # cells up to which two pieces stand side by side
+TWO = 0.25  # share of the cells of an object that a part of it has which may be another thing
 REACH, FAR = 250, 1000
 """Cells to each side of the middle of what is seen above the plane: farther things are left out. And cells from those
 of the first frame beyond which nothing can be a part of the same object."""

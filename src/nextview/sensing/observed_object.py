@@ -44,18 +44,12 @@ from nextview.sensing.segmentation import (
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-SIZE = 224
-"""Side of the observations' images: what the bundled networks take."""
-FEWEST = 60
-"""Pixels that an object has to have in a frame."""
-NEAREST = 0.01
-"""Metres between the camera and the point that names an object: nothing nearer can be measured."""
-MENDED = 0.03
-"""Share of an object's pixels in an earlier frame that has to change before they are looked at again."""
-FINEST = 1 / 32
-"""Object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``."""
-SAME = 0.01
-"""Change of the centre or the radius, in object radii, below which the object frame is left as it is."""
+SIZE = 224  # side of the observations' images: what the bundled networks take
+FEWEST = 60  # pixels that an object has to have in a frame
+NEAREST = 0.01  # metres between the camera and the point that names an object: nothing nearer can be measured
+MENDED = 0.03  # share of an object's pixels in an earlier frame that has to change before they are looked at again
+FINEST = 1 / 32  # object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``
+SAME = 0.01  # change of the centre or the radius, in object radii, below which the object frame is left as it is
 
 BELOW = 0.02
 """Metres below the support plane at which the point of an object may lie: on it, but for what a pose is off."""
@@ -185,7 +179,8 @@ class ObservedObject:
         if before.sightings and (frame.pose is None or before.sightings[0].frame.pose is None):
             raise ObservationError("a second frame needs a pose, and the first one too: how else do they fit together?")
         target, radius = (self.point, 0.0) if self.known is None else (self.known.centre, self.known.radius)
-        refuse_far(frame, before.sightings[-1].frame if before.sightings else None, target, radius)
+        last = before.sightings[-1].frame if before.sightings else None
+        refuse_far(frame, last, target, radius)
         few = slice(None, None, max(1, frame.shape[0] // ROWS))
         noise = estimate_noise(frame.depth[few], frame.depth[few] > 0)
         seen = frame.depth > 0 if frame.mask is None else (frame.depth > 0) & ~frame.mask
@@ -217,7 +212,8 @@ class ObservedObject:
         revision = before.revision + any(new is not old for new, old in zip(made, before.observations, strict=True))
         made.append(self._observe(sightings[-1], latest))
         warnings = check_frame(frame) + check_observation(made[-1]) + [MAY_BE_TWO] * two
-        warnings += check_pose_moved(frame, [s.frame for s in before.sightings])
+        if last is not None:
+            warnings += check_pose_moved(frame, last)
         if self.point is not None:
             warnings += check_point(upright_axes(up)[:2] @ (self.point - latest.centre), latest.radius)
         warnings += [NO_PLANE] * (self.support and plane is None and self.known is None)
@@ -229,9 +225,8 @@ class ObservedObject:
         """The support plane of the first frame."""
         plane = find_plane(samples, rng, up, self._above())
         share = 0.0 if plane is None else float(plane.holds(samples).mean())
-        if (
-            self.point is not None and up is not None and share < 1 / 3
-        ):  # the point may lie on the plane, or a little below
+        if self.point is not None and up is not None and share < 1 / 3:
+            # The point may lie on the plane, or a little below.
             higher = self.point + (2 * np.median(samples.tolerance) + BELOW) * up
             under = find_plane(samples, deepcopy(rng), up, higher)
             if under is not None and (more := float(under.holds(samples).mean())) > 2 * share:
@@ -325,21 +320,17 @@ class ObservedObject:
                     mended = self._sighting(s.frame, s.footprint.pixels_over(now), s.plane, s.noise)
                     s = replace(mended, footprint=s.footprint, chosen=now)
             sightings.append(s)
-        return (
-            [*sightings, replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)],
-            cell,
-            bool(two[target]),
-        )
+        latest = replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)
+        return [*sightings, latest], cell, bool(two[target])
 
     def _target(
         self, labels: list[NDArray[np.int64]], footprints: list[Footprint], ground: Float, to_cells: Float
     ) -> int:
         """The object's label: by the point; else that of most cells that were the object's before; else the largest."""
         if self.point is not None:
-            asked = clusters.nearest(footprints, labels, to_cells @ self.point)
-            return (
-                asked if asked in labels[-1] else clusters.nearest(footprints[-1:], labels[-1:], to_cells @ self.point)
-            )
+            asked, here = to_cells @ self.point, labels[-1]
+            target = clusters.nearest(footprints, labels, asked)
+            return target if target in here else clusters.nearest(footprints[-1:], [here], asked)
         before = [s.chosen for s in self.sightings if s.chosen is not None]
         votes = np.concatenate([[0], *(now[then] for now, then in zip(labels[:-1], before, strict=True))]).astype(int)
         count = np.bincount(votes)

@@ -18,26 +18,18 @@ from nextview.sensing.facets import Noise
 Mask = NDArray[np.bool_]
 Inverse = NDArray[np.float32]
 
-WIDTH = 320
-"""Columns in which edges are searched: a wider image is taken in steps."""
-LAG = 4
-"""Pixels from an edge at which the surfaces to both sides of it are looked at."""
-VALLEY = 0.004
-"""Depth of a concave edge, as a part of the distance, from which it cuts."""
-LEAST = 12
-"""Pixels of a piece."""
-STANDS = 0.02
-"""Height over the plane, as a part of the distance, down to which a piece is seen if it stands there."""
-BOTTOM = 0.002
-"""Height of a bottom over the plane, as a part of the distance, from which it is no hole."""
-CONTACT = 0.3
-"""Pixels in which two pieces touch, as a part of the root of those of the smaller one: fewer are a corner."""
+WIDTH = 320  # columns in which edges are searched: a wider image is taken in steps
+LAG = 4  # pixels from an edge at which the surfaces to both sides of it are looked at
+VALLEY = 0.004  # depth of a concave edge, as a part of the distance, from which it cuts
+LEAST = 12  # pixels of a piece
+STANDS = 0.02  # height over the plane, as a part of the distance, down to which a piece is seen if it stands there
+BOTTOM = 0.002  # height of a bottom over the plane, as a part of the distance, from which it is no hole
+CONTACT = 0.3  # pixels in which two pieces touch, as a part of the root of those of the smaller one: fewer are a corner
 ENCLOSED = 0.7
 """Share of the border of a piece that it has to one other, from which it lies inside it: the bottom of a bathtub."""
 NEXT: Any = ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))
 """All pairs of pixels side by side: the first of each, and the second."""
-LOWEST = 5
-"""Pixels of a piece that may be so low by noise."""
+LOWEST = 5  # pixels of a piece that may be so low by noise
 
 
 @dataclass(frozen=True)
@@ -108,9 +100,8 @@ def _bottoms(depth: NDArray[np.float32], mask: Mask, height: NDArray[np.float32]
 def _smooth(depth: NDArray[np.float32], mask: Mask) -> Inverse:
     """Mean inverse depth of those of 3 x 3 pixels that are in the mask, (H, W), 1/metres; NaN outside of it."""
     weight = ndimage.uniform_filter(mask.astype(np.float32), 3, mode="constant")
-    total = ndimage.uniform_filter(
-        np.where(mask, 1 / np.where(mask, depth, 1), 0).astype(np.float32), 3, mode="constant"
-    )
+    inverse = np.where(mask, 1 / np.where(mask, depth, 1), 0).astype(np.float32)
+    total = ndimage.uniform_filter(inverse, 3, mode="constant")
     return np.where(mask, total / np.maximum(weight, np.float32(1e-6)), np.float32(np.nan))
 
 

@@ -1,6 +1,5 @@
 """Refuse what cannot be right in a frame, and name the likely mistake behind an observation."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,16 +81,15 @@ def check_point(aside: Float, radius: float) -> list[ViewWarning]:
     return [ViewWarning("point", f"{message}: is the point of another world, or what stands there out of view?")]
 
 
-def check_pose_moved(frame: Frame, earlier: Sequence[Frame]) -> list[ViewWarning]:
-    """Whether the picture changed though the pose did not; usually not."""
-    for other in earlier[-1:]:
-        if frame.shape != other.shape or np.abs(frame.camera_to_world - other.camera_to_world).max() > STILL:
-            continue
-        now, then = (f.depth[::4, ::4] for f in (frame, other))
-        both = (now > 0) & (then > 0)
-        if both.any() and np.mean(np.abs(now - then)[both] > CHANGED * now[both]) > CHANGED_SHARE:
-            return [ViewWarning("stale pose", "the picture changed, the pose did not: an old pose, or a moved object?")]
-    return []
+def check_pose_moved(frame: Frame, last: Frame) -> list[ViewWarning]:
+    """Whether the picture changed since the last frame though the pose did not; usually not."""
+    if frame.shape != last.shape or np.abs(frame.camera_to_world - last.camera_to_world).max() > STILL:
+        return []
+    now, then = (f.depth[::4, ::4] for f in (frame, last))
+    both = (now > 0) & (then > 0)
+    if not both.any() or np.mean(np.abs(now - then)[both] > CHANGED * now[both]) <= CHANGED_SHARE:
+        return []
+    return [ViewWarning("stale pose", "the picture changed, the pose did not: an old pose, or a moved object?")]
 
 
 def check_observation(observation: Observation) -> list[ViewWarning]:
