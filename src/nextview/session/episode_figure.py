@@ -25,7 +25,7 @@ from nextview.session.view import View
 WIDE, GAP, LARGE = 2.2, 0.3, 6.0  # inches: of a column, between two, and of the large picture at most
 SHOWN = 4  # classes
 RING, RIM = "#cdbfa6", "#a8977a"  # of the dome: its lines, its candidate views
-WORTH = LinearSegmentedColormap.from_list("worth", ["#f1e9da", "#9cc3dc", BLUE])
+VALUES = LinearSegmentedColormap.from_list("value", ["#f1e9da", "#9cc3dc", BLUE])
 DOME, AWAY = 1.35, 10.0  # how far from the object its candidate views are drawn, and the eye is, object radii
 NUMBER: dict[str, Any] = {"ha": "center", "va": "center_baseline", "color": "white", "weight": "bold"}
 
@@ -46,7 +46,7 @@ def draw_episode(
     valued = any(view.values is not None for view in views)
     light, path = SoftLight([view.observation for view in views]), np.array([view.direction for view in views])
     seen_from = _best_side(path)
-    rows = [("", WIDE), ("what it believes", 1.5), ("worth of each view, from above", WIDE)]
+    rows = [("", WIDE), ("what it believes", 1.5), ("value of each view, from above (darker: higher)", WIDE)]
     rows = rows if valued else rows[:2]
     large = LARGE if valued else LARGE - 1
     width = GAP + len(views) * (WIDE + GAP) + large + GAP
@@ -135,7 +135,7 @@ def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_fro
     values = np.full(len(sphere), np.nan) if view.values is None else view.values
     known = np.isfinite(values)
     low, high = (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)
-    colours = np.where(known[:, None], WORTH((values - low) / (high - low or 1)), to_rgba("#ece9e3"))
+    colours = np.where(known[:, None], VALUES((values - low) / (high - low or 1)), to_rgba("#ece9e3"))
     flat = np.stack([out * np.cos(turned), out * np.sin(turned)], 1)
     limit = max(97.0, float(out.max()) + 10)
     if isinstance(sphere, ViewSphere):
@@ -194,9 +194,8 @@ def _draw_path(axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light:
     around = np.linspace(0, 2 * np.pi, 181)
     rings = sphere.elevations if isinstance(sphere, ViewSphere) else (0, 30, 60)
     for up in np.radians(rings):
-        line(
-            np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), 0 * around + np.sin(up)], 1), RING, 0.9
-        )
+        ring = [np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), 0 * around + np.sin(up)]
+        line(np.stack(ring, 1), RING, 0.9)
     for turn in np.arange(8) * np.pi / 4:  # meridians
         line(great_circle(np.array([np.cos(turn), np.sin(turn), 0]), np.array([0.0, 0, 1]), 61), RING, 0.5)
     flat, plain = place(sphere.directions)
