@@ -29,8 +29,7 @@ from nextview.sensing import Frame, ObservedObject, observed_object
 
 INTRINSICS = np.array([[520.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]])
 SHAPE = 480, 640
-FRAMES = 40
-"""Different ones; they come again."""
+FRAMES = 40  # different ones; they come again
 PARTS = ("finding", "geometry", "networks", "policy", "rest")
 
 

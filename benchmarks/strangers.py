@@ -1,9 +1,9 @@
-"""What whole episodes say of objects: of known classes, or of none.
+"""What whole episodes say of objects: of known classes, or of none; "most like" counts what is unknown too.
 
     python benchmarks/strangers.py data/ModelNet10 --split test --objects 250 [--sensor wrist]
     python benchmarks/strangers.py data/PSB --objects 300 --every-second; YCB --unit m [--models mine]
 
-With all defaults, from a random first view. "most like" counts what was called unknown, too.
+With all defaults, from a random first view.
 """
 
 from pathlib import Path
@@ -45,9 +45,8 @@ def main(
             yield done
 
     track(work(), len(entries), f"episodes of {meshes.name}")
-    names = ("named", "named and confident", "right", "most like", "views")
-    numbers = ", ".join(f"{name} {value:.3f}" for name, value in zip(names, np.mean(found, 0), strict=True))
-    print(f"{len(entries)} objects: {numbers}")
+    shown = "{:.3f} named, {:.3f} named and confident, {:.3f} right, {:.3f} most like their class; {:.2f} views"
+    print(f"{len(entries)} objects: " + shown.format(*np.mean(found, 0)))
 
 
 if __name__ == "__main__":
