@@ -62,9 +62,9 @@ def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans
     seen = SimulatedCamera(load_mesh(scans / "chair.off"), 64).observe(pose)
     np.testing.assert_array_equal(picture, seen.picture)
     shown = walk_card(walk)
-    assert f"From view {walk.next_view} these two" in shown
+    assert f"as view {walk.next_view} would show them" in shown
     assert f"differ by {1 - rivals.alike[walk.next_view]:.2f}" in shown
-    assert f"From view {view} these two" in preview_card(seen, walk)
+    assert f"The two likeliest, as view {view} would show them" in preview_card(seen, walk)
     bundled = nextview.load(models="ycb", threads=1).models.recogniser  # its meshes are not here
     kept = bundled.memory.pictures[bundled.memory.thing[100]]
     np.testing.assert_array_equal(remembered_picture(bundled, 100, 0, 0), kept)

@@ -29,7 +29,7 @@ def shoot(browser: Browser, page: Page, views: int, path: Path) -> None:
     tab.set_default_timeout(120_000)
     tab.goto(page.address)
     for step in range(views):
-        tab.get_by_text("Next view by the policy").click()
+        tab.get_by_text("Take the next view").click()
         while len(page.exploration.walks[-1].views) <= step:
             tab.wait_for_timeout(100)
     tab.locator(".mantine-Notification-closeButton").first.click()  # it draws in software: that is meant so

@@ -11,7 +11,7 @@ from PIL import Image
 
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere, direction_of
-from nextview.session.style import ACCENT, FAINT, INK, heat
+from nextview.session.style import ACCENT, FAINT, GROUND, INK, WOOD, heat, rgb
 from nextview.session.view import View
 from nextview.viewers.exploration import Walk
 
@@ -19,11 +19,12 @@ CELL = 11  # side of a cell of a map, pixels
 SHOWN = 5  # classes of which the belief is shown
 STYLE = f"""<style>
 .nv {{ font: 13px sans-serif; color: {INK}; padding: 0.4em 0.8em 0.8em }}
-.nv h3 {{ margin: 0 0 0.2em; font-size: 15px }}
-.nv p {{ margin: 0.3em 0 }}
-.nv img {{ image-rendering: pixelated; vertical-align: top; margin: 0 4px 4px 0 }}
-.nv figure {{ display: inline-block; margin: 0 4px 0 0; font-size: 11px; vertical-align: top }}
-.nv figcaption {{ width: 0; min-width: 100% }}
+.nv h3 {{ margin: 0 0 0.1em; font-size: 20px }}
+.nv h3 small {{ color: {ACCENT}; font-size: 17px }}
+.nv p {{ margin: 0.2em 0 0.7em; color: #5b6672 }}
+.nv img {{ image-rendering: pixelated; vertical-align: top; border-radius: 5px; margin-bottom: 4px }}
+.nv figure {{ display: inline-block; margin: 0 10px 8px 0; font-size: 11px; vertical-align: top; color: #5b6672 }}
+.nv figcaption {{ width: 0; min-width: 100%; overflow-wrap: anywhere }}
 .nv table {{ border-spacing: 0 3px; width: 100% }}
 .nv td {{ padding: 0 4px; white-space: nowrap; font-variant-numeric: tabular-nums }}
 .nv .bar {{ position: relative; height: 13px; width: 120px; background: #eef1f4 }}
@@ -38,17 +39,18 @@ def walk_card(walk: Walk) -> str:
         return f'{STYLE}<div class="nv"><p>No view was taken yet. The policy begins at view {walk.start}.</p></div>'
     view, classes = walk.views[-1], walk.session.models.classes
     best = int(view.belief.argmax())
-    believed = f"{escape(classes[best])} {view.belief[best]:.3f}" if view.observation.seen else "nothing is seen"
-    goes_on = "the rule would stop here" if walk.stopped else "the rule would look on"
+    believed = f"{escape(classes[best])} <small>{view.belief[best]:.1%}</small>"
+    believed = believed if view.observation.seen else "Nothing is seen"
+    goes_on = "It would stop here." if walk.stopped else "Not sure enough yet: it would look again."
     parts = [f"<h3>{believed}</h3><p>{goes_on}</p>", _figures(walk, view), _beliefs(walk), rivals_card(walk)]
-    parts.append(_steps(walk))
+    parts += [_maps(view), _steps(walk)]
     return f'{STYLE}<div class="nv">{"".join(parts)}</div>'
 
 
 def preview_card(observation: Observation, walk: Walk) -> str:
     """What a camera that is being dragged would see, and the leading things as remembered from nearest there."""
     nearest, _ = walk.sphere.nearest(direction_of(observation.pose))
-    parts = f"<h3>from here</h3>{_image(observation.picture, 200)}{rivals_card(walk, nearest)}"
+    parts = f"<h3>From here</h3>{_image(observation.picture, 200)}{rivals_card(walk, nearest)}"
     return f'{STYLE}<div class="nv">{parts}</div>'
 
 
@@ -57,24 +59,38 @@ def class_card(label: str) -> str:
     return f'{STYLE}<div class="nv">Its class is <b>{escape(label)}</b>; no policy knows.</div>'
 
 
+def warm(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A grey picture, (H, W), black where nothing is, in the colours of the things and the ground, (H, W, 3)."""
+    wood = np.minimum(np.array(rgb(WOOD)) * np.minimum(picture[..., None] / 200, 1.15), 255)
+    return np.where(picture[..., None] > 0, wood, rgb(GROUND)).astype(np.uint8)
+
+
 def _image(pixels: NDArray[np.uint8], width: int) -> str:
     file = BytesIO()
-    Image.fromarray(pixels).save(file, "png")
+    Image.fromarray(warm(pixels) if pixels.ndim == 2 else pixels).save(file, "png")
     return f'<img width="{width}" src="data:image/png;base64,{b64encode(file.getvalue()).decode()}">'
 
 
 def _figures(walk: Walk, view: View) -> str:
-    """The image, local maps, and the value of each view where they lie on rings; the highest ring on top."""
+    """The image, and the value of each view where they lie on rings; the highest ring on top."""
     elevation, azimuth = view.angles
-    where = f"view {view.index}: {elevation:.0f}° up, {round(azimuth) % 360}° round"
-    found = [(where, _image(view.observation.picture, 120))]
-    for name, values in view.maps.items():
-        found.append((f"{name}, from here", _image(heat(values[::-1]), CELL * values.shape[1])))
+    where = f"from view {view.index}, {elevation:.0f}° up, {round(azimuth) % 360}° round"
+    found = [(where, _image(view.observation.picture, 160))]
     if view.values is not None and isinstance(walk.sphere, ViewSphere):
         grid = view.values.reshape(walk.sphere.rings, walk.sphere.azimuths)
         order = np.argsort(walk.sphere.elevations)[::-1]
         found.append(("value of each view", _image(heat(grid[order]), CELL * grid.shape[1])))
-    return "".join(f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>" for below, image in found)
+    return _captioned(found)
+
+
+def _maps(view: View) -> str:
+    """The maps predicted from a view."""
+    found = [(name, _image(heat(values[::-1]), CELL * values.shape[1])) for name, values in view.maps.items()]
+    return f"<p>Maps of the views around this one:</p>{_captioned(found)}" if found else ""
+
+
+def _captioned(images: Iterable[tuple[str, str]]) -> str:
+    return "".join(f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>" for below, image in images)
 
 
 def _table(rows: Iterable[Iterable[str]]) -> str:
@@ -91,11 +107,10 @@ def rivals_card(walk: Walk, view: int | None = None) -> str:
     differ = 1 - rivals.alike
     if isinstance(walk.sphere, ViewSphere):
         grid = differ.reshape(walk.sphere.rings, walk.sphere.azimuths)[np.argsort(walk.sphere.elevations)[::-1]]
-        both.append(("how much from each view", _image(heat(grid), CELL * grid.shape[1])))
+        both.append(("how much they differ from each view", _image(heat(grid), CELL * grid.shape[1])))
     known = not np.isnan(differ[at])
-    said = f"differ by {differ[at]:.2f} of {np.nanmax(differ):.2f} at most" if known else "not remembered"
-    pictures = "".join(f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>" for below, image in both)
-    return f"<p>From view {at} these two, as remembered, {said}:</p>{pictures}"
+    said = f"they differ by {differ[at]:.2f}, {np.nanmax(differ):.2f} at most" if known else "not remembered from there"
+    return f"<p>The two likeliest, as view {at} would show them ({said}):</p>{_captioned(both)}"
 
 
 def _beliefs(walk: Walk) -> str:
@@ -111,8 +126,8 @@ def _beliefs(walk: Walk) -> str:
             f'<i style="top:8px;height:5px;width:{100 * view.alone[c]:.1f}%;background:{FAINT}"></i>'
             f'<b style="left:{threshold:.1f}%"></b></div>'
         )
-        rows.append((escape(classes[c]), bars, f"{view.belief[c]:.3f}", f"{view.belief[c] - before[c]:+.3f}"))
-    legend = "belief · grey: this view alone · dotted: the threshold · last: change by this view"
+        rows.append((escape(classes[c]), bars, f"{view.belief[c]:.1%}", f"{view.belief[c] - before[c]:+.1%}"))
+    legend = "red: belief · grey: by this view alone · dotted: enough to stop · right: change"
     return f"{_table(rows)}<p><small>{legend}</small></p>"
 
 
@@ -120,6 +135,6 @@ def _steps(walk: Walk) -> str:
     classes, rows = walk.session.models.classes, []
     for step, view in enumerate(walk.views, 1):
         best, warnings = int(view.belief.argmax()), ", ".join(warning.name for warning in view.warnings)
-        believed = escape(classes[best]), f"{view.belief[best]:.3f}"
+        believed = escape(classes[best]), f"{view.belief[best]:.1%}"
         rows.append((f"{step}", f"view {view.index}", *believed, f"{view.travel:.2f} cells", escape(warnings)))
     return _table(rows)

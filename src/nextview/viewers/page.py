@@ -21,17 +21,18 @@ from nextview.errors import NextviewError, UsageError
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import map_policy_names, policy_names
 from nextview.recognition.model_card import find_models
+from nextview.session.style import GROUND, PAPER, rgb
 from nextview.simulation.sensor import SENSORS
 from nextview.viewers.card import class_card, preview_card, walk_card
 from nextview.viewers.exploration import Exploration
 from nextview.viewers.walk_scene import WalkScene
 
+SAND = "#e9dfd0"  # at the foot of the background
 NOTHING, CLEAN = "nothing", "clean renders"
 APART = 8.5  # between two objects side by side, object radii
 PAUSE = 0.5  # between the views of a policy that walks, seconds: long enough to see each
-HELP = """Click a **ball** to look from there. Drag the **arrows** to look from anywhere else. Balls are coloured by
-what the policy values them at: yellow most, violet least, grey what it does not consider. It would go to the large red
-one next; small dark ones were visited."""
+HELP = """Click a **ball** to look from there, or drag the **arrows**. The large **red** ball is where the policy would
+look next. Yellow views promise most, violet ones least; small dark ones are done."""
 _starting = threading.Lock()
 
 
@@ -49,7 +50,15 @@ class Page:
         gui = self.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(209, 73, 91))
         gui.set_panel_label("nextview explore")
-        self.server.scene.set_up_direction("+z")
+        scene = self.server.scene
+        scene.set_up_direction("+z")
+        scene.set_background_image(_sky())
+        scene.configure_default_lights(False)
+        scene.configure_environment_map(None)
+        scene.add_light_hemisphere("/sky", sky_color=rgb(PAPER), ground_color=rgb(GROUND), intensity=3.0)
+        scene.add_light_directional(
+            "/lamp", color=rgb(GROUND), intensity=2.0, cast_shadow=True, position=(-4.0, -5.0, 8.0)
+        )
         self._controls(gui)
         self._rebuild()
 
@@ -77,9 +86,9 @@ class Page:
         self._sensor = gui.add_dropdown("Sensor", self._sensors, initial_value=name or CLEAN)
         given = float(strength or 1)
         self._strength = gui.add_slider("Noise strength", 0.0, max(4.0, given), 0.25, initial_value=given)
-        self._hide = gui.add_checkbox("Hide what was not seen", initial_value=exploration.mesh is None)
-        step = gui.add_button("Next view by the policy")
-        walk = gui.add_button("Walk until it stops")
+        self._hide = gui.add_checkbox("Only what was seen", initial_value=exploration.mesh is None)
+        step = gui.add_button("Take the next view")
+        walk = gui.add_button("Go on until it is sure")
         restart = gui.add_button("Start over")
         self._preview = gui.add_html("", visible=False)
 
@@ -187,7 +196,7 @@ class Page:
             panel.dock_below(self._panels[-1]) if self._panels else panel.dock_right()
             panel.set_width(400)
             self._panels.append(panel)
-        position, at = np.array([0.0, -1.0, 0.55]) * (7.5 + 4.5 * (n - 1)), np.array([0.0, 0.0, 0.4])
+        position, at = np.array([0.38 * (n < 2), -0.92, 0.42]) * (6.6 + 6.0 * (n - 1)), np.array([0.0, 0.0, 0.75])
         if not np.allclose(self.server.initial_camera.position, position):
             cameras = [self.server.initial_camera, *(client.camera for client in self.server.get_clients().values())]
             for camera in cameras:
@@ -201,6 +210,11 @@ class Page:
             for walk, scene, card in zip(self.exploration.walks, self._scenes, self._cards, strict=True):
                 scene.draw(walk, bool(self._hide.value))
                 card.content = walk_card(walk)
+
+
+def _sky() -> NDArray[np.uint8]:
+    """The background: paper that darkens a little towards the ground, (H, 1, 3)."""
+    return np.linspace(rgb(PAPER), rgb(SAND), 256).astype(np.uint8)[:, None]
 
 
 def _listed(value: object, options: Collection[str]) -> str:

@@ -10,11 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.viewsphere import great_circle
-from nextview.session.style import ACCENT, INK, heat, rgb
+from nextview.session.style import ACCENT, FAINT, INK, WOOD, heat, rgb
+from nextview.viewers.card import warm
 from nextview.viewers.exploration import Walk
 
 Float = NDArray[np.float64]
-BALL = 0.12  # radius of a candidate view, object radii
+BALL = 0.09  # radius of a candidate view, object radii
+TABLE = 2.4  # radius of what the object stands on
+SMOOTH = 10_000  # faces of a mesh from which its vertices are shaded, not its faces: scans
 
 
 class WalkScene:
@@ -39,10 +42,23 @@ class WalkScene:
         self._drawn = 0
         self._object: viser.MeshHandle | None = None
         if mesh is not None:
-            vertices = mesh.vertices.astype(np.float32)
+            vertices, flat = mesh.vertices.astype(np.float32), len(mesh.faces) < SMOOTH
             self._object = server.scene.add_mesh_simple(
-                f"{name}/object", vertices, mesh.faces, color=(180, 187, 194), flat_shading=True, side="double"
+                f"{name}/object", vertices, mesh.faces, color=rgb(WOOD), flat_shading=flat, side="double"
             )
+        floor = -1.0 if mesh is None else float(mesh.vertices[:, 2].min())
+        server.scene.add_cylinder(
+            f"{name}/table",
+            TABLE,
+            0.04,
+            (255, 246, 230),
+            radial_segments=96,
+            position=(0, 0, floor - 0.03),
+            cast_shadow=False,
+        )
+        server.scene.add_line_segments(
+            f"{name}/rings", _rings(walk.sphere.poses[:, :3, 3]), rgb(FAINT), thickness=0.015
+        )
         plain: dict[str, Any] = {"subdivisions": 2, "cast_shadow": False, "receive_shadow": False}
         self._balls = [
             server.scene.add_icosphere(f"{name}/views/{view}", BALL, position=place, **plain)
@@ -80,7 +96,7 @@ class WalkScene:
             aspect=width / height,
             scale=0.5,
             color=rgb(ACCENT),
-            image=np.repeat(observation.picture[..., None], 3, -1),
+            image=warm(observation.picture),
             wxyz=Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True),
             position=pose[:3, 3],
             cast_shadow=False,
@@ -108,3 +124,14 @@ class WalkScene:
                 segments = np.stack([line[:-1], line[1:]], 1)
                 self._scene.add_line_segments(f"{name}/way", segments, rgb(ACCENT), thickness=0.03)
         self._drawn = len(places)
+
+
+def _rings(places: Float) -> NDArray[np.float32]:
+    """Level circles below views, (V, 3), as segments, (S, 2, 3); none for views that lie on no rings."""
+    around = np.linspace(0, 2 * np.pi, 97)
+    heights = np.unique(np.round(places[:, 2], 3))
+    heights = heights[: 0 if len(heights) > 12 else None]
+    radius = np.sqrt(np.maximum((places[0] ** 2).sum() - heights**2, 0))[:, None]
+    height = np.broadcast_to(heights[:, None] - BALL, (len(heights), 97))  # the balls lie on them
+    circles = np.stack([radius * np.cos(around), radius * np.sin(around), height], -1)
+    return np.stack([circles[:, :-1], circles[:, 1:]], 2).reshape(-1, 2, 3).astype(np.float32)
