@@ -21,7 +21,7 @@ from nextview.errors import UsageError
 from nextview.geometry.depth import headlight
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.session.style import STYLE
+from nextview.session.style import PAPER, STYLE
 from nextview.simulation.scene import Scene, build_scene
 from nextview.simulation.scene_layout import LEVELS
 from nextview.simulation.simulated import OTHER, TABLE_TOP, TARGET, SceneCamera
@@ -29,7 +29,7 @@ from nextview.simulation.simulated import OTHER, TABLE_TOP, TARGET, SceneCamera
 SIZE = 240
 WIDE = 0.55
 """Of the focal length with which the target fills the picture."""
-COLOURS = {TARGET: (0.95, 0.55, 0.15), OTHER: (0.62, 0.60, 0.58), TABLE_TOP: (0.95, 0.92, 0.86)}
+COLOURS = {TARGET: (0.95, 0.55, 0.15), OTHER: (0.74, 0.71, 0.67), TABLE_TOP: (0.95, 0.92, 0.86)}
 VIEWS = (10, 12, 14, 16, 18, 27)
 
 
@@ -40,7 +40,7 @@ def picture(scene: Scene, pose: np.ndarray) -> np.ndarray:
     shade = headlight(depth, intrinsics)[..., None] / 255
     image = np.tile(np.array([0.98, 0.965, 0.94]), (SIZE, SIZE, 1))
     for which, colour in COLOURS.items():
-        image = np.where((owner == which)[..., None], np.array(colour) * (0.35 + 0.65 * shade), image)
+        image = np.where((owner == which)[..., None], np.array(colour) * (0.45 + 0.55 * shade), image)
     return np.clip(image, 0, 1)
 
 
@@ -70,7 +70,7 @@ def main(
                     axis.plot([0, SIZE - 1], [0, SIZE - 1], color="#b00020", linewidth=1.2)
                     axis.plot([0, SIZE - 1], [SIZE - 1, 0], color="#b00020", linewidth=1.2)
             row[0].set_ylabel(f"{level}, {np.mean(layout.visible):.0%} on average", fontsize=8)
-        figure.savefig(out, dpi=90, facecolor="white", bbox_inches="tight", pad_inches=0.05)
+        figure.savefig(out, dpi=120, facecolor=PAPER, bbox_inches="tight", pad_inches=0.05)
 
 
 if __name__ == "__main__":
