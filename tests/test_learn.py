@@ -21,10 +21,12 @@ from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.learning.learn import learn
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate import Discriminate
+from nextview.recognition.approximate import NearestViews
 from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, reorient
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.memory import AZIMUTHS, RINGS, by_ring, read_memory, similarities
 from nextview.recognition.model_card import read_card
+from nextview.recognition.novelty import unit
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.viewers.card import preview_card, walk_card
 from nextview.viewers.exploration import Exploration, remembered_picture, shown_objects
@@ -182,6 +184,20 @@ def test_similarity_is_a_cosine_between_rings_interpolated():
     found = similarities(by_ring(views), seen, np.radians([27.0, 80.0]))
     np.testing.assert_allclose(found[0], (views[:, 1] + views[:, 2]) @ seen[0] / 2, rtol=1e-4)
     np.testing.assert_allclose(found[1], views[:, 4] @ seen[1], rtol=1e-4)
+
+
+def test_the_nearest_of_many_views_are_those_of_an_exact_search():
+    pytest.importorskip("faiss", reason="the extra 'large' is not installed")
+    rng = np.random.default_rng(0)
+    kinds, kind = rng.normal(size=(300, 256)), rng.integers(300, size=10_500)
+    views = unit(kinds[kind] + 0.5 * rng.normal(size=(len(kind), 256))).astype(np.float32)
+    seen = unit(kinds[:20] + 0.5 * rng.normal(size=(20, 256))).astype(np.float32)
+    found = NearestViews(np.stack([views, views]))
+    found, exact = found.similarities(seen, np.full((20, 2), 0.5, np.float32)), seen @ views.T
+    best = np.argsort(-exact, 1)[:, :20]
+    close = np.isclose(np.take_along_axis(found, best, 1), np.take_along_axis(exact, best, 1), atol=1e-5)
+    assert close.mean() > 0.95
+    np.testing.assert_array_less(found.max(1), exact.max(1) + 1e-5)
 
 
 @pytest.mark.parametrize("place", [3, 21, 38])

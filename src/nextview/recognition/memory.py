@@ -13,6 +13,7 @@ from safetensors.numpy import load, save
 
 from nextview.errors import ModelError
 from nextview.files import checked_bytes, new_file
+from nextview.recognition.approximate import NearestViews, is_large
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Features, Recogniser
 from nextview.recognition.model_card import MEMORY_SUFFIX, find_card
@@ -78,14 +79,20 @@ def similarities(views: Float, embeddings: Float, elevations: Float) -> NDArray[
     The memory's ``views`` are ring by ring, (rings, H * azimuths, F) float32; ``embeddings`` unit vectors, (B, F)
     float32; ``elevations`` those from which the views were taken, radians, (B,).
     """
-    place = np.interp(elevations, np.radians(RINGS), np.arange(len(RINGS)))
+    shares = ring_shares(elevations)
     found = np.zeros((len(embeddings), views.shape[1]), np.float32)
-    for ring in range(len(RINGS)):
-        share = np.maximum(1 - np.abs(place - ring), 0)
-        rows = np.flatnonzero(share > 1e-6)
+    for ring, share in enumerate(shares.T):
+        rows = np.flatnonzero(share)
         if len(rows):
-            found[rows] += share[rows, None].astype(np.float32) * (embeddings[rows] @ views[ring].T)
+            found[rows] += share[rows, None] * (embeddings[rows] @ views[ring].T)
     return found.reshape(len(embeddings), -1, AZIMUTHS)
+
+
+def ring_shares(elevations: Float) -> NDArray[np.float32]:
+    """How much each ring counts for views from elevations, (B,), radians: (B, rings)."""
+    place = np.interp(elevations, np.radians(RINGS), np.arange(len(RINGS)))
+    shares = np.maximum(1 - np.abs(place[:, None] - np.arange(len(RINGS))), 0)
+    return np.where(shares > 1e-6, shares, 0).astype(np.float32)
 
 
 class TaughtRecogniser(Recogniser):
@@ -106,6 +113,7 @@ class TaughtRecogniser(Recogniser):
         if (h, things) != (len(self.calibration.hypotheses), len(self.memory.radii)):
             raise ModelError(f"{self.card.path}: holds {h} resting poses, and its card is of others")
         self._views = by_ring(self.memory.views)
+        self._nearest = NearestViews(self._views) if is_large(self._views) else None
         judged = np.array([self.memory.held_out[..., 0].size])
         self.novelty = Quantiles(np.array(about.novelty), judged, joint=True) if about.novelty else None
 
@@ -118,7 +126,12 @@ class TaughtRecogniser(Recogniser):
     def evidence(self, embeddings: Float, elevations: Float) -> Evidence:
         """Evidence of views by their embeddings, unit vectors, (B, F), and elevations, radians, (B,)."""
         assert self.card.memory is not None
-        alike = similarities(self._views, embeddings, elevations)
+        if self._nearest is None:
+            alike = similarities(self._views, embeddings, elevations)
+        else:
+            alike = self._nearest.similarities(embeddings, ring_shares(elevations)).reshape(
+                len(embeddings), -1, AZIMUTHS
+            )
         logits = embeddings @ self.memory.head + self.memory.head_bias
         return Evidence(logits, azimuth_bins=self.card.memory.weight * alike)
 

@@ -1,0 +1,53 @@
+"""The nearest of very many remembered views, found by faiss, which the extra "large" brings."""
+
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+LARGE = 20_000  # remembered views of a ring, from which looking at all of them takes more than 10 ms
+INDEX, PROBED = (
+    "PCA64,IVF256,SQ8",
+    16,
+)  # 64 numbers of a byte for each view, in 256 cells, of which so many are searched
+SAMPLE = 10_240  # views from which an index learns its cells
+NEAREST = 1000  # views of a ring that are compared exactly
+
+
+def is_large(views: NDArray[np.float32]) -> bool:
+    """Whether remembered views, (rings, N, F), are searched approximately: there are many, and faiss is installed."""
+    return views.shape[1] >= LARGE and find_spec("faiss") is not None
+
+
+class NearestViews:
+    """An index for each ring of remembered views, (rings, N, F) float32, unit vectors."""
+
+    def __init__(self, views: NDArray[np.float32]) -> None:
+        sample = np.random.default_rng(0).permutation(views.shape[1])[:SAMPLE]
+        self._views, self._indices = views, [_index(ring, sample) for ring in views]
+
+    def similarities(self, embeddings: NDArray[np.floating], shares: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Cosines of views, (B, F), with what is remembered, (B, N) float32: the sum over rings by shares, (B, rings).
+
+        The nearest of each ring are compared exactly. All others count as the least alike of these.
+        """
+        found = np.empty((len(embeddings), self._views.shape[1]), np.float32)
+        for row, (embedding, share) in enumerate(zip(np.asarray(embeddings, np.float32), shares, strict=True)):
+            rings = np.flatnonzero(share > 0)
+            near = np.concatenate([self._indices[ring].search(embedding[None], NEAREST)[1][0] for ring in rings])
+            near = np.unique(near[near >= 0])
+            alike = sum(share[ring] * (self._views[ring, near] @ embedding) for ring in rings)
+            found[row] = np.min(alike)
+            found[row, near] = alike
+        return found
+
+
+def _index(views: NDArray[np.float32], sample: NDArray[np.int64]) -> Any:
+    import faiss
+
+    index = faiss.index_factory(views.shape[-1], INDEX, faiss.METRIC_INNER_PRODUCT)
+    index.train(views[sample])
+    index.add(views)
+    faiss.extract_index_ivf(index).nprobe = PROBED
+    return index
