@@ -182,7 +182,7 @@ def write_card(card, policy, state=None):
     """The card of a policy, and the ONNX file beside it."""
     seen = features(SPHERE, state or some_state(), policy.inputs, policy.frame)
     about = PolicyCard("gain", policy.scope, SPHERE.elevations, SPHERE.azimuths, ("a", "b", "c", "d"), {})
-    return write_gain(card, policy, about, seen.astype(np.float32), overwrite=True)
+    return write_gain(card, policy, about, seen.astype(np.float32))
 
 
 def shipped(folder, policy) -> Gain:
