@@ -162,11 +162,9 @@ def train_map(
 def target_of(measure: str, store: ViewStore, predictions: Predictions | None = None) -> tuple[NDArray, NDArray]:
     """A measure of all views, scaled to 0 .. 1 over each object's, or the confidence; and which objects have it."""
     if (measure == CONFIDENCE) != (predictions is not None):
-        raise UsageError(
-            "a map of the confidence is learned from predictions: give those of the recogniser"
-            if predictions is None
-            else f"a map of {measure} is learned from the store alone: predictions are for a map of the {CONFIDENCE}"
-        )
+        alone = f"a map of {measure} is learned from the store alone: predictions are for a map of the {CONFIDENCE}"
+        of_them = "a map of the confidence is learned from predictions: give those of the recogniser"
+        raise UsageError(of_them if predictions is None else alone)
     if predictions is None:
         return normalise_per_object(store.measure(measure)), store.done
     here = store.rows_of(predictions.names)

@@ -318,10 +318,10 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
         share[turn % colours, turn % channels] = 1
         share /= share.sum(1, keepdim=True)
         state[first] = torch.einsum("okhw,kc->ochw", state[first], share)
-    ours, theirs = ({name: tuple(value.shape) for name, value in values.items()} for values in (own, state))
-    faults = [f"it lacks {name}" for name in sorted(ours.keys() - theirs.keys())]
-    faults += [f"it holds {name}" for name in sorted(theirs.keys() - ours.keys())]
-    both = ((name, shape, theirs[name]) for name, shape in ours.items() if name in theirs)
+    wanted, given = ({name: tuple(value.shape) for name, value in values.items()} for values in (own, state))
+    faults = [f"it lacks {name}" for name in sorted(wanted.keys() - given.keys())]
+    faults += [f"it holds {name}" for name in sorted(given.keys() - wanted.keys())]
+    both = ((name, shape, given[name]) for name, shape in wanted.items() if name in given)
     faults += [f"{name} is {there}, not {shape}" for name, shape, there in both if there != shape]
     if faults:
         raise ModelError(f"{path}: not the weights of this {network.name} ({faults[0]})")
