@@ -71,10 +71,10 @@ def run(source: Path | tuple[int, int], names: list[str] | None, max_views: int 
 def with_networks(meshes: list[Path], n_views: int = 40) -> float:
     """Seconds a view with the simulated camera and the bundled networks, one view of a time, as live."""
     from nextview.geometry.mesh import load_mesh
-    from nextview.recognition.inference import load_models
+    from nextview.session.system import load
     from nextview.simulation.simulated import SimulatedCamera
 
-    models, sphere = load_models(("lem",)), ViewSphere.named("40")
+    models, sphere = load(policy="lem").models, ViewSphere.named("40")
     cameras = [SimulatedCamera(load_mesh(path), 224, sphere.distance) for path in meshes]
     models.evidence([cameras[0].observe(sphere.poses[0])])
     began = time.perf_counter()

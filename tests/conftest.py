@@ -4,20 +4,21 @@ A test that alters a file of it copies the file first. And: the order of the fil
 is not wrong); tests that take minutes run where NEXTVIEW_TESTS=all.
 """
 
-import json
 import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pipeline
 import pytest
 from filelock import FileLock
 from hypothesis import settings
-from pipeline import FURNITURE, SPHERE, make_map_network, make_recogniser, some_predictions, write_furniture, write_off
 
 from nextview.data.samples import sample_mesh
 from nextview.learning.learn import learn
+from nextview.recognition.belief import Calibration
+from nextview.recognition.inference import MapNetwork, Models, Recogniser
 
 LONG = ("test_workflow.py", "test_training.py")
 """Files that take longest: begun first, no process is left alone with one at the end."""
@@ -56,8 +57,12 @@ def shared(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
 @pytest.fixture(scope="session")
 def scans(shared) -> Path:
     """Three meshes in one folder, centimetres."""
-    names = ("chair", "monitor", "table")
-    return shared("scans", lambda folder: [write_off(folder / f"{name}.off", sample_mesh(name)) for name in names])
+
+    def make(folder: Path) -> None:
+        for name in pipeline.FURNITURE:
+            pipeline.write_off(folder / f"{name}.off", sample_mesh(name))
+
+    return shared("scans", make)
 
 
 @pytest.fixture(scope="session")
@@ -69,7 +74,7 @@ def taught(shared, scans) -> Path:
 @pytest.fixture(scope="session")
 def furniture(shared) -> Path:
     """Meshes of boxes: FURNITURE's 3 classes, 4 for training and 2 for tests of each, CLASS/SPLIT/CLASS_K.off."""
-    return shared("furniture", write_furniture)
+    return shared("furniture", pipeline.write_furniture)
 
 
 @pytest.fixture(scope="session")
@@ -78,7 +83,7 @@ def views(shared, furniture) -> Path:
     from nextview.data.rendering import render
 
     def make(folder: Path) -> None:
-        list(render(furniture, folder / "views.zarr", SPHERE, 32, workers=0))
+        list(render(furniture, folder / "views.zarr", pipeline.SPHERE, 32, workers=0))
 
     return shared("views", make) / "views.zarr"
 
@@ -88,14 +93,21 @@ def models(shared) -> Path:
     """A folder of tiny networks for FURNITURE: tiny.json (recogniser, 8 azimuth bins, calibrated), tiny-lem.json."""
 
     def make(folder: Path) -> None:
-        card = make_recogniser(folder, FURNITURE, size=32, azimuth_bins=8)
-        values = json.loads(card.read_text())
-        values["calibration"] = {"temperature": 0.8, "correlation": 0.3, "bin_correlation": 0.2}
-        values["held_out"] = [f"{label}_{k}" for label in FURNITURE for k in (2, 3)]
-        card.write_text(json.dumps(values))
-        make_map_network(folder, valleys=("table",))
+        card = pipeline.make_recogniser(folder, pipeline.FURNITURE, size=32, azimuth_bins=8)
+        calibration = {"temperature": 0.8, "correlation": 0.3, "bin_correlation": 0.2}
+        held_out = [f"{label}_{k}" for label in pipeline.FURNITURE for k in (2, 3)]
+        pipeline.change_card(card, calibration=calibration, held_out=held_out)
+        pipeline.make_map_network(folder, valleys=("table",))
 
     return shared("models", make)
+
+
+@pytest.fixture(scope="session")
+def tiny(models):
+    """They, opened, with a calibration of several views: by no views at all one cannot divide."""
+    recogniser = Recogniser(models / "tiny.json")
+    recogniser.calibration = Calibration(0.8, 1.0, bin_correlation=1.5)
+    return Models(recogniser, {"lem": MapNetwork(models / "tiny-lem.json")})
 
 
 @pytest.fixture(scope="session")
@@ -117,13 +129,10 @@ def results(shared) -> Path:
     pytest.importorskip("pandas")
     from dataclasses import replace
 
-    from nextview.benchmark.run import BenchmarkSettings, run_benchmark
-
     def make(folder: Path) -> None:
         conflicting = np.isin(np.arange(40), (3, 8))
-        replace(some_predictions(40, seed=2), conflicting=conflicting).save(folder / "p.npz")
-        settings = BenchmarkSettings(thresholds=(0.7, 0.9), runs=3, samples=200)
-        run_benchmark(folder / "p.npz", folder / "out", settings)
+        replace(pipeline.some_predictions(40, seed=2), conflicting=conflicting).save(folder / "p.npz")
+        pipeline.benchmark(folder / "p.npz", folder / "out", thresholds=(0.7, 0.9), runs=3, samples=200)
 
     return shared("results", make)
 
@@ -144,7 +153,9 @@ def cluttered_views(shared, cluttered, furniture) -> Path:
     """A store of ``cluttered``: 40 views, 48 pixels."""
     from nextview.data.rendering import RenderOptions, render
 
+    options = RenderOptions(meshes=furniture)
+
     def make(folder: Path) -> None:
-        list(render(cluttered, folder / "views.zarr", SPHERE, 48, workers=0, options=RenderOptions(meshes=furniture)))
+        list(render(cluttered, folder / "views.zarr", pipeline.SPHERE, 48, options, workers=0))
 
     return shared("cluttered_views", make) / "views.zarr"

@@ -21,11 +21,12 @@ from onnx import TensorProto, helper, numpy_helper
 from scipy.spatial.transform import Rotation
 
 from nextview.cli.main import main
+from nextview.data.folders import Entry
 from nextview.data.measures import MeasuredView
 from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, boxes_mesh
-from nextview.data.store import ViewStore
-from nextview.geometry.mesh import Mesh
+from nextview.data.store import DONE, ViewStore, describe
+from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.recognition.belief import Calibration
@@ -57,6 +58,11 @@ def run_python(code: str, **options) -> subprocess.CompletedProcess:
 
 
 # Meshes
+
+
+def meshed(*parts: trimesh.Trimesh) -> Mesh:
+    whole = trimesh.util.concatenate(parts)
+    return make_mesh(whole.vertices, whole.faces)
 
 
 def write_off(path: Path, mesh: Mesh) -> Path:
@@ -145,6 +151,10 @@ def _save(path: Path, nodes: list, inputs: list, outputs: list, constants: dict,
     return path
 
 
+def change_card(path: Path, **values) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
 # Predictions
 
 
@@ -183,6 +193,23 @@ def scene_predictions(store: Path, classes: Sequence[str]) -> Predictions:
         some_predictions(len(opened)), logits=logits, classes=tuple(classes), names=tuple(opened.names), maps={},
         valley_classes={}, depth_entropy=opened.measure(), store=str(store), calibration=Calibration(1.0, 0.3),
     )  # fmt: skip
+
+
+def benchmark(predictions: Path, out: Path, **settings):
+    from nextview.benchmark.run import BenchmarkSettings, run_benchmark  # takes pandas
+
+    return run_benchmark(predictions, out, BenchmarkSettings(**settings))
+
+
+def store_of(path: Path, names, labels, sphere: ViewSphere, size: int = 16, **arrays) -> ViewStore:
+    """A store whose objects are rendered, if only these arrays of it hold anything: depth_entropy, image."""
+    both = zip(names, map(str, labels), strict=True)
+    entries = [Entry(Path(f"{name}.off"), name, label, "train") for name, label in both]
+    store = ViewStore.create(path, describe(entries, sphere, size, {}))
+    for name, values in arrays.items():
+        store.group[name if name in store.rendered else f"measures/{name}"][:] = values
+    store.group["status"][:] = DONE
+    return store
 
 
 # Scenes: meshes in metres, and a pinhole camera that casts rays at them

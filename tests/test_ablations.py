@@ -6,10 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import some_predictions
+from pipeline import some_predictions, store_of
 
-from nextview.data.folders import Entry
-from nextview.data.store import DONE, ViewStore, describe
 from nextview.errors import PredictionsError
 
 ABLATIONS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "ablations.py"))
@@ -45,10 +43,8 @@ def test_views_that_agree_on_the_azimuth_bin_settle_what_logits_leave_open(tmp_p
 def test_azimuth_bins_are_right_exactly_or_up_to_a_half_turn(tmp_path):
     pytest.importorskip("torch")
     p = some_predictions(10)
-    entries = [Entry(tmp_path / f"{n}.off", n, p.classes[c], "train") for n, c in zip(p.names, p.labels, strict=True)]
-    store = ViewStore.create(tmp_path / "views.zarr", describe(entries, p.sphere, 16, {}))
-    store.group["measures/depth_entropy"][:] = np.tile(np.cos(np.pi / 4 * p.sphere.azimuth_index), (10, 1))
-    store.group["status"][:] = DONE
+    values = np.tile(np.cos(np.pi / 4 * p.sphere.azimuth_index), (10, 1))
+    store = store_of(tmp_path / "views.zarr", p.names, p.labels, p.sphere, depth_entropy=values)
     features = np.repeat(p.sphere.azimuth_index[None], 10, axis=0)
     features[:3] += 4  # the wrong way round
     features[3] += 1

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from pipeline import refused
+from pipeline import benchmark, refused
 
 from nextview.benchmark.leaderboard import promised_risks
 from nextview.benchmark.published import ACCURACY, published, read_table
 from nextview.benchmark.replay import make_specs, replay, truncate
 from nextview.benchmark.report import report
-from nextview.benchmark.run import BenchmarkSettings, load, run_benchmark
+from nextview.benchmark.run import load
 from nextview.cli.main import main
 from nextview.data.metrics import calibration_error
 from nextview.data.predictions import Predictions
@@ -27,10 +27,6 @@ TEN = tuple(read_table(ACCURACY[10]))
 @pytest.fixture(scope="module")
 def predictions(results):
     return Predictions.load(results / "p.npz")
-
-
-def benchmark(predictions, out, **settings):
-    return run_benchmark(predictions, out, BenchmarkSettings(**settings))
 
 
 def test_every_episode_is_a_row_and_is_what_it_says(results, predictions):
@@ -104,10 +100,8 @@ def test_a_stopping_rule_of_ones_own_decides_in_the_command(predictions, tmp_pat
     predictions.save(tmp_path / "p.npz")
     main(["benchmark", str(tmp_path / "p.npz"), str(tmp_path / "out"), "--policies", "lem", "--runs", "2",
           "--samples", "20", "--thresholds", "0.6", "--stopping", "test_replay:uncertain"])  # fmt: skip
-    ends = truncate(
-        replay("lem", make_specs(predictions, runs=2, seed=0), 5, 0, beliefs=True),
-        own_stopping("test_replay:uncertain", 0.6, 5),
-    )
+    specs, rule = make_specs(predictions, runs=2, seed=0), own_stopping("test_replay:uncertain", 0.6, 5)
+    ends = truncate(replay("lem", specs, 5, 0, beliefs=True), rule)
     rows = load(tmp_path / "out").episodes("lem", 0.6)
     np.testing.assert_array_equal(ends.n_views, rows["n_views"])
     assert len(set(ends.n_views)) > 1

@@ -59,17 +59,8 @@ def test_the_page_shows_the_numbers_of_the_tables(made):
 
 def test_predictions_that_name_no_model_are_judged_alike(made, tmp_path, capsys):
     replace(Predictions.load(made / "p.npz"), models={}).save(tmp_path / "p.npz")
-    main(
-        [
-            "evaluate",
-            str(tmp_path / "p.npz"),
-            str(tmp_path / "out"),
-            "--samples",
-            "50",
-            "--figures",
-            str(tmp_path / "fig"),
-        ]
-    )
+    more = ["--samples", "50", "--figures", str(tmp_path / "fig")]
+    main(["evaluate", str(tmp_path / "p.npz"), str(tmp_path / "out"), *more])
     written = {path.name for path in (tmp_path / "fig").iterdir()}
     assert written >= {f"fusion.{kind}" for kind in ("pdf", "svg", "csv", "tex")}
     assert table(tmp_path, "accuracy") == table(made, "accuracy")

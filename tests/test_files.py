@@ -62,14 +62,6 @@ def test_links_and_places_of_another_kind_are_refused(tmp_path):
         files.check_new(tmp_path, overwrite=True)
 
 
-def test_a_hard_link_to_another_file_leaves_that_file_as_it_was(tmp_path):
-    (tmp_path / "theirs").write_text("theirs")
-    os.link(tmp_path / "theirs", tmp_path / "ours")
-    with files.new_file(tmp_path / "ours", overwrite=True) as part:
-        part.write_text("ours")
-    assert everything(tmp_path) == {"theirs": "theirs", "ours": "ours"}
-
-
 def test_a_full_disk_is_one_sentence_and_leaves_the_old_file(tmp_path):
     (tmp_path / "a").write_text("old")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import make_recogniser, some_predictions, train_predictions
+from pipeline import change_card, make_recogniser, some_predictions, train_predictions
 from scipy.special import log_softmax, softmax
 from scipy.stats import binomtest
 
@@ -218,9 +218,8 @@ def training_predictions(tmp_path):
     p = some_predictions(90)
     logits = p.logits.copy()
     logits[np.arange(90), :, p.labels] += np.random.default_rng(0).normal(0.6, 0.8, (90, 1))
-    about = json.loads(card.read_text())
-    card.write_text(json.dumps(about | {"held_out": list(p.names[:45])}))
-    models = {**p.models, "recogniser": ("tiny", about["sha256"])}
+    change_card(card, held_out=list(p.names[:45]))
+    models = {**p.models, "recogniser": ("tiny", read_card(card).sha256)}
     path = tmp_path / "training.npz"
     replace(p, logits=logits.astype(np.float32), splits=np.array(["train"] * 90), models=models).save(path)
     return card, path
@@ -254,7 +253,7 @@ def test_logits_of_ones_own_are_fitted_to_where_they_name_no_model(training_pred
 def test_a_calibration_by_a_bad_sensor_trusts_views_less(training_predictions, tmp_path):
     card, path = training_predictions
     p = Predictions.load(path)
-    card.write_text(json.dumps(json.loads(card.read_text()) | {"held_out": list(p.names[:60])}))
+    change_card(card, held_out=list(p.names[:60]))
     clean = fit_calibration(path, card).calibration
     order = np.random.default_rng(1).permutation(90)  # the same objects, in another order
     noise = np.random.default_rng(2).normal(0, 4, p.logits.shape)
@@ -275,7 +274,7 @@ def test_a_card_that_was_changed_meanwhile_or_does_not_fit_is_left_alone(trainin
     def fit_slowly(*given, **options):
         with pytest.raises(DatasetError, match="another run is writing it"), card_to_fit(card):
             pass
-        card.write_text(json.dumps(whole | {"note": "changed"}))
+        change_card(card, note="changed")
         return fit_temperature(*given, **options)
 
     monkeypatch.setattr(calibration, "fit_temperature", fit_slowly)

@@ -57,9 +57,8 @@ def test_the_ball():
         found = channels_of(depth, pose)
         for name, expected in expected_channels(depth, pose, positions).items():
             np.testing.assert_array_equal(np.isnan(found[name]), depth == 0)
-            inner = (
-                DISTANCE**2 - (RAYS**2).sum(-1) * (DISTANCE**2 - 1) > 0.2
-            )  # towards the rim a pixel covers a steep slope
+            # Towards the rim a pixel covers a steep slope.
+            inner = DISTANCE**2 - (RAYS**2).sum(-1) * (DISTANCE**2 - 1) > 0.2
             # Positions are exact; a normal is taken over one pixel's width, on a curved surface.
             limit = STEP if name in ("height", "nearness") else 0.03
             np.testing.assert_allclose(found[name][inner], expected[inner], atol=limit, err_msg=name)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import refused, write_off
+from pipeline import box, refused, write_off
 from scipy.special import logsumexp
 
 import nextview
@@ -221,14 +221,12 @@ def test_the_policy_goes_where_two_things_differ(place):
 
 
 def test_a_box_rests_on_its_faces_and_keeps_its_size():
-    corners = np.array([[x, y, z] for x in (0, 3) for y in (0, 2) for z in (0, 1)], float)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([(a, b, c) for a, b, c, d in quads] + [(a, c, d) for a, b, c, d in quads])
-    box = make_mesh(corners, faces, unit="cm")
-    found = resting_poses(box)
+    shape = box((3, 2, 1))
+    brick = make_mesh(shape.vertices, shape.faces, unit="cm")
+    found = resting_poses(brick)
     np.testing.assert_array_equal(found[0], np.eye(3))
     ups = np.abs(found[:, 2])
     assert all(np.isclose(up.max(), 1, atol=1e-6) for up in ups)  # a face is down, never an edge
     for rotation in found:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
-        assert rotated(box, rotation).metres == pytest.approx(np.sqrt(14) / 2 * UNITS["cm"])
+        assert rotated(brick, rotation).metres == pytest.approx(np.sqrt(14) / 2 * UNITS["cm"])

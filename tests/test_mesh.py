@@ -243,9 +243,7 @@ MANY_TIMES = one_triangle(scenes=[{"nodes": list(range(101))}], nodes=101 * [{"m
 BROKEN = {
     "no faces": ("a.off", "OFF\n3 0 0\n" + GOOD, "no faces"),
     "index too high": ("a.off", off(GOOD, "3 0 1 3"), "outside of the 3"),
-    "index below zero": ("a.off", off(GOOD, "3 0 1 -1"), "vertex -1"),
     "too few corners": ("a.off", off(GOOD, "3 0 1"), "face 0 has 2 of 3 corners"),
-    "too few coordinates": ("a.off", off("0 0 0\n1 0\n0 1 0", "3 0 1 2"), "vertex 1 has 2 of 3 coordinates"),
     "NaN": ("a.off", off("0 0 nan\n1 0 0\n0 1 0", "3 0 1 2"), "1 vertices are NaN or infinite"),
     "too large": ("a.off", off("-1.7e308 -1.7e308 0\n1.7e308 0 0\n0 1.7e308 0", "3 0 1 2"), "too large"),
     "one place": ("a.off", off("5 5 5\n5 5 5\n5 5 5", "3 0 1 2"), "no extent"),
@@ -266,7 +264,6 @@ BROKEN = {
     "PLY points": ("a.ply", trimesh.PointCloud(np.eye(3)).export(file_type="ply"), "no vertices"),
     "PLY of more rows than lines": ("a.ply", ply(BIG, GOOD + "\n3 0 1 2\n"), "cut short"),
     "PLY of a list longer than the file": ("a.ply", ply(1, GOOD + f"\n{BIG} 0 1 2\n"), ""),
-    "STL cut": ("a.stl", exported(wedge(), "stl")[:400], "cut short or damaged, 12 faces"),
     "STL cut in its second solid": ("a.stl", 2 * exported(wedge(), "stl_ascii")[:-30] + b"\n", "cut short"),
     "GLB without data": ("a.glb", glb(one_triangle({"bufferView": None, "count": BIG}), TRIANGLE), "than its bytes"),
     "GLB of more positions than bytes": ("a.glb", glb(one_triangle({"count": BIG}), TRIANGLE), ""),
@@ -279,7 +276,6 @@ BROKEN = {
 }  # fmt: skip
 for suffix in FORMATS:
     BROKEN[f"empty{suffix}"] = (f"a{suffix}", b" \r\n\n", "the file is empty")
-    BROKEN[f"zeros{suffix}"] = (f"a{suffix}", bytes(300), "")
     BROKEN[f"prose{suffix}"] = (f"a{suffix}", "To whom it may concern\n" * 20, "")
     BROKEN[f"noise{suffix}"] = (f"a{suffix}", np.random.default_rng(0).bytes(500), "")
 

@@ -1,13 +1,11 @@
 """Models of a card and an ONNX file: what is written is read again, what does not fit is refused in one sentence."""
 
-import json
-
 import numpy as np
 import onnx
 import pytest
 from msgspec.structs import replace
 from onnx import TensorProto, helper, numpy_helper
-from pipeline import make_map_network, make_recogniser
+from pipeline import change_card, make_map_network, make_recogniser
 
 from nextview.errors import ModelError
 from nextview.files import sha256_of
@@ -27,10 +25,6 @@ def test_cards_are_read_as_they_were_written(tmp_path):
         assert read_card(tmp_path / "card.json") == replace(card, path=tmp_path / f"card{card.path.suffix}")
 
 
-def change(path, **values):
-    path.write_text(json.dumps(json.loads(path.read_text()) | values))
-
-
 def test_a_model_that_is_not_there():
     with pytest.raises(ModelError, match="no bundled model is called 'resnet'; there are features, lcm-"):
         find_card("resnet")
@@ -47,16 +41,16 @@ def test_a_card_of_other_classes_or_inputs_than_its_network_is_refused_when_that
         ({"input": {"kind": "image", "size": 16}}, r"has input \(batch, 4, 16, 16\)"),
     ):
         before = card.read_text()
-        change(card, **values)
+        change_card(card, **values)
         with pytest.raises(ModelError, match=sentence):
             Recogniser(card)
         card.write_text(before)
     lem = make_map_network(tmp_path)
-    change(lem, good="valley")
+    change_card(lem, good="valley")
     assert MapNetwork(lem).card.valleys(("a", "b")) == ("a", "b")
-    change(lem, valley_gain={"a": -0.1, "b": 0.1}, valley_classes=["b"])
+    change_card(lem, valley_gain={"a": -0.1, "b": 0.1}, valley_classes=["b"])
     assert MapNetwork(lem).card.valleys(("a", "b")) == ("b",)
-    change(lem, output="sphere")
+    change_card(lem, output="sphere")
     with pytest.raises(ModelError, match="gives no sphere"):
         MapNetwork(lem)
 
@@ -123,7 +117,7 @@ def test_a_file_that_is_not_what_its_card_promises(tmp_path, monkeypatch, change
     file.write_bytes(model.SerializeToString())
     with pytest.raises(ModelError, match="the SHA-256 differs"):
         Recogniser(card, 1)
-    card.write_text(json.dumps(json.loads(card.read_text()) | {"sha256": sha256_of(file)}))
+    change_card(card, sha256=sha256_of(file))
     with pytest.raises(ModelError, match=f"tiny.onnx: {sentence}") as refused:
         Recogniser(card, 1)([SEEN, SEEN])
     assert "\n" not in str(refused.value)

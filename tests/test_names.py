@@ -7,11 +7,10 @@ import matplotlib
 import numpy as np
 import pytest
 import trimesh
-from pipeline import refused, some_predictions
+from pipeline import benchmark, refused, some_predictions
 
 from nextview.benchmark.figures import confusion_matrix
 from nextview.benchmark.report import report
-from nextview.benchmark.run import BenchmarkSettings, run_benchmark
 from nextview.cli.ending import printable
 from nextview.cli.main import main
 from nextview.data.folders import list_dataset
@@ -56,8 +55,7 @@ def strange(tmp_path_factory):
     names = (f"{COMMENT}{MATH}", *p.names[1:])
     p = replace(p, logits=logits, classes=CLASSES, names=names, labels=np.arange(24) % 4, valley_classes={"lem": ()})
     p.save(folder / "p.npz")
-    settings = BenchmarkSettings(thresholds=(0.8, 0.97), runs=2, samples=50)
-    run_benchmark(folder / "p.npz", folder / "out", settings)
+    benchmark(folder / "p.npz", folder / "out", thresholds=(0.8, 0.97), runs=2, samples=50)
     report(folder / "out")
     return folder
 

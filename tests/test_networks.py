@@ -88,24 +88,18 @@ def test_a_torchvision_checkpoint_loads_whole(tmp_path, depth):
 
 
 @pytest.mark.parametrize("channels", [1, 4])
-def test_other_channels_answer_grey_images_as_before(tmp_path, channels):
-    checkpoint(tmp_path / "rgb.pth", classes=5)
-    rgb, ours = ResNet(18, 5, 3), ResNet(18, 5, channels)
+def test_other_channels_answer_grey_images_as_before_and_other_classes_keep_the_last_layer(tmp_path, channels):
+    state = checkpoint(tmp_path / "rgb.pth", classes=5)
+    rgb, ours = ResNet(18, 5, 3), ResNet(18, 10, channels)
+    before = ours.fc.weight.clone()
     for network in (rgb, ours):
         start_from(network, tmp_path / "rgb.pth")
+    assert torch.equal(ours.fc.weight, before)
+    assert torch.equal(ours.layer3[0].conv1.weight, state["layer3.0.conv1.weight"])
     grey = torch.rand(2, 1, 32, 32)
     with torch.no_grad():
         expected = rgb.conv1(grey.expand(-1, 3, -1, -1))
         assert torch.allclose(ours.conv1(grey.expand(-1, channels, -1, -1)), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_other_classes_keep_the_last_layer_of_the_network(tmp_path):
-    state = checkpoint(tmp_path / "imagenet.pth")
-    network = ResNet(18, 10, 3)
-    before = network.fc.weight.clone()
-    start_from(network, tmp_path / "imagenet.pth")
-    assert torch.equal(network.fc.weight, before)
-    assert torch.equal(network.layer3[0].conv1.weight, state["layer3.0.conv1.weight"])
 
 
 class Bomb:

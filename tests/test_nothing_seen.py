@@ -7,34 +7,25 @@ import numpy as np
 import pytest
 import trimesh
 from matplotlib.text import Text
-from pipeline import make_recogniser, refused
+from pipeline import box, make_recogniser, meshed, refused
 from scipy.special import softmax
 
 import nextview
-from nextview import SimulatedCamera, Stopping, ViewSphere, make_policy
+from nextview import SimulatedCamera, Stopping, ViewSphere
 from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import render
 from nextview.data.samples import sample_mesh
 from nextview.data.store import ViewStore
-from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import Observation, pinhole
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Unidirectional
 from nextview.recognition.belief import Calibration
-from nextview.recognition.inference import MapNetwork, Models, Recogniser, load_models
 from nextview.recognition.model_card import read_card
 from nextview.session.episode import Episodes
 from nextview.session.session import Session
 
 SPHERE = ViewSphere.named("40")
-
-
-@pytest.fixture(scope="module")
-def tiny(models) -> Models:
-    recogniser = Recogniser(models / "tiny.json")
-    recogniser.calibration = Calibration(0.8, 1.0, bin_correlation=1.5)  # by no views at all one cannot divide
-    return Models(recogniser, {"lem": MapNetwork(models / "tiny-lem.json")})
 
 
 def features(logits, seen=None, azimuth_bins=None) -> Evidence:
@@ -99,9 +90,7 @@ def test_a_threshold_that_comes_down_does_not_come_down_by_empty_views():
 
 @pytest.mark.parametrize("name", ["gain", "lem", "spread-local"])
 def test_every_kind_of_policy_goes_on_past_an_empty_view(name):
-    policy = make_policy(name, SPHERE)
-    models = load_models(policy.needs)
-    policy = make_policy(name, SPHERE, models.valley_classes(policy.needs[0]) if policy.needs else (), models.classes)
+    system = nextview.load(policy=name)
     camera = SimulatedCamera(sample_mesh("chair"))
 
     class Covered:
@@ -114,7 +103,7 @@ def test_every_kind_of_policy_goes_on_past_an_empty_view(name):
             view = camera.observe(pose)
             return view if self.taken > 2 else replace(view, depth=np.zeros_like(view.depth))
 
-    result = Session(models, policy, SPHERE, 9, Stopping(1.0, 5)).run(Covered())
+    result = Session(system.models, system.policy, SPHERE, 9, Stopping(1.0, 5)).run(Covered())
     assert len({view.index for view in result.views}) == 5
     np.testing.assert_array_equal(result.views[1].belief, np.full(10, 0.1))
     np.testing.assert_allclose(result.views[2].belief, result.views[2].alone, atol=1e-6)  # the first that counts
@@ -145,9 +134,7 @@ def test_nothing_seen_is_no_answer(tiny):
 @pytest.mark.parametrize("gap", [20, 300])
 def test_two_boxes_far_apart_are_nothing(gap):
     """Most of their bounding sphere is empty; the networks would name what they see of it a table, confidently."""
-    boxes = [trimesh.creation.box((1, 1, 1)).apply_translation((x, 0, 0)) for x in (0, gap + 1)]
-    both = trimesh.util.concatenate(boxes)
-    found = nextview.recognise(make_mesh(both.vertices, both.faces), start=9)
+    found = nextview.recognise(meshed(*(box((1, 1, 1), (x, 0, 0)) for x in (0, gap + 1))), start=9)
     assert (found.answer, found.confident) == (None, False)
 
 

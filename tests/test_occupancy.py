@@ -28,17 +28,13 @@ def wall_depth(pose, x, half):
     return np.where((t > 0) & (np.abs(at[..., 1:]) < half).all(-1), t, 0)
 
 
-def crossings(points, eye, radius):
-    """How far along the way from points (P, 3) to an eye the sphere is crossed, (P, 2); NaN for never."""
+def hidden_by_ball(points, eye, radius):
+    """Whether the sphere is crossed on the way from points (P, 3) to an eye."""
     d = eye - points
     a, b, c = (d * d).sum(1), (points * d).sum(1), (points * points).sum(1) - radius**2
     with np.errstate(invalid="ignore"):
-        root = np.sqrt(b * b - a * c)
-    return np.stack([(-b - root) / a, (-b + root) / a], 1)
-
-
-def hidden_by_ball(points, eye, radius):
-    t = crossings(points, eye, radius)
+        root = np.sqrt(b * b - a * c)  # NaN for never
+    t = np.stack([-b - root, -b + root], 1) / a[:, None]
     return ((t > 0) & (t < 1)).any(1)
 
 

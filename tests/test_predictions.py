@@ -18,7 +18,7 @@ from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import render
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, PredictionsError, ResultsError
+from nextview.errors import DatasetError, PredictionsError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration, RiskBounds
@@ -59,15 +59,6 @@ def test_predictions_that_do_not_fit_together_are_refused(change, sentence):
         replace(some_predictions(), **change)
 
 
-@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut off"])
-def test_a_file_that_is_no_predictions_is_refused_in_one_sentence(tmp_path, content):
-    (tmp_path / "p.npz").write_bytes(content)
-    with pytest.raises(PredictionsError, match=r"p\.npz: not a predictions file"):
-        Predictions.load(tmp_path / "p.npz")
-    with pytest.raises(PredictionsError, match="there is no such file"):
-        Predictions.load(tmp_path / "q.npz")
-
-
 def test_a_flipped_bit_is_harmless_or_refused_in_one_sentence(tmp_path):
     path, rng = tmp_path / "p.npz", np.random.default_rng(0)
     some_predictions(2).save(path)
@@ -87,6 +78,8 @@ def test_a_flipped_bit_is_harmless_or_refused_in_one_sentence(tmp_path):
             refused.append(str(refusal))
     assert len(refused) > 100
     assert all(sentence.startswith(f"{path}: ") and "\n" not in sentence for sentence in refused)
+    with pytest.raises(PredictionsError, match="there is no such file"):
+        Predictions.load(tmp_path / "q.npz")
 
 
 def test_a_split_is_its_objects_and_nothing_else():
@@ -96,9 +89,8 @@ def test_a_split_is_its_objects_and_nothing_else():
     np.testing.assert_array_equal(test.logits, some.logits[1::2])
     np.testing.assert_array_equal(test.maps["lem"], some.maps["lem"][1::2])
     azimuth_bins = np.random.default_rng(0).normal(size=(6, 40, 3, 8)).astype(np.float32)
-    np.testing.assert_array_equal(
-        replace(some, azimuth_bins=azimuth_bins).of_split("test").azimuth_bins, azimuth_bins[1::2]
-    )
+    with_bins = replace(some, azimuth_bins=azimuth_bins).of_split("test")
+    np.testing.assert_array_equal(with_bins.azimuth_bins, azimuth_bins[1::2])
     with pytest.raises(PredictionsError, match="no objects of the split 'train', only of 'test'"):
         test.of_split("train")
 
@@ -131,9 +123,8 @@ def test_predictions_are_what_the_networks_say_of_each_look(views, models, predi
 
 def test_logits_of_ones_own_make_the_predictions_that_the_networks_make(views, models, predictions):
     made, store = Predictions.load(predictions).by_shape(), ViewStore.open(views)
-    logits = np.stack(
-        [Recogniser(models / "tiny.json").from_inputs(from_store(SPEC, store, i)).logits for i in range(18)]
-    )
+    recogniser = Recogniser(models / "tiny.json")
+    logits = np.stack([recogniser.from_inputs(from_store(SPEC, store, i)).logits for i in range(18)])
     own = Predictions.from_logits(views, logits, made.classes)
     np.testing.assert_allclose(own.logits, made.logits, atol=1e-5)
     assert own.models == {}
@@ -185,8 +176,6 @@ def test_a_killed_run_goes_on_where_it_was(views, models, predictions, tmp_path)
     assert 2 <= steps[0][0] < 18  # the worker may have finished another one before it ended
     assert not out.with_name("again.npz.part").exists()
     np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(predictions).logits)
-    with pytest.raises(ResultsError, match="exists; give another name"):
-        next(predict(views, out, recogniser, maps, workers=1))
 
 
 def test_an_array_that_announces_more_than_the_file_holds_is_refused_before_it_takes_memory(tmp_path):

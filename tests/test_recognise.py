@@ -53,16 +53,6 @@ def test_several_are_a_line_of_json_each_and_what_cannot_be_used_is_named(chair,
         assert (one["unknown"], one["warnings"]) == (False, [])
 
 
-def test_a_risk_stops_at_the_threshold_that_the_recogniser_promises(chair, capsys):
-    main(["recognise", str(chair), "--risk", "0.1", "--start", "3", "--json"])
-    by_risk = capsys.readouterr().out
-    result = nextview.load(risk=0.1).recognise(chair, start=3)
-    found = json.loads(by_risk)
-    assert [view["view"] for view in found["views"]] == [view.index for view in result.views]
-    assert found["confidence"] == pytest.approx(result.confidence, abs=1e-6)
-    assert "cannot promise" in refused(capsys, "recognise", chair, "--risk", "0.000001")
-
-
 def test_every_bundled_policy_runs_live(chair, capsys):
     for name in bundled_policies():
         arguments = ["--policy", name, "--threshold", "1", "--max-views", "3", "--start", "9", "--json"]
@@ -81,6 +71,7 @@ def test_every_bundled_policy_runs_live(chair, capsys):
         (["missing.off"], "no such file"),
         (["chair.off", "--start", "40"], "0 to 39"),
         (["chair.off", "--policy", "clairvoyant"], "no policy is called"),
+        (["chair.off", "--risk", "0.000001"], "cannot promise"),
         (["chair.off", "--figure", "chair"], "ends in .png or .pdf or .svg"),
     ],
 )

@@ -3,24 +3,17 @@
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import scene_predictions, some_predictions
+from pipeline import benchmark, scene_predictions, some_predictions, store_of
 
 from nextview.benchmark.leaderboard import level_differences
 from nextview.benchmark.published import ACCURACY, read_table
 from nextview.benchmark.report import pictures_of, report
-from nextview.benchmark.run import BenchmarkSettings, load, run_benchmark
+from nextview.benchmark.run import load
 from nextview.cli.leaderboard_table import print_leaderboard
-from nextview.data.folders import Entry
-from nextview.data.store import DONE, ViewStore, describe
 from nextview.errors import ResultsError
-
-
-def benchmark(predictions, out, **settings):
-    return run_benchmark(predictions, out, BenchmarkSettings(**settings))
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +23,9 @@ def made(tmp_path_factory):
     p = replace(some_predictions(20, seed=1), store=str(folder / "views.zarr"))
     p.save(folder / "p.npz")
     benchmark(folder / "p.npz", folder / "out", thresholds=(0.8, 0.97), runs=3, samples=100)
-    entries = [Entry(Path("none"), name, p.classes[i], "test") for name, i in zip(p.names, p.labels, strict=True)]
-    store = ViewStore.create(folder / "views.zarr", describe(entries, p.sphere, 32, {}))
-    store.group["image"][:] = np.random.default_rng(0).integers(0, 255, store.group["image"].shape, np.uint8)
-    store.group["measures/depth_entropy"][:] = p.depth_entropy
-    store.group["status"][:] = DONE
+    image = np.random.default_rng(0).integers(0, 255, (20, 40, 32, 32), np.uint8)
+    labels, arrays = np.array(p.classes)[p.labels], {"image": image, "depth_entropy": p.depth_entropy}
+    store_of(folder / "views.zarr", p.names, labels, p.sphere, 32, **arrays)
     report(folder / "out")
     return folder
 

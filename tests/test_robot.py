@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from pipeline import TABLE, box, cast, make_map_network, make_recogniser, pose_at
+from pipeline import TABLE, box, cast, pose_at
 from scipy.spatial.transform import Rotation
 
 import nextview
@@ -18,8 +18,7 @@ from nextview.errors import ObservationError, UsageError
 from nextview.geometry.viewsphere import viewpoints_of
 from nextview.policies.maps import MapPeak
 from nextview.policies.registry import make_policy
-from nextview.recognition.belief import Calibration, log_evidence_of
-from nextview.recognition.inference import MapNetwork, Models, Recogniser
+from nextview.recognition.belief import log_evidence_of
 from nextview.sensing import Frame, ObservedObject
 from nextview.session.session import Session
 
@@ -27,14 +26,6 @@ SPHERE = ViewSphere.named("40")
 SHAPE = 120, 160
 INTRINSICS = np.array([[260.0, 0, 80], [0, 260.0, 60], [0, 0, 1]])
 SOFA = trimesh.util.concatenate([box((0.2, 0.16, 0.1), (0, 0, 0.05)), box((0.06, 0.16, 0.08), (-0.07, 0, 0.14))])
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory) -> Models:
-    folder = tmp_path_factory.mktemp("tiny")
-    recogniser = Recogniser(make_recogniser(folder, ["box", "ball", "pillar"], azimuth_bins=8))
-    recogniser.calibration = Calibration(0.8, 1.0, bin_correlation=1.5)
-    return Models(recogniser, {"lem": MapNetwork(make_map_network(folder))})
 
 
 def frame(pose, move=np.eye(4), scale=1.0, meshes=(TABLE, SOFA), masked=False, **more) -> Frame:
@@ -170,7 +161,7 @@ def test_a_session_is_as_it_was_after_each_mistake(tiny, what, make, error, afte
 
 
 def test_the_pose_that_was_reached_counts(tiny):
-    camera = SimulatedCamera(sample_mesh("chair"), 16)
+    camera = SimulatedCamera(sample_mesh("chair"), 32)
     session = begin(tiny, distance=None)
     place = (27.0, 100.0)
     pose = nextview.geometry.viewsphere.look_at_origin(*np.radians(place), 3.0)
@@ -193,7 +184,7 @@ def test_the_pose_that_was_reached_counts(tiny):
 def test_failed_and_unreachable_views_never_come(tiny, data, layout, name):
     sphere = viewpoints_of(layout)
     policy = MapPeak(SPHERE, "lem") if name == "lem" else make_policy(name, sphere)
-    camera = SimulatedCamera(sample_mesh("chair"), 16)
+    camera = SimulatedCamera(sample_mesh("chair"), 32)
     session = begin(tiny, policy, sphere=sphere, max_views=6, distance=None, seed=data.draw(st.integers(0, 99)))
     mask = np.random.default_rng(data.draw(st.integers(0, 999))).random(len(sphere)) < data.draw(st.floats(0.05, 1))
     assume(mask.any())
@@ -221,7 +212,7 @@ def test_failed_and_unreachable_views_never_come(tiny, data, layout, name):
 
 
 def test_a_view_that_becomes_unreachable_is_replaced_at_once(tiny):
-    camera = SimulatedCamera(sample_mesh("chair"), 16)
+    camera = SimulatedCamera(sample_mesh("chair"), 32)
     session = begin(tiny, distance=None)
     session.update(camera.observe(session.pose))
     first = session.view
@@ -251,7 +242,7 @@ def test_travel_in_seconds_is_weighed_as_travel_in_cells(tiny):
             travel = SPHERE.travel[state.current] if state.travel is None else state.travel
             return np.where(state.free, -self.travel_weight * travel, -np.inf).argmax(1)
 
-    camera, rng = SimulatedCamera(sample_mesh("chair"), 16), np.random.default_rng(0)
+    camera, rng = SimulatedCamera(sample_mesh("chair"), 32), np.random.default_rng(0)
     costs = {"cells": None, "seconds": 3.5 * SPHERE.travel, "matrix": rng.random((40, 40))}
     costs["callable"] = lambda a, b: costs["matrix"][
         tuple(int(np.abs(SPHERE.poses - pose).sum((1, 2)).argmin()) for pose in (a, b))

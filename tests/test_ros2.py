@@ -47,12 +47,15 @@ def image_message(depth, encoding, big=False, padding=0, **more):
     return message("sensor_msgs/msg/Image", **(fields | more))
 
 
+def roi(offset):
+    return message("sensor_msgs/msg/RegionOfInterest", x_offset=offset, y_offset=0, height=0, width=0, do_rectify=False)
+
+
 def info_message(k=K, shape=SHAPE, d=(), p=None, **more):
-    roi = message("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     p = np.hstack([k, np.zeros((3, 1))]) if p is None else p
     fields = {"header": header("optical"), "height": shape[0], "width": shape[1], "distortion_model": "plumb_bob"}
     fields |= {"d": np.array(d, float), "k": np.array(k, float).ravel(), "r": np.eye(3).ravel(), "p": p.ravel()}
-    return message("sensor_msgs/msg/CameraInfo", **(fields | {"binning_x": 0, "binning_y": 0, "roi": roi} | more))
+    return message("sensor_msgs/msg/CameraInfo", **(fields | {"binning_x": 0, "binning_y": 0, "roi": roi(0)} | more))
 
 
 def transform_message(pose, child="optical", time=12.5):
@@ -110,10 +113,6 @@ def test_rectified_images_have_the_intrinsics_of_p():
     np.testing.assert_array_equal(conversion.intrinsics_of(info, rectified=True), p[:, :3])
     with pytest.raises(ObservationError, match=r"distorts \(plumb_bob\): use rectified images"):
         conversion.intrinsics_of(info)
-
-
-def roi(offset):
-    return message("sensor_msgs/msg/RegionOfInterest", x_offset=offset, y_offset=0, height=0, width=0, do_rectify=False)
 
 
 @pytest.mark.parametrize(

@@ -7,21 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
-from pipeline import scene_predictions, some_predictions
+from pipeline import box, meshed, scene_predictions, some_predictions
+from test_policies import state_of as state_at
 from test_scenes import GRID, scene_of
 
 import nextview
 from nextview.benchmark import statistics
 from nextview.benchmark.entries import default_entries
-from nextview.benchmark.published import ACCURACY, comparable_classes, read_table
+from nextview.benchmark.published import ACCURACY, read_table
 from nextview.benchmark.replay import make_specs, replay
 from nextview.benchmark.summary import target_weights
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import SceneSight, scene_intrinsics, scene_views
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, EntryError, PredictionsError
-from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import SceneView
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.gain import INPUTS, VISIBILITY, Gain, features, mirrored, mirrored_features
@@ -53,15 +52,11 @@ def looks(scene, *views: int) -> list[SceneView]:
 
 def state_of(visibility, belief=None, reachable=None) -> EpisodeState:
     """One episode after view 0."""
-    visited = np.zeros((1, 40), bool)
-    visited[0, 0] = True
-    belief = np.full((1, 10), 0.1) if belief is None else belief
-    bins = np.full((1, 10, 8), 1 / 8)
+    belief, bins = np.full((1, 10), 0.1) if belief is None else belief, np.full((1, 10, 8), 1 / 8)
     evidence = Evidence(np.log(belief), {"lem-sphere": np.zeros((1, 5, 8))}, bins)
-    return EpisodeState(
-        np.zeros(1, int), visited, belief, evidence, 1, azimuth_bins=bins, reachable=reachable,
-        visibility=np.asarray(visibility, float).reshape(1, 40),
-    )  # fmt: skip
+    share = np.asarray(visibility, float).reshape(1, 40)
+    known = {"azimuth_bins": bins, "reachable": reachable, "visibility": share}
+    return replace(state_at(GRID, 0, belief=belief), evidence=evidence, **known)
 
 
 # What is expected to show
@@ -252,12 +247,6 @@ def test_scenes_without_their_store_are_not_taken_for_single_objects(predictions
     assert make_specs(alone, 1, 0).scenes is None
 
 
-def test_nothing_published_stands_beside_scenes(predictions):
-    assert comparable_classes(predictions) == ()
-    alone = replace(predictions, names=tuple(f"thing_{i}" for i in range(len(predictions))))
-    assert comparable_classes(alone) == TEN
-
-
 def test_scenes_around_one_target_are_drawn_together():
     names = ("a@light-0", "b@light-0", "a@heavy-0", "c@heavy-0", "a@heavy-1")
     weights = target_weights(names, 200, np.random.default_rng(0))
@@ -285,7 +274,7 @@ def test_what_the_script_judges_is_what_replay_believes(predictions):
 
 @pytest.mark.parametrize("named", ["box", "mask"])
 def test_a_robot_sees_around_a_box(named):
-    crate = make_mesh(*(lambda m: (m.vertices, m.faces))(trimesh.creation.box([1, 1.2, 0.9])))
+    crate = meshed(box([1, 1.2, 0.9]))
     scene = scene_of(Block(1.9, 0.0, 0.0, 0.3, 1.1, 1.6), target=crate)
     truth = np.array([OccludedCamera(scene, 64).visible_share(pose) for pose in GRID.poses])
     assert truth[0] < 0.6 < truth[3]

@@ -8,28 +8,19 @@ import pytest
 import trimesh
 from matplotlib.path import Path as Outline
 
-from nextview.data.rendering import RenderOptions, render
+from nextview import SimulatedCamera
 from nextview.data.scene_drawing import SPREAD, TOLERANCE, draw_scenes
 from nextview.data.scene_views import scene_views
-from nextview.data.store import PENDING, ViewStore, check
+from nextview.data.store import ViewStore, check
 from nextview.errors import DatasetError
-from nextview.geometry.mesh import make_mesh
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.simulation.robot_camera import RobotCamera
 from nextview.simulation.scene import TABLE, Scene, block_item, build_scene, footprint, separation
 from nextview.simulation.scene_layout import LEVELS, Block, SceneLayout
-from nextview.simulation.simulated import (
-    NOTHING,
-    OTHER,
-    TABLE_TOP,
-    TARGET,
-    OccludedCamera,
-    SceneCamera,
-    SimulatedCamera,
-)
+from nextview.simulation.simulated import NOTHING, OTHER, TABLE_TOP, TARGET, OccludedCamera, SceneCamera
 
 GRID = ViewSphere.named("40")
-BALL = make_mesh(*(lambda m: (m.vertices, m.faces))(trimesh.creation.icosphere(4)))
+BALL = pipeline.meshed(trimesh.creation.icosphere(4))
 FRONT = GRID.poses[0]
 """From +x, level."""
 
@@ -50,15 +41,7 @@ def test_a_wall_before_one_half_hides_exactly_half():
     columns = np.flatnonzero(seen.depth.any(0))
     assert columns.max() < 56 or columns.min() >= 56
     np.testing.assert_array_equal(seen.depth > 0, seen.picture > 0)
-
-
-def test_a_box_before_the_target_hides_it_and_shows_its_own_face():
-    scene = scene_of(Block(1.5, 0.0, 0.0, 0.2, 2.5, 2.5))
-    assert OccludedCamera(scene).visible_share(FRONT) == 0
-    assert not OccludedCamera(scene).observe(FRONT).seen
-    depth, owner = SceneCamera(scene, np.array([[60.0, 0, 40], [0, 60, 40], [0, 0, 1]]), (80, 80)).look(FRONT)
-    assert owner[40, 40] == OTHER
-    assert depth[40, 40] == pytest.approx(3 - 1.6, abs=1e-5)  # its near face is at x = 1.6
+    assert not OccludedCamera(scene_of(Block(1.5, 0.0, 0.0, 0.2, 2.5, 2.5))).observe(FRONT).seen
 
 
 def test_every_pixel_has_its_owner():
@@ -170,27 +153,12 @@ def test_a_store_of_scenes_holds_what_shows_and_the_scene(cluttered_views, clutt
     assert wide == pytest.approx(narrow, abs=0.1 * narrow.max())
 
 
-def test_a_store_of_scenes_goes_on_where_it_was_cut_off(cluttered_views, cluttered, furniture, tmp_path):
-    path = tmp_path / "cut.zarr"
-    options = RenderOptions(meshes=furniture)
-    begun = render(cluttered, path, GRID, 48, options, workers=0)
-    next(begun)
-    begun.close()
-    opened = ViewStore.open(path)
-    assert opened.done.sum() == 1
-    opened.write(int(np.flatnonzero(opened.done)[0]), {"status": np.array(PENDING, np.uint8)})
-    assert len(list(render(cluttered, path, GRID, 48, options, workers=0))) == 6
-    whole, cut = ViewStore.open(cluttered_views), ViewStore.open(path)
-    for name in whole.rendered:
-        np.testing.assert_array_equal(whole.array(name)[:], cut.array(name)[:], err_msg=name)
-
-
 # Live
 
 
 @pytest.mark.parametrize("named", ["known", "mask", "box", "point"])
 def test_a_robot_sees_the_target_that_it_was_told_of(named):
-    crate = make_mesh(*(lambda m: (m.vertices, m.faces))(trimesh.creation.box([1, 1.2, 0.9])))
+    crate = pipeline.meshed(pipeline.box([1, 1.2, 0.9]))
     scene = scene_of(Block(-1.9, 0.4, 0.2, 0.6, 0.6, 0.9), Block(0.5, 1.6, 0.5, 0.5, 0.4, 0.7), target=crate)
     camera = RobotCamera(scene, named=named)
     frame = camera.observe(GRID.poses[16])

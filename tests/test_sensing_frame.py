@@ -61,11 +61,14 @@ def test_colour_becomes_grey():
 
 WRONG = {
     "millimetres?": {"depth": DEPTH * 1000},
+    "inches": {"depth": DEPTH * 39.37},
     "scaled to 0 .. 1": {"depth": DEPTH / 1000},
     "nothing is seen": {"depth": np.full(SHAPE, np.nan)},
     "transposed, or with a skew": {"intrinsics": INTRINSICS.T},
     "in pixels, not in millimetres": {"intrinsics": np.diag([3.6, 3.6, 1])},
     "another resolution": {"intrinsics": np.array([[520, 0, 1500], [0, 520, 900], [0, 0, 1.0]])},
+    "intrinsics of another resolution": {"intrinsics": np.diag([0.75, 0.75, 1]) @ INTRINSICS},
+    "of another resolution": {"intrinsics": np.diag([1.5, 1.5, 1]) @ INTRINSICS},
     "transposed?": {"pose": POSE.T},
     "scaled by 2": {"pose": POSE @ np.diag([2, 2, 2, 1.0])},
     "left-handed": {"pose": POSE @ np.diag([1, -1, 1, 1.0])},

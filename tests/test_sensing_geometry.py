@@ -91,9 +91,11 @@ def test_the_plane_is_that_of_least_squares_through_what_lies_on_it():
 # Noise
 
 
-def table_depth(shape=SHAPE):
-    pose = pose_at(50, 20, 0.8)
-    return cast([TABLE.copy().apply_scale([4, 4, 1])], pose, shape=shape)[0].astype(np.float64)
+ABOVE = pose_at(50, 20, 0.8)
+
+
+def table_depth():
+    return cast([TABLE.copy().apply_scale([4, 4, 1])], ABOVE)[0].astype(np.float64)
 
 
 @pytest.mark.parametrize("sigma", [0.0005, 0.002, 0.01])
@@ -125,10 +127,9 @@ def facet_depth(facets, shape=SHAPE):
 
 
 def test_the_facets_of_a_plane_are_that_plane():
-    pose = pose_at(50, 20, 0.8)
-    depth = cast([TABLE.copy().apply_scale([4, 4, 1])], pose)[0]
+    depth = table_depth().astype(np.float32)
     # z = 0 in the world: up @ (R P + t) = 0, so n . P = 1 with n = -R^T up / up @ t.
-    n = -(pose[:3, :3].T @ UP) / pose[2, 3]
+    n = -(ABOVE[:3, :3].T @ UP) / ABOVE[2, 3]
     for denoise in (False, True):
         facets = fit_facets(depth, depth > 0, INTRINSICS, denoise=denoise)
         assert len(facets.planes) == depth.size

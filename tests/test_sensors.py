@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from pipeline import box, cast, pose_at, rays
+from pipeline import box, cast, meshed, pose_at, rays
 from scipy.stats import norm
 
 import nextview
@@ -14,12 +14,11 @@ from nextview.data.rendering import RenderOptions, render
 from nextview.data.samples import sample_mesh
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError
-from nextview.geometry.mesh import make_mesh
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import ERRORS, SENSORS, Sensor, SensorMix, sensor_named
 
 SPHERE, FEW = ViewSphere.named("40"), ViewSphere((20.0,), 3)
-BALL = make_mesh(trimesh.creation.icosphere(4).vertices, trimesh.creation.icosphere(4).faces)
+BALL = meshed(trimesh.creation.icosphere(4))
 
 
 def rng(*seed: int) -> np.random.Generator:
@@ -105,26 +104,9 @@ def test_grazing_pixels_are_lost(tilt, grain):
     assert lost == pytest.approx(np.maximum(0, 1 - np.cos(angle[some]) / 0.3).mean(), abs=0.01 if grain == 0 else 0.03)
 
 
-def box_before_wall(sensor: Sensor, left: int, right: int) -> np.ndarray:
-    depth = np.full(sensor.shape, 1.5, np.float32)
-    depth[100:300, left:right] = 0.75
-    return depth
-
-
 @pytest.mark.parametrize("baseline", [0.05, 0.075])
-def test_the_shadow_of_a_box_on_a_wall_has_the_width_that_geometry_says(baseline):
+def test_shadows_are_where_rays_from_the_projector_do_not_arrive(baseline):
     sensor = replace(SENSORS["none"], shadow=baseline)
-    width = sensor.focal * baseline * (1 / 0.75 - 1 / 1.5)  # of the shadow, pixels, on the side away from the projector
-    lost = sensor.measure(box_before_wall(sensor, 300, 400), rng(10))[0] == 0
-    assert not lost[:100].any()
-    assert not lost[300:].any()
-    np.testing.assert_allclose(lost[100:300].sum(1), width, atol=1)
-    assert lost[100:300, int(300 - width + 1) : 300].all()
-    assert not lost[:, 300:].any()
-
-
-def test_shadows_are_where_rays_from_the_projector_do_not_arrive():
-    sensor = replace(SENSORS["none"], shadow=0.075)
     things = [box((0.3, 0.06, 0.2), (0, 0, 0.2)), box((0.05, 0.05, 0.3), (-0.1, 0.15, 0.1)), box((2, 2, 0.02))]
     things.append(trimesh.creation.icosphere(4, 0.08).apply_translation((0.15, -0.2, 0.15)))
     pose = pose_at(35, 60, 1.0)
@@ -132,13 +114,13 @@ def test_shadows_are_where_rays_from_the_projector_do_not_arrive():
     lost = sensor.measure(depth, rng(12))[0] == 0
     scene = trimesh.util.concatenate(things)
     points = (rays(sensor.intrinsics, sensor.shape) * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
-    projector = pose[:3, 3] + 0.075 * pose[:3, 0]
+    projector = pose[:3, 3] + baseline * pose[:3, 0]
     towards = projector - points.reshape(-1, 3)
     length = np.linalg.norm(towards, axis=1)
     starts = points.reshape(-1, 3) + 0.004 * towards / length[:, None]
     hidden = scene.ray.intersects_any(starts, towards / length[:, None]).reshape(depth.shape) & (depth > 0)
     lost &= depth > 0
-    assert hidden.sum() > 2000
+    assert hidden.sum() > 1000
     differ = hidden != lost
     assert (differ & hidden).sum() < 0.1 * hidden.sum()
     assert (differ & lost).sum() < 0.1 * hidden.sum()

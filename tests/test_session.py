@@ -72,6 +72,7 @@ class Margin(Stopping):
 def test_a_stopping_rule_of_ones_own(camera):
     rule = Margin(max_views=6, lead=0.95)
     system = nextview.load(stopping=rule)
+    assert len(pickle.dumps(system)) < 1000  # as how it was loaded
     for again in (system, pickle.loads(pickle.dumps(system))):
         result = again.recognise(camera, start=20)
         leads = [np.ptp(np.sort(view.belief)[-2:]) for view in result.views]

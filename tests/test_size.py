@@ -1,13 +1,12 @@
 """How large an object is counts for its class where it is known, and nowhere else."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from pipeline import make_recogniser, refused, train_predictions
+from pipeline import change_card, make_recogniser, refused, train_predictions
 from scipy.stats import norm
 
 from nextview.cli.main import main
@@ -37,9 +36,7 @@ def shop(tmp_path_factory):
             path.parent.mkdir(parents=True, exist_ok=True)
             trimesh.creation.icosphere(2, radius * rng.uniform(0.8, 1.25)).export(path)
     list(render(folder / "meshes", folder / "views.zarr", SPHERE, 32, workers=1))
-    make_recogniser(folder, CLASSES)
-    card = json.loads((folder / "tiny.json").read_text())
-    (folder / "tiny.json").write_text(json.dumps(card | {"held_out": ["big_0", "big_1", "small_0", "small_1"]}))
+    change_card(make_recogniser(folder, CLASSES), held_out=["big_0", "big_1", "small_0", "small_1"])
     return folder
 
 

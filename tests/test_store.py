@@ -94,8 +94,13 @@ def test_a_store_without_its_root_or_another_folder_is_left_alone(store, furnitu
             list(render(furniture, store, SPHERE, 32, workers=0, overwrite=overwrite))
 
 
-def test_other_settings_are_refused_or_replace_the_store(store, furniture):
+def test_other_settings_and_meshes_are_refused_or_replace_the_store(store, furniture, tmp_path):
     (store / "notes.txt").write_text("mine")
+    changed = shutil.copytree(furniture, tmp_path / "changed")
+    with (changed / "chair/test/chair_4.off").open("a") as file:
+        file.write("\n")
+    with pytest.raises(DatasetError, match="begun with other sha256"):
+        list(render(changed, store, SPHERE, 32))
     for options in ({"options": RenderOptions(seed=1)}, {"size": 16}, {"options": RenderOptions(split="train")}):
         with pytest.raises(DatasetError, match=r"was begun with other .*--overwrite"):
             list(render(furniture, store, SPHERE, **{"size": 32, "workers": 0} | options))

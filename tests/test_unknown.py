@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from pipeline import INTRINSICS, TABLE, box, cast, pose_at
+from pipeline import INTRINSICS, TABLE, box, cast, meshed, pose_at
 from scipy.spatial.distance import cdist
 from scipy.stats import kstest
 
@@ -49,12 +49,6 @@ def test_the_score_is_what_brute_force_gives():
     np.testing.assert_allclose(score.scores(views, np.arange(20) > 9)[10:], (-tenth[10:] + 0.9) / 0.1, atol=1e-4)
 
 
-def test_a_score_that_was_fitted_to_other_features_is_refused():
-    score = some_score(np.random.default_rng(6))
-    with pytest.raises(ModelError, match="other features; run nextview fit unknown"):
-        score.scores(np.zeros((1, 8)))
-
-
 def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
     """Of 4,000 objects, each with a mean of its own around which its views scatter, at 400 held-out ones."""
     rng = np.random.default_rng(2)
@@ -74,18 +68,15 @@ def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
 # Files and cards
 
 
-def test_a_score_is_read_as_it_was_written(tmp_path):
-    score = some_score(np.random.default_rng(6))
-    sha256 = score.save(tmp_path / "a.novelty.safetensors")
-    again = read_novelty(tmp_path / "a.novelty.safetensors", sha256)
+def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_another_is_refused(tmp_path):
+    score, path = some_score(np.random.default_rng(6)), tmp_path / "a.novelty.safetensors"
+    sha256 = score.save(path)
+    again = read_novelty(path, sha256)
     for name, values in vars(score).items():
         np.testing.assert_array_equal(getattr(again, name), values)
-
-
-def test_a_score_that_is_missing_damaged_or_another_is_refused(tmp_path):
-    path = tmp_path / "a.novelty.safetensors"
-    sha256 = some_score(np.random.default_rng(6)).save(path)
-    with pytest.raises(ModelError, match="missing"):
+    with pytest.raises(ModelError, match="other features; run nextview fit unknown"):
+        again.scores(np.zeros((1, 8)))
+    with pytest.raises(ModelError, match="no such file"):
         read_novelty(tmp_path / "b.novelty.safetensors", sha256)
     with pytest.raises(ModelError, match="SHA-256 differs"):
         read_novelty(path, "0" * 64)
@@ -152,8 +143,7 @@ def scrambled(seed):
 
 
 def test_a_ball_and_a_scrambled_chair_are_unknown_and_the_samples_are_not(wary):
-    ball = trimesh.creation.icosphere(3)
-    for mesh in (make_mesh(ball.vertices, ball.faces), scrambled(0), scrambled(1)):
+    for mesh in (meshed(trimesh.creation.icosphere(3)), scrambled(0), scrambled(1)):
         result = wary.recognise(mesh, start=3)
         assert (result.answer, result.unknown) == (None, True)
         assert result.novelty < 0.02

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from pipeline import refused, some_predictions
+from pipeline import benchmark, refused, some_predictions
 
-from nextview.benchmark.run import BenchmarkSettings, run_benchmark
 from nextview.cli.main import main
 
 VIEWS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "views.py"))
@@ -27,8 +26,8 @@ def made(tmp_path_factory):
 def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
     names = ("random", "random-all", "lem", "furthest", "spread", "oracle-gain")
     out = made / f"benchmark{n_views}"
-    settings = BenchmarkSettings(policies=names, thresholds=(1.0,), runs=3, max_views=n_views, samples=200)
-    tables = run_benchmark(made / "p.npz", out, settings).tables
+    settings = {"policies": names, "thresholds": (1.0,), "runs": 3, "max_views": n_views, "samples": 200}
+    tables = benchmark(made / "p.npz", out, **settings).tables
     found = pd.read_csv(made / "out" / "views.csv").set_index(["policy", "n_views", "measure"]).sort_index()
     for ours, theirs in (("accuracy", "accuracy"), ("travel", "travel_all")):
         summary = tables.summary[tables.summary["measure"] == theirs].set_index("policy")

@@ -22,21 +22,15 @@ def haversine(sphere: ViewSphere, a: int, b: int) -> float:
     return 2 * np.arcsin(np.sqrt(min(h, 1)))
 
 
-def test_forty_views():
+def test_forty_views_whose_azimuth_runs_from_x_to_y_and_elevation_upwards():
     sphere = ViewSphere.named("40")
     assert len(sphere) == 40
-    for ring, elevation in enumerate([0, 18, 36, 54, 72]):
-        for k in range(8):
-            view = ring * 8 + k
-            assert sphere.angles(view) == (elevation, 45 * k)
-            assert (sphere.ring[view], sphere.azimuth_index[view]) == (ring, k)
-
-
-def test_azimuth_runs_from_x_to_y_and_elevation_upwards():
-    sphere = ViewSphere.named("40")
     for view, direction in {0: (1, 0, 0), 2: (0, 1, 0), 4: (-1, 0, 0), 6: (0, -1, 0)}.items():
         np.testing.assert_allclose(sphere.directions[view], direction, atol=1e-15)
     for view in range(40):
+        ring, k = divmod(view, 8)
+        assert sphere.angles(view) == (18 * ring, 45 * k)
+        assert (sphere.ring[view], sphere.azimuth_index[view]) == (ring, k)
         elevation, azimuth = np.radians(sphere.angles(view))
         x, y, z = sphere.directions[view]
         assert np.arctan2(z, np.hypot(x, y)) == pytest.approx(elevation)

@@ -41,7 +41,8 @@ CAMERAS = 16  # meshes that are kept ready to be looked at
 _HERE = "nextview.benchmark.environments"
 gymnasium.register("nextview/Recognise-v0", f"{_HERE}:RecogniseEnv", vector_entry_point=f"{_HERE}:RecogniseVectorEnv")
 gymnasium.register("nextview/RecogniseMesh-v0", f"{_HERE}:RecogniseMeshEnv")
-Split = Literal["train", "test"]  # objects to learn from, or objects to judge by
+Split = Literal["train", "test"] | None  # objects to learn from, or objects to judge by; None for all
+Info = dict[str, Any]
 FAR = 100.0  # bound of the observation space for what a map network says; the networks of this project stay far below
 
 
@@ -114,7 +115,7 @@ class Task:
     def __post_init__(self) -> None:
         whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
 
-    def begin(self, n: int, rng: np.random.Generator, options: dict[str, Any] | None = None) -> "Cohort":
+    def begin(self, n: int, rng: np.random.Generator, options: Info | None = None) -> "Cohort":
         """Begin ``n`` episodes: the options of ``reset`` may name each "object" and "start"; else they are drawn."""
         weight = 1 / np.bincount(self.labels)[self.labels]
         chance = weight / weight.sum() if self.balanced else None
@@ -137,9 +138,7 @@ class Task:
         return gymnasium.spaces.Discrete(len(self.sphere))
 
 
-def replayed(
-    predictions: Source, split: Split | None = "train", balanced: bool = False, rules: Rules = Rules()
-) -> Task:
+def replayed(predictions: Source, split: Split = "train", balanced: bool = False, rules: Rules = Rules()) -> Task:
     """The task of recognising the objects of one split, each shape once for "train"; None takes all objects.
 
     ``predictions`` to learn from are of objects that the recogniser was not trained on (``nextview predict
@@ -247,12 +246,12 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self.observation_space, self.action_space = task.observation_space, task.action_space
         self._cohort: Cohort | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         super().reset(seed=seed)
         self._cohort = self.task.begin(1, self.np_random, options)
         return self.observed(self._cohort.first), info_of(self._cohort.first)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
         seen = self.go(action)
         return self.observed(seen), float((seen.change - seen.price)[0]), bool(seen.ended[0]), False, info_of(seen)
 
@@ -267,20 +266,15 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         return seen.observation[0]
 
 
-def info_of(seen: Seen) -> dict[str, Any]:
+def info_of(seen: Seen) -> Info:
     """The info of a single episode."""
     return {name: values[0] for name, values in seen.info.items()}
 
 
 class RecogniseEnv(TaskEnv):
-    """Recognise an object by few views, looked up in predictions: see ``replayed``; ``rules`` are options of ``Rules``.
+    """Recognise an object by few views, looked up in predictions: see ``replayed``; ``rules`` as of ``Rules``."""
 
-    >>> env = gymnasium.make("nextview/Recognise-v0", predictions="validation.npz")    # doctest: +SKIP
-    """
-
-    def __init__(
-        self, predictions: Source, split: Split | None = "train", balanced: bool = False, **rules: Any
-    ) -> None:
+    def __init__(self, predictions: Source, split: Split = "train", balanced: bool = False, **rules: Any) -> None:
         super().__init__(replayed(predictions, split, balanced, Rules(**rules)))
 
 
@@ -296,21 +290,17 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         self.action_space = batch_space(task.action_space, num_envs)
         self._cohorts: list[tuple[Cohort, Rows]] = []
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[np.float32], Info]:
         super().reset(seed=seed)
         cohort = self.task.begin(self.num_envs, self.np_random, options)
         self._cohorts = [(cohort, np.arange(self.num_envs))]
         return cohort.first.observation, cohort.first.info
 
-    def step(
-        self, actions: Any
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[NDArray[np.float32], NDArray, NDArray[np.bool_], NDArray[np.bool_], Info]:
         seen, info = self.go(actions)
         return seen.observation, seen.change - seen.price, seen.ended, np.zeros(self.num_envs, bool), info
 
-    def go(self, actions: Any) -> tuple[Seen, dict[str, Any]]:
+    def go(self, actions: Any) -> tuple[Seen, Info]:
         """What is seen in each episode; where one ended, the observation and the info are those of the next."""
         if not self._cohorts:
             raise SessionError("no episode is under way; call reset")
@@ -341,7 +331,7 @@ class RecogniseVectorEnv(TaskVectorEnv):
     """See ``RecogniseEnv``, of which this runs ``num_envs`` side by side."""
 
     def __init__(
-        self, num_envs: int, predictions: Source, split: Split | None = "train", balanced: bool = False, **rules: Any
+        self, num_envs: int, predictions: Source, split: Split = "train", balanced: bool = False, **rules: Any
     ) -> None:
         super().__init__(replayed(predictions, split, balanced, Rules(**rules)), num_envs)
 
@@ -360,7 +350,7 @@ class RecogniseMeshEnv(TaskEnv):
     def __init__(
         self,
         meshes: str | Path | None = None,
-        split: Split | None = "train",
+        split: Split = "train",
         models: str | Path = "modelnet10",
         viewpoints: str = "40",
         depth: bool = False,

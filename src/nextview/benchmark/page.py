@@ -52,12 +52,9 @@ def words(name: str) -> str:
 
 def render(template: str, **given: Any) -> str:
     """A whole page by a template of this package. All that is given is text and never markup."""
+    templates = PackageLoader("nextview.benchmark", "templates")
     environment = Environment(
-        loader=PackageLoader("nextview.benchmark", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=templates, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.tests["oracle"] = knows_truth
     environment.filters |= {

@@ -17,6 +17,7 @@ from nextview.data import metrics
 from nextview.simulation.scene_layout import LEVELS, clutter_level
 
 Float = NDArray[np.float64]
+Drawn = dict[tuple, NDArray[np.float64]]  # what resampling gives, by policy, threshold and measure
 Cell = tuple[str, float | None, Outcomes]
 TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
 SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)  # from the first view for all to the last for most
@@ -136,9 +137,7 @@ def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
     return _frame(rows, ["policy", "threshold", "label", "measure", "value", "low", "high", "published"])
 
 
-def _tests(
-    grid: Grid, cells: list[Cell], summary: pd.DataFrame, drawn: dict[tuple, Float], reference: str
-) -> pd.DataFrame:
+def _tests(grid: Grid, cells: list[Cell], summary: pd.DataFrame, drawn: Drawn, reference: str) -> pd.DataFrame:
     value = summary.set_index(["policy", "threshold", "measure"])["value"].to_dict()
     right = {(policy, threshold): grid.right(ends.answer) for policy, threshold, ends in cells}
     rows = []

@@ -47,10 +47,9 @@ def stored_rows(p: Predictions, name: str) -> NDArray:
     try:
         store = ViewStore.open(p.store)
         store.array(name)
-        row = {stored: i for i, stored in enumerate(store.names)}
-        objects = [row.get(wanted, -1) for wanted in p.names]
-        if -1 in objects:
-            raise EntryError(f"{p.store}: holds no object {p.names[objects.index(-1)]}, for which {name} is needed")
+        objects = store.rows_of(p.names)
+        if (objects < 0).any():
+            raise EntryError(f"{p.store}: holds no object {p.names[objects.argmin()]}, for which {name} is needed")
         entropy = np.array([store.read("measures/depth_entropy", i) for i in objects])
         if not np.array_equal(entropy, p.depth_entropy):
             raise EntryError(f"{p.store}: holds other views than those that these predictions were made from")

@@ -15,7 +15,7 @@ class Command:
 
 
 CLI, LEARNING = "nextview.cli", "nextview.learning"
-THESIS = f"{LEARNING}.recipes:THESIS"
+THESIS, EXPORT = f"{LEARNING}.recipes:THESIS", f"{LEARNING}.export:export"
 EXPORTED = "{found.card}: largest difference between torch and ONNX on real views {found.difference:.2g}"
 COMMANDS = {  # by name, in the order in which they are listed
     "recognise": Command(f"{CLI}.recognise:recognise", "say what an object is: a mesh file, or captured views"),
@@ -52,10 +52,8 @@ COMMANDS = {  # by name, in the order in which they are listed
         "{found.value} at travel weight 0; travel weight {found.travel_weight:g}: {found.card}; in {found.states} "
         "states its answers differ from the networks' by {found.difference:.1g} at most",
     ),
-    "export recogniser": Command(
-        f"{LEARNING}.export:export_recogniser", "turn a trained recogniser into a model", EXPORTED
-    ),
-    "export map": Command(f"{LEARNING}.export:export_map", "turn a trained map network into a model", EXPORTED),
+    "export recogniser": Command(f"{EXPORT}_recogniser", "turn a trained recogniser into a model", EXPORTED),
+    "export map": Command(f"{EXPORT}_map", "turn a trained map network into a model", EXPORTED),
     "predict": Command(f"{CLI}.predict:predict", "run the models over every view of a store, once"),
     "fit calibration": Command(
         f"{LEARNING}.card_fits:fit_calibration",

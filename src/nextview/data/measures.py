@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import find_objects
 
 from nextview.checks import plugin, plugin_errors, plugins
 from nextview.data.pool import counted
@@ -34,13 +35,10 @@ class MeasuredView:
         object.__setattr__(self, "depth", object_depth(depth_image(self.depth)))
 
     @cached_property
-    def box(self) -> tuple[slice, slice]:
+    def box(self) -> tuple[slice, ...]:
         """Rows and columns that hold the object, (H', W'); none of them where nothing is seen."""
-        seen = self.depth > 0
-        rows, columns = (np.flatnonzero(seen.any(axis)) for axis in (1, 0))
-        if len(rows) == 0:
-            return slice(0, 0), slice(0, 0)
-        return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+        found = find_objects((self.depth > 0).astype(np.int8))
+        return found[0] if found else (slice(0, 0), slice(0, 0))
 
     @cached_property
     def near(self) -> NDArray[np.floating]:
@@ -56,6 +54,9 @@ class MeasuredView:
     def depths(self) -> NDArray[np.floating]:
         """Depth of the pixels that show the object, (n,), row by row."""
         return self.near[self.seen]
+
+
+Views = Callable[[ViewStore, int], Iterator[MeasuredView]]  # gives an object of a store, from all its views
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ def measure(
     scheduler: str | None = None,
     objects: NDArray[np.int64] | None = None,
     overwrite: bool = False,
-    views: Callable[[ViewStore, int], Iterator[MeasuredView]] = depth_views,
+    views: Views = depth_views,
 ) -> Iterator[tuple[int, int]]:
     """Put view measures of rendered objects, or of some rows, into a store: ``measures/NAME`` (N, V) float32.
 
@@ -163,9 +164,7 @@ def measure(
     yield from keep(path, [f"measures/{name}" for name in names], function, workers, scheduler, objects, overwrite)
 
 
-def _measure(
-    names: tuple[str, ...], views: Callable[[ViewStore, int], Iterator[MeasuredView]], store: ViewStore, i: int
-) -> Made:
+def _measure(names: tuple[str, ...], views: Views, store: ViewStore, i: int) -> Made:
     object_name, functions = store.names[i], {name: find_measure(name) for name in names}
     values = {name: np.empty(len(store.sphere), np.float32) for name in names}
 

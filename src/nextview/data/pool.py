@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -21,8 +21,8 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class WorkerDied(Exception):
-    """The process that worked on an item was killed, or crashed, again when it worked on that item alone."""
+class WorkerDied(str):
+    """The process that worked on an item was killed, or crashed, again when it worked on that item alone; in words."""
 
 
 def count(workers: int | None) -> int:
@@ -73,10 +73,7 @@ def counted(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, int]]:
-    """Call a function for the items that are left of ``total``, see ``each``; yields how many are done, and the total.
-
-    DatasetError if the process of an item died; it begins with the item's ``name``.
-    """
+    """Call a function for the items left of ``total``, see ``each``; yields how many are done, and the total."""
     before = total - len(items)
     yield before, total
     for finished, (item, result) in enumerate(each(function, items, workers, scheduler), before + 1):
@@ -109,9 +106,7 @@ def _begin_worker() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _on_cluster(
-    function: Callable[[Item], Result], items: Sequence[Item], scheduler: str
-) -> Iterator[tuple[Item, Result | WorkerDied]]:
+def _on_cluster(function: Callable, items: Sequence[Item], scheduler: str) -> Iterator[tuple[Item, Any]]:
     try:
         from distributed import Client, KilledWorker, as_completed
     except ImportError as error:

@@ -1,7 +1,6 @@
 """Run the models over every view of a store, once; resumable by object."""
 
 import hashlib
-import json
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -25,14 +24,15 @@ from nextview.recognition.model_card import BUNDLED, ModelCard
 from nextview.recognition.network_input import from_store
 
 BATCH = 8  # views a call of the networks
-Arrays = dict[str, NDArray[np.float32]]  # what the networks give: ``logits``, ``azimuth_bins`` and ``map/NAME``
+Cards = dict[str, ModelCard]  # of map networks, by name
+Files = tuple[tuple[str, Path], ...]  # where these are
 
 
 def predict(
     path: Path,
     out: Path,
     recogniser: ModelCard,
-    maps: dict[str, ModelCard],
+    maps: Cards,
     split: str | None = None,
     held_out: bool = False,
     size: bool = True,
@@ -62,8 +62,8 @@ def predict(
             (place / key).mkdir(parents=True)
         files = [place / key / f"{i}.npz" for i in objects]
         items = [item for item in zip(objects.tolist(), files, strict=True) if not item[1].exists()]
-        cards = _card_file(recogniser), {name: _card_file(card) for name, card in maps.items()}
-        work = partial(_predict_object, json.dumps((str(store.path.absolute()), *cards)))
+        networks = tuple((name, _card_file(card)) for name, card in maps.items())
+        work = partial(_predict_object, (store.path.absolute(), _card_file(recogniser), networks))
         yield from counted(work, items, len(objects), lambda it: f"{path}: {store.names[it[0]]}", workers, scheduler)
         arrays = _together(files)
         maps_found = {name.removeprefix("map/"): found for name, found in arrays.items() if name.startswith("map/")}
@@ -73,9 +73,7 @@ def predict(
         shutil.rmtree(place)
 
 
-def _plan(
-    store: ViewStore, objects: NDArray[np.int64], recogniser: ModelCard, maps: dict[str, ModelCard]
-) -> Predictions:
+def _plan(store: ViewStore, objects: NDArray[np.int64], recogniser: ModelCard, maps: Cards) -> Predictions:
     """What store and cards say of the objects; what the networks say is still to come."""
     own = [card for card in (recogniser, *maps.values()) if card.path.parent != BUNDLED]
     made_by = [*store.commands, *(line for card in own for line in card.training.commands), command()]
@@ -88,22 +86,20 @@ def _plan(
     )
 
 
-def _card_file(card: ModelCard) -> str:
-    return str(card.path.with_suffix(".json").absolute())
+def _card_file(card: ModelCard) -> Path:
+    return card.path.with_suffix(".json").absolute()
 
 
 @lru_cache(maxsize=1)
-def _open(files: str) -> tuple[ViewStore, Recogniser, dict[str, MapNetwork]]:
+def _open(store: Path, recogniser: Path, maps: Files) -> tuple[ViewStore, Recogniser, dict[str, MapNetwork]]:
     """Each process has its own store and networks, and one thread: objects are what runs side by side."""
-    store, recogniser, maps = json.loads(files)
-    networks = {name: MapNetwork(card, threads=1) for name, card in maps.items()}
-    return ViewStore.open(store), open_recogniser(Path(recogniser), threads=1), networks
+    networks = {name: MapNetwork(card, threads=1) for name, card in maps}
+    return ViewStore.open(store), open_recogniser(recogniser, threads=1), networks
 
 
-def _predict_object(files: str, item: tuple[int, Path]) -> None:
+def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> None:
     """Write maps, azimuth bins and logits of all views of one object, whole or not at all; zeros if nothing is seen."""
-    i, file = item
-    store, recogniser, maps = _open(files)
+    (i, file), (store, recogniser, maps) = item, _open(*files)
     specs = {recogniser.card.input} | {network.card.input for network in maps.values()}
     inputs = {spec: from_store(spec, store, i) for spec in specs}
     batches = [slice(start, start + BATCH) for start in range(0, len(store.sphere), BATCH)]
@@ -127,8 +123,8 @@ def _predict_object(files: str, item: tuple[int, Path]) -> None:
     aside.replace(file)
 
 
-def _together(files: Sequence[Path]) -> Arrays:
-    """The arrays of all objects, (N, ...), from one file for each."""
+def _together(files: Sequence[Path]) -> dict[str, NDArray[np.float32]]:
+    """The arrays of all objects, (N, ...), from one file for each: "logits", "azimuth_bins" and "map/NAME"."""
     objects = []
     for file in files:
         try:

@@ -1,15 +1,13 @@
 """How a long job tells how far it is, to whoever wants to know: a progress bar, a log or nobody."""
 
 from collections import deque
-from collections.abc import Iterable
-from typing import Protocol
+from collections.abc import Callable, Iterable
 
+Track = Callable[[Iterable[int], int, str], None]
+"""Follows one part of a job to its end, given counts of what is done, their last one and its name.
 
-class Track(Protocol):
-    """Follows one part of a job to its end. ``cli.progress.track``, a progress bar, is one; ``silently`` is another."""
-
-    def __call__(self, done: Iterable[int], total: int, what: str, /) -> None:
-        """Draw all of ``done``."""
+``cli.progress.track``, a progress bar, is one; ``silently`` is another.
+"""
 
 
 def silently(done: Iterable[int], total: int, what: str, /) -> None:

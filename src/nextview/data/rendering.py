@@ -30,6 +30,7 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named
 from nextview.simulation.simulated import OccludedCamera, SimulatedCamera
 
+AnySensor = Sensor | SensorMix | None
 LARGEST_CHUNK = 2**31 - 2**20  # bytes that may be compressed at once, the compressor's own included
 FARTHEST = np.iinfo(np.uint16).max * DEPTH_UNIT  # depth that can be stored, object radii
 SENSING = 256  # sets the draws of a sensor apart from those of a deformation: no byte of a name is as large
@@ -115,27 +116,17 @@ def render(
     with writing(path):
         with ThreadPoolExecutor() as pool:
             hashes = list(pool.map(_hash, [e.path for e in entries]))
-        recipe = {
-            "seed": options.seed,
-            "noise_seed": options.noise_seed,
-            "stretch": options.deform.stretch,
-            "rotated": options.deform.rotated,
-            "sha256": hashes,
-            "sensor": None if sensor is None else sensor.to_dict(),
-            "scene": None if options.meshes is None else SIDE,
-            "unit": options.unit,
-            "dataset": dataset.name,
-        }
-        wanted = describe(entries, sphere, size, recipe)
-        store = _begin(path, wanted, overwrite)
+        recipe = {name: getattr(options, name) for name in ("seed", "noise_seed", "unit")} | vars(options.deform)
+        recipe |= {"sha256": hashes, "sensor": None if sensor is None else sensor.to_dict()}
+        recipe |= {"scene": None if options.meshes is None else SIDE, "dataset": dataset.name}
+        store = _begin(path, describe(entries, sphere, size, recipe), overwrite)
         if (made_by := command()) not in store.commands:
             store.note(commands=[*store.commands, made_by])
         # Largest files first, so that no worker is left with a long one at the end.
         todo = np.flatnonzero(~store.done).tolist()
         todo.sort(key=lambda i: -entries[i].path.stat().st_size)
         items = [(i, entries[i]) for i in todo]
-        for (i, entry), problem in each(partial(_render_entry, path, options, sensor), items, workers, scheduler):
-            reason = None if problem is None else f"{problem}"
+        for (i, entry), reason in each(partial(_render_entry, path, options, sensor), items, workers, scheduler):
             others = {name: said for name, said in store.attributes.failures.items() if name != entry.name}
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is done.
@@ -146,7 +137,7 @@ def render(
             yield entry.name, reason
 
 
-def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) -> Sensor | SensorMix | None:
+def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) -> AnySensor:
     """Refuse settings that make no views; the sensor, if there is one."""
     whole(size, f"the size of {len(sphere)} views in pixels", 1, int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere))))
     whole(options.seed, "the seed", 0, 2**63 - 1)
@@ -221,9 +212,7 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
     return store
 
 
-def _render_entry(
-    path: Path, options: RenderOptions, sensor: Sensor | SensorMix | None, item: tuple[int, Entry]
-) -> str | None:
+def _render_entry(path: Path, options: RenderOptions, sensor: AnySensor, item: tuple[int, Entry]) -> str | None:
     """Render one object, or the target of one scene, into the store; the reason if its mesh cannot be used."""
     (i, entry), store = item, opened(path)
     try:
@@ -236,9 +225,7 @@ def _render_entry(
     return None
 
 
-def _rendered(
-    store: ViewStore, options: RenderOptions, sensor: Sensor | SensorMix | None, entry: Entry
-) -> dict[str, NDArray]:
+def _rendered(store: ViewStore, options: RenderOptions, sensor: AnySensor, entry: Entry) -> dict[str, NDArray]:
     sphere, size = store.sphere, store.attributes.size
     seed = options.seed if options.noise_seed is None else options.noise_seed
     rng = np.random.default_rng([seed, SENSING, *entry.name.encode()])

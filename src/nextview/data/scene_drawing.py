@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.checks import whole
-from nextview.data.folders import Entry, list_dataset, select
+from nextview.data.folders import list_dataset, select
 from nextview.data.pool import each
 from nextview.data.store import writing
 from nextview.errors import DatasetError, MeshError, UsageError
@@ -105,11 +105,11 @@ def draw_scenes(
     todo = [task for task in wanted if task not in done]
     files: dict[str, list[str]] = {}
     for entry in list_dataset(dataset):
-        files.setdefault(entry.split, []).append(_relative(entry, dataset))
+        files.setdefault(entry.split, []).append(entry.path.relative_to(dataset).as_posix())
     meshes = {name: Meshes(dataset.absolute(), tuple(sorted(found))) for name, found in files.items()}
     with writing(out):
         for task, reason in each(partial(_draw, meshes, seed), todo, workers, scheduler):
-            yield task.name, None if reason is None else f"{reason}"
+            yield task.name, reason
 
 
 def tasks(
@@ -138,12 +138,8 @@ def tasks(
             for level in levels:
                 name = f"{entry.name}@{level}-{number // len(mine)}"
                 path = out.absolute() / entry.label / one / f"{name}{SUFFIX}"
-                found.append(Task(_relative(entry, dataset), one, level, name, path))
+                found.append(Task(entry.path.relative_to(dataset).as_posix(), one, level, name, path))
     return found
-
-
-def _relative(entry: Entry, dataset: Path) -> str:
-    return entry.path.relative_to(dataset).as_posix()
 
 
 def _draw(meshes: dict[str, Meshes], seed: int, task: Task) -> str | None:

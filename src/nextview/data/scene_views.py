@@ -121,11 +121,9 @@ class SceneSight:
         """Of some of a store's objects; None if it holds no scenes."""
         if store.attributes.scene is None:
             return None
-        row = {name: i for i, name in enumerate(store.names)}
-        lost = [name for name in names if name not in row]
-        if lost:
-            raise DatasetError(f"{store.path}: holds no scene {lost[0]}")
-        rows = np.array([row[name] for name in names])
+        rows = store.rows_of(names)
+        if (rows < 0).any():
+            raise DatasetError(f"{store.path}: holds no scene {names[int(rows.argmin())]}")
         return cls(store, rows, np.stack([store.read("scene/reachable", i) for i in rows]))
 
     def of_scenes(self, kept: NDArray[np.int64]) -> "SceneSight":

@@ -10,21 +10,22 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.recognition.model_card import ModelCard, find_card
 
+Indices = NDArray[np.int64]
+Floats = NDArray[np.floating]
 
-def duplicate_groups(measured: NDArray[np.floating]) -> NDArray[np.int64]:
+
+def duplicate_groups(measured: Floats) -> Indices:
     """A number for each object, (N,), the same for those whose depth-entropies, (N, V), are: copies of one mesh."""
     return np.unique(measured, axis=0, return_inverse=True)[1].ravel()
 
 
-def deduplicated(labels: NDArray[np.int64], measured: NDArray[np.floating]) -> NDArray[np.int64]:
+def deduplicated(labels: Indices, measured: Floats) -> Indices:
     """One object of each shape and label, the first: indices, sorted."""
     _, first = np.unique(np.stack([duplicate_groups(measured), labels], 1), axis=0, return_index=True)
     return np.sort(first)
 
 
-def divide(
-    labels: NDArray[np.int64], measured: NDArray[np.floating], share: float, seed: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def divide(labels: Indices, measured: Floats, share: float, seed: int) -> tuple[Indices, Indices]:
     """Indices of objects that train, and of the share of every class that validates; their copies follow them."""
     group = duplicate_groups(measured)
     rng = np.random.default_rng(seed)
@@ -36,7 +37,7 @@ def divide(
     return np.flatnonzero(~validates), np.flatnonzero(validates)
 
 
-def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple[Indices, Indices]:
     """Divide the rendered objects of the training split (all objects of a store without splits), see ``divide``."""
     usable = np.flatnonzero(store.done & np.isin(store.splits, ("train", "")))
     if len(usable) == 0:
@@ -45,19 +46,19 @@ def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple
     return usable[training], usable[validation]
 
 
-def check_any(store: ViewStore, training: NDArray[np.int64], validation: NDArray[np.int64], lacking: str = "") -> None:
+def check_any(store: ViewStore, training: Indices, validation: Indices, lacking: str = "") -> None:
     """Refuse to train on no object, or to validate with none; ``lacking`` says why some may be missing."""
     for objects, what in ((training, "to train on"), (validation, "to validate with (see --validation)")):
         if len(objects) == 0:
             raise DatasetError(f"{store.path}: no object is left {what}{lacking}")
 
 
-def deduplicate(store: ViewStore, objects: NDArray[np.int64]) -> NDArray[np.int64]:
+def deduplicate(store: ViewStore, objects: Indices) -> Indices:
     """One object of each shape and label among some of a store, see ``deduplicated``."""
     return objects[deduplicated(store.labels[objects], store.measure()[objects])]
 
 
-def sample(objects: NDArray[np.int64], count: int | None = None) -> NDArray[np.int64]:
+def sample(objects: Indices, count: int | None = None) -> Indices:
     """So many of some objects, in even steps from the first; all if there are no more."""
     if count is not None:
         whole(count, "the number of objects", 1)
@@ -67,7 +68,7 @@ def sample(objects: NDArray[np.int64], count: int | None = None) -> NDArray[np.i
 
 def some_objects(
     store: ViewStore, split: str | None = None, held_out: ModelCard | str | Path | None = None, count: int | None = None
-) -> NDArray[np.int64]:
+) -> Indices:
     """Indices of the rendered objects of a store that are asked for, sorted."""
     chosen = store.done & (True if split is None else store.splits == split)
     of = "" if split is None else f" of the split {split!r}"

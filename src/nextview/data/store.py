@@ -210,14 +210,16 @@ class ViewStore:
 
     def read(self, name: str, i: int) -> NDArray:
         """The values of object i in an array, as they are stored."""
-        array = self.array(name)
+        array, what = self.array(name), f"{name} of {self.names[i]}"
         if not self._chunk(array, i).exists():
-            raise DatasetError(f"{self.path}: {name} of {self.names[i]} is missing; {self._remedy(name)}")
+            raise DatasetError(f"{self.path}: {what} is missing; {self._remedy(name)}")
+        return self._values(array, i, what)
+
+    def _values(self, array: zarr.Array, at: int | slice, what: str) -> NDArray:
         try:
-            return array[i]
+            return array[at]
         except Exception as error:  # a damaged chunk raises whatever its codec makes of it
-            sentence = f"{self.path}: {name} of {self.names[i]} cannot be read ({error}); {self._remedy(name)}"
-            raise DatasetError(sentence) from None
+            raise DatasetError(f"{self.path}: {what} cannot be read ({error}); {self._remedy(array.path)}") from None
 
     def rows(self, name: str) -> NDArray:
         """One of the arrays, as it is stored, (N, ...). Rows of objects that are not rendered may hold anything."""
@@ -245,6 +247,11 @@ class ViewStore:
         """Of the objects, unique, N of them."""
         return self.attributes.names
 
+    def rows_of(self, names: Sequence[str]) -> NDArray[np.int64]:
+        """The rows of objects by name, (n,); -1 for those that it lacks."""
+        row = {name: i for i, name in enumerate(self.names)}
+        return np.array([row.get(name, -1) for name in names])
+
     @property
     def classes(self) -> list[str]:
         """Names of the classes, sorted."""
@@ -253,8 +260,7 @@ class ViewStore:
     @property
     def labels(self) -> NDArray[np.int64]:
         """Class of each object as an index into ``classes``, (N,) int64."""
-        row = {name: i for i, name in enumerate(self.classes)}
-        return np.array([row[label] for label in self.attributes.labels])
+        return np.unique(self.attributes.labels, return_inverse=True)[1]
 
     @property
     def splits(self) -> NDArray[np.str_]:
@@ -286,12 +292,7 @@ class ViewStore:
     @property
     def done(self) -> NDArray[np.bool_]:
         """Objects that are rendered, (N,)."""
-        try:
-            return self.array("status")[:] == DONE
-        except DatasetError:
-            raise
-        except Exception as error:  # a damaged chunk raises whatever its codec makes of it
-            raise DatasetError(f"{self.path}: status cannot be read ({error}); {self._remedy('status')}") from None
+        return self._values(self.array("status"), slice(None), "status") == DONE
 
     @property
     def radii(self) -> NDArray[np.float64]:
@@ -358,7 +359,7 @@ def check(path: Path, workers: int | None = None, scheduler: str | None = None) 
         store.array(name)  # says what is wrong
     objects = np.flatnonzero(store.done).tolist()
     for i, problem in each(partial(_check_object, path.absolute()), objects, workers, scheduler):
-        yield store.names[i], None if problem is None else f"{problem}"
+        yield store.names[i], problem
 
 
 def _check_object(path: Path, i: int) -> str | None:

@@ -70,7 +70,8 @@ class Observation:
     exact: bool = False
 
     def __post_init__(self) -> None:
-        given = _depth(self.depth)
+        with np.errstate(over="ignore"):  # what is too large becomes infinity, and so 0
+            given = depth_image(self.depth).astype(np.float32, copy=False)
         depth = object_depth(given)
         if depth is not given:
             _check_unit(given, int(np.count_nonzero(depth)))
@@ -195,12 +196,6 @@ def depth_image(depth: Any) -> NDArray[Any]:
     if depth.ndim != 2 or depth.size == 0:
         raise ObservationError(f"the depth is one image of the shape (H, W), not {depth.shape}")
     return depth
-
-
-def _depth(depth: Any) -> NDArray[np.float32]:
-    depth = depth_image(depth)
-    with np.errstate(over="ignore"):  # what is too large becomes infinity, and so 0
-        return depth.astype(np.float32, copy=False)
 
 
 def _check_unit(given: NDArray[np.float32], near: int) -> None:

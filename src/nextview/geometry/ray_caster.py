@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Triangles = tuple[NDArray[np.floating], NDArray[np.int32]]  # vertices, (N, 3), and faces, (F, 3)
+Floats = NDArray[np.floating]
+Triangles = tuple[Floats, NDArray[np.int32]]  # vertices, (N, 3), and faces, (F, 3)
 
 
 def embree_scene(things: Sequence[Triangles]) -> Any:
@@ -26,9 +27,7 @@ class RayCaster:
     def __init__(self, things: Sequence[Triangles]) -> None:
         self._scene = embree_scene(things)
 
-    def cast(
-        self, origins: NDArray[np.floating], rays: NDArray[np.floating]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    def cast(self, origins: Floats, rays: Floats) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Where rays, (N, 3), of any length, end first, from (N, 3) points or one for all, (3,).
 
         How many times its length each goes, (N,), infinity if it ends nowhere; and on which thing, -1 for none.

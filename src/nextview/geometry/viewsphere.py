@@ -153,14 +153,11 @@ class Viewpoints:
 
 @dataclass(frozen=True, eq=False)
 class Directions(Viewpoints):
-    """Candidate viewpoints in any directions.
+    """Candidate viewpoints in any directions; UsageError if they are none.
 
     Attributes:
         directions: from the object towards the views, (V, 3); any length but 0.
         distance: of every viewpoint from the origin, object radii.
-
-    Raises:
-        UsageError: they are no directions.
 
     >>> len(Directions.fibonacci(60))
     60

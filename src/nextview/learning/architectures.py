@@ -128,9 +128,9 @@ class Residual(nn.Module):
     def __init__(self, inputs: int, width: int, stride: int, narrow: bool) -> None:
         super().__init__()
         self.relu, outputs = nn.ReLU(inplace=True), width * (4 if narrow else 1)
-        kernels = (
-            [(1, width, 1), (3, width, stride), (1, outputs, 1)] if narrow else [(3, width, stride), (3, width, 1)]
-        )
+        kernels = [(3, width, stride), (3, width, 1)]
+        if narrow:
+            kernels = [(1, width, 1), (3, width, stride), (1, outputs, 1)]
         self.length, before = len(kernels), inputs
         for k, (kernel, after, step) in enumerate(kernels, 1):
             self.add_module(f"conv{k}", nn.Conv2d(before, after, kernel, step, kernel // 2, bias=False))

@@ -24,6 +24,7 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration, RiskBounds, Size
 from nextview.recognition.model_card import ModelCard
 
 Float = NDArray[np.float64]
+Floats = NDArray[np.floating]
 THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())  # of promised error rates
 
 
@@ -150,13 +151,11 @@ def fit_risk(
     belief = calibration.belief(walked.totals, walked.numbers, len(data.classes))
     sure, wrong = belief.max(2), belief.argmax(2) != data.labels[walked.objects][:, None]
     halves = np.split(np.arange(len(walked.objects)), 2)
-    promised = np.array(
-        [
-            np.max([_promise(sure[half, :n], wrong[half, :n], data.weights, delta) for half in halves], axis=0)
-            for n in walked.numbers
-        ]
-    )
-    return RiskBounds(THRESHOLDS, tuple(map(tuple, np.round(promised, 5).tolist())), delta)
+    promised = []
+    for n in walked.numbers:
+        each = [_promise(sure[half, :n], wrong[half, :n], data.weights, delta) for half in halves]
+        promised.append(tuple(np.max(each, axis=0).round(5).tolist()))
+    return RiskBounds(THRESHOLDS, tuple(promised), delta)
 
 
 def _promise(sure: Float, wrong: NDArray[np.bool_], weights: Float, delta: float) -> Float:
@@ -216,15 +215,14 @@ def fit_size(
     table = predicted.deduplicate().by_shape()
     if np.isnan(views.radii[views.done]).any():
         raise DatasetError(f"{store}: does not know the unit of its meshes; tell it with nextview render --unit")
-    row = {name: i for i, name in enumerate(views.names)}
-    unknown = [name for name in predicted.names if name not in row]
-    if unknown:
-        raise PredictionsError(f"{predictions}: holds {unknown[0]!r}, which {store} does not")
+    rows = views.rows_of(predicted.names)
+    if (rows < 0).any():
+        raise PredictionsError(f"{predictions}: holds {predicted.names[rows.argmin()]!r}, which {store} does not")
     with card_to_fit(card) as (model, write):
         _check_recogniser(card, model, predictions, table)
-        data, judged = for_fitting(table), [row[name] for name in table.names]
+        data, judged = for_fitting(table), views.rows_of(table.names)
         of_training = views.done & (views.splits == "train") & np.isin(views.attributes.labels, table.classes)
-        taught = np.setdiff1d(np.flatnonzero(of_training), [row[name] for name in predicted.names])
+        taught = np.setdiff1d(np.flatnonzero(of_training), rows)
         classes = np.array([table.classes.index(name) if name in table.classes else -1 for name in views.classes])
         log_density = densities(views.radii[taught], classes[views.labels[taught]], len(table.classes))
         size, before, after = fit_weight(data, views.radii[judged], log_density)
@@ -295,9 +293,7 @@ def fit_valleys(
     return FittedValleys(classes, gains, len(kept))
 
 
-def valley_gains(
-    sphere: ViewSphere, logits: NDArray[np.floating], maps: NDArray[np.floating], labels: NDArray[np.int64]
-) -> dict[int, float]:
+def valley_gains(sphere: ViewSphere, logits: Floats, maps: Floats, labels: NDArray[np.int64]) -> dict[int, float]:
     """For each class, what the second view gains in belief in the truth at the valley rather than at the peak."""
     n, v, classes = logits.shape
     objects, first = np.repeat(np.arange(n), v), np.tile(np.arange(v), n)

@@ -72,15 +72,13 @@ class ShippedMap(nn.Module):
         return (outputs[..., [-1, 0, 1]], outputs) if self.whole else (outputs,)
 
 
-def export_onnx(
-    network: nn.Module, example: NDArray, inputs: str, outputs: list[str], path: Path, bits: int = 16
-) -> None:
+def export_onnx(net: nn.Module, example: NDArray, inputs: str, outputs: list[str], path: Path, bits: int = 16) -> None:
     """Write a network as ONNX: any batch size, weights in fewer bits, arithmetic in single precision."""
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is not installed
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            network.eval(),
+            net.eval(),
             (torch.from_numpy(example),),
             dynamo=True,
             input_names=[inputs],
@@ -267,9 +265,7 @@ def _map(run: Path, store: Path, predictions: Path | None, name: str | None, not
     )
 
 
-def _training(
-    views: ViewStore, held_out: Iterable[str], recipes: Sequence[Any], usable: NDArray[np.bool_] | bool = True
-) -> Training:
+def _training(views: ViewStore, held_out: Iterable[str], recipes: Sequence[Any], usable: Any = True) -> Training:
     learned = views.done & usable & (views.splits == "train") & ~np.isin(views.names, list(held_out))
     about = f"{learned.sum()} objects of the training split, {len(views.sphere)} views each"
     return Training(about, tuple(asdict(recipe) for recipe in recipes))

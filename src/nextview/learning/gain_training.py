@@ -40,6 +40,7 @@ from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_
 from nextview.recognition.inference import open_onnx
 from nextview.recognition.map_names import in_order
 
+Best = tuple[tuple[Gain, ...], Value]  # policies, one for each fold, and their mean value
 BOUND = 1e-5
 """Largest difference of the file's answers from those of the networks in double precision, relative to the largest
 answer beyond 1. For gains a fiftieth of the lowest travel weight that is tried."""
@@ -49,7 +50,7 @@ class Perceptrons(nn.Module):
     """Several perceptrons, averaged over an object and its mirror: features (B, D) to the value of cells (B, V)."""
 
     def __init__(
-        self, weights: Sequence[Tensor], biases: Sequence[Tensor], features_flip: NDArray, cells_flip: NDArray
+        self, weights: list[Tensor], biases: list[Tensor], features_flip: NDArray, cells_flip: NDArray
     ) -> None:
         super().__init__()
         self.weights, self.biases = nn.ParameterList(weights), nn.ParameterList(biases)
@@ -94,18 +95,12 @@ class Score:
             return self.networks(torch.from_numpy(features).to(self.networks.weights[0].dtype)).numpy()
 
 
-@dataclass(frozen=True)
-class States:
-    """S states on walks, and the value of each choice there; cells as in ``policies.learned_tables``."""
+def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np.random.Generator) -> list[NDArray]:
+    """S states that are met when each of the policies is followed once over every object.
 
-    features: NDArray[np.float32]  # (S, D)
-    values: NDArray[np.float32]  # less the mean over the free cells, (S, V)
-    free: NDArray[np.bool_]  # (S, V)
-    objects: NDArray[np.int64]  # (S,)
-
-
-def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np.random.Generator) -> States:
-    """The states met when each of the policies is followed once over every object."""
+    Their features, (S, D) float32; the value of each choice less the mean over the free ones, (S, V) float32, cells as
+    in ``policies.learned_tables``; which are free, (S, V); and the objects, (S,).
+    """
     sphere, parts = table.data.sphere, []
     for policy in policies:
         for moment in rollout(table, policy, recipe.n_views - 1, rng, VISIBILITY in recipe.inputs):
@@ -116,7 +111,7 @@ def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np
             mean = (value * free).sum(1, keepdims=True) / np.maximum(free.sum(1, keepdims=True), 1)
             seen = features(sphere, state, recipe.inputs, recipe.frame)
             parts.append((seen.astype(np.float32), (value - mean).astype(np.float32), free, state.episodes))
-    return States(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
 
 def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
@@ -140,15 +135,15 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.lr, total_steps=recipe.epochs * batches)
     policies: list[Policy] = [(Random, RandomAll)[i % 2](sphere) for i in range(recipe.walks)]
     for _ in range(recipe.epochs):
-        states = walk(table, policies, recipe, rng)
-        for batch in np.array_split(rng.permutation(len(states.objects)), batches):
-            seen, value, free = (torch.from_numpy(a[batch]) for a in (states.features, states.values, states.free))
+        *states, objects = walk(table, policies, recipe, rng)
+        for batch in np.array_split(rng.permutation(len(objects)), batches):
+            seen, value, free = (torch.from_numpy(values[batch]) for values in states)
             flipped = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
             seen = torch.where(flipped, seen[:, networks.features_flip], seen)
             value, free = (torch.where(flipped, a[:, networks.cells_flip], a) for a in (value, free))
             error = (((networks.each(seen) - value) ** 2) * free).sum(-1) / free.sum(-1).clamp(min=1)
             optimiser.zero_grad()
-            ((weights[:, states.objects[batch]] * error).sum() / len(batch)).backward()
+            ((weights[:, objects[batch]] * error).sum() / len(batch)).backward()
             optimiser.step()
             schedule.step()
         policy = Gain(sphere, c, Score(deepcopy(networks)), recipe.inputs, frame=recipe.frame)
@@ -156,9 +151,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
         yield policy
 
 
-def best_epoch(
-    folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], recipe: GainRecipe
-) -> Iterator[tuple[tuple[Gain, ...], Value]]:
+def best_epoch(folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], recipe: GainRecipe) -> Iterator[Best]:
     """After every epoch, the policies of the best epoch so far, and their mean value over all objects."""
     best = None
     for policies in zip(*folds, strict=True):
@@ -172,22 +165,16 @@ def best_epoch(
 def averaged(policies: Sequence[Gain]) -> Gain:
     """One policy whose networks are those of all."""
     networks = [policy.score.networks for policy in policies if isinstance(policy.score, Score)]
-    weights, biases = (
-        [torch.cat([getattr(n, part)[i].detach() for n in networks]) for i in range(len(networks[0].weights))]
-        for part in ("weights", "biases")
-    )
+    weights = [torch.cat(layers).detach() for layers in zip(*(n.weights for n in networks), strict=True)]
+    biases = [torch.cat(layers).detach() for layers in zip(*(n.biases for n in networks), strict=True)]
     joined = Perceptrons(weights, biases, networks[0].features_flip, networks[0].cells_flip)
     return replace(policies[0], score=Score(joined))
 
 
-def write_gain(
-    card: Path, policy: Gain, about: PolicyCard, features: NDArray[np.float32], overwrite: bool = False
-) -> float:
-    """Write a policy that was trained: NAME.onnx and NAME.json."""
+def write_gain(card: Path, policy: Gain, about: PolicyCard, features: NDArray[np.float32]) -> float:
+    """Write a policy that was trained, NAME.onnx and NAME.json, in place of what has these names."""
     assert isinstance(policy.score, Score)
     weights, networks = card.with_suffix(".onnx"), policy.score.networks
-    for path in (weights, card):
-        check_new(path, overwrite)
     expected = Score(deepcopy(networks).double())(features.astype(np.float64))
     with new_folder(card.parent, overwrite=True) as part:
         made = part / weights.name
@@ -248,7 +235,7 @@ def train_gain(
     for path in (out, out.with_suffix(".onnx")):
         check_new(path, overwrite)
     data = _load(predictions, validation, sensed, recipe, folds)
-    best: list[tuple[tuple[Gain, ...], Value]] = []
+    best: list[Best] = []
 
     def epochs() -> Iterator[int]:
         trainings = [train(part, recipe, fold) for fold, part in enumerate(data.learned)]
@@ -263,8 +250,8 @@ def train_gain(
         judged = list(zip(data.validated, policies, strict=True))
         travel_weight = fit_travel_weight(judged, recipe.n_views, recipe.objective, recipe.seed)
     policy = replace(averaged(policies), travel_weight=travel_weight)
-    states = np.concatenate([walk(part, [policy], recipe, data.rng).features for part in data.validated])
-    difference = write_gain(out, policy, data.about, states, overwrite)
+    states = np.concatenate([walk(part, [policy], recipe, data.rng)[0] for part in data.validated])
+    difference = write_gain(out, policy, data.about, states)
     return TrainedGain(out, data.objects, data.validated_on, value.mean, travel_weight, len(states), difference)
 
 
@@ -280,9 +267,7 @@ class _Data:
     rng: np.random.Generator
 
 
-def _load(
-    predictions: Path, validation: Path | None, sensed: tuple[Path, ...], recipe: GainRecipe, folds: int
-) -> _Data:
+def _load(predictions: Path, validation: Path | None, sensed: Sequence[Path], recipe: GainRecipe, folds: int) -> _Data:
     table = Predictions.load(predictions).deduplicate()
     other = table if validation is None else Predictions.load(validation).deduplicate()
     if (other.classes, other.sphere) != (table.classes, table.sphere):
@@ -290,11 +275,8 @@ def _load(
     if sensed and validation is not None:
         raise UsageError("predictions through sensors choose with those that are learned from: no --validation")
     variants = load_sensed(sensed, table)
-    sources = [
-        (predictions, table),
-        *([(validation, other)] if validation else []),
-        *zip(sensed, variants, strict=True),
-    ]
+    sources = [(predictions, table)] if validation is None else [(predictions, table), (validation, other)]
+    sources += zip(sensed, variants, strict=True)
     for path, p in sources:
         _check(path, p, recipe)
     everything = np.arange(len(table))

@@ -21,22 +21,18 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.architectures import map_columns, map_network, orthogonality
 from nextview.learning.inputs import PackedViews, ready_inputs
 from nextview.learning.recipes import Hardware, MapRecipe
-from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, read_run, refuse_seen, start_from, train_once
+from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, read_run, start_from, train_once
 from nextview.recognition.map_names import CONFIDENCE
 from nextview.recognition.network_input import cloud_input
 
+Seen = NDArray[Any] | PackedViews  # of N objects from V views, what the network sees
+
 
 class Windows(OwnBatches):
-    """Batches of (what the network sees, map (B, rings, columns)), new draws each epoch."""
+    """Batches of (what the network sees, map (B, rings, columns)) from values (N, V) of some objects, drawn anew."""
 
     def __init__(
-        self,
-        seen: NDArray[Any] | PackedViews,
-        values: NDArray[np.float32],
-        sphere: ViewSphere,
-        objects: NDArray[np.int64],
-        recipe: MapRecipe,
-        training: bool,
+        self, seen: Seen, values: NDArray, sphere: ViewSphere, objects: NDArray, recipe: MapRecipe, training: bool
     ) -> None:
         self.seen, self.values, self.poses, self.objects = seen, values, sphere.poses, objects
         steps, n = np.array(map_columns(recipe, sphere)), sphere.azimuths
@@ -144,8 +140,7 @@ def train_map(
     training, validation = (part[there[part]] for part in aside)
     check_any(views, training, validation, "" if there.all() else ": of the others no map is known")
     held_out = [views.names[i] for i in aside[1]]  # those without values too
-    refuse_seen(weights, held_out)
-    run = new_run(recipe, weights, held_out, held_out, [views] if predicted is None else [views, predicted])
+    run = new_run(recipe, weights, held_out, [views] if predicted is None else [views, predicted])
     parts = training, deduplicate(views, validation)  # copies of one mesh count once
 
     def fitted() -> nn.Module:
@@ -164,20 +159,15 @@ def train_map(
     return [out]
 
 
-def target_of(
-    measure: str, store: ViewStore, predictions: Predictions | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def target_of(measure: str, store: ViewStore, predictions: Predictions | None = None) -> tuple[NDArray, NDArray]:
     """A measure of all views, scaled to 0 .. 1 over each object's, or the confidence; and which objects have it."""
     if (measure == CONFIDENCE) != (predictions is not None):
-        raise UsageError(
-            "a map of the confidence is learned from predictions: give those of the recogniser"
-            if predictions is None
-            else f"a map of {measure} is learned from the store alone: predictions are for a map of the {CONFIDENCE}"
-        )
+        alone = f"a map of {measure} is learned from the store alone: predictions are for a map of the {CONFIDENCE}"
+        of_them = "a map of the confidence is learned from predictions: give those of the recogniser"
+        raise UsageError(of_them if predictions is None else alone)
     if predictions is None:
         return normalise_per_object(store.measure(measure)), store.done
-    row = {name: i for i, name in enumerate(store.names)}
-    here = np.array([row.get(name, -1) for name in predictions.names])
+    here = store.rows_of(predictions.names)
     if (here < 0).all() or predictions.sphere != store.sphere:
         raise PredictionsError(f"these predictions are not of the views of {store.path}")
     values = np.zeros((len(store), len(store.sphere)), np.float32)

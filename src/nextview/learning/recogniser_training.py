@@ -21,7 +21,7 @@ from nextview.errors import DatasetError
 from nextview.learning.architectures import recogniser_network
 from nextview.learning.inputs import PackedViews, ready_inputs
 from nextview.learning.recipes import Hardware, RecogniserRecipe
-from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, refuse_seen, start_from, train_once
+from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, start_from, train_once
 
 Float = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -237,12 +237,11 @@ def train_recogniser(
     azimuths, planes = 0, None
     if recipe.azimuth_bins_weight:
         azimuths, planes = views.sphere.azimuths, mirror_planes(views, training)
-    aside = [views.names[i] for i in validation]
-    refuse_seen(weights, aside)
     stores = [views, *map(ViewStore.open, deformed)]
+    run = new_run(recipe, weights, [views.names[i] for i in validation], stores)
     sources = [_source(each, views, training, recipe, planes, track) for each in stores]
     fitted = sources, views.labels, (training, validating), recipe, out, weights, hardware, azimuths
-    train_once(out, new_run(recipe, weights, aside, aside, stores), partial(fit_recogniser, *fitted))
+    train_once(out, run, partial(fit_recogniser, *fitted))
     return [out]
 
 
@@ -250,8 +249,7 @@ def _source(
     store: ViewStore, views: ViewStore, needed: Indices, recipe: RecogniserRecipe, planes: Float | None, track: Track
 ) -> Source:
     """Inputs of a store, and the row of each object of ``views`` in them, -1 for none."""
-    row = {name: i for i, name in enumerate(store.names)}
-    rows = np.array([row.get(name, -1) for name in views.names])
+    rows = store.rows_of(views.names)
     if (rows[needed] < 0).all():
         raise DatasetError(f"{store.path}: holds none of the training objects")
     inputs = ready_inputs(store.path, recipe.size, recipe.input, track)

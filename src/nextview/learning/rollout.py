@@ -2,8 +2,10 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from nextview.data.predictions import Predictions
@@ -33,7 +35,7 @@ class ReplayTable:
         cls,
         predictions: Predictions,
         kept: NDArray,
-        rng: np.random.Generator,
+        rng: Generator,
         sensed: Sequence[Predictions] = (),
         scenes: SceneSight | None = None,
     ) -> "ReplayTable":
@@ -57,7 +59,7 @@ class DecisionState:
 
 
 def rollout(
-    table: ReplayTable, policy: Policy, n_views: int, rng: np.random.Generator, visibility: bool = False
+    table: ReplayTable, policy: Policy, n_views: int, rng: Generator, visibility: bool = False
 ) -> Iterator[DecisionState]:
     """Every object once, from a random first view to where the policy leads: the decision state after each view."""
     data, sphere, everything = table.data, table.data.sphere, np.arange(len(table.data))
@@ -100,17 +102,14 @@ def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Fl
     return value_after(table, moment.total[:, None] + evidence, n_views, kind)
 
 
-@dataclass(frozen=True)
-class Value:
+class Value(NamedTuple):
     """Mean objective, and travel in cells, after 2, 3, ... views, (views - 1,); classes weighted evenly."""
 
     mean: Float
     travel: Float
 
 
-def judge(
-    table: ReplayTable, policy: Policy, n_views: int, kind: str, rng: np.random.Generator, rounds: int = 8
-) -> Value:
+def judge(table: ReplayTable, policy: Policy, n_views: int, kind: str, rng: Generator, rounds: int = 8) -> Value:
     """Follow a policy ``rounds`` times over every object."""
     weights, reached = table.data.weights / len(table.data) / rounds, np.zeros((2, n_views - 1))
     for _ in range(rounds):
@@ -122,17 +121,15 @@ def judge(
     return Value(*reached)
 
 
+Judged = Sequence[tuple[ReplayTable, Policy]]  # tables, each with the policy that is followed over its objects
 TRAVEL_WEIGHTS = (0.0, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.012, 0.015, 0.02, 0.03, 0.05, 0.1)
 """Of a grid cell of travel, in the unit of the objective."""
 
 
-def judge_all(
-    judged: Sequence[tuple[ReplayTable, Policy]], n_views: int, kind: str, seed: int | list[int], rounds: int = 8
-) -> Value:
+def judge_all(judged: Judged, n_views: int, kind: str, seed: int | list[int], rounds: int = 8) -> Value:
     """Mean value over the objects of all tables, each followed by a policy of its own; see ``judge``."""
     values = [judge(*pair, n_views, kind, np.random.default_rng(seed), rounds) for pair in judged]
-    sizes = [len(table.data) for table, _ in judged]
-    return Value(*(np.average([getattr(value, name) for value in values], 0, sizes) for name in ("mean", "travel")))
+    return Value(*np.average(values, 0, [len(table.data) for table, _ in judged]))
 
 
 def fit_travel_weight(judged: Sequence[tuple[ReplayTable, Gain]], n_views: int, kind: str, seed: int) -> float:

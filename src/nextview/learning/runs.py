@@ -6,7 +6,7 @@ import logging
 import re
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -67,9 +67,7 @@ def _loader(batches: IterableDataset) -> DataLoader:
 class StepSeed(L.Callback):
     """Seeds torch by epoch, step and device, so that a resumed run augments as an uninterrupted one would."""
 
-    def on_train_batch_start(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: Any, batch: Any, batch_idx: int) -> None:
         step = [pl_module.recipe.seed, trainer.current_epoch, batch_idx, trainer.global_rank]
         torch.manual_seed(int(np.random.SeedSequence(step).generate_state(1, np.uint64)[0]))
 
@@ -218,22 +216,23 @@ class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     commands: tuple[str, ...]
 
 
-def new_run(
-    recipe: Any,
-    weights: Path | None,
-    held_out: Iterable[str],
-    validation: Iterable[str],
-    made: Iterable[ViewStore | Predictions],
-) -> Run:
-    """A run by the command that runs now, from stores and predictions, and maybe from other weights."""
+def new_run(recipe: Any, weights: Path | None, held_out: Sequence[str], made: Iterable[ViewStore | Predictions]) -> Run:
+    """A run by the command that runs now, from stores and predictions; what is held out validates it."""
     before = [line for source in made for line in source.commands]
     if weights is not None and weights.is_dir():
-        before += read_run(weights).commands
+        earlier, wanted = read_run(weights), set(held_out)
+        seen = sorted(wanted - set(earlier.held_out))
+        if 0 < len(seen) < len(wanted):
+            what = (
+                f"{len(seen)} of the {len(wanted)} objects that this network must not have seen, {seen[0]} among them"
+            )
+            raise ModelError(f"{weights}: was trained on {what}; take its --seed and --validation")
+        before += earlier.commands
         weights /= "network.pt"
     if weights is not None and not weights.is_file():
         raise ModelError(f"{weights}: there is no such checkpoint")
-    sha256 = None if weights is None else sha256_of(weights)
-    return Run(asdict(recipe), sha256, tuple(held_out), tuple(validation), tuple(dict.fromkeys((*before, command()))))
+    sha256, names = None if weights is None else sha256_of(weights), tuple(held_out)
+    return Run(asdict(recipe), sha256, names, names, tuple(dict.fromkeys((*before, command()))))
 
 
 def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
@@ -319,29 +318,17 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
         share[turn % colours, turn % channels] = 1
         share /= share.sum(1, keepdim=True)
         state[first] = torch.einsum("okhw,kc->ochw", state[first], share)
-    faults = [f"it lacks {name}" for name in sorted(own.keys() - state.keys())]
-    faults += [f"it holds {name}" for name in sorted(state.keys() - own.keys())]
-    faults += [
-        f"{name} is {tuple(state[name].shape)}, not {tuple(value.shape)}"
-        for name, value in own.items()
-        if name in state and state[name].shape != value.shape
-    ]
+    wanted, given = ({name: tuple(value.shape) for name, value in values.items()} for values in (own, state))
+    faults = [f"it lacks {name}" for name in sorted(wanted.keys() - given.keys())]
+    faults += [f"it holds {name}" for name in sorted(given.keys() - wanted.keys())]
+    both = ((name, shape, given[name]) for name, shape in wanted.items() if name in given)
+    faults += [f"{name} is {there}, not {shape}" for name, shape, there in both if there != shape]
     if faults:
         raise ModelError(f"{path}: not the weights of this {network.name} ({faults[0]})")
     for name, value in state.items():
         if not torch.isfinite(value).all():
             raise ModelError(f"{path}: {name} holds numbers that are not finite; download the checkpoint again")
     network.load_state_dict(state)
-
-
-def refuse_seen(weights: Path | None, held_out: list[str]) -> None:
-    """Refuse to go on from a run that was trained on objects which are held out now, unless it had another dataset."""
-    if weights is None or not weights.is_dir():
-        return
-    seen = sorted(set(held_out) - set(read_run(weights).held_out))
-    if 0 < len(seen) < len(set(held_out)):
-        what = f"{len(seen)} of the {len(set(held_out))} objects that this network must not have seen"
-        raise ModelError(f"{weights}: was trained on {what}, {seen[0]} among them; take its --seed and --validation")
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:

@@ -1,7 +1,5 @@
 """Learn to notice objects of no known class: what objects of the known ones look like, and how novel others of them."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -23,6 +21,7 @@ from nextview.recognition.novelty import Novelty, novelty_path
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 
+Float32 = NDArray[np.float32]
 LEARNED_VIEWS, HELD_OUT_VIEWS = 2, 5
 """Views of each object without a sensor's errors, and as many through it."""
 LEVELS = 201  # of the quantiles
@@ -37,11 +36,11 @@ class FittedUnknown:
 
 
 def fit_unknown(
-    meshes: Path,
-    card: Path,
-    sensor: str = "wrist",
-    seed: int = 0,
-    workers: int | None = None,
+    meshes: Path,  # folder of the meshes that the recogniser was trained on; those of the test split are left out
+    card: Path,  # of the recogniser
+    sensor: str = "wrist",  # through which half of the views are taken, see simulation.sensor.sensor_named
+    seed: int = 0,  # of all that is drawn
+    workers: int | None = None,  # processes; one for each core by default
     track: Track = silently,
 ) -> FittedUnknown:
     """Teach a recogniser to notice objects of no class that it knows, at a false-alarm rate that can be chosen.
@@ -49,23 +48,11 @@ def fit_unknown(
     It remembers views of its training objects, and how novel views of the objects are that its card calls held out. The
     novelty score goes into NAME.novelty.safetensors beside the card, and its SHA-256 into the card. When stopped, it
     begins anew.
-
-    Args:
-        meshes: folder of the meshes that the recogniser was trained on; those of the test split are left out.
-        card: of the recogniser.
-        sensor: through which half of the views are taken, see ``simulation.sensor.sensor_named``.
-        seed: of all that is drawn.
-        workers: processes; one for each core by default.
-        track: follows the meshes.
-
-    Raises:
-        DatasetError, ModelError: they do not fit together.
     """
     with card_to_fit(card) as (model, write):
         entries = [e for e in list_dataset(meshes) if e.split != "test" and e.label in model.classes]
-        aside = [e.name in model.held_out for e in entries]
         look = partial(_looked_at, frozenset(model.held_out), sensor, seed)
-        seen: dict[Entry, NDArray[np.float32]] = {}
+        seen: dict[Entry, Float32] = {}
 
         def work() -> Iterator[int]:
             for done, (entry, views) in enumerate(each(look, entries, workers), 1):
@@ -74,8 +61,8 @@ def fit_unknown(
                 yield done
 
         track(work(), len(entries), f"views of {meshes.name}")
-        known = [seen[e] for e, out in zip(entries, aside, strict=True) if e in seen and not out]
-        held_out = [e for e, out in zip(entries, aside, strict=True) if e in seen and out]
+        known = [seen[e] for e in entries if e in seen and e.name not in model.held_out]
+        held_out = [e for e in entries if e in seen and e.name in model.held_out]
         if not known or not held_out:
             raise DatasetError(f"{meshes}: holds no object that {card} was trained on, or none that it calls held out")
         labels = np.array([model.classes.index(e.label) for e in held_out])
@@ -88,7 +75,7 @@ def fit_unknown(
     return FittedUnknown(len(known), len(held_out))
 
 
-def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -> NDArray[np.float32]:
+def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -> Float32:
     """Embeddings of views of a mesh through a sensor, and without one, (2, views, F); none if it cannot be seen."""
     rng = np.random.default_rng([seed, zlib.crc32(entry.name.encode())])
     wanted, poses = HELD_OUT_VIEWS if entry.name in held_out else LEARNED_VIEWS, ViewSphere.named("40").poses
@@ -106,9 +93,7 @@ def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -
     return np.stack(found)
 
 
-def fit_novelty(
-    known: NDArray[np.float32], held_out: NDArray[np.float32], labels: NDArray[np.int64], n_views: int = 5
-) -> Novelty:
+def fit_novelty(known: Float32, held_out: Float32, labels: NDArray[np.int64], n_views: int = 5) -> Novelty:
     """A novelty score of views, calibrated on objects that are not among the known ones.
 
     ``known`` are embeddings of views through a sensor and without one, (2, rows, F), ``held_out`` those of N objects,
@@ -123,7 +108,7 @@ def fit_novelty(
     return replace(raw, standard=standard, quantiles=table)
 
 
-def quantiles(scores: NDArray[np.float64], labels: NDArray[np.int64], n_views: int) -> NDArray[np.float32]:
+def quantiles(scores: NDArray[np.float64], labels: NDArray[np.int64], n_views: int) -> Float32:
     """Quantiles of the mean score over 1 to ``n_views`` views, classes weighted evenly: (views, LEVELS), ascending."""
     count = np.bincount(labels)
     share_of, levels = 1 / count[labels], []

@@ -4,6 +4,7 @@ The thesis's baselines (section 5.3, figure 11) are ``Random``, ``Furthest`` and
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,33 +23,29 @@ from nextview.policies.base import (
 
 
 @dataclass(frozen=True)
-class Random:
-    """Any unvisited view of the local window, with equal chance."""
+class Baseline:
+    """A policy that asks for nothing but the viewpoints."""
 
-    sphere: ViewSphere
+    sphere: Any  # a ``ViewSphere``; for ``RandomAll`` any ``Viewpoints``
     needs: tuple[str, ...] = ()
+
+
+class Random(Baseline):
+    """Any unvisited view of the local window, with equal chance."""
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         return best_in_window(self.sphere, state, rng.random((len(state.current), self.sphere.rings, 3)))
 
 
-@dataclass(frozen=True)
-class RandomAll:
+class RandomAll(Baseline):
     """Any unvisited view of the whole sphere, with equal chance: the far views that a local window rules out."""
-
-    sphere: Viewpoints
-    needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         return best_view(self.sphere, state, rng.random(state.visited.shape))
 
 
-@dataclass(frozen=True)
-class Furthest:
+class Furthest(Baseline):
     """The unvisited view of the local window with the largest grid distance; equal ones with equal chance."""
-
-    sphere: ViewSphere
-    needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         window = self.sphere.windows[state.current]
@@ -56,12 +53,8 @@ class Furthest:
         return best_in_window(self.sphere, state, distance + 1e-6 * rng.random(distance.shape))
 
 
-@dataclass(frozen=True)
-class Unidirectional:
+class Unidirectional(Baseline):
     """The next unvisited azimuth on the same ring, always the same way round."""
-
-    sphere: ViewSphere
-    needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         n = self.sphere.azimuths

@@ -23,6 +23,7 @@ from nextview.recognition.inference import OnnxFile, check_end, open_onnx, run_o
 from nextview.recognition.map_names import SPHERE, in_order, maps_among
 
 Float = NDArray[np.float64]
+Index = NDArray[np.int64]
 INPUTS = ("belief", "view", "place", "azimuth_bin")
 """What a network may take: the belief over all views; that by the last view alone; the ring and the views visited; and
 the azimuth bin that is seen, of the class believed most and over all classes. Any other name is that of a map."""
@@ -48,13 +49,13 @@ def ordered(inputs: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in (*before, *maps_of(inputs), azimuth_bin, VISIBILITY) if name in inputs)
 
 
-def mirrored(sphere: ViewSphere) -> NDArray[np.int64]:
+def mirrored(sphere: ViewSphere) -> Index:
     """The cell that lies as far behind as each lies ahead, (V,) int64."""
     n = sphere.azimuths
     return sphere.ring * n + (-sphere.azimuth_index) % n
 
 
-def origin(sphere: ViewSphere, state: EpisodeState, frame: Frame) -> NDArray[np.int64]:
+def origin(sphere: ViewSphere, state: EpisodeState, frame: Frame) -> Index:
     """The view from which the cells of each episode are counted, (B,) int64."""
     if frame == "camera":
         return state.current
@@ -113,9 +114,7 @@ def _facets(belief: Float) -> list[Float]:
     return [belief, logs, -np.sort(-logs, 1)[:, :3]]
 
 
-def mirrored_features(
-    sphere: ViewSphere, classes: int, inputs: Sequence[str], frame: Frame = "camera"
-) -> NDArray[np.int64]:
+def mirrored_features(sphere: ViewSphere, classes: int, inputs: Sequence[str], frame: Frame = "camera") -> Index:
     """Which of the numbers of ``features`` stands in each place for the mirror image of an object, (D,) int64."""
     n, facets = sphere.azimuths, 2 * classes + min(3, classes)
     window = np.arange(sphere.rings * 3).reshape(-1, 3)[:, ::-1].ravel()
@@ -185,7 +184,7 @@ class Gain:
         """The gains of the views where it may go; see ``ScoresViews``."""
         return considered(self.sphere, state, self.gains(state), self.scope)
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         return best_view(self.sphere, state, self.view_values(state), self.scope)
 
 
@@ -223,7 +222,7 @@ class VisibleGain:
         """The products less the weighted travel there, (B, V)."""
         return self.scores(state) - self.travel_weight * travel_from(self.sphere, state)
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         return best_view(self.sphere, state, self.view_values(state))
 
 

@@ -28,11 +28,6 @@ def _softmax(logs: Floating) -> Float:
     return values / values.sum(-1, keepdims=True)
 
 
-def _pointing(total: Floating, classes: int, hypotheses: int) -> Floating:
-    """Sums of log-evidence of the azimuths to which azimuth bin 0 points, (..., azimuth bins, hypotheses)."""
-    return total[..., classes:].reshape(*total.shape[:-1], -1, hypotheses)
-
-
 def reorient(azimuth_bins: Floating, azimuth: Floating) -> Floating:
     """Log-evidence of the bins seen from an azimuth as log-evidence of the azimuths to which bin 0 points; or back.
 
@@ -166,8 +161,10 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return logs + agreement
 
     def _pointing(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
+        """Log-evidence of the azimuths to which azimuth bin 0 points, (..., azimuth bins, hypotheses)."""
         correlation = self.correlation if self.bin_correlation is None else self.bin_correlation
-        pointing = _pointing(np.asarray(total, np.float64), classes, len(self.hypotheses) or classes)
+        sums = np.asarray(total, np.float64)[..., classes:]
+        pointing = sums.reshape(*sums.shape[:-1], -1, len(self.hypotheses) or classes)
         return pointing / (1 + correlation * (np.asarray(n_views)[..., None, None] - 1))
 
     def joint(self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating) -> Float:

@@ -16,7 +16,7 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import direction_of, elevation_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.map_names import SPHERE, maps_among
-from nextview.recognition.model_card import FEATURES, MAPS, RECOGNISER, ModelCard, find_card
+from nextview.recognition.model_card import FEATURES, RECOGNISER, ModelCard, find_card
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import Novelty, Quantiles, novelty_path, read_novelty
 
@@ -59,9 +59,7 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> OnnxFile:
         raise ModelError(f"{path}: not a usable ONNX model ({one_line(str(error), LONGEST)})") from None
 
 
-def run_onnx(
-    path: Path, session: ort.InferenceSession, names: Sequence[str], inputs: NDArray[Any]
-) -> list[NDArray[Any]]:
+def run_onnx(path: Path, session: ort.InferenceSession, names: Sequence[str], inputs: NDArray) -> list[NDArray]:
     """The named outputs of a network with one input, (B, ...); ModelError if they are not B rows of finite numbers."""
     try:
         answers = session.run(list(names), {session.get_inputs()[0].name: inputs})
@@ -76,15 +74,6 @@ def run_onnx(
         if not np.isfinite(values).all():
             raise ModelError(f"{path}: gives {name} that are not finite numbers")
     return answers
-
-
-def check_input(path: Path, session: ort.InferenceSession, name: str | None, kind: str, shape: Shape) -> None:
-    """Refuse a network that takes anything but one input of a name (None: any), see ``check_end``."""
-    ends = session.get_inputs()
-    if len(ends) != 1 or name not in (None, ends[0].name):
-        wants = ", ".join(end.name for end in ends) or "nothing"
-        raise ModelError(f"{path}: takes {wants}, not one input{f' called {name}' if name else ''}")
-    check_end(path, ends[0], kind, shape)
 
 
 def check_end(path: Path, end: ort.NodeArg, kind: str, shape: Shape) -> None:
@@ -109,7 +98,11 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
             shapes[BINS_OUTPUT] = (len(card.classes), card.azimuth_bins)
     else:
         shapes = {"map": (None, 3)} | ({"sphere": (None, None)} if card.output == "sphere" else {})
-    check_input(card.path, session, INPUT if card.is_recogniser else None, kind, card.input.shape)
+    taken, called = session.get_inputs(), f" called {INPUT}" if card.is_recogniser else ""
+    if len(taken) != 1 or (called and taken[0].name != INPUT):
+        wants = ", ".join(end.name for end in taken) or "nothing"
+        raise ModelError(f"{card.path}: takes {wants}, not one input{called}")
+    check_end(card.path, taken[0], kind, card.input.shape)
     for name, shape in shapes.items():
         if name not in ends:
             raise ModelError(f"{card.path}: gives no {name}, which its card promises")
@@ -250,8 +243,3 @@ def open_maps(cards: Mapping[str, str | Path], needs: Sequence[str], threads: in
         known = (name for card in cards.values() for name in find_card(card).maps)
         raise ModelError(f"no network predicts the map {missing[0]!r}; there are {', '.join(known)}")
     return networks
-
-
-def load_models(maps: Sequence[str] = (), recogniser: str | Path = RECOGNISER, threads: int = 0) -> Models:
-    """The bundled recogniser, or that of a card, and the bundled map networks of some names or of a policy's needs."""
-    return Models(Recogniser(recogniser, threads), open_maps(MAPS, maps, threads))

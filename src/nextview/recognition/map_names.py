@@ -26,11 +26,7 @@ def maps_among(needs: Sequence[str]) -> list[str]:
 
 
 def in_order(maps: Iterable[str]) -> list[str]:
-    """Names of maps, each once, in the order of networks and tables.
-
-    Maps of local windows stand before those of whole spheres; of each kind the thesis's come first, then the others by
-    the alphabet.
-    """
+    """Names of maps, each once: local windows before whole spheres, of each the thesis's first, then by alphabet."""
     own = list(MAP_NAMES.values())
 
     def place(name: str) -> tuple[bool, int, str]:

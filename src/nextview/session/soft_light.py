@@ -1,7 +1,5 @@
 """What was seen of an object, on a warm ground in soft light: the pictures of an episode."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

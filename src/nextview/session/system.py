@@ -1,9 +1,4 @@
-"""The front door: a recogniser, maps, a policy, candidate viewpoints and a stopping rule that belong together.
-
->>> system = load()
->>> system.recognise("chair.off")                                               # doctest: +SKIP
-chair (belief 0.998, 2 views, 1.41 cells of travel, confident)
-"""
+"""The front door: a recogniser, maps, a policy, candidate viewpoints and a stopping rule that belong together."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

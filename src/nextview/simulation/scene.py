@@ -82,10 +82,9 @@ class Scene:
 
 
 def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FACES) -> Scene:
-    """A scene as geometry, of the mesh files below a folder, with at most so many faces together.
+    """A scene as geometry, of the mesh files below a folder; MeshError if they have more faces together.
 
-    DatasetError: a file is not the one that the scene was made with. MeshError: it cannot be used, or has too many
-    faces.
+    DatasetError: a file is not the one that the scene was made with.
     """
     loaded: list[Mesh] = []
     for placed in (layout.target, *layout.objects):
