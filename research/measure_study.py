@@ -1,6 +1,6 @@
 """Which measure of a view serves recognition? Every measure that a store holds, against what a recogniser says.
 
-    python -m research.measure_study test.npz validation.npz --out measures [--store views.zarr] [--runs 10]
+    python -m research.measure_study test.npz validation.npz measures [--store views.zarr] [--runs 10]
         [--policies random-all volumetric mvselect.json gain] [--objects 300]
 
 Writes measures.md (the table), measures.csv (every number in a row of its own) and measures.png into the folder.
@@ -227,12 +227,12 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
 def main(
     test: tyro.conf.Positional[Path],
     validation: tyro.conf.Positional[Path],
-    out: Path = Path("measures"),
+    out: tyro.conf.Positional[Path],
     store: Path | None = None,
     measures: tuple[str, ...] = (),
     policies: tuple[str, ...] = (),
     objects: int | None = None,
-    n_views: tuple[int, ...] = (2, 3, 5),
+    views: tuple[int, ...] = (2, 3, 5),
     runs: int = 10,
     samples: int = 1000,
     seed: int = 0,
@@ -247,7 +247,7 @@ def main(
         measures: names; by default all that the store holds, and the confidence.
         policies: others in the same table, as nextview benchmark names them.
         objects: only so many of each file, as nextview measure and nextview plan spread them.
-        n_views: after which policies are compared.
+        views: after which policies are compared.
         runs: random first views of each object.
         samples: of the bootstrap.
         seed: of everything random.
@@ -260,21 +260,21 @@ def main(
         raise UsageError(f"{validation}: holds objects of {test}: peak or valley would be chosen on what is judged")
     if tables[0].classes != tables[1].classes:
         raise UsageError(f"{validation}: is of other classes than {test}")
-    if not n_views or min(n_views) < 2:
+    if not views or min(views) < 2:
         raise UsageError("policies are compared after two views or more")
     names = list(measures) or [*ViewStore.open(tables[0].store).measures, CONFIDENCE]
     rows: list[tuple] = []
-    comparing = study(*tables, names, policies, n_views, runs, samples, seed, rows)
+    comparing = study(*tables, names, policies, views, runs, samples, seed, rows)
     track(comparing, 1 + len(names) + len(policies), "comparing measures")
     table = pd.DataFrame(rows, columns=["measure", "label", "quantity", "value", "low", "high", "p"])
     table["p_holm"] = holm(table["p"].to_numpy())
-    text = markdown(table, n_views)
+    text = markdown(table, views)
     out.mkdir(parents=True, exist_ok=True)
     with new_file(out / "measures.csv", True) as part:
         table.to_csv(part, index=False)
     with new_file(out / "measures.md", True) as part:
         part.write_text(text)
-    to_png(figure(table, n_views), out / "measures.png")
+    to_png(figure(table, views), out / "measures.png")
     print(text, end="")
 
 

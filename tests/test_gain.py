@@ -258,7 +258,7 @@ def test_a_map_of_another_measure_is_predicted_live_where_a_network_of_the_folde
 # Training
 
 
-QUICK = GainRecipe(epochs=6, walks=2, batch=128, networks=2, n_views=3, lr=1e-2)
+QUICK = GainRecipe(epochs=6, episodes=2, batch=128, networks_per_fold=2, max_views=3, lr=1e-2)
 
 
 def test_training_finds_the_views_that_tell_the_class_believed():
@@ -409,7 +409,7 @@ def test_a_map_of_a_measure_of_ones_own_leads_a_policy_to_the_views_that_it_show
         "0.01",
         "--batch",
         "128",
-        "--n-views",
+        "--max-views",
         "2",
         "--travel-weight",
         "0",

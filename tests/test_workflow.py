@@ -91,7 +91,7 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
         "plan views.zarr volumetric coverage",
     ):
         assert f"python -m research.{script}" in planned
-    assert "research.measure_study test.npz validation.npz --out measures" in planned
+    assert "research.measure_study test.npz validation.npz measures" in planned
     assert "docs/results.md" in planned
 
 

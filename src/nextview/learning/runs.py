@@ -196,7 +196,7 @@ def fit(
 def optimiser(parameters: Any, recipe: Any, steps: int, falls: float) -> dict[str, Any]:
     """AdamW, by one cycle over all steps, or with a rate that falls to such a part every fifth epoch."""
     adam = torch.optim.AdamW(parameters, lr=recipe.lr, weight_decay=recipe.weight_decay)
-    if recipe.schedule == "one-cycle":
+    if recipe.lr_schedule == "one-cycle":
         cycle = torch.optim.lr_scheduler.OneCycleLR(adam, recipe.lr, steps, pct_start=0.2)
         return {"optimizer": adam, "lr_scheduler": {"scheduler": cycle, "interval": "step"}}
     stairs = torch.optim.lr_scheduler.StepLR(adam, step_size=5, gamma=falls)
@@ -341,7 +341,7 @@ def refuse_seen(weights: Path | None, held_out: list[str]) -> None:
     seen = sorted(set(held_out) - set(read_run(weights).held_out))
     if 0 < len(seen) < len(set(held_out)):
         what = f"{len(seen)} of the {len(set(held_out))} objects that this network must not have seen"
-        raise ModelError(f"{weights}: was trained on {what}, {seen[0]} among them; take its --seed and --validation")
+        raise ModelError(f"{weights}: was trained on {what}, {seen[0]} among them; take its --seed, --validation-share")
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:
