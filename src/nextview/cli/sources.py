@@ -25,8 +25,8 @@ class Looking:
 
     models: str = "modelnet10"  # bundled models by name, or a folder with models of your own
     # chooses the next view: gain (the predicted gain of a view less its weighted travel; the default), MAP, MAP-peak or
-    # MAP-sphere-peak for a map of the models (lem, lcm), random, random-all, furthest, unidirectional, spread,
-    # spread-local, the card of a learned one (.json), or MODULE:CLASS for your own
+    # MAP-sphere-peak for a map of the models (lem, lcm), discriminate (the default of taught things), random,
+    # random-all, furthest, unidirectional, spread, spread-local, the card of a learned one (.json), or MODULE:CLASS
     policy: str | None = None
     threshold: float = 0.97  # stop when the belief in one class reaches this after one view, less after several
     # instead, stop at the lowest threshold at which at most this share of those who stop early is wrong
