@@ -86,12 +86,11 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
         assert f"nextview {command} " in planned
     for script in (
         "fit_policies validation.npz policies",
-        "measure views.zarr",
+        "measure_study views.zarr measures --meshes",
         "train_agent ppo validation.npz",
         "plan views.zarr volumetric coverage",
     ):
         assert f"python -m research.{script}" in planned
-    assert "research.measure_study test.npz validation.npz measures" in planned
     assert "docs/results.md" in planned
 
 
