@@ -1,6 +1,6 @@
 """Views a second from mesh files to a store on disk, beside the bare ray casts and other renderers, on the same meshes.
 
-    python benchmarks/render.py MODELNET10 [--meshes 100] [--workers 2] [--python RIVALS/bin/python]
+    python benchmarks/render.py MODELNET10 [--objects 100] [--workers 2] [--python RIVALS/bin/python]
 
 Open3D and pyrender are no part of this project: give a Python that has them, and rows without one are reported as such.
 Every row runs in processes of its own, as many side by side as there are workers.
@@ -250,7 +250,7 @@ def end_to_end(files: list[str], workers: int) -> tuple[np.ndarray, float, float
 def main(
     modelnet10: Path,
     /,
-    meshes: int = 100,
+    objects: int = 100,
     seed: int = 0,
     workers: int = os.cpu_count() or 1,
     python: str = sys.executable,
@@ -259,7 +259,7 @@ def main(
 
     Args:
         modelnet10: the dataset's folder.
-        meshes: how many, drawn by the seed.
+        objects: how many, drawn by the seed.
         seed: of the draw.
         workers: processes side by side.
         python: a Python with open3d and pyrender, for the rivals.
@@ -267,7 +267,7 @@ def main(
     from nextview.data.folders import list_dataset
 
     entries = list_dataset(modelnet10)
-    chosen = np.random.default_rng(seed).choice(len(entries), min(meshes, len(entries)), replace=False)
+    chosen = np.random.default_rng(seed).choice(len(entries), min(objects, len(entries)), replace=False)
     files = [str(entries[i].path) for i in sorted(chosen)]
     print(f"{len(files)} meshes x 40 views of {SIZE} x {SIZE}, {workers} processes\n")
     ours, size, memory, seconds = end_to_end(files, workers)

@@ -2,7 +2,7 @@
 
     python benchmarks/scenes.py choose learning.npz [--policies random-all visibility@0 visible-gain@0]
     nextview plan scenes.zarr volumetric    # of the store that scenes.npz was predicted from
-    python benchmarks/scenes.py judge scenes.npz ... --ours visible-gain [--policies ...] [--out scenes_travel.png]
+    python benchmarks/scenes.py judge scenes.npz ... --ours visible-gain [--policies ...] [--figure scenes_travel.png]
     python benchmarks/scenes.py calibration scenes.npz ... --alone single-objects.npz ...
 
 ``choose``: what policies reach on scenes for learning, classes weighted evenly: the mean log-belief in the truth and
@@ -113,7 +113,7 @@ def judge(
     policies: tuple[str, ...] = POLICIES,
     rivals: tuple[str, ...] = RIVALS,
     known: tuple[Path, ...] = (),
-    out: Path | None = None,
+    figure: Path | None = None,
     table: Path | None = None,
     runs: int = 10,
     samples: int = 10000,
@@ -127,7 +127,7 @@ def judge(
         policies: that stand in the tables, with their points over random.
         rivals: those that ours is tested against.
         known: predictions of scenes that were looked at before; those around the same targets are left out.
-        out: the figure.
+        figure: accuracy against travel, a picture.
         table: the comparisons, with p before and after the correction, as CSV.
         runs: first views of each scene.
         samples: of the bootstrap.
@@ -160,8 +160,8 @@ def judge(
     show(scenes, comparisons, ours)
     if table is not None:
         comparisons.to_csv(table, index=False)
-    if out is not None:
-        draw(scenes, out)
+    if figure is not None:
+        draw(scenes, figure)
 
 
 def compared(
@@ -254,7 +254,7 @@ class Believed:
 def calibration(
     predictions: tyro.conf.Positional[tuple[Path, ...]],
     alone: tuple[Path, ...],
-    walks: int = 10,
+    episodes: int = 10,
     samples: int = 2000,
     seed: int = 0,
 ) -> None:
@@ -263,7 +263,7 @@ def calibration(
     Args:
         predictions: of scenes.
         alone: of single objects, among them the targets of these scenes.
-        walks: of random views that can be reached, of each scene; the same ones of the target alone.
+        episodes: of random views that can be reached, of each scene; the same ones of the target alone.
         samples: of the bootstrap over targets.
         seed: of all that is random.
     """
@@ -273,7 +273,7 @@ def calibration(
         scenes = scenes_of(p)
         if scenes is None:
             raise UsageError(f"{path}: holds single objects, no scenes")
-        rows = np.repeat(np.arange(len(p)), walks)
+        rows = np.repeat(np.arange(len(p)), episodes)
         draws = np.where(scenes.reachable[rows], rng.random((len(rows), len(p.sphere))), -1)
         views = np.argsort(-draws, axis=1)[:, : max(COUNTS)]
         targets = np.array([name.partition("@")[0] for name in p.names])

@@ -3,7 +3,7 @@
     nextview render THINGS shown.zarr --sensor wrist --rotated --seed 7
     nextview render THINGS again.zarr --sensor wrist --rotated --seed 7 --noise-seed 1     # the same, with other errors
     nextview predict shown.zarr shown.npz --models MINE; nextview predict again.zarr again.npz --models MINE
-    python benchmarks/things.py MINE/memory.json shown.npz again.npz [--by-shape] [--runs 10] [--out things]
+    python benchmarks/things.py MINE/memory.json things shown.npz again.npz [--by-shape] [--runs 10]
 
 Each predictions file is a draw of the sensor's noise: all are judged. Writes things.md (the table) and things.csv
 (every number) into the folder. The bootstrap is over things, whose runs and draws belong together; p is McNemar's test
@@ -160,22 +160,22 @@ def markdown(table: pd.DataFrame, n_views: Sequence[int]) -> str:
 
 def main(
     card: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
     predictions: tyro.conf.Positional[tuple[Path, ...]],
-    out: Path = Path("things"),
     by_shape: bool = False,
     runs: int = 10,
-    n_views: tuple[int, ...] = (1, 2, 3, 5),
+    views: tuple[int, ...] = (1, 2, 3, 5),
     seed: int = 0,
 ) -> None:
     """Run all policies and write the table.
 
     Args:
         card: of the memory.
-        predictions: made by it, of one draw of the noise each.
         out: folder to write.
+        predictions: made by it, of one draw of the noise each.
         by_shape: as if sizes were not known.
         runs: random first views of each thing in each draw.
-        n_views: after how many the policies are compared.
+        views: after how many the policies are compared.
         seed: decides first views and random policies.
     """
     draws = [draw.by_shape() if by_shape else draw for draw in map(Predictions.load, predictions)]
@@ -184,15 +184,15 @@ def main(
         raise UsageError(f"{card}: knows other things than the predictions")
     margin = margins(recogniser, by_shape)[draws[0].labels]
     half = np.sort(np.argsort(margin, kind="stable")[: len(margin) // 2])
-    paths = run(draws, card, runs, seed, max(n_views))
+    paths = run(draws, card, runs, seed, max(views))
     rows: list[dict] = []
     for name, things in (("all", np.arange(len(margin))), ("the confusable half", half)):
-        rows += [{"things": name} | row for row in measured(paths, draws[0].labels, things, n_views)]
+        rows += [{"things": name} | row for row in measured(paths, draws[0].labels, things, views)]
     table = pd.DataFrame(rows)
     table["p_holm"] = holm(table["p"].to_numpy())
     out.mkdir(parents=True, exist_ok=True)
     table.to_csv(out / "things.csv", index=False)
-    (out / "things.md").write_text(text := markdown(table, n_views), encoding="utf-8")
+    (out / "things.md").write_text(text := markdown(table, views), encoding="utf-8")
     print(text, end="")
 
 

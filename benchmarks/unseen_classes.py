@@ -1,7 +1,7 @@
 """How well a map network does on objects of classes that it has never seen (the thesis's third research question).
 
     nextview render data/PSB unseen.zarr
-    python benchmarks/unseen_classes.py unseen.zarr [--card lem-modelnet10]
+    python benchmarks/unseen_classes.py unseen.zarr [--model lem-modelnet10]
 
 The store's classes must not be among those that the network was trained on; that is up to you. Prints the scores over
 all views, beside a baseline: the mean map of these very objects, the same for every view.
@@ -31,16 +31,16 @@ from nextview.recognition.network_input import from_store
 PUBLISHED = "published LEM, trained on 10 classes, tested on its own unseen ones (table 4): d <= 1 0.364"
 
 
-def main(store: tyro.conf.Positional[Path], card: str = "lem-modelnet10", samples: int = 2000, seed: int = 0) -> None:
+def main(store: tyro.conf.Positional[Path], model: str = "lem-modelnet10", samples: int = 2000, seed: int = 0) -> None:
     """Print the table.
 
     Args:
         store: views of objects of unseen classes.
-        card: the map network, by name or card.
+        model: the map network, by name or card.
         samples: of the bootstrap over objects.
         seed: of the bootstrap.
     """
-    views, network = ViewStore.open(store), MapNetwork(card)
+    views, network = ViewStore.open(store), MapNetwork(model)
     objects = np.flatnonzero(views.done)
     maps = np.empty((len(objects), len(views.sphere), views.sphere.rings, 3), np.float32)
 

@@ -1,6 +1,6 @@
 """``nextview benchmark --views`` with a choice of policies and references of its own, and its figure.
 
-    python benchmarks/views.py test.npz --out views [--policies gain@0.01 ...] [--n-views 2 3 5] [--against lem ...]
+    python benchmarks/views.py test.npz views [--policies gain@0.01 ...] [--views 2 3 5] [--against lem ...]
 
 Writes views.md (the table), views.csv (every number in a row of its own) and front.png (accuracy against travel) into
 the folder, and prints the table. The gap is that between random and oracle-gain, which sees what every view of the
@@ -188,9 +188,9 @@ def _overlap(a: Bbox, b: Bbox) -> float:
 
 def main(
     predictions: tyro.conf.Positional[Path],
-    out: Path = Path("views"),
+    out: tyro.conf.Positional[Path] = Path("views"),
     policies: tuple[str, ...] = (),
-    n_views: tuple[int, ...] = (2, 3, 5),
+    views: tuple[int, ...] = (2, 3, 5),
     split: Literal["train", "test"] | None = None,
     runs: int = 10,
     samples: int = 2000,
@@ -204,7 +204,7 @@ def main(
         out: folder for views.md, views.csv and front.png.
         policies: names, or MODULE:CLASS for your own, beside random, random-all and oracle-gain; by default a choice of
             those that the predictions allow.
-        n_views: after how many the policies are compared.
+        views: after how many the policies are compared.
         split: take only the objects of this one; needed where the predictions hold several.
         runs: random first views of each object.
         samples: of the bootstrap.
@@ -216,18 +216,18 @@ def main(
         table = table.of_split(split)
     elif len(set(table.splits)) > 1:
         raise UsageError(f"{predictions}: holds training and test objects; choose with --split which are compared")
-    if not n_views or not 1 <= min(n_views) <= max(n_views) <= len(table.sphere):
-        raise UsageError(f"policies are compared after 1 to {len(table.sphere)} views, not {n_views}")
+    if not views or not 1 <= min(views) <= max(views) <= len(table.sphere):
+        raise UsageError(f"policies are compared after 1 to {len(table.sphere)} views, not {views}")
     specs = make_specs(table, runs, seed)
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
     names = list(dict.fromkeys([*REFERENCES, *against, *(policies or POLICIES), CEILING]))
-    grid = Grid(specs, runs, (), max(n_views), seed)
+    grid = Grid(specs, runs, (), max(views), seed)
     track(run_grid(grid, names), len(names), "replaying policies")
-    for name in [name for name, paths in grid.paths.items() if paths.views.shape[1] < max(n_views) and paths.fixed]:
-        grid.failures[name] = f"{name} is over before view {max(n_views)}"
+    for name in [name for name, paths in grid.paths.items() if paths.views.shape[1] < max(views) and paths.fixed]:
+        grid.failures[name] = f"{name} is over before view {max(views)}"
         del grid.paths[name]
     compared = [name for name in dict.fromkeys((REFERENCES[0], *against)) if name in grid.paths]
-    found = measured(grid, sorted(set(n_views)), samples, compared)
+    found = measured(grid, sorted(set(views)), samples, compared)
     text = markdown(as_rows(found), list(grid.failures.values()))
     out.mkdir(parents=True, exist_ok=True)
     (out / "views.md").write_text(text, encoding="utf-8")

@@ -1,6 +1,6 @@
 """Learn the tables of ``nextview.policies.learned_tables``: those after whose views the true class is believed most.
 
-python -m research.fit_policies predictions.npz policies [--validation 1] [--travel-weight 0.01] ...
+python -m research.fit_policies predictions.npz policies [--validation-share 1] [--travel-weight 0.01] ...
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class FittedPolicies:
 def fit_policies(
     predictions: Path,
     out: Path,
-    validation: float = 0.1,
+    validation_share: float = 0.1,
     split_seed: int = 0,
     length: int = 7,
-    n_views: int = 5,
+    max_views: int = 5,
     shrinkage: float = 20.0,
     travel_weight: float = 0.01,
     seed: int = 0,
@@ -59,10 +59,10 @@ def fit_policies(
     Args:
         predictions: of the training split (nextview predict --split train).
         out: folder for NAME.json; run one with --policy OUT/NAME.json.
-        validation: part of every class that the recogniser was not trained on; 1 for out-of-fold predictions.
+        validation_share: part of every class that the recogniser was not trained on; 1 for out-of-fold predictions.
         split_seed: the recogniser's seed, which decided which.
         length: moves of the fixed sequence.
-        n_views: over which the ring and the class table are chosen.
+        max_views: over which the ring and the class table are chosen.
         shrinkage: objects by whose weight the gains of one believed class are drawn towards those of all.
         travel_weight: of one cell of travel for NAME-near, in units of the logarithm of the belief in the true class.
         seed: of the walks behind the class table.
@@ -71,16 +71,16 @@ def fit_policies(
     Raises:
         UsageError, PredictionsError, ResultsError: arguments without sense, nothing to fit to, or a card that exists.
     """
-    if length < 1 or n_views < 2 or shrinkage < 0 or travel_weight < 0:
+    if length < 1 or max_views < 2 or shrinkage < 0 or travel_weight < 0:
         raise UsageError("length has to be at least 1, views at least 2, shrinkage and travel weight not negative")
     cards = {name: out / f"{name}.json" for name in NAMES}
     for path in cards.values():
         check_new(path, overwrite)
     table = Predictions.load(predictions)
-    data = fitting_set(table, validation, split_seed)
+    data = fitting_set(table, validation_share, split_seed)
     calibration = calibration_of(data, np.random.default_rng([seed, 0]), walks=1 + 8000 // len(data))
-    values = fit_class_table(data, n_views, shrinkage, calibration, np.random.default_rng(seed))
-    settings = {"length": length, "n_views": n_views, "shrinkage": shrinkage, "seed": seed}
+    values = fit_class_table(data, max_views, shrinkage, calibration, np.random.default_rng(seed))
+    settings = {"length": length, "n_views": max_views, "shrinkage": shrinkage, "seed": seed}
     for suffix, scope in VARIANTS:
         settings["travel_weight"] = travel_weight if suffix == "-near" else 0.0
         card = PolicyCard(

@@ -1,6 +1,6 @@
 """Pictures of a view store: one object from all sides, or the whole data set, whose numbers are printed.
 
-python -m research.inspect_store views.zarr [views.png] [--object table_0399]
+python -m research.inspect_store views.zarr [views.png] [--object-name table_0399]
 """
 
 from __future__ import annotations
@@ -157,26 +157,26 @@ def _ticks(axes: Axes, sphere: ViewSphere, side: float = 1, downwards: bool = Fa
     axes.tick_params(length=0)
 
 
-def inspect(store: Path, out: Path | None = None, /, object: str | None = None, overwrite: bool = False) -> None:
+def inspect(store: Path, out: Path | None = None, /, object_name: str | None = None, overwrite: bool = False) -> None:
     """Draw what a view store holds: classes, counts, failures; or one object from all sides.
 
     Args:
         store: view store made by nextview render.
         out: picture to make (PNG, PDF or SVG); STORE.png or OBJECT.png here if not given.
-        object: name of the object to draw instead of the whole store.
+        object_name: name of the object to draw instead of the whole store.
         overwrite: replace the picture if it exists.
     """
     views = ViewStore.open(store)
-    out = out or Path(f"{object or store.resolve().stem}.png")
+    out = out or Path(f"{object_name or store.resolve().stem}.png")
     check_file(out, overwrite)
-    if object is not None:
-        if object not in views.names:
-            near = get_close_matches(object, views.names, 3, 0) or views.names[:3]
-            raise DatasetError(f"{store}: has no object {object!r}; there are {', '.join(near)} and others")
-        row = views.names.index(object)
+    if object_name is not None:
+        if object_name not in views.names:
+            near = get_close_matches(object_name, views.names, 3, 0) or views.names[:3]
+            raise DatasetError(f"{store}: has no object {object_name!r}; there are {', '.join(near)} and others")
+        row = views.names.index(object_name)
         if not views.done[row]:
             raise DatasetError(
-                f"{store}: {object} is not rendered ({views.attributes.failures.get(object, 'not yet')})"
+                f"{store}: {object_name} is not rendered ({views.attributes.failures.get(object_name, 'not yet')})"
             )
         figure = object_figure(views, row)
     else:

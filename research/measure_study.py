@@ -1,9 +1,11 @@
 """Which measure of a view serves recognition? Every measure that a store holds, against what a recogniser says.
 
-    python -m research.measure_study test.npz validation.npz --out measures [--store views.zarr] [--runs 10]
-        [--policies random-all volumetric mvselect.json gain] [--objects 300]
+    python -m research.measure_study views.zarr measures [--meshes data/ModelNet10] [--objects 300] [--runs 10]
+        [--policies random-all volumetric mvselect.json gain] [--test test.npz --validation validation.npz]
 
-Writes measures.md (the table), measures.csv (every number in a row of its own) and measures.png into the folder.
+From the view store alone: what the models say of its views is predicted, and what the measures say is measured, where
+that is not there yet. Writes into the folder the table (measures.md, table.csv and table.tex), measures.csv (every
+number in a row of its own), and the figure (measures.png, .pdf and .svg). Stopped, it goes on where it was.
 
 For each measure: the rank correlation, over the views of an object, of its value with the log-probability that the
 recogniser gives the true class there, as the mean over objects, of all classes and of each; how often its best view is
@@ -20,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from nextview.cli.ending import require
 
@@ -35,11 +37,14 @@ from numpy.typing import NDArray
 from scipy.special import log_softmax
 from scipy.stats import rankdata
 
+from nextview.benchmark.page import write_figures
 from nextview.benchmark.replay import make_specs, replay
 from nextview.benchmark.statistics import holm, interval, mcnemar, resample
 from nextview.benchmark.true_maps import true_map, true_measure
 from nextview.cli.ending import orderly_end
-from nextview.cli.progress import track
+from nextview.cli.progress import follow, track
+from nextview.data import predicting
+from nextview.data.measures import measure
 from nextview.data.metrics import ratio
 from nextview.data.predictions import Predictions
 from nextview.data.splits import sample
@@ -48,8 +53,11 @@ from nextview.errors import UsageError
 from nextview.files import new_file
 from nextview.learning.card_fits import valley_gains
 from nextview.recognition.map_names import map_name
+from nextview.recognition.model_card import find_card, find_models
 from nextview.session.style import BLUE, INK, STYLE, PlainFigure, to_png
+from research.measure import measure as measure_meshes
 
+Split = Literal["train", "test"]
 RANDOM = "random"
 """What the policies are compared with: a view of the local window drawn at random."""
 CONFIDENCE = "confidence"
@@ -140,14 +148,14 @@ def study(
         yield done
 
 
-def markdown(table: pd.DataFrame, n_views: tuple[int, ...]) -> str:
-    """The table as text, the highest correlation first."""
+def readable(table: pd.DataFrame, n_views: tuple[int, ...]) -> pd.DataFrame:
+    """The table as it is read, the highest correlation first."""
     found = {(r.measure, r.quantity): r for r in table.itertuples() if not r.label or r.quantity == "valleys"}
     names = [*ordered(table)[::-1], *others(table)]
     at = ", ".join(map(str, n_views))
     head = ["measure", "correlation", *AGREEMENT.values(), f"accuracy at {at} views", f"points over random at {at}",
             f"travel at {at}", "valley for"]  # fmt: skip
-    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    rows = []
     for name in [RANDOM, *names]:
         r = found.get((name, "correlation"))
         cells = [name.replace("_", " ") if r else Path(name).stem if name.endswith(".json") else name]
@@ -161,8 +169,15 @@ def markdown(table: pd.DataFrame, n_views: tuple[int, ...]) -> str:
         cells.append(", ".join(map(points, over)))
         cells.append(", ".join(f"{found[name, f'travel_{k}'].value:.2f}" for k in n_views))
         cells.append("" if r is None else found[name, "valleys"].label or "none")
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", "\\* p < 0.05 after Holm's correction."]) + "\n"
+        rows.append(cells)
+    return pd.DataFrame(rows, columns=head)
+
+
+def markdown(readable: pd.DataFrame) -> str:
+    """The table as text."""
+    lines = [list(readable), ["---"] * readable.shape[1], *readable.to_numpy().tolist()]
+    said = ["| " + " | ".join(cells) + " |" for cells in lines]
+    return "\n".join([*said, "", "\\* p < 0.05 after Holm's correction."]) + "\n"
 
 
 def points(row: Any) -> str:
@@ -224,57 +239,87 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
     return made
 
 
+def predicted(out: Path, store: Path, models: str, split: Split, workers: int | None) -> Predictions:
+    """What models say of a split of a store; of the training split only of what they held out."""
+    if not out.exists():
+        recogniser = find_card(find_models(models).recogniser)
+        held_out = None if split == "test" else recogniser
+        steps = predicting.predict(store, out, recogniser, {}, split, held_out, size=False, workers=workers)
+        follow(steps, f"predicting {out.name}")
+    return Predictions.load(out)
+
+
 def main(
-    test: tyro.conf.Positional[Path],
-    validation: tyro.conf.Positional[Path],
-    out: Path = Path("measures"),
-    store: Path | None = None,
+    store: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    meshes: Path | None = None,
+    models: str = "modelnet10",
+    test: Path | None = None,
+    validation: Path | None = None,
     measures: tuple[str, ...] = (),
     policies: tuple[str, ...] = (),
     objects: int | None = None,
-    n_views: tuple[int, ...] = (2, 3, 5),
+    views: tuple[int, ...] = (2, 3, 5),
     runs: int = 10,
     samples: int = 1000,
     seed: int = 0,
+    workers: int | None = None,
 ) -> None:
     """Compare the measures.
 
     Args:
-        test: predictions of the test split (nextview predict --split test).
-        validation: predictions of training objects that the recogniser has not seen (nextview predict --held-out).
+        store: view store made by nextview render.
         out: folder of the results.
-        store: the view store, if it is not where the predictions say, with its measures (nextview measure).
-        measures: names; by default all that the store holds, and the confidence.
+        meshes: the dataset folder that the store was rendered from, for measures that need the mesh.
+        models: bundled models by name, or a folder with models of your own; of these the recogniser.
+        test: predictions of the test split, if there are some; else OUT/test.npz, made by the models.
+        validation: of training objects that the recogniser has not seen; else OUT/validation.npz.
+        measures: names, or MODULE:FUNCTION of your own; by default all that the store then holds, and the confidence.
         policies: others in the same table, as nextview benchmark names them.
-        objects: only so many of each file, as nextview measure and nextview plan spread them.
-        n_views: after which policies are compared.
+        objects: only so many of each split, as nextview measure and research.plan spread them.
+        views: after which policies are compared.
         runs: random first views of each object.
         samples: of the bootstrap.
         seed: of everything random.
+        workers: processes; one for each core by default.
     """
-    tables = [Predictions.load(path) for path in (test, validation)]
-    tables = [p.of_objects(sample(np.arange(len(p)), objects)) for p in tables]
-    if store is not None:
-        tables = [replace(p, store=str(store.resolve())) for p in tables]
-    if set(tables[0].names) & set(tables[1].names):
-        raise UsageError(f"{validation}: holds objects of {test}: peak or valley would be chosen on what is judged")
-    if tables[0].classes != tables[1].classes:
-        raise UsageError(f"{validation}: is of other classes than {test}")
-    if not n_views or min(n_views) < 2:
+    if not views or min(views) < 2:
         raise UsageError("policies are compared after two views or more")
-    names = list(measures) or [*ViewStore.open(tables[0].store).measures, CONFIDENCE]
-    rows: list[tuple] = []
-    comparing = study(*tables, names, policies, n_views, runs, samples, seed, rows)
-    track(comparing, 1 + len(names) + len(policies), "comparing measures")
-    table = pd.DataFrame(rows, columns=["measure", "label", "quantity", "value", "low", "high", "p"])
-    table["p_holm"] = holm(table["p"].to_numpy())
-    text = markdown(table, n_views)
     out.mkdir(parents=True, exist_ok=True)
+    given: list[tuple[Path | None, Split]] = [(test, "test"), (validation, "train")]
+    found = [path or out / f"{name}.npz" for (path, _), name in zip(given, ("test", "validation"), strict=True)]
+    tables = [
+        Predictions.load(path) if path else predicted(to, store, models, split, workers)
+        for (path, split), to in zip(given, found, strict=True)
+    ]
+    tables = [p.of_objects(sample(np.arange(len(p)), objects)) for p in tables]
+    tables = [replace(p, store=str(store.resolve())) for p in tables]
+    if set(tables[0].names) & set(tables[1].names):
+        raise UsageError(f"{found[1]}: holds objects of {found[0]}: peak or valley would be chosen on what is judged")
+    if tables[0].classes != tables[1].classes:
+        raise UsageError(f"{found[1]}: is of other classes than {found[0]}")
+    rows = np.flatnonzero(np.isin(ViewStore.open(store).names, [*tables[0].names, *tables[1].names]))
+    wanted = [name for name in measures if name != CONFIDENCE]
+    if meshes is not None:
+        steps = measure_meshes(store, meshes, wanted or ["all"], workers, objects=rows)
+    else:
+        steps = measure(store, wanted, workers, objects=rows)
+    if wanted or not measures:
+        follow(steps, f"measuring {store.name}")
+    names = list(measures) or [*ViewStore.open(store).measures, CONFIDENCE]
+    numbers: list[tuple] = []
+    comparing = study(*tables, names, policies, views, runs, samples, seed, numbers)
+    track(comparing, 1 + len(names) + len(policies), "comparing measures")
+    table = pd.DataFrame(numbers, columns=["measure", "label", "quantity", "value", "low", "high", "p"])
+    table["p_holm"] = holm(table["p"].to_numpy())
+    drawn, wide = figure(table, views), readable(table, views)
+    text = markdown(wide)
+    write_figures(out, {"measures": drawn}, {"table": wide}, overwrite=True)
     with new_file(out / "measures.csv", True) as part:
         table.to_csv(part, index=False)
     with new_file(out / "measures.md", True) as part:
         part.write_text(text)
-    to_png(figure(table, n_views), out / "measures.png")
+    to_png(drawn, out / "measures.png")
     print(text, end="")
 
 

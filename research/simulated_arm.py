@@ -1,6 +1,6 @@
 """A simulated arm recognises objects on a table: how long does it move until it is right?
 
-    python -m research.simulated_arm DATASET/ModelNet10 episodes.jsonl [--objects 50] [--starts 1]
+    python -m research.simulated_arm DATASET/ModelNet10 episodes.jsonl [--objects 50] [--runs 1]
 
 Test objects of 10 cm radius stand on a table, turned at random; the camera on the wrist is a simulated stereo camera
 (``cameras.sensors``, "stereo"), 0.4 m away. Each policy starts from the same places with the same errors, and goes
@@ -56,7 +56,7 @@ class Settings:
         episodes: file to which episodes are appended.
         models: bundled models by name, or a folder with models of your own and their policy gain.
         objects: so many of the test split, spread over it.
-        starts: first views of each, from directions drawn from those in reach.
+        runs: first views of each, from directions drawn from those in reach.
         radius: of the objects, metres.
         seed: decides where objects and arm are, the sensor's errors and what random draws.
     """
@@ -65,7 +65,7 @@ class Settings:
     episodes: tyro.conf.Positional[Path]
     models: str = "modelnet10"
     objects: int = 50
-    starts: int = 1
+    runs: int = 1
     radius: float = 0.1
     seed: int = 0
 
@@ -111,7 +111,7 @@ def run(settings: Settings, done: dict[tuple[str, int, str], dict[str, Any]]) ->
     entries = entries[:: len(entries) // settings.objects][: settings.objects]
     by_policy, count = systems(settings.models), 0
     with settings.episodes.open("a", buffering=1) as file:
-        for start in range(settings.starts):
+        for start in range(settings.runs):
             for i, entry in enumerate(entries):
                 asked = [(entry.path.stem, start, name) for name in POLICIES]
                 ended = next((done[each] for each in asked if each in done), {"views": 0})
@@ -153,8 +153,8 @@ def main(settings: Settings) -> None:
     """Run the episodes that the file lacks, and print the table."""
     rows = [json.loads(line) for line in settings.episodes.open()] if settings.episodes.exists() else []
     done = {(row["object"], row["start"], row["policy"]): row for row in rows}
-    track(run(settings, done), settings.objects * settings.starts * len(POLICIES), "recognising")
-    rows = [row for row in map(json.loads, settings.episodes.open()) if row["start"] < settings.starts]
+    track(run(settings, done), settings.objects * settings.runs * len(POLICIES), "recognising")
+    rows = [row for row in map(json.loads, settings.episodes.open()) if row["start"] < settings.runs]
     print("\n".join(table(rows)))
     longest, moves = max(row["moved"] for row in rows), sum(row["views"] - 1 for row in rows)
     print(f"{len(rows)} episodes; {moves} moves, the longest episode {longest:.1f} s; settings {asdict(settings)}")

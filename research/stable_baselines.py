@@ -31,7 +31,7 @@ class AgentRecipe:
         frame: from where the azimuths of actions and observations are counted, see ``GainRecipe``.
         objective: what is paid: the change of "right" (1 if the most believed class is the true one), of the "belief"
             in the true class or of its "log-belief".
-        n_views: views of an episode, the first included.
+        max_views: views of an episode, the first included.
         view_price: taken from the reward for each view.
         travel_price: taken from it for each grid cell of travel.
         hidden: width of the two hidden layers.
@@ -54,7 +54,7 @@ class AgentRecipe:
     inputs: tuple[str, ...] = ("belief", "view", "place", "lem-sphere", "azimuth_bin")
     frame: Literal["camera", "object"] = "object"
     objective: Literal["belief", "log-belief", "right"] = "log-belief"
-    n_views: int = 5
+    max_views: int = 5
     view_price: float = 0.0
     travel_price: float = 0.0
     hidden: int = 64

@@ -82,7 +82,7 @@ def train_agent(
     judging = hold_out(table.labels, table.depth_entropy, recipe.holdout, recipe.seed)[0]
     learning = np.setdiff1d(np.arange(len(table)), judging)
     rules = Rules(
-        recipe.inputs, recipe.frame, recipe.objective, recipe.n_views,
+        recipe.inputs, recipe.frame, recipe.objective, recipe.max_views,
         view_price=recipe.view_price, travel_price=recipe.travel_price,
     )  # fmt: skip
     env = TaskVectorEnv(replayed(table.of_objects(learning), "train", True, rules), recipe.envs)
@@ -116,7 +116,7 @@ def _best(env: TaskVectorEnv, judges: ReplayTable, recipe: AgentRecipe, track: T
         for k, layers in enumerate(learn(model, recipe), 1):
             agent = _agent(env, layers, recipe)
             rng = np.random.default_rng([recipe.seed, 2])
-            value = judge(judges, agent, recipe.n_views, recipe.objective, rng, rounds=4)
+            value = judge(judges, agent, recipe.max_views, recipe.objective, rng, rounds=4)
             score = float(value.mean.mean() - recipe.travel_price * value.travel[-1])
             if not found or score > found[-1][0]:
                 found.append((score, model.num_timesteps, agent, value))
@@ -137,7 +137,7 @@ def _agent(env: TaskVectorEnv, layers: Layers, recipe: AgentRecipe) -> Gain:
 
 def _states(judges: ReplayTable, agent: Gain, recipe: AgentRecipe) -> NDArray[np.float32]:
     """States that the agent meets, to compare its file with."""
-    met = rollout(judges, agent, recipe.n_views - 1, np.random.default_rng([recipe.seed, 3]))
+    met = rollout(judges, agent, recipe.max_views - 1, np.random.default_rng([recipe.seed, 3]))
     seen = [features(agent.sphere, moment.state, agent.inputs, agent.frame) for moment in met]
     return np.concatenate(seen).astype(np.float32)
 

@@ -54,8 +54,8 @@ def train_grid(
     Args:
         store: the view store.
         out: folder for the runs, resnet18-batch4 and so on, and for grid.csv.
-        recipe: how to train; network, depth and batch are those of the table.
-        depths: train only networks of these depths.
+        recipe: how to train; network, layers and batch are those of the table.
+        depths: train only networks of so many layers.
         batches: train only networks with these batch sizes.
         hardware: on what.
         track: follows the preparation of the inputs and the tests.
@@ -79,14 +79,14 @@ def train_grid(
         raise UsageError("table 6 holds no network of these depths and batch sizes")
     recipes = {}
     for depth, batch in cells:
-        changes: dict[str, Any] = {"network": "resnet", "depth": depth, "batch": batch}
+        changes: dict[str, Any] = {"network": "resnet", "layers": depth, "batch": batch}
         recipes[out / f"resnet{depth}-batch{batch}"] = replace(recipe, **changes)
     for run, own in recipes.items():
         train_recogniser(store, run, recipe=own, hardware=hardware, track=track)
     if is_first():
         rows: list[dict[str, Any]] = []
         for (run, own), published in zip(recipes.items(), cells.values(), strict=True):
-            cell = {"depth": own.depth, "batch_size": own.batch} | _scores(run, store, views, own, track)
+            cell = {"depth": own.layers, "batch_size": own.batch} | _scores(run, store, views, own, track)
             rows += [cell | {"published": accuracy} for accuracy in (published or (None,))]
         with new_file(out / TABLE, True) as part, part.open("w", newline="") as file:
             table = csv.DictWriter(file, list(rows[0]))
@@ -223,9 +223,9 @@ def main(
     Args:
         store: view store made by nextview render.
         out: folder for the runs, grid.csv and grid.png.
-        depths: train only networks of these depths.
+        depths: train only networks of so many layers.
         batches: train only networks with these batch sizes.
-        recipe: how to train; network, depth and batch are those of the table.
+        recipe: how to train; network, layers and batch are those of the table.
         hardware: on what.
     """
     table = train_grid(store, out, recipe, depths=depths, batches=batches, hardware=hardware, track=progress)

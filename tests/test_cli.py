@@ -1,12 +1,15 @@
 """The command line: its table of commands, how they end, and what they show."""
 
+import inspect
 import io
 import re
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
@@ -59,6 +62,40 @@ def test_all_commands_are_listed_without_importing_one():
 def test_a_next_command_is_there(name):
     named = re.findall(r"nextview (\w+(?: \w+)?)", COMMANDS[name].then)
     assert all(words in COMMANDS or words.split()[0] in COMMANDS for words in named)
+
+
+def kinds(hint):
+    """What an option takes: numbers, texts or a switch; and whether several."""
+    if is_dataclass(hint):
+        return set()
+    if get_origin(hint) is tuple:
+        return {("several", kind) for part in get_args(hint) for kind in kinds(part)}
+    if get_origin(hint) is Literal:
+        return {type(value) for value in get_args(hint)}
+    parts = [part for part in get_args(hint) if part is not type(None)]
+    return set().union(*map(kinds, parts)) if parts else {str if hint is Path else hint}
+
+
+def options(name):
+    """The options of a command, and of its dataclasses, with what they take."""
+    function = find(COMMANDS[name].function)
+    hints, found = get_type_hints(function), {}
+    for each in inspect.signature(function).parameters.values():
+        hint = hints[each.name]
+        if is_dataclass(hint):
+            found |= {f.name: kinds(get_type_hints(hint)[f.name]) for f in fields(hint)}
+        elif each.default is not each.empty and each.kind is not each.POSITIONAL_ONLY:
+            found[each.name] = kinds(hint)
+    return found
+
+
+def test_an_option_takes_the_same_in_every_command():
+    pytest.importorskip("torch")
+    taken = {}
+    for name in COMMANDS:
+        for option, kind in options(name).items():
+            assert not kind or taken.setdefault(option, kind) & kind, (option, name, kind, taken[option])
+    assert {"held_out", "validation", "views", "seed"} <= taken.keys()
 
 
 @pytest.mark.parametrize(("words", "meant"), [("recognize", "recognise"), ("train recognizer", "train recogniser")])

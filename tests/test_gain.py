@@ -239,7 +239,7 @@ def test_a_map_of_another_measure_is_predicted_live_where_a_network_of_the_folde
 # Training
 
 
-QUICK = GainRecipe(epochs=6, walks=2, batch=128, networks=2, n_views=3, lr=1e-2)
+QUICK = GainRecipe(epochs=6, episodes=2, batch=128, networks_per_fold=2, max_views=3, lr=1e-2)
 
 
 def test_training_finds_the_views_that_tell_the_class_believed():
@@ -379,7 +379,7 @@ def test_a_map_of_a_measure_of_ones_own_leads_a_policy_to_the_views_that_it_show
     p = ring_that_tells(60, 1, "test")
     p.save(fresh)
     quick = ["--epochs", "12", "--folds", "2", "--lr", "0.01", "--batch", "128"]
-    how = ["--inputs", given, "place", "--frame", "camera", "--n-views", "2", "--travel-weight", "0"]
+    how = ["--inputs", given, "place", "--frame", "camera", "--max-views", "2", "--travel-weight", "0"]
     main(["train", "gain", str(learned), str(card), *how, *quick])
     assert json.loads(card.read_text())["table"]["inputs"] == [given, "place"]
     run = ["--runs", "4", "--samples", "20", "--max-views", "2", "--thresholds", "0.999"]

@@ -14,14 +14,14 @@ from nextview.data.predictions import Predictions
 
 SAMPLE = str(Path(__file__).parent.parent / "samples/chair.off")
 FITS = {name for name in COMMANDS if name.startswith("fit ")}
-GAIN = "--walks 1 --networks 1 --inputs belief view"
-SMALL = "--size 32 --epochs 1 --views 2 --batch 8 --validation 0.3"
+GAIN = "--episodes 1 --networks-per-fold 1 --inputs belief view"
+SMALL = "--size 32 --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.3"
 WRITES = {
     "recognise": (f"recognise {SAMPLE} --max-views 1 --figure", "e.png"),
     "recognise --record": (f"recognise {SAMPLE} --max-views 1 --record", "e.rrd"),
     "demo": ("demo --figure", "demo.svg"),
     "capture": (f"capture {SAMPLE}", "folder", "--radius 0.4 --viewpoints 12"),
-    "scenes": ("scenes {furniture}", "folder", "--scenes 1 --level light --split test --workers 0"),
+    "scenes": ("scenes {furniture}", "folder", "--scenes 1 --levels light --split test --workers 0"),
     "render": ("render {furniture}", "v.zarr", "--viewpoints 12 --size 16 --split test --workers 0"),
     "predict": ("predict {views}", "p.npz", "--models {models} --maps lem --split test --workers 0"),
     "learn": (f"learn {Path(SAMPLE).parent}", "folder", "--upright --workers 0"),

@@ -92,10 +92,10 @@ def test_its_options_are_there(line, capsys):
 
 SMALL = {
     "render": "--workers 1",
-    "train recogniser": "--size 32 --epochs 1 --views 2 --batch 8 --validation 0.4",
+    "train recogniser": "--size 32 --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
     "predict": "--workers 1",
     "fit calibration": "--delta 0.2",
-    "train gain": "--folds 2 --epochs 1 --walks 1 --networks 1",
+    "train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
     "benchmark": "--runs 2 --samples 100",
 }
 """What makes a command of the page quick."""

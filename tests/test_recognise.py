@@ -9,7 +9,7 @@ from pipeline import SAMPLE_FILES, refused, run_python
 import nextview
 from nextview import ViewSphere
 from nextview.cli.main import main
-from nextview.errors import ModelError
+from nextview.errors import ModelError, UsageError
 from nextview.policies.policy_card import bundled_policies
 from nextview.recognition.inference import MapNetwork, Recogniser
 from nextview.recognition.model_card import BUNDLED, RECOGNISER, bundled_cards
@@ -53,6 +53,27 @@ def test_several_are_a_line_of_json_each_and_what_cannot_be_used_is_named(chair,
         assert (one["unknown"], one["warnings"]) == (False, [])
 
 
+def test_a_rule_of_ones_own_shows_no_threshold_that_it_does_not_have(chair, tmp_path, monkeypatch, capsys):
+    (tmp_path / "own_rule.py").write_text(
+        "def second(seen, threshold):\n    return seen.n_views >= 2 + 0 * seen.highest\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    command = ["recognise", str(chair), "--stopping", "own_rule:second", "--start", "3"]
+    main([*command, "--figure", "episode.svg"])
+    shown = capsys.readouterr().out
+    assert "stops at" not in shown
+    assert "2 views" in shown
+    assert "enough: inf" not in (tmp_path / "episode.svg").read_text()
+    main([*command, "--json"])
+    assert [view["threshold"] for view in json.loads(capsys.readouterr().out)["views"]] == [None, None]
+
+
+@pytest.mark.parametrize("wrong", [{"models": 3}, {"policy": 3}, {"risk": "low"}])
+def test_what_is_no_name_is_refused(wrong):
+    with pytest.raises(UsageError, match=r"(name or path|a number), not"):
+        nextview.load(**wrong)
+
+
 def test_every_bundled_policy_runs_live(chair, capsys):
     for name in bundled_policies():
         arguments = ["--policy", name, "--threshold", "1", "--max-views", "3", "--start", "9", "--json"]
@@ -72,7 +93,11 @@ def test_every_bundled_policy_runs_live(chair, capsys):
         (["chair.off", "--start", "40"], "0 to 39"),
         (["chair.off", "--policy", "clairvoyant"], "no policy is called"),
         (["chair.off", "--risk", "0.000001"], "cannot promise"),
+        (["chair.off", "--policy", "gian"], "did you mean 'gain'?"),
+        (["chair.off", "--policy", "discriminate"], "is for taught things"),
+        (["chair.off", "--policy", "true-depth_entropy"], "takes part in nextview benchmark alone"),
         (["chair.off", "--figure", "chair"], "ends in .png or .pdf or .svg"),
+        (["."], "is a folder of meshes, not of captured views; recognise one of them"),
     ],
 )
 def test_mistakes_end_in_one_sentence(chair, monkeypatch, capsys, arguments, words):

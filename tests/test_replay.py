@@ -127,6 +127,13 @@ def test_each_map_has_the_valley_classes_of_its_own_card():
     assert {*np.flatnonzero(peak != valley)} == {*np.flatnonzero(specs.labels == 1)}
 
 
+def test_a_true_map_is_found_by_the_name_of_its_measure(specs):
+    found = [replay(f"true-{name}-peak", specs, max_views=4, seed=0).views for name in ("depth_entropy", "lem")]
+    np.testing.assert_array_equal(*found)
+    with pytest.raises(EntryError, match="no true map is called 'true-depth_entrop'; there are true-lem, "):
+        replay("true-depth_entrop", specs, max_views=4, seed=0)
+
+
 def test_fixed_views_are_the_ones_their_name_says(specs):
     p = specs.predictions
     sure = softmax(p.logits.astype(float), axis=2)[np.arange(len(p)), :, p.labels][specs.objects]

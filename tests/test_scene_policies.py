@@ -221,7 +221,7 @@ def test_gain_learns_in_scenes_what_to_make_of_what_shows(predictions, tmp_path)
 
     train = np.array(["train"] * len(predictions))
     replace(predictions, splits=train).save(tmp_path / "p.npz")
-    recipe = GainRecipe(("belief", "place", "visibility"), "camera", epochs=1, walks=1, networks=1)
+    recipe = GainRecipe(("belief", "place", "visibility"), "camera", epochs=1, episodes=1, networks_per_fold=1)
     made = train_gain(tmp_path / "p.npz", tmp_path / "in-scenes.json", recipe=recipe, folds=2, travel_weight=0.01)
     assert made.objects == len(predictions)
     policy = make_policy(str(made.card), GRID, classes=predictions.classes)

@@ -79,7 +79,7 @@ def test_the_weight_is_the_most_likely_one():
 def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     views, card, honest = str(shop / "views.zarr"), str(shop / "tiny.json"), str(tmp_path / "held-out.npz")
     assert np.isnan(ViewStore.open(views).radii).all()
-    main(["predict", views, honest, "--held-out", "--recogniser", card, "--maps"])
+    main(["predict", views, honest, "--held-out", card, "--recogniser", card, "--maps"])
     assert "--unit" in refused(capsys, "fit", "size", views, honest, card)
     main(["render", str(shop / "meshes"), views, "--size", "32", "--unit", "cm"])
     radii = dict(zip(ViewStore.open(views).names, ViewStore.open(views).radii, strict=True))

@@ -36,12 +36,12 @@ from research.training_curves import read_log
 
 V = 5
 SPHERE = ViewSphere((0.0, 30.0), 8, 3.0)
-RECIPE = RecogniserRecipe(size=32, epochs=3, views=4, batch=8)
+RECIPE = RecogniserRecipe(size=32, epochs=3, views_per_object=4, batch=8)
 # Of 16 pixels the last step of a ResNet is a strided convolution of one pixel, whose bfloat16 gradient on a CPU is not
 # always finite (torch 2.13).
-SMALL = RecogniserRecipe(size=32, epochs=1, views=2, batch=4, validation=0.25, azimuth_bins_weight=0.3)
+SMALL = RecogniserRecipe(size=32, epochs=1, views_per_object=2, batch=4, validation_share=0.25, azimuth_bins_weight=0.3)
 EXACT = Hardware(precision="32-true")
-SMALL_MAP = MapRecipe(size=32, epochs=1, views=2, batch=4, validation=0.25)
+SMALL_MAP = MapRecipe(size=32, epochs=1, views_per_object=2, batch=4, validation_share=0.25)
 
 
 # Batches
@@ -68,7 +68,7 @@ def test_the_published_recipe_sees_every_view_once_an_epoch_in_a_new_order():
 def test_balanced_draws_even_out_the_classes():
     labels = np.repeat([0, 1], [90, 10])
     inputs = np.zeros((100, V, 1, 1, 1), np.uint8)
-    recipe = RecogniserRecipe(views=100, batch=100)
+    recipe = RecogniserRecipe(views_per_object=100, batch=100)
     views = Views([Source(inputs, np.arange(100))], np.arange(100), labels, recipe)
     seen = np.concatenate([label for _, label in views])
     share = 10**0.5 / (10**0.5 + 90**0.5)  # a class of n objects is drawn with weight n / sqrt(n)
@@ -77,7 +77,7 @@ def test_balanced_draws_even_out_the_classes():
 
 def test_objects_without_a_deformed_twin_are_seen_as_they_are():
     own, twins = (np.full((2, 40, 1, 1, 1), k, np.uint8) for k in (0, 1))
-    recipe = RecogniserRecipe(views=2000, batch=50, deformed_share=0.5, balanced=False)
+    recipe = RecogniserRecipe(views_per_object=2000, batch=50, deformed_share=0.5, balanced=False)
     sources = [Source(own, np.arange(2)), Source(twins, np.array([-1, 0]))]
     views = Views(sources, np.arange(2), np.arange(2), recipe)
     images, labels = (
@@ -89,7 +89,7 @@ def test_objects_without_a_deformed_twin_are_seen_as_they_are():
 
 @pytest.mark.parametrize("balanced", [True, False])
 def test_devices_share_every_batch(balanced):
-    recipe = replace(THESIS_RECOGNISER, batch=6, balanced=balanced, views=V)
+    recipe = replace(THESIS_RECOGNISER, batch=6, balanced=balanced, views_per_object=V)
     whole, parts = views_of(recipe), [views_of(recipe) for _ in range(2)]
     for rank, part in enumerate(parts):
         part.share = slice(rank, None, 2)
@@ -113,7 +113,7 @@ def test_map_batches_hold_each_view_with_its_own_map():
     values = rng.random((7, 40)).astype(np.float32)
     seen = np.zeros((7, 40, 4, 2, 2), np.uint8)  # object and view, in the left half of the image
     seen[..., 0, 0, 0], seen[..., 1, 0, 0] = np.arange(7)[:, None] + 1, np.arange(40) + 1
-    windows = Windows(seen, values, sphere, np.array([1, 2, 5]), MapRecipe(views=6, batch=4), training=True)
+    windows = Windows(seen, values, sphere, np.array([1, 2, 5]), MapRecipe(views_per_object=6, batch=4), training=True)
     drawn, flips = [], []
     for images, targets in windows:
         assert len(images) == 4
@@ -343,7 +343,7 @@ def test_trained_models_have_cards_and_run(trained, views):
 def test_several_runs_are_averaged(trained, views, tmp_path):
     run = trained / "runs/recogniser"
     train_recogniser(views, tmp_path / "on", weights=run, recipe=replace(SMALL, ensemble_seed=1))
-    export_recogniser(run, views, tmp_path, also=(tmp_path / "on",), name="both")
+    export_recogniser(run, views, tmp_path, ensemble=(tmp_path / "on",), name="both")
     x = load_inputs(views, 32)[0, :3]
     networks = [run_network(folder, SMALL, ViewStore.open(views)) for folder in (run, tmp_path / "on")]
     with torch.no_grad():
@@ -371,7 +371,7 @@ def test_a_network_goes_on_from_a_run(trained, views, tmp_path):
     last = torch.load(tmp_path / "lem/network.pt", weights_only=True)["resnet.fc.weight"]
     assert torch.equal(last, maps.resnet.fc.weight)  # a rate of 0 leaves the weights that it was given
     with pytest.raises(ModelError, match=r"was trained on .* objects that this network must not"):
-        train_recogniser(views, tmp_path / "seen", weights=run, recipe=replace(SMALL, validation=0.5))
+        train_recogniser(views, tmp_path / "seen", weights=run, recipe=replace(SMALL, validation_share=0.5))
     with pytest.raises(ModelError, match="other first weights"):
         train_map(views, tmp_path / "lem", recipe=replace(SMALL_MAP, lr=0.0))
     with pytest.raises(ModelError, match=r"another recipe \(epochs was 1, not 2\)"):
@@ -383,13 +383,13 @@ def test_a_network_goes_on_from_a_run(trained, views, tmp_path):
 
 
 def test_the_published_networks_train_on_images_and_clouds(views, tmp_path):
-    image = replace(THESIS_RECOGNISER, depth=18, epochs=1, size=32, views=1, batch=4, validation=0.25)
+    image = replace(THESIS_RECOGNISER, layers=18, epochs=1, size=32, views_per_object=1, batch=4, validation_share=0.25)
     assert train_recogniser(views, tmp_path / "image", recipe=image) == [tmp_path / "image"]
     run = read_run(tmp_path / "image")
     assert run.recipe == asdict(image)
     assert set(run.validation) == set(run.held_out)
     assert torch.load(tmp_path / "image/network.pt", weights_only=True)["conv1.weight"].shape == (64, 1, 7, 7)
-    cloud = replace(THESIS_MAP, epochs=1, views=1, points=64, validation=0.25)
+    cloud = replace(THESIS_MAP, epochs=1, views_per_object=1, points=64, validation_share=0.25)
     train_map(views, tmp_path / "cloud", recipe=cloud)
     made = export_map(tmp_path / "cloud", views, tmp_path, name="published")
     seen = from_store(InputSpec("cloud"), ViewStore.open(views), 0)[:2]

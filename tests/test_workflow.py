@@ -84,10 +84,9 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
     for command in ("render ModelNet10 sensed-held-out.zarr --sensor mix", "fit calibration", "fit size", "fit valleys",
                     "train gain", "evaluate", "benchmark", "report"):  # fmt: skip
         assert f"nextview {command} " in planned
-    for script in ("fit_policies validation.npz policies", "measure views.zarr", "train_agent ppo validation.npz",
-                   "plan views.zarr volumetric coverage"):  # fmt: skip
+    for script in ("fit_policies validation.npz policies", "measure_study views.zarr measures --meshes",
+                   "train_agent ppo validation.npz", "plan views.zarr volumetric coverage"):  # fmt: skip
         assert f"python -m research.{script}" in planned
-    assert "research.measure_study test.npz validation.npz --out measures" in planned
     assert "docs/results.md" in planned
 
 

@@ -50,7 +50,7 @@ def test_an_agent_finds_the_ring_of_the_class_believed(tmp_path, preset):
     names, entropy = tuple(map(str, range(150))), np.random.default_rng(0).random((150, 12)).astype(np.float32)
     about = (("a", "b", "c"), np.array(["train"] * 150), np.zeros(150, bool), SMALL, {}, {}, Calibration(1.01))
     Predictions(logits, {}, entropy, names, labels, *about).save(tmp_path / "p.npz")
-    learns = ["--steps", "24000", "--envs", "64", "--evaluations", "4", "--batch", "256", "--n-views", "2"]
+    learns = ["--steps", "24000", "--envs", "64", "--evaluations", "4", "--batch", "256", "--max-views", "2"]
     train([preset, str(tmp_path / "p.npz"), str(tmp_path / "a.json"), *learns, "--objective", "log-belief", *PLAIN])
     labels, logits = hinting(90, seed=1)
     fresh = ReplayTable(train_predictions(logits, labels, SMALL, ("a", "b", "c"), calibration=Calibration(1.01)))

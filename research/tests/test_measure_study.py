@@ -22,7 +22,7 @@ def made(views, tmp_path_factory):
     """The recogniser sees chairs and monitors best where most of them shows, and tables where least does."""
     folder = tmp_path_factory.mktemp("study")
     shutil.copytree(views, folder / "views.zarr")
-    list(measure(folder / "views.zarr", ["view_area", "above_preference"], workers=0))
+    list(measure(folder / "views.zarr", ["view_area"], workers=0))
     store = ViewStore.open(folder / "views.zarr")
     area, labels = store.measure("view_area"), store.labels
     scaled = (area - area.min(1, keepdims=True)) / np.ptp(area, axis=1, keepdims=True)
@@ -35,8 +35,10 @@ def made(views, tmp_path_factory):
     )  # fmt: skip
     p.of_objects(np.arange(0, 18, 2)).save(folder / "test.npz")
     p.of_objects(np.arange(1, 18, 2)).save(folder / "validation.npz")
-    options = {"policies": ("unidirectional", "true-view_area-5"), "runs": 4, "samples": 50}
-    STUDY["main"](folder / "test.npz", folder / "validation.npz", folder / "out", **options)
+    options = {"policies": ("unidirectional", "true-view_area-5"), "runs": 4, "samples": 50, "workers": 0}
+    options["measures"] = ("view_area", "above_preference", "confidence")
+    predictions = {"test": folder / "test.npz", "validation": folder / "validation.npz"}
+    STUDY["main"](folder / "views.zarr", folder / "out", **predictions, **options)
     return folder
 
 

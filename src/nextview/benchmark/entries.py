@@ -18,7 +18,7 @@ from nextview.policies.maps import MapPeak
 from nextview.policies.oracle import OracleGain, OracleMeasure, OracleValley
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import DEFAULT, VISIBLE, make_policy, map_policy, map_policy_names, policy_names
-from nextview.recognition.map_names import LCM, LEM, SPHERE, in_order
+from nextview.recognition.map_names import LCM, LEM, SPHERE, in_order, map_name
 
 
 @dataclass(frozen=True)
@@ -121,8 +121,12 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
     match = MAP_ORACLE.fullmatch(name)
     true, base, how = match.groups("") if match else ("", "", "")
     predicted = [name for name in p.maps if how == "-oracle-valley" and not name.endswith(SPHERE)]
+    base = map_name(base) if true else base  # the true map of a measure, by either name
     if base in (known_maps(p) if true else predicted):
         return _oracle(specs, true, base, how)
+    if true and base.isidentifier():
+        there = ", ".join(f"{TRUE}{known}" for known in known_maps(p))
+        raise EntryError(f"no true map is called {name!r}; there are {there}, and more after nextview measure")
     known = plain in policy_names() or map_policy(plain, p.sphere, (), p.maps) is not None
     card = plain.removeprefix(VISIBLE)
     if known or card in bundled_policies() or card.endswith(".json") or ":" in name:

@@ -23,8 +23,10 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
     sphere = result.sphere
     table = Table(box=box.SIMPLE, show_lines=True, pad_edge=False, padding=(0, 1, 0, 0))
     table.title = f"Looking at {name}, next views by {policy}"
-    table.caption = f"view: number, elevation, azimuth; travel: grid cells; stops at {result.stopping}"
-    for column in ("step", "view", "this view alone", "belief, top 3", "stops at", "next", "travel"):
+    table.caption = f"view: number, elevation, azimuth; travel: grid cells; stops by {result.stopping}"
+    stops = [float(result.stopping.threshold_at(step)) for step in range(1, len(result.views) + 1)]
+    enough = ["stops at"] * any(np.isfinite(stops))  # a rule of your own need not stop at a belief
+    for column in ("step", "view", "this view alone", "belief, top 3", *enough, "next", "travel"):
         table.add_column(column, justify="right" if column in ("step", "travel") else "left", no_wrap=True)
     if frames:  # their names may be long
         table.columns[1].no_wrap, table.columns[1].overflow = False, "fold"
@@ -37,7 +39,7 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
             _angles(view.index, view.angles) + (f"\n{frames[step - 1]}\n{view.degrees_off:.1f}° off" if frames else ""),
             f"{result.classes[own]}\n{view.alone[own]:.3f}" if view.observation.seen else "nothing\nis seen",
             "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top),
-            f"{float(result.stopping.threshold_at(step)):.2f}",
+            *[f"{stops[step - 1]:.2f}"] * len(enough),
             "stop" if view.next_view is None else _angles(view.next_view, sphere.angles(view.next_view)),
             f"{view.travel:.2f}",
         )
@@ -47,7 +49,7 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
         for warning in view.warnings:
             console.print(f"Step {step}: warning ({warning.name}): {warning.message}.")
     left = "no other view in reach" if result.stranded else "not confident"
-    reason = "threshold reached" if result.confident else left
+    reason = ("threshold reached" if enough else f"{result.stopping}") if result.confident else left
     views = f"{len(result.views)} view{'s' * (len(result.views) > 1)}"
     rest = f"{result.views[-1].belief.max():.3f}, after {views} and {result.travel:.2f} cells of travel ({reason})."
     if result.unknown:
@@ -89,4 +91,4 @@ def _plain(value: Any) -> Any:
         value = value.tolist()
     if isinstance(value, list | tuple):
         return [_plain(each) for each in value]
-    return (None if np.isnan(value) else round(value, 6)) if isinstance(value, float) else value
+    return (round(value, 6) if np.isfinite(value) else None) if isinstance(value, float) else value

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from nextview.cli.progress import console
-from nextview.cli.sources import Looking
+from nextview.cli.sources import Looking, Unit
 
 
 def explore(
@@ -19,6 +19,7 @@ def explore(
     sensor: str | None = None,
     start: int | None = None,  # where policies look first; drawn by the seed if not given
     up: Literal["y", "z"] | None = None,  # the up axis of mesh files; z if not given, but y for GLB
+    unit: Unit | None = None,  # the unit of length of mesh files: the size of an object says something of its class
     seed: int = 0,  # decides the first view, whatever a policy draws and the errors of a sensor
     # address to serve the page at; 0.0.0.0 lets every machine that reaches this one see and drive the page
     host: str = "127.0.0.1",
@@ -37,7 +38,7 @@ def explore(
 
     options = dict(vars(looking))
     policies = [options.pop("policy"), *([] if compare is None else [compare])]
-    page = Page(Exploration(shown_objects(path, up), policies, sensor, start, seed, **options), host, port)
+    page = Page(Exploration(shown_objects(path, up, unit), policies, sensor, start, seed, **options), host, port)
     console.print(f"{page.address} shows {len(page.exploration.objects)} objects; Ctrl-C ends it")
     if host not in ("127.0.0.1", "localhost", "::1"):
         console.print("Everybody who reaches this address may drive the page.", style="yellow")

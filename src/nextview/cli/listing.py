@@ -47,8 +47,8 @@ def show(
 
 
 def download(
-    dataset: Literal["modelnet10", "modelnet40"],  # which one
-    destination: Path,  # folder to put it into, as DESTINATION/ModelNet10
+    name: Literal["modelnet10", "modelnet40"],  # which one
+    out: Path,  # folder to put it into, as OUT/ModelNet10
     /,
 ) -> None:
     """Download ModelNet10 (473 MB) or ModelNet40 (2 GB), verify and unpack it."""
@@ -57,10 +57,10 @@ def download(
     from nextview.data.downloading import ARCHIVES
     from nextview.data.downloading import download as fetch
 
-    archive = ARCHIVES[dataset]
+    archive = ARCHIVES[name]
     columns = BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()
     with Progress(TextColumn("{task.description}"), *columns, console=console) as progress:
         move = partial(progress.update, progress.add_task(f"downloading {archive.folder}", total=None))
         bar = SimpleNamespace(total=0, reset=partial(move, completed=0), close=lambda: None)  # as pooch wants it
         bar.update = lambda advance: move(advance=advance, total=bar.total)
-        console.print(f"{fetch(archive, destination, bar=bar)}")
+        console.print(f"{fetch(archive, out, bar=bar)}")

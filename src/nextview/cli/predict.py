@@ -19,7 +19,7 @@ def predict(
     split: Split | None = None,  # only this split
     models: str = "modelnet10",  # bundled models by name, or a folder with models of your own
     recogniser: str | None = None,  # instead, name of a bundled model or path of a card
-    held_out: bool = False,  # only objects that were held out from the training of the recogniser
+    held_out: str | None = None,  # only the objects that this model (its name or card) held out of its training
     # maps to predict with those models, or NAME=CARD for others; all that those models predict by default
     maps: tuple[str, ...] | None = None,
     # recognise by shape alone. By default the size of the objects counts too, where the store knows it (nextview render

@@ -20,12 +20,11 @@ def scenes(
     out: Path,  # folder for the scenes; those that are there are kept
     /,
     # how much of the target shows, on the average over the 40 views: light 85 %, medium 65 %, heavy 45 %
-    level: tuple[Level, ...] = ("light", "medium", "heavy"),
+    levels: tuple[Level, ...] = ("light", "medium", "heavy"),
     scenes: int | None = None,  # how many at each level, of each split; by default one around each object
     split: Split | None = None,  # only this one
-    # only around objects that the model of this card (NAME.json) calls held out of its training: scenes for learning
-    # policies
-    held_out: Path | None = None,
+    # only around objects that this model (its name or card) held out of its training, for learning policies
+    held_out: str | None = None,
     seed: int = 0,  # decides which objects are targets, and all that stands around them
     workers: Workers = Workers(),
 ) -> None:
@@ -35,8 +34,8 @@ def scenes(
     Resumes where it was. Objects of one split stand only among objects of that split. Render them with nextview render
     OUT STORE --meshes MESHES, and go on as with any other store.
     """
-    total = len(scene_drawing.tasks(meshes, out, level, scenes, seed, split, held_out))
-    drawn = scene_drawing.draw_scenes(meshes, out, level, scenes, seed, split, **vars(workers), held_out=held_out)
+    total = len(scene_drawing.tasks(meshes, out, levels, scenes, seed, split, held_out))
+    drawn = scene_drawing.draw_scenes(meshes, out, levels, scenes, seed, split, **vars(workers), held_out=held_out)
     failed = track_all(drawn, total, f"drawing {out.name}")
     if len(failed) == total:
         raise DatasetError(f"{out}: none of the {total} scenes can be drawn; see the reasons above")
@@ -45,7 +44,7 @@ def scenes(
 
 def capture(
     mesh: Path,  # OFF, OBJ, PLY, STL or GLB file of one object that stands upright
-    folder: Path,  # to write, in the layout of the BOP challenge; whole or not there at all
+    out: Path,  # folder to write, in the layout of the BOP challenge; whole or not there at all
     /,
     viewpoints: Literal["40", "12"] = "40",  # from where it is captured, as in nextview recognise
     table: bool = False,  # the object stands on a table, which is seen too; without one, masks are written
@@ -58,12 +57,12 @@ def capture(
     """Write captured views of a mesh: depth images, poses, intrinsics, as ``nextview recognise FOLDER`` reads them."""
     from nextview.simulation.capturing import write_capture
 
-    check_new(folder, overwrite, folder=True)
+    check_new(out, overwrite, folder=True)
     loaded = load_mesh(mesh, up, unit, max_faces)
     metres = loaded.metres if radius is None else radius
     if metres is None:
         raise UsageError(f"{mesh}: how large is it? Give the file's --unit or the object's --radius in metres")
     sphere = ViewSphere.named(viewpoints)
-    frames = write_capture(loaded, folder, sphere, metres, table, not table, overwrite)
+    frames = write_capture(loaded, out, sphere, metres, table, not table, overwrite)
     track(frames, len(sphere), f"capturing {mesh.name}")
-    console.print(f"{folder}: {len(sphere)} views; look at them with: nextview recognise {folder}")
+    console.print(f"{out}: {len(sphere)} views; look at them with: nextview recognise {out}")

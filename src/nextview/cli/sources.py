@@ -25,8 +25,8 @@ class Looking:
 
     models: str = "modelnet10"  # bundled models by name, or a folder with models of your own
     # chooses the next view: gain (the predicted gain of a view less its weighted travel; the default), MAP, MAP-peak or
-    # MAP-sphere-peak for a map of the models (lem, lcm), random, random-all, furthest, unidirectional, spread,
-    # spread-local, the card of a learned one (.json), or MODULE:CLASS for your own
+    # MAP-sphere-peak for a map of the models (lem, lcm), discriminate (the default of taught things), random,
+    # random-all, furthest, unidirectional, spread, spread-local, the card of a learned one (.json), or MODULE:CLASS
     policy: str | None = None
     threshold: float = 0.97  # stop when the belief in one class reaches this after one view, less after several
     # instead, stop at the lowest threshold at which at most this share of those who stop early is wrong
@@ -61,7 +61,7 @@ class Source:
     # of a folder: FX FY CX CY, pixels, or a file with the pinhole matrix
     intrinsics: tuple[float, float, float, float] | Path | None = None
     raw: bool = False  # of a folder: take the depth as it is, without denoising
-    any_size: bool = False  # of a folder: the object's size says nothing of its class, as with toys
+    by_shape: bool = False  # of a folder: the object's size says nothing of its class, as with toys
 
     def camera(self, path: Path, seed: int) -> Camera | FrameCamera:
         """A camera before the object of a mesh file or of a folder."""
@@ -90,7 +90,7 @@ class Source:
             if upwards is None:
                 raise UsageError(f"{folder}: a box is upright, and in this layout nothing tells where up is: give --up")
             box = Box(np.array(self.box[:3]), np.array(self.box[3:]), upright_axes(upwards))
-        return CapturedCamera(capture, up, self.point, box, not self.raw, not self.any_size)
+        return CapturedCamera(capture, up, self.point, box, not self.raw, not self.by_shape)
 
 
 def check_file(path: Path | None, overwrite: bool, kinds: tuple[str, ...] = PICTURES) -> None:

@@ -90,8 +90,7 @@ def measure(
     # names (see nextview list measures), or MODULE:FUNCTION of your own; by default all that need the depth alone
     measures: tuple[str, ...] = (),
     split: Split | None = None,  # only this split
-    # only the objects that this model, bundled or a card (NAME.json), calls held out of its training
-    held_out: str | None = None,
+    held_out: str | None = None,  # only the objects that this model (its name or card) held out of its training
     objects: int | None = None,  # only so many of these, spread evenly; twice as many later hold the same
     workers: Workers = Workers(),
     overwrite: bool = False,  # measure anew what is there

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import FORMATS
-from nextview.recognition.model_card import read_card
+from nextview.recognition.model_card import find_card
 
 SPLITS = ("train", "test", "val")
 FEW = 3  # files that are named of those left out for one reason
@@ -79,13 +79,13 @@ def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> Listi
     return Listing(sorted(_named(entries, root), key=lambda e: (e.label, e.split != "train", e.name)), left_out)
 
 
-def select(entries: list[Entry], dataset: Path, split: str | None, held_out: Path | None) -> list[Entry]:
+def select(entries: list[Entry], dataset: Path, split: str | None, held_out: str | Path | None) -> list[Entry]:
     """Those of one split, and those (meshes, or scenes by their target) that a card calls held out of its training."""
     entries = [entry for entry in entries if split in (None, entry.split)]
     if not entries:
         raise DatasetError(f"{dataset}: nothing in CLASS/{split}/NAME below it")
     if held_out is not None:
-        kept = set(read_card(held_out).held_out)
+        kept = set(find_card(held_out).held_out)
         entries = [entry for entry in entries if entry.name.partition("@")[0] in kept]
         if not entries:
             raise DatasetError(f"{dataset}: holds no object that {held_out} calls held out")

@@ -34,7 +34,7 @@ def predict(
     recogniser: ModelCard,
     maps: Cards,
     split: str | None = None,
-    held_out: bool = False,
+    held_out: ModelCard | str | Path | None = None,
     size: bool = True,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -50,7 +50,7 @@ def predict(
     path, out = Path(path), Path(out)
     check_new(out, overwrite)
     store = ViewStore.open(path)
-    objects = some_objects(store, split, recogniser if held_out else None)
+    objects = some_objects(store, split, held_out)
     plan, radii, of_size = _plan(store, objects, recogniser, maps), store.radii[objects], None
     if size and recogniser.size is not None and not np.isnan(radii).all():
         of_size = recogniser.size.logits(radii).astype(np.float32)

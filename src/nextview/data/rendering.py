@@ -87,7 +87,7 @@ class RenderOptions:
     # of length in the mesh files (mm, cm, inch, foot, m), so that sizes are known (ModelNet: inch)
     unit: str | None = None
     split: str | None = None  # only this split of the dataset
-    held_out: Path | None = None  # only objects that the model of this card calls held out of its training
+    held_out: str | None = None  # only the objects that this model (its name or card) held out of its training
     meshes: Path | None = None  # of scenes: the folder of the meshes that they are made of
     max_faces: int = MAX_FACES  # leave out a mesh of more triangles, or a file of more than 60 bytes for each of these
 

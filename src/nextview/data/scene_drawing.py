@@ -84,7 +84,7 @@ def draw_scenes(
     split: str | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
-    held_out: Path | None = None,
+    held_out: str | Path | None = None,
 ) -> Iterator[tuple[str, str | None]]:
     """Draw the scenes that are not in the folder yet. Which they are depends on the seed alone.
 
@@ -119,7 +119,7 @@ def tasks(
     scenes: int | None,
     seed: int,
     split: str | None,
-    held_out: Path | None = None,
+    held_out: str | Path | None = None,
 ) -> list[Task]:
     """All scenes that are asked for, see ``draw_scenes``."""
     unknown = [level for level in levels if level not in LEVELS]

@@ -48,7 +48,7 @@ def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple
 
 def check_any(store: ViewStore, training: Indices, validation: Indices, lacking: str = "") -> None:
     """Refuse to train on no object, or to validate with none; ``lacking`` says why some may be missing."""
-    for objects, what in ((training, "to train on"), (validation, "to validate with (see --validation)")):
+    for objects, what in ((training, "to train on"), (validation, "to validate with (see --validation-share)")):
         if len(objects) == 0:
             raise DatasetError(f"{store.path}: no object is left {what}{lacking}")
 

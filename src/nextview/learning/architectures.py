@@ -181,7 +181,7 @@ def recogniser_network(recipe: RecogniserRecipe, classes: int, azimuths: int) ->
     channels = CHANNELS_OF[recipe.input]
     if recipe.network == "lite0":
         return LiteNet(classes, channels, azimuths, recipe.dropout)
-    return ResNet(recipe.depth, classes, channels, azimuths)
+    return ResNet(recipe.layers, classes, channels, azimuths)
 
 
 def _dense(between: tuple[nn.Module, ...]) -> nn.Sequential:
@@ -256,13 +256,13 @@ def map_network(recipe: MapRecipe, sphere: ViewSphere) -> nn.Module:
     columns = len(map_columns(recipe, sphere))
     if recipe.input == "cloud":
         return PointNet(sphere.rings, columns)
-    network = ViewMap(sphere.rings, columns, recipe.depth, CHANNELS_OF[recipe.input])
+    network = ViewMap(sphere.rings, columns, recipe.layers, CHANNELS_OF[recipe.input])
     return network.to(memory_format=torch.channels_last)
 
 
 def map_columns(recipe: MapRecipe, sphere: ViewSphere) -> list[int]:
     """Azimuth steps from the view to each column of a map: -1, 0, +1, or 0, 1, ... once round."""
-    return [-1, 0, 1] if recipe.output == "window" else list(range(sphere.azimuths))
+    return [-1, 0, 1] if recipe.extent == "window" else list(range(sphere.azimuths))
 
 
 def orthogonality(matrix: Tensor) -> Tensor:

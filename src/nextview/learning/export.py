@@ -156,7 +156,7 @@ def export_recogniser(
     run: Path,  # folder made by nextview train recogniser
     store: Path,  # that it was trained on
     out: Path,  # folder for NAME.onnx and NAME.json
-    also: tuple[Path, ...] = (),  # further runs on the same store and input; the logits of all are averaged
+    ensemble: tuple[Path, ...] = (),  # further runs on the same store and input; the logits of all are averaged
     bits: Literal[8, 16] = 16,  # that a weight takes in the file
     name: str | None = None,  # of the model; by default recogniser-DATASET, after the mesh folder of the store
     note: str = "",  # what else the card should say
@@ -169,7 +169,7 @@ def export_recogniser(
         ModelError: a run is not finished or of another store, runs do not fit together, or the file's answers differ.
         ResultsError: the model exists.
     """
-    return _export(_recogniser((run, *also), store, name, note), out, bits, overwrite, track)
+    return _export(_recogniser((run, *ensemble), store, name, note), out, bits, overwrite, track)
 
 
 def _recogniser(folders: Sequence[Path], store: Path, name: str | None, note: str) -> _Candidate:
@@ -245,7 +245,7 @@ def _map(run: Path, store: Path, predictions: Path | None, name: str | None, not
         kind,
         spec,
         "",
-        network="PointNet with both transforms" if spec.kind == "cloud" else f"ResNet-{recipe.depth}",
+        network="PointNet with both transforms" if spec.kind == "cloud" else f"ResNet-{recipe.layers}",
         measure=recipe.measure,
         good=good,
         output="sphere" if shipped.whole else "window",

@@ -103,7 +103,7 @@ def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np
     """
     sphere, parts = table.data.sphere, []
     for policy in policies:
-        for moment in rollout(table, policy, recipe.n_views - 1, rng, VISIBILITY in recipe.inputs):
+        for moment in rollout(table, policy, recipe.max_views - 1, rng, VISIBILITY in recipe.inputs):
             state = moment.state
             view = cells_from(sphere)[origin(sphere, state, recipe.frame)]
             value = np.take_along_axis(candidate_values(table, moment, recipe.objective), view, 1)
@@ -123,17 +123,17 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
     widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)]))
     scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
     first = [
-        scale * torch.randn(recipe.networks, *width, generator=generator)
+        scale * torch.randn(recipe.networks_per_fold, *width, generator=generator)
         for scale, width in zip(scales, widths, strict=True)
     ]
-    biases = [torch.zeros(recipe.networks, 1, outputs) for _, outputs in widths]
+    biases = [torch.zeros(recipe.networks_per_fold, 1, outputs) for _, outputs in widths]
     networks = Perceptrons(first, biases, features_flip, mirrored(sphere))
-    drawn = rng.multinomial(n, np.full(n, 1 / n), size=recipe.networks)
+    drawn = rng.multinomial(n, np.full(n, 1 / n), size=recipe.networks_per_fold)
     weights = torch.from_numpy(drawn * data.weights).float()
     optimiser = torch.optim.AdamW(networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay)
-    batches = -(-recipe.walks * (recipe.n_views - 1) * n // recipe.batch)
+    batches = -(-recipe.episodes * (recipe.max_views - 1) * n // recipe.batch)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.lr, total_steps=recipe.epochs * batches)
-    policies: list[Policy] = [(Random, RandomAll)[i % 2](sphere) for i in range(recipe.walks)]
+    policies: list[Policy] = [(Random, RandomAll)[i % 2](sphere) for i in range(recipe.episodes)]
     for _ in range(recipe.epochs):
         *states, objects = walk(table, policies, recipe, rng)
         for batch in np.array_split(rng.permutation(len(objects)), batches):
@@ -156,7 +156,7 @@ def best_epoch(folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], r
     best = None
     for policies in zip(*folds, strict=True):
         judged = list(zip(tables, policies, strict=True))
-        value = judge_all(judged, recipe.n_views, recipe.objective, [recipe.seed, 2], rounds=4)
+        value = judge_all(judged, recipe.max_views, recipe.objective, [recipe.seed, 2], rounds=4)
         if best is None or value.mean.mean() > best[1].mean.mean():
             best = policies, value
         yield best
@@ -248,7 +248,7 @@ def train_gain(
     policies = [replace(policy, scope="local" if local else "global") for policy in chosen]
     if travel_weight is None:
         judged = list(zip(data.validated, policies, strict=True))
-        travel_weight = fit_travel_weight(judged, recipe.n_views, recipe.objective, recipe.seed)
+        travel_weight = fit_travel_weight(judged, recipe.max_views, recipe.objective, recipe.seed)
     policy = replace(averaged(policies), travel_weight=travel_weight)
     states = np.concatenate([walk(part, [policy], recipe, data.rng)[0] for part in data.validated])
     difference = write_gain(out, policy, data.about, states)

@@ -40,21 +40,21 @@ class Windows(OwnBatches):
         self.around = np.arange(sphere.rings)[None, :, None] * n + azimuths[:, None, :]  # (V, rings, columns)
         self.mirror = [list(steps % n).index(-step % n) for step in steps]
         self.recipe, self.training = recipe, training
-        self.batch = min(recipe.batch, len(objects) * recipe.views)
+        self.batch = min(recipe.batch, len(objects) * recipe.views_per_object)
 
     def __len__(self) -> int:
-        return len(self.objects) * self.recipe.views // self.batch
+        return len(self.objects) * self.recipe.views_per_object // self.batch
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
         rng = np.random.default_rng([self.recipe.seed, self.epoch])
         n, v, batch = len(self) * self.batch, len(self.poses), self.batch
         if self.training:  # every object as often as any other, and each of its views before one comes again
             turns = np.argsort(rng.random((v, len(self.objects))), axis=0)
-            views = np.resize(turns, (self.recipe.views, len(self.objects))).flatten()
-            objects, order = np.tile(self.objects, self.recipe.views), rng.permutation(len(views))[:n]
+            views = np.resize(turns, (self.recipe.views_per_object, len(self.objects))).flatten()
+            objects, order = np.tile(self.objects, self.recipe.views_per_object), rng.permutation(len(views))[:n]
             objects, views = objects[order], views[order]
         else:  # the same spread of views every time
-            objects, views = np.repeat(self.objects, self.recipe.views)[:n], (np.arange(n) * 7) % v
+            objects, views = np.repeat(self.objects, self.recipe.views_per_object)[:n], (np.arange(n) * 7) % v
         mirrored = rng.random(n) < 0.5 * (self.training and self.recipe.mirror)
         for here in np.arange(n).reshape(-1, batch)[:, self.share]:
             points = rng.permutation(1024)[: self.recipe.points] if self.training else np.arange(1024)
@@ -101,11 +101,13 @@ class MapModule(L.LightningModule):
         near, goal = predicted[..., self.window], true[..., self.window]
         error = F.mse_loss(near, goal)
         self.log("mse", error, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True)
-        if self.recipe.output == "sphere":
+        if self.recipe.extent == "sphere":
             error = (error + F.mse_loss(predicted, true)) / 2
-        if self.recipe.peak:
-            error = error + self.recipe.peak * peak_loss(near / self.recipe.sharpness, goal, self.recipe.reach)
-        return error + self.recipe.regular * sum(orthogonality(t.float()) for t in transforms)
+        if self.recipe.peak_weight:
+            error = error + self.recipe.peak_weight * peak_loss(
+                near / self.recipe.peak_sharpness, goal, self.recipe.peak_reach
+            )
+        return error + self.recipe.orthogonality_weight * sum(orthogonality(t.float()) for t in transforms)
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
         error = F.mse_loss(self(batch[0])[0].float()[..., self.window], batch[1][..., self.window])
@@ -136,7 +138,7 @@ def train_map(
     views = ViewStore.open(store)
     predicted = None if predictions is None else Predictions.load(predictions)
     values, there = target_of(recipe.measure, views, predicted)
-    aside = split_training(views, recipe.validation, recipe.seed)
+    aside = split_training(views, recipe.validation_share, recipe.seed)
     training, validation = (part[there[part]] for part in aside)
     check_any(views, training, validation, "" if there.all() else ": of the others no map is known")
     held_out = [views.names[i] for i in aside[1]]  # those without values too

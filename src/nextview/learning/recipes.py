@@ -16,7 +16,7 @@ class Hardware:
 
 
 POLICY_INPUTS = ("belief", "view", "place", "lem-sphere", "azimuth_bin")  # of the bundled policy
-Depth = Literal[18, 34, 50, 101, 152]
+Layers = Literal[18, 34, 50, 101, 152]
 
 
 def _check(recipe: Any, at_least_one: tuple[str, ...], shares: tuple[str, ...] = ()) -> None:
@@ -31,13 +31,13 @@ class RecogniserRecipe:
     """How the recogniser is trained."""
 
     network: Literal["resnet", "lite0"] = "resnet"  # or EfficientNet-Lite0, a fifth of a ResNet-18's arithmetic
-    depth: Depth = 18  # of the ResNet
+    layers: Layers = 18  # of the ResNet
     # of EfficientNet-Lite0: chance that a pooled feature is dropped; the chance that a block is skipped for a view
     # rises from 0 at the first towards it at the last
     dropout: float = 0.0
     size: int = 112  # side of the input image, pixels
     epochs: int = 12  # passes over the training objects
-    views: int = 8  # of each object in one epoch, drawn at random
+    views_per_object: int = 8  # of each object in one epoch, drawn at random
     batch: int = 64  # views a step
     lr: float = 2e-3  # peak learning rate of AdamW
     weight_decay: float = 0.05  # of AdamW
@@ -45,28 +45,28 @@ class RecogniserRecipe:
     # weight of the loss for the azimuth bin from which the object is seen, beside that of its class; 0 does without.
     # All objects of a class have to face the same way in their files, as ModelNet10's do
     azimuth_bins_weight: float = 0.0
-    validation: float = 0.1  # part of the training split held out for validation
+    validation_share: float = 0.1  # part of the training split held out for validation
     deformed_share: float = 0.5  # chance that a view is drawn from the deformed objects, where they are given
     seed: int = 0  # decides everything random
     ensemble_seed: int = 0  # of one network of an ensemble: its first weights and draws; --seed: what validates all
     input: Literal["geometry", "image"] = "geometry"  # what the network sees: a depth camera's, or the shaded image
     augment: bool = True  # whether views are varied: mirrored, shifted, scaled, partly hidden
     balanced: bool = True  # draw rare classes more often; else every view comes once before any comes again
-    schedule: Literal["one-cycle", "halving"] = "one-cycle"  # of the rate: up and down, or halved every fifth epoch
+    lr_schedule: Literal["one-cycle", "halving"] = "one-cycle"  # of the rate: up and down, or halved every fifth epoch
     patience: int = 0  # stop after so many epochs without a better class mean on validation; 0 never stops early
     # how far the parameters go in the end, from the first to the trained ones. Less than 1 keeps more of what the
     # network learned before (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022)
-    way: float = 1.0
+    interpolation: float = 1.0
 
     def __post_init__(self) -> None:
-        _check(self, ("size", "epochs", "views", "batch"), ("dropout", "smoothing", "validation"))
+        _check(self, ("size", "epochs", "views_per_object", "batch"), ("dropout", "smoothing", "validation_share"))
 
 
 THESIS_RECOGNISER = RecogniserRecipe(
-    depth=34,
+    layers=34,
     size=224,
     epochs=15,
-    views=40,
+    views_per_object=40,
     batch=32,
     lr=1e-3,
     weight_decay=0.0,
@@ -75,7 +75,7 @@ THESIS_RECOGNISER = RecogniserRecipe(
     input="image",
     augment=False,
     balanced=False,
-    schedule="halving",
+    lr_schedule="halving",
 )
 """As published (thesis, section 5.1). The epochs and the validation part are ours: the text names neither, and its map
 networks settle around the tenth epoch (section 6.2.2)."""
@@ -91,40 +91,40 @@ class MapRecipe:
     # what the network sees: the geometry of the view, through a ResNet; or the partial cloud, through a PointNet, as
     # published
     input: Literal["geometry", "cloud"] = "geometry"
-    depth: Depth = 18  # of the ResNet
+    layers: Layers = 18  # of the ResNet
     size: int = 56  # side of the ResNet's input image, pixels
     points: int = 256  # drawn from each cloud in training; validation and use take all 1,024
-    output: Literal["window", "sphere"] = "sphere"  # what it predicts: the local window alone, or all views
+    extent: Literal["window", "sphere"] = "sphere"  # what it predicts: the local window alone, or all views
     epochs: int = 8  # passes over the training objects
-    views: int = 12  # of each object in one epoch, drawn at random
+    views_per_object: int = 12  # of each object in one epoch, drawn at random
     batch: int = 64  # views a step
     lr: float = 2e-3  # peak learning rate of AdamW
     weight_decay: float = 0.05  # of AdamW
-    regular: float = 1e-4  # weight of the orthogonality terms of the PointNet's transforms
-    peak: float = 0.0  # weight of the cross-entropy of the window's highest cell, beside the squared error of all
-    sharpness: float = 0.05  # of --peak: values are divided by it to give log-odds
-    reach: int = 0  # of --peak: 0 for the highest cell itself, 1 for its four neighbours too
+    orthogonality_weight: float = 1e-4  # of the orthogonality terms of the PointNet's transforms
+    peak_weight: float = 0.0  # of the cross-entropy of the window's highest cell, beside the squared error of all
+    peak_sharpness: float = 0.05  # of --peak-weight: values are divided by it to give log-odds
+    peak_reach: int = 0  # of --peak-weight: 0 for the highest cell itself, 1 for its four neighbours too
     mirror: bool = True  # whether left and right are exchanged in half of the views, in the map too
-    schedule: Literal["one-cycle", "tenth"] = "one-cycle"  # of the rate: up and down, or a tenth every fifth epoch
-    validation: float = 0.1  # part of the training split held out for validation
+    lr_schedule: Literal["one-cycle", "tenth"] = "one-cycle"  # of the rate: up and down, or a tenth every fifth epoch
+    validation_share: float = 0.1  # part of the training split held out for validation
     seed: int = 0  # decides everything random
     patience: int = 0  # stop after so many epochs without a lower error on validation; 0 never stops early
 
     def __post_init__(self) -> None:
-        _check(self, ("size", "points", "epochs", "views", "batch"), ("validation",))
+        _check(self, ("size", "points", "epochs", "views_per_object", "batch"), ("validation_share",))
 
 
 THESIS_MAP = MapRecipe(
     input="cloud",
     points=1024,
-    output="window",
+    extent="window",
     epochs=15,
-    views=40,
+    views_per_object=40,
     batch=16,
     lr=1e-3,
     weight_decay=0.0,
     mirror=False,
-    schedule="tenth",
+    lr_schedule="tenth",
 )
 """As published (thesis, sections 2.2.3 and 5.1): PointNet, every view once an epoch. The epochs are ours."""
 
@@ -141,16 +141,16 @@ class GainRecipe:
     frame: Literal["camera", "object"] = "object"
     # value of a view: the belief in the true class after it, its logarithm, or whether the answer is right
     objective: Literal["belief", "log-belief", "right"] = "log-belief"
-    n_views: int = 5  # the values of views 2 to this one are learned
+    max_views: int = 5  # the values of views 2 to this one are learned
     hidden: int = 32  # width of the two hidden layers
-    networks: int = 2  # averaged, of each fold; each weighs the objects by a bootstrap draw of its own
-    epochs: int = 15  # each over new walks of all objects
-    walks: int = 8  # of each object in an epoch
+    networks_per_fold: int = 2  # averaged, of each fold; each weighs the objects by a bootstrap draw of its own
+    epochs: int = 15  # each over new episodes of all objects
+    episodes: int = 8  # of each object in an epoch
     batch: int = 1024  # states in a step
     lr: float = 3e-3  # AdamW's learning rate at its peak (one-cycle)
     weight_decay: float = 0.1  # AdamW's
     seed: int = 0  # of everything random
 
     def __post_init__(self) -> None:
-        _check(self, ("hidden", "networks", "epochs", "walks", "batch"))
-        whole(self.n_views, "--n-views", 2)
+        _check(self, ("hidden", "networks_per_fold", "epochs", "episodes", "batch"))
+        whole(self.max_views, "--max-views", 2)

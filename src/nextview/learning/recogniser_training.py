@@ -43,7 +43,7 @@ class Views(OwnBatches):
         self.sources, self.objects, self.labels, self.recipe = sources, objects, labels, recipe
         count = np.bincount(labels[objects])[labels[objects]]
         self.weights = count**-0.5 / (count**-0.5).sum()
-        views = recipe.views if recipe.balanced else min(recipe.views, sources[0].inputs.shape[1])
+        views = recipe.views_per_object if recipe.balanced else min(recipe.views_per_object, sources[0].inputs.shape[1])
         self.drawn = len(objects) * views
         self.batch = min(recipe.batch, self.drawn)
 
@@ -176,7 +176,7 @@ def fit_recogniser(
     validation = ValidationViews(sources[0].inputs, parts[1], labels)
     best = fit(module, views, validation, out, "class_accuracy", "max", hardware)
     way = {
-        name: torch.lerp(start[name].to(values), values, recipe.way) if values.is_floating_point() else values
+        name: torch.lerp(start[name].to(values), values, recipe.interpolation) if values.is_floating_point() else values
         for name, values in best.net.state_dict().items()  # counters stay those of the end
     }
     best.net.load_state_dict(way)
@@ -231,7 +231,7 @@ def train_recogniser(
         ModelError: the weights cannot be used, or have seen what is held out; or ``out`` holds another run.
     """
     views = ViewStore.open(store)
-    training, validation = split_training(views, recipe.validation, recipe.seed)
+    training, validation = split_training(views, recipe.validation_share, recipe.seed)
     check_any(views, training, validation)
     validating = deduplicate(views, validation)  # copies of one mesh count once
     azimuths, planes = 0, None

@@ -194,7 +194,7 @@ def fit(
 def optimiser(parameters: Any, recipe: Any, steps: int, falls: float) -> dict[str, Any]:
     """AdamW, by one cycle over all steps, or with a rate that falls to such a part every fifth epoch."""
     adam = torch.optim.AdamW(parameters, lr=recipe.lr, weight_decay=recipe.weight_decay)
-    if recipe.schedule == "one-cycle":
+    if recipe.lr_schedule == "one-cycle":
         cycle = torch.optim.lr_scheduler.OneCycleLR(adam, recipe.lr, steps, pct_start=0.2)
         return {"optimizer": adam, "lr_scheduler": {"scheduler": cycle, "interval": "step"}}
     stairs = torch.optim.lr_scheduler.StepLR(adam, step_size=5, gamma=falls)
@@ -226,7 +226,7 @@ def new_run(recipe: Any, weights: Path | None, held_out: Sequence[str], made: It
             what = (
                 f"{len(seen)} of the {len(wanted)} objects that this network must not have seen, {seen[0]} among them"
             )
-            raise ModelError(f"{weights}: was trained on {what}; take its --seed and --validation")
+            raise ModelError(f"{weights}: was trained on {what}; take its --seed and --validation-share")
         before += earlier.commands
         weights /= "network.pt"
     if weights is not None and not weights.is_file():

@@ -15,7 +15,7 @@ from nextview.policies.gain import Gain, VisibleGain
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card
 from nextview.recognition.map_names import SPHERE, in_order
-from nextview.recognition.model_card import MAPS, MEMORY_SUFFIX
+from nextview.recognition.model_card import DISCRIMINATE, MAPS, MEMORY_SUFFIX
 
 POLICIES: dict[str, Callable[[Any], Policy]] = {  # those of no map; each map has its own, see ``map_policy``
     "random": Random,
@@ -72,6 +72,10 @@ def make_policy(
     path = plugins(GROUP).get(name, name)
     if ":" in path:
         return _import_policy(path, sphere)
+    if name == DISCRIMINATE:
+        raise PolicyError("the policy discriminate is for taught things: models ycb, or those of nextview learn")
+    if name.startswith(("true-", "oracle-", "best-", "worst-")) or name.endswith("-oracle-valley"):
+        raise PolicyError(f"{name} knows what no robot does: it takes part in nextview benchmark alone")
     known = [*policy_names(), *map_policy_names(maps), *bundled_policies(), f"{VISIBLE}{DEFAULT}"]
     raise PolicyError(f"no policy is called {name!r}{did_you_mean(name, known) or '; there are ' + ', '.join(known)}")
 

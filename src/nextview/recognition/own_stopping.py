@@ -58,6 +58,10 @@ class OwnStopping(Stopping):
             raise UsageError(f"the stopping rule {self.name} has to return {wanted}")
         return said
 
+    def threshold_at(self, n_views: NDArray | int) -> NDArray[np.float64]:
+        """Infinity, same shape: what the rule makes of its threshold is not known."""
+        return np.full(np.shape(n_views), np.inf)
+
     def __str__(self) -> str:
         return f"{self.name} at {self.threshold:.3g}"
 

@@ -123,8 +123,11 @@ def _draw_belief(axis: Axes, view: View, threshold: float, classes: Sequence[str
         axis.plot([0.015, 0.985], [row, row], color=FAINT, linewidth=5, solid_capstyle="round")
         if share >= 0.005:
             axis.plot([0.015, 0.015 + 0.97 * share], [row, row], color=colour, linewidth=5, solid_capstyle="round")
-        axis.plot([at, at], [row - 0.14, row + 0.14], color=INK, linewidth=1.6)
-    axis.text(min(at + 0.02, 1), row + 0.72, f"enough: {100 * threshold:.0f} %", fontsize=8.5, color=GREY, ha="right")
+        if np.isfinite(threshold):
+            axis.plot([at, at], [row - 0.14, row + 0.14], color=INK, linewidth=1.6)
+    if np.isfinite(threshold):  # a rule of your own need not stop at a belief
+        enough = f"enough: {100 * threshold:.0f} %"
+        axis.text(min(at + 0.02, 1), row + 0.72, enough, fontsize=8.5, color=GREY, ha="right")
     axis.set(xlim=(0, 1), ylim=(SHOWN - 0.2, -0.62))
 
 

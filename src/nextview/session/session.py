@@ -114,6 +114,10 @@ class Session:
         unknown: float = 0.0,
     ) -> None:
         _check_needs(policy, models)
+        if object is not None and not hasattr(object, "sightings"):
+            raise UsageError(
+                f"what to find in frames is a nextview.sensing.ObservedObject, not {one_line(repr(object))}"
+            )
         if number(unknown, "the share of known objects called unknown", 0) >= 1:
             raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
         if distance is not None:

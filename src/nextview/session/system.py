@@ -175,7 +175,12 @@ def load(
         UsageError: a threshold, a rate or a number of views makes no sense.
     """
     given = locals() | {"models": str(models)}
+    for value, what in ((models, "models are"), (DEFAULT if policy is None else policy, "a policy is")):
+        if not isinstance(value, str | Path):
+            raise UsageError(f"{what} given by name or path, not {one_line(repr(value))}")
     whole(threads, "the number of threads", 0, MOST_THREADS)
+    if risk is not None:
+        number(risk, "the risk")
     if unknown is not None and number(unknown, "the share of known objects called unknown", 0) >= 1:
         raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
     Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
@@ -191,7 +196,7 @@ def load(
     if policy is None:
         policy, made = _default_policy(found.policies, sphere, recogniser)
     else:
-        name = with_cards(policy, found.policies)
+        name = with_cards(str(policy), found.policies)
         made = make_policy_anywhere(name, sphere, (), recogniser.classes, found.maps)
     opened = Models(recogniser, open_maps(found.maps, made.needs, threads))
     if policy in opened.maps:  # a map's own policy goes to the valley for some classes, which the map's card names

@@ -1,6 +1,6 @@
 """One view of a session, and what followed from it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,20 +15,22 @@ class View:
     """One view and what followed from it."""
 
     index: int  # candidate viewpoint that it was taken from, or the nearest one to where the camera stood
-    observation: Observation
-    alone: NDArray[np.float64]  # belief by this view alone, (classes,); even if nothing is seen in it
-    belief: NDArray[np.float64]  # fused over all views so far, (classes,)
-    maps: dict[str, NDArray[np.floating]]  # predicted local maps by name, each (rings, 3)
+    observation: Observation = field(repr=False)
+    alone: NDArray[np.float64] = field(
+        repr=False
+    )  # belief by this view alone, (classes,); even if nothing is seen in it
+    belief: NDArray[np.float64] = field(repr=False)  # fused over all views so far, (classes,)
+    maps: dict[str, NDArray[np.floating]] = field(repr=False)  # predicted local maps by name, each (rings, 3)
     next_view: int | None  # where to look next; None where the episode ends
     travel: float  # so far, grid cells
     arc: float  # so far, radians
     direction: NDArray[np.float64]  # unit vector from the object to where the camera stood, (3,)
     # Belief, over all views, in the azimuth from which the object is seen here, for each class, in even steps,
     # (classes, azimuth bins); None if the recogniser does not tell.
-    azimuth_bins: NDArray[np.float64] | None = None
+    azimuth_bins: NDArray[np.float64] | None = field(default=None, repr=False)
     # What the policy valued each candidate view at, (V,), NaN if not considered; None at the end, and for policies that
     # value nothing.
-    values: NDArray[np.float64] | None = None
+    values: NDArray[np.float64] | None = field(default=None, repr=False)
     novelty: float | None = None  # score of this view; None if nothing is seen in it, or the recogniser has none
     warnings: tuple[ViewWarning, ...] = ()  # what is likely to be wrong with the view; usually nothing
     degrees_off: float = 0.0  # between the view that was asked for and where the camera stood; 0 for a first frame

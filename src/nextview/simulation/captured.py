@@ -6,6 +6,7 @@ BOP: Hodan et al., ECCV 2018. TUM RGB-D: Sturm et al., IROS 2012. 7-Scenes: Shot
 import os
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from nextview.errors import DatasetError, ObservationError, UsageError
 from nextview.files import read_record, regular_file
+from nextview.geometry.mesh import FORMATS
 from nextview.sensing.frame import Frame, check_pose
 from nextview.sensing.object_frame import Box
 
@@ -93,16 +95,15 @@ def read_capture(
     folder = Path(folder)
     if not folder.is_dir():
         raise DatasetError(f"{folder}: there is no such folder")
+    found = [layout for layout, (files, _) in LAYOUTS.items() if next(folder.glob(files), None)]
+    if not found:
+        raise DatasetError(_no_capture(folder))
     for path in folder.rglob("*"):  # a capture from elsewhere may not read other files of this machine
         # Not Path.resolve, which raises where links go round in a circle.
         if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
             raise DatasetError(f"{path}: is a link out of this folder; put what it points to in its place")
-    found = [layout for layout, (files, _) in LAYOUTS.items() if next(folder.glob(files), None)]
     if len(found) > 1:
         raise DatasetError(f"{folder}: has the files of two layouts, {found[0]} and {found[1]}; move one of them away")
-    if not found:
-        known = ", ".join(f"{files} ({layout})" for layout, (files, _) in LAYOUTS.items())
-        raise DatasetError(f"{folder}: no captured views are found; there is none of {known}")
     layout, k, said = found[0], None, list[str]()
     if object_id is not None and layout != "BOP":
         raise UsageError(f"objects have numbers in BOP's layout only, and {folder} has the layout of {layout}")
@@ -116,6 +117,15 @@ def read_capture(
         raise DatasetError(f"{folder}: no image shows the object")
     up = None if layout == "7-Scenes" else (0.0, 0.0, 1.0)  # the world of 7-Scenes is that of its first camera
     return Capture(folder, layout, tuple(frames), up, (*said, *notes))
+
+
+def _no_capture(folder: Path) -> str:
+    """Why a folder is no capture: it may be one of meshes."""
+    if mesh := next((f for f in islice(folder.rglob("*"), 1000) if f.suffix.lower() in FORMATS), None):
+        look = f"recognise one of them ({mesh}), or teach it them: nextview learn {folder} OUT"
+        return f"{folder}: is a folder of meshes, not of captured views; {look}"
+    known = ", ".join(f"{files} ({layout})" for layout, (files, _) in LAYOUTS.items())
+    return f"{folder}: no captured views are found; there is none of {known}"
 
 
 class _BoxFile(Struct, forbid_unknown_fields=True):

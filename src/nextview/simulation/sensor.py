@@ -233,7 +233,7 @@ def sensor_named(text: str | Sensor | SensorMix) -> Sensor | SensorMix:
     """A sensor by NAME or NAME:STRENGTH, or as it is; "mix" is another one for every object."""
     if isinstance(text, Sensor | SensorMix):
         return text
-    name, given, strength = text.partition(":")
+    name, given, strength = str(text).partition(":")
     if name not in (*SENSORS, "mix"):
         raise UsageError(f"no sensor is called {name!r}; there are {', '.join(SENSORS)} and mix")
     try:

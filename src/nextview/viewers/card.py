@@ -119,12 +119,12 @@ def _beliefs(walk: Walk) -> str:
     before = walk.views[-2].belief if len(walk.views) > 1 else np.full(len(classes), 1 / len(classes))
     highest = np.maximum(view.belief, before) if len(walk.views) > 1 else view.belief
     counted = sum(view.observation.seen for view in walk.views)
-    threshold = 100 * float(walk.stopping.threshold_at(max(counted, 1)))
+    threshold = 100 * float(walk.stopping.threshold_at(max(counted, 1)))  # none is drawn where it is infinite
     for c in np.argsort(-highest, kind="stable")[:SHOWN]:
         bars = (
             f'<div class="bar"><i style="top:0;height:8px;width:{100 * view.belief[c]:.1f}%;background:{ACCENT}"></i>'
             f'<i style="top:8px;height:5px;width:{100 * view.alone[c]:.1f}%;background:{FAINT}"></i>'
-            f'<b style="left:{threshold:.1f}%"></b></div>'
+            f"""{f'<b style="left:{threshold:.1f}%"></b>' * bool(np.isfinite(threshold))}</div>"""
         )
         rows.append((escape(classes[c]), bars, f"{view.belief[c]:.1%}", f"{view.belief[c] - before[c]:+.1%}"))
     legend = "red: belief · grey: by this view alone · dotted: enough to stop · right: change"

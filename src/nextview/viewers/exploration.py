@@ -54,12 +54,12 @@ class ShownObject:
     label: str | None = None
 
 
-def shown_objects(path: Path | None = None, up: str | None = None) -> tuple[ShownObject, ...]:
+def shown_objects(path: Path | None = None, up: str | None = None, unit: str | None = None) -> tuple[ShownObject, ...]:
     """The objects of a path, in order: of a mesh file, a folder of meshes or a view store; the samples if not given."""
     if path is None:
         return tuple(ShownObject(name, partial(sample_mesh, name), name) for name in SAMPLES)
     if not path.is_dir():
-        return (ShownObject(path.stem, partial(load_mesh, path, up)),)
+        return (ShownObject(path.stem, partial(load_mesh, path, up, unit)),)
     if (path / "zarr.json").exists():
         store = ViewStore.open(path)
         rows = np.flatnonzero(store.done).tolist()
@@ -69,9 +69,9 @@ def shown_objects(path: Path | None = None, up: str | None = None) -> tuple[Show
         return tuple(ShownObject(store.names[k], partial(StoredViews, store, k), labels[k]) for k in rows)
     flat = sorted(file for file in path.iterdir() if file.suffix.lower() in FORMATS and file.is_file())
     if flat:
-        return tuple(ShownObject(file.name, partial(load_mesh, file, up)) for file in flat)
+        return tuple(ShownObject(file.name, partial(load_mesh, file, up, unit)) for file in flat)
     entries = list_dataset(path)
-    return tuple(ShownObject(entry.name, partial(load_mesh, entry.path, up), entry.label) for entry in entries)
+    return tuple(ShownObject(entry.name, partial(load_mesh, entry.path, up, unit), entry.label) for entry in entries)
 
 
 class Walk:
