@@ -4,7 +4,7 @@
 
 A chair on a table, noise 1 mm, 3 % holes, from random places around it; sessions of up to five frames, one after the
 other, that never reach the threshold by default. The time of an update is until it is said where to look next, or, in
-the last one, what the object is. Prints the mean, and the median and the 99th percentile, of the milliseconds, in parts:
+the last one, what the object is. Prints the mean, the median and the 99th percentile of the milliseconds, in parts:
 finding the object in the frame (noise, support plane, cluster), its geometry (surface, object frame, images, of
 earlier frames too where the object frame got better), the networks, the policy, and the rest (checks). Then the same by
 the number of the frame in its session, and the resident memory after each tenth of the updates.
