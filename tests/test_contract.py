@@ -32,7 +32,7 @@ NAMES = {
 ATTRIBUTES = {
     nextview.Session: "done failed pose poses reachable result run target travel_cost update view",
     nextview.Recognition: "answer confidence most_like novelty plot seen travel unknown",
-    nextview.View: "angles",
+    nextview.View: "angles novelty",
     nextview.System: "classes recognise session",
     ObservedObject: "add object_frame observations",
     Frame: "camera_to_world",
@@ -40,7 +40,7 @@ ATTRIBUTES = {
 }
 FIELDS = {
     nextview.Recognition: "classes confident sphere stopping stranded views",
-    nextview.View: "alone arc azimuth_bins belief degrees_off direction index maps next_view novelty travel warnings",
+    nextview.View: "alone arc azimuth_bins belief degrees_off direction index maps next_view travel warnings",
     Frame: "depth image intrinsics mask",
     nextview.EpisodeState: "azimuth_bins belief current evidence observations reachable step travel visibility visited",
     nextview.Observation: "depth intrinsics pose",

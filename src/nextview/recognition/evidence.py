@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.geometry.observation import Observation
+from nextview.recognition.novelty import ViewScore
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,8 @@ class Evidence:
             azimuth bins) float. None if the recogniser cannot tell.
         seen: whether anything was seen, (B,) bool; None if something was in all. A view without is no evidence: in
             episodes all the above counts as zero there.
-        novelty: score of each view, (B,) float, see ``nextview.recognition.novelty``; None if the recogniser has none.
+        novelty: score of each view, B of them, made when asked for, see ``nextview.recognition.novelty``; None if the
+            recogniser judges no single views.
         observations: the views themselves, B of them; None where only what the models say is known.
     """
 
@@ -30,7 +32,7 @@ class Evidence:
     maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
     azimuth_bins: NDArray[np.floating] | None = None
     seen: NDArray[np.bool_] | None = None
-    novelty: NDArray[np.floating] | None = None
+    novelty: Sequence[ViewScore] | None = None
     observations: Sequence[Observation] | None = None
 
     def select(self, rows: Any) -> "Evidence":
@@ -39,11 +41,9 @@ class Evidence:
         def some(values: Any) -> Any:
             return None if values is None else values[rows]
 
-        maps, observations = (
-            {name: values[rows] for name, values in self.maps.items()},
-            items_at(self.observations, rows),
-        )
-        bins, seen, novelty = map(some, (self.azimuth_bins, self.seen, self.novelty))
+        maps = {name: values[rows] for name, values in self.maps.items()}
+        novelty, observations = items_at(self.novelty, rows), items_at(self.observations, rows)
+        bins, seen = map(some, (self.azimuth_bins, self.seen))
         return Evidence(self.logits[rows], maps, bins, seen, novelty, observations)
 
 

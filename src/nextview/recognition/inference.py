@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from nextview.recognition.evidence import Evidence
 from nextview.recognition.map_names import SPHERE, maps_among
 from nextview.recognition.model_card import FEATURES, RECOGNISER, ModelCard, find_card
 from nextview.recognition.network_input import from_observations
-from nextview.recognition.novelty import Novelty, Quantiles, novelty_path, read_novelty
+from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, novelty_path, read_novelty
 
 INPUT = "input"
 BINS_OUTPUT = "sides"
@@ -26,6 +27,7 @@ FEATURES_OUTPUT = "features"
 EMBEDDING_OUTPUT = "embedding"
 """Ends of a recogniser's ONNX file: the last is what its last layers make the logits of, (B, F)."""
 LONGEST = 300  # letters of what the runtime says
+_opening = Lock()  # while the features of a novelty score are opened; of no object, so that these can be pickled
 Shape = tuple[int | None, ...]  # without the batch; None for a size that is free
 
 
@@ -135,8 +137,7 @@ class Recogniser:
         elevations = np.array([elevation_of(direction_of(o.pose)) for o in observations])
         evidence = replace(self.from_inputs(inputs, elevations), seen=np.array([o.seen for o in observations]))
         if isinstance(self.novelty, Novelty):
-            exact = np.array([o.exact for o in observations])
-            evidence = replace(evidence, novelty=self.novelty.scores(self._embeddings(observations, inputs), exact))
+            evidence = replace(evidence, novelty=[ViewScore(o, self.novelty_scores) for o in observations])
         if self.card.size is None:
             return evidence
         radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
@@ -148,12 +149,20 @@ class Recogniser:
         outputs = dict(zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True))
         return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT))
 
-    def _embeddings(self, observations: Sequence[Observation], inputs: NDArray[Any]) -> NDArray[np.float32]:
-        """What the features that know no classes make of views, (B, F); ``inputs`` are what the recogniser takes."""
-        if self._known is None:
-            self._known = Features(self._threads)
-        spec = self._known.card.input
-        return self._known(inputs if spec == self.card.input else from_observations(spec, observations))
+    def novelty_scores(self, observations: Sequence[Observation]) -> NDArray[np.float64]:
+        """How novel B views are, (B,), by the features that know no classes; ModelError if that was not fitted."""
+        if not isinstance(self.novelty, Novelty):
+            raise ModelError(f"{self.card.path}: has no novelty score of views")
+        known = self.open_features()
+        inputs = np.concatenate([from_observations(known.card.input, [o]) for o in observations])
+        return self.novelty.scores(known(inputs), np.array([o.exact for o in observations]))
+
+    def open_features(self) -> "Features":
+        """The features of the novelty score, opened once: in good time by a thread, or where they are needed."""
+        with _opening:
+            if self._known is None:
+                self._known = Features(self._threads)
+        return self._known
 
     def features(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
         """What the last layer makes the logits of, (B, F), from what the network takes."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from safetensors.numpy import load, save
 
 from nextview.errors import ModelError
 from nextview.files import checked_bytes, new_file
+from nextview.geometry.observation import Observation
 
 Float = NDArray[np.floating]
 
@@ -110,6 +111,24 @@ class Novelty(Quantiles):
         with new_file(path, overwrite) as part:
             part.write_bytes(content)
         return hashlib.sha256(content).hexdigest()
+
+
+@dataclass(eq=False)
+class ViewScore:
+    """The novelty score of one view. Its network runs when the score is first asked for: few frames decide by it."""
+
+    observation: Observation
+    judge: Callable[[Sequence[Observation]], Float] | None  # scores of views, (B,); None where it is known
+    value: float = np.nan
+
+
+def values_of(scores: Sequence[ViewScore]) -> list[float]:
+    """The values of some scores; those that are not known yet are made together."""
+    asked = [score for score in scores if score.judge is not None]
+    if asked and (judge := asked[0].judge) is not None:
+        for score, value in zip(asked, judge([s.observation for s in asked]), strict=True):
+            score.value, score.judge = float(value), None
+    return [score.value for score in scores]
 
 
 def unit(rows: Float) -> Float:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 from scipy.linalg import block_diag
 from scipy.spatial import ConvexHull, QhullError
 
@@ -107,11 +106,10 @@ def clusters(footprints: Sequence[Footprint]) -> tuple[list[NDArray[np.int64]], 
     node = np.concatenate([f.piece + start for f, start in zip(footprints, first, strict=False)])
     cells = np.concatenate([f.cells for f in footprints])
     near = np.abs(cells - cells[0]).max(1) <= FAR
-    here, around = (_cells_over(cells[near], node[near], int(first[-1]), reach) for reach in (0, BESIDE))
-    size = np.maximum(np.asarray(here.sum(1)).ravel(), 1)
-    shared = (here @ here.T).toarray() / np.minimum.outer(size, size)
-    beside = (around @ here.T).toarray() > 0
-    cluster, refused = _joined(*_links(footprints, shared, beside | beside.T))
+    here, around = _cells_over(cells[near], node[near], int(first[-1]))
+    size = np.maximum(here.sum(1), 1)
+    shared, beside = here @ here.T / np.minimum.outer(size, size), around @ here.T > 0
+    cluster, refused = _joined(*_links(footprints, shared, beside))
     two = np.zeros(cluster.max() + 2, bool)
     whole = np.bincount(cluster, size)
     for a, b in refused:
@@ -120,16 +118,20 @@ def clusters(footprints: Sequence[Footprint]) -> tuple[list[NDArray[np.int64]], 
     return np.split(np.where(near, cluster[node] + 1, 0), np.cumsum(sizes)[:-1]), two
 
 
-def _cells_over(cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int, reach: int) -> sparse.csr_matrix:
-    """Which cells lie over each node, or up to ``reach`` from it, (nodes, cells), 0 or 1."""
+def _cells_over(cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int) -> tuple[Float, Float]:
+    """Which of the cells over which anything lies are over each node, and up to BESIDE from it, (nodes, cells) each."""
     at = cells - cells.min(0) + BESIDE
     width = int(at[:, 1].max()) + 1 + BESIDE
-    steps = [(i, j) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1)]
-    places = np.concatenate([(at[:, 0] + i) * width + at[:, 1] + j for i, j in steps])
-    shape = nodes, (int(at[:, 0].max()) + 1 + BESIDE) * width
-    found = sparse.csr_matrix((np.ones(len(places)), (np.tile(node, len(steps)), places)), shape)
-    found.data[:] = 1
-    return found
+    place = at[:, 0] * width + at[:, 1]
+    number = np.full((int(at[:, 0].max()) + 1 + BESIDE) * width, -1, np.int32)
+    number[place] = 0
+    used = np.flatnonzero(number == 0)
+    number[used] = np.arange(len(used))
+    here, around = np.zeros((2, nodes, len(used) + 1))  # the last is that of -1
+    here[node, number[place]] = 1
+    steps = np.arange(-BESIDE, BESIDE + 1)
+    around[node[:, None], number[place[:, None] + np.add.outer(width * steps, steps).ravel()]] = 1
+    return here[:, :-1], around[:, :-1]
 
 
 def _links(footprints: Sequence[Footprint], shared: Float, beside: Mask) -> tuple[Float, Mask]:

@@ -352,7 +352,8 @@ class ObservedObject:
         if len(facets.planes) * coarse**2 < FEWEST:
             raise ObservationError("too little is seen of the object")
         pose = frame.camera_to_world
-        points = facets.points[:: max(1, len(facets.planes) // 3000)] @ pose[:3, :3].T + pose[:3, 3]
+        few = slice(None, None, max(1, len(facets.planes) // 3000))
+        points = replace(facets, planes=facets.planes[few], rays=facets.rays[few]).points @ pose[:3, :3].T + pose[:3, 3]
         with suppress(QhullError):  # all in one plane: they do as they are
             points = points[ConvexHull(points).vertices]
         return Sighting(frame, noise, facets, mask, points, plane)

@@ -21,6 +21,7 @@ Inverse = NDArray[np.float32]
 WIDTH = 320  # columns in which edges are searched: a wider image is taken in steps
 LAG = 4  # pixels from an edge at which the surfaces to both sides of it are looked at
 VALLEY = 0.004  # depth of a concave edge, as a part of the distance, from which it cuts
+STEP = 0.08  # part of the distance by which a pixel lies behind another one LAG away, from which it is cut at an end
 LEAST = 12  # pixels of a piece
 STANDS = 0.02  # height over the plane, as a part of the distance, down to which a piece is seen if it stands there
 BOTTOM = 0.002  # height of a bottom over the plane, as a part of the distance, from which it is no hole
@@ -108,17 +109,19 @@ def _smooth(depth: NDArray[np.float32], mask: Mask) -> Inverse:
 def _concave(inverse: Inverse, tolerance: Inverse) -> Mask:
     """Pixels in a concave edge, (H, W) bool: farther than the line between two others to both sides of them.
 
-    Inverse depth is linear over the image of a plane; ``tolerance`` is of its unit, (H, W).
+    Inverse depth is linear over the image of a plane; ``tolerance`` is of its unit, (H, W). Where one of the two is no
+    pixel of a thing, as in a narrow strip that shows beside what hides the rest, a step in depth does.
     """
     found = np.zeros(inverse.shape, bool)
     padded = np.pad(inverse, LAG, constant_values=np.nan)
     height, width = inverse.shape
-    limit = 2 * (inverse + tolerance)
+    limit, step = 2 * (inverse + tolerance), (1 + np.float32(STEP)) * inverse + tolerance
     with np.errstate(invalid="ignore"):
         for dy, dx in ((0, LAG), (LAG, 0), (LAG, LAG), (LAG, -LAG)):
             one = padded[LAG + dy : LAG + dy + height, LAG + dx : LAG + dx + width]
             other = padded[LAG - dy : LAG - dy + height, LAG - dx : LAG - dx + width]
-            found |= one + other > limit
+            both = one + other
+            found |= (both > limit) | np.isnan(both) & (np.fmax(one, other) > step)
     return found
 
 

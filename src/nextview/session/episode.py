@@ -112,10 +112,14 @@ class Episodes:
         constrain: Constrain = unconstrained,
         hold: Callable[[Step], bool] = lambda step: False,
     ) -> Taken:
-        """What ``update`` would take in. Nothing is changed; ``keep`` takes it in. No threshold stops on ``hold``."""
+        """What ``update`` would take in. Nothing is changed; ``keep`` takes it in.
+
+        No threshold stops on ``hold``, which is asked where belief is enough.
+        """
         taken = self._taken(evidence, directions)
         step, n_views = taken.step, len(self.steps) + 1
-        enough = self.stopping.reached(step.belief, np.maximum(step.seen, 1)) & (step.seen > 0) & (not hold(step))
+        enough = self.stopping.reached(step.belief, np.maximum(step.seen, 1)) & (step.seen > 0)
+        enough &= not (enough.any() and hold(step))
         stopped = enough & taken.counts
         if n_views >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
@@ -339,7 +343,7 @@ def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
         return np.where(seen.reshape(-1, *[1] * (values.ndim - 1)), values, 0)
 
     maps = {name: kept(values) for name, values in evidence.maps.items()}
-    others = {name: getattr(evidence, name) for name in ("logits", "azimuth_bins", "novelty")}
+    others = {name: getattr(evidence, name) for name in ("logits", "azimuth_bins")}
     others = {name: values if values is None else kept(values) for name, values in others.items()}
     return replace(evidence, maps=maps, **others), seen
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.recognition.belief import Stopping
-from nextview.recognition.novelty import Quantiles
+from nextview.recognition.novelty import Quantiles, values_of
 from nextview.session.view import View
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Recognition:
         """
         if self.score is None or not self.seen:
             return None
-        return self.score.of_views([view.novelty for view in self.views if view.novelty is not None])
+        return self.score.of_views(values_of([view.score for view in self.views if view.score is not None]))
 
     @property
     def unknown(self) -> bool:

@@ -22,6 +22,7 @@ from nextview.policies.off_grid import anywhere
 from nextview.recognition.belief import MUCH, Stopping, log_evidence_of
 from nextview.recognition.inference import Models
 from nextview.recognition.map_names import maps_among
+from nextview.recognition.novelty import ViewScore, values_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.plausibility import ViewWarning, check_observation, check_views
 from nextview.session.episode import Episodes, Step
@@ -353,7 +354,7 @@ class Session:
             hold=lambda step: (
                 bool(warnings)
                 or self._contradicted(last + 1)
-                or self._suspicious(self._scores([*episodes.steps, step], observations))
+                or self._suspicious([*episodes.steps, step], observations)
             ),
         )
         steps, views = [*episodes.steps, taken.step], list(self.views)
@@ -394,31 +395,31 @@ class Session:
             arc=travel[1],
             direction=direction,
             azimuth_bins=None if bins is None else bins[0],
-            novelty=next(iter(self._novelty(step, observation)), None),
+            score=self._score(step, observation),
         )
 
-    def _novelty(self, step: Step, observation: Observation) -> list[float]:
-        """The novelty score of a view; none where nothing is seen, or the recogniser has no score."""
+    def _score(self, step: Step, observation: Observation) -> ViewScore | None:
+        """The novelty score of a view; None where nothing is seen, or the recogniser has no score."""
         score, evidence = self.models.recogniser.novelty, step.evidence
         if not observation.seen or (evidence.seen is not None and not evidence.seen[0]):
-            return []
+            return None
         if score is not None and score.joint:  # how badly all views are explained by what is known
             calibration, classes = self.models.recogniser.calibration, len(self.models.classes)
-            return [-float(calibration.log_belief(step.total, np.maximum(step.seen, 1), classes).max())]
-        return [] if evidence.novelty is None else [float(evidence.novelty[0])]
-
-    def _scores(self, steps: Sequence[Step], observations: Sequence[Observation]) -> list[float]:
-        """The novelty scores of some steps, as their views are seen by now."""
-        return [score for step, seen in zip(steps, observations, strict=True) for score in self._novelty(step, seen)]
+            value = -float(calibration.log_belief(step.total, np.maximum(step.seen, 1), classes).max())
+            return ViewScore(observation, None, value)
+        return None if evidence.novelty is None else evidence.novelty[0]
 
     def _contradicted(self, n_views: int) -> bool:
         """Whether half of so many views or more contradict others: the object moved, or is another one by now."""
         return 2 * sum(any(w.name == "contradiction" for w in view.warnings) for view in self.views) >= n_views > 0
 
-    def _suspicious(self, novelty: Sequence[float]) -> bool:
-        """Whether an object with these scores is too novel for a confident answer."""
+    def _suspicious(self, steps: Sequence[Step], observations: Sequence[Observation]) -> bool:
+        """Whether an object is too novel for a confident answer by some steps, as their views are seen by now."""
         score = self.models.recogniser.novelty
-        return score is not None and bool(self.unknown) and score.of_views(novelty) < SUSPICIOUS * self.unknown
+        if score is None or not self.unknown:
+            return False
+        found = [self._score(step, seen) for step, seen in zip(steps, observations, strict=True)]
+        return score.of_views(values_of([s for s in found if s is not None])) < SUSPICIOUS * self.unknown
 
     def _travelled(self, views: Sequence[int], directions: Sequence[Float]) -> list[tuple[float, float]]:
         """Cells and radians on the way to each view, from the places where the camera stood."""

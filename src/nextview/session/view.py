@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, elevation_of
+from nextview.recognition.novelty import ViewScore, values_of
 from nextview.sensing.plausibility import ViewWarning
 
 
@@ -31,9 +32,15 @@ class View:
     # What the policy valued each candidate view at, (V,), NaN if not considered; None at the end, and for policies that
     # value nothing.
     values: NDArray[np.float64] | None = field(default=None, repr=False)
-    novelty: float | None = None  # score of this view; None if nothing is seen in it, or the recogniser has none
+    # how novel it is; None if nothing is seen in it, or the recogniser has no score
+    score: ViewScore | None = field(default=None, repr=False)
     warnings: tuple[ViewWarning, ...] = ()  # what is likely to be wrong with the view; usually nothing
     degrees_off: float = 0.0  # between the view that was asked for and where the camera stood; 0 for a first frame
+
+    @property
+    def novelty(self) -> float | None:
+        """The novelty score of this view, made when it is first asked for; None if there is none."""
+        return None if self.score is None else values_of([self.score])[0]
 
     @property
     def angles(self) -> tuple[float, float]:
