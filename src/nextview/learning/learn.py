@@ -12,6 +12,7 @@ from msgspec.structs import replace as replace_record
 from safetensors.numpy import load_file, save_file
 
 from nextview.data.pool import WorkerDied, each
+from nextview.data.pool import count as count_workers
 from nextview.data.progress import Track, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, command, new_file, new_folder, only_one
@@ -173,7 +174,10 @@ def _teach(
             taught.append((source, arrays))
         else:
             waiting.append((source, stamp))
-    before, results = len(sources) - len(waiting), each(partial(_teach_one, how, part), waiting, workers, scheduler)
+    # A thing alone takes all cores.
+    threads = 1 if scheduler else max(1, count_workers(workers) // max(1, len(waiting)))
+    work = partial(_teach_one, how, part, threads)
+    before, results = len(sources) - len(waiting), each(work, waiting, workers, scheduler)
     yield before
     for count, ((source, _), result) in enumerate(results, before + 1):
         if isinstance(result, WorkerDied | str):
@@ -191,11 +195,11 @@ def _finished(file: Path, stamp: str) -> Arrays | None:
     return arrays if bytes(arrays.pop("stamp").tobytes()).decode() == stamp else None
 
 
-def _teach_one(how: How, part: Path, item: tuple[Source, str]) -> Arrays | str:
+def _teach_one(how: How, part: Path, threads: int, item: tuple[Source, str]) -> Arrays | str:
     """What is to be remembered of one thing; a sentence where it cannot be taught."""
     source, stamp = item
     try:
-        arrays = teach(source.path, source.name, how.unit, how.up, how.upright, how.sensor, how.seed)
+        arrays = teach(source.path, source.name, how.unit, how.up, how.upright, how.sensor, how.seed, threads)
     except NextviewError as error:
         return str(error)
     arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}

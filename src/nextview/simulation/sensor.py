@@ -301,19 +301,21 @@ def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
     column = np.arange(width) - disparity
     offset = int(np.ceil(abs(disparity).max(initial=0.0))) + 1
     lit = np.zeros((height, width + 2 * offset + 2))  # the largest disparity in each column of the projector
-    row, seen = np.broadcast_to(np.arange(height)[:, None], q.shape), q > 0
+    first_in_row, seen = np.arange(height)[:, None] * lit.shape[1] + offset, q > 0
     # A surface covers all projector columns from one of its pixels to the next.
     along, joined = _slope(q), np.zeros(q.shape, bool)
     bend = np.abs(q[:, 1:] - q[:, :-1] - along[:, :-1])
     joined[:, :-1] = seen[:, :-1] & seen[:, 1:] & (bend <= EDGE * q[:, :-1])
     last = np.where(joined, np.roll(column, -1, 1), column)
-    first_index, last_index = np.rint(column).astype(int) + offset, np.rint(last).astype(int) + offset
+    # One index into all rows: NumPy takes half the time.
+    first_index, last_index = (first_in_row + np.rint(at).astype(int) for at in (column, last))
+    flat = lit.reshape(-1)
     for k in range(WIDEST):
         at = first_index + k
         some = seen & ((k == 0) | (at < last_index))
-        np.maximum.at(lit, (row[some], at[some]), disparity[some])
+        np.maximum.at(flat, at[some], disparity[some])
     narrow = NARROWEST + focal * abs(baseline) * np.abs(along)
-    return seen & (lit[row, np.where(seen, first_index, 0)] > disparity + narrow)
+    return seen & (flat[np.where(seen, first_index, 0)] > disparity + narrow)
 
 
 def kinect_axial(depth: NDArray[np.floating], angle: NDArray[np.floating]) -> Image:
