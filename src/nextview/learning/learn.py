@@ -235,7 +235,7 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
     things = tuple(Thing(source.name, str(source.path), n) for (source, _), n in zip(taught, poses, strict=True))
     features = find_card(FEATURES)
     calibration = Calibration(1.0, 1.0, None, fit.correlation, tuple(label[thing].tolist()))
-    novelty = tuple(map(tuple, np.round(fit.quantiles, 4).tolist()))
+    novelty, usual = (tuple(map(tuple, np.round(rows, 4).tolist())) for rows in (fit.quantiles, fit.usual))
     card = ModelCard(
         NAME,
         "recogniser",
@@ -248,7 +248,7 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
         size=size_evidence(stacked["radii"], label),
         training=Training(f"{len(taught)} things", commands=() if old is None else old.training.commands),
         scores={"held-out views": {str(k): round(a, 4) for k, a in zip(VIEWS, fit.accuracy, strict=True)}},
-        memory=Taught(things, features.sha256, fit.weight, novelty=novelty),
+        memory=Taught(things, features.sha256, fit.weight, novelty=novelty, usual=usual),
     ).made_by(command())
     with new_folder(out, overwrite=True) as part:
         sha256 = memory.save(part / f"{NAME}.safetensors")

@@ -31,6 +31,7 @@ class Fit:
     head: Float
     head_bias: Float
     quantiles: Float
+    usual: Float  # see ``recognition.novelty.Quantiles``
     accuracy: tuple[float, ...]
     confused: tuple[tuple[int, int, float], ...]
 
@@ -70,16 +71,30 @@ def fit_memory(
     beliefs, (weight, correlation, head) = scored[int(np.argmin(loss))]
     accuracy = tuple(float((logs.argmax(-1) == truth[:, None]).mean()) for logs in beliefs)
     each = _belief(weight * alike, head * heads + sizes, where, drawn, of_class, correlation, range(1, 1 + max(VIEWS)))
-    quantiles = np.stack([np.quantile(-logs.max(-1), np.linspace(0, 1, LEVELS)) for logs in each])
+    usual = np.stack([_usual(logs, truth) for logs in each])
+    scores = [-logs.max(-1) - own[logs.argmax(-1)] for logs, own in zip(each, usual, strict=True)]
+    quantiles = np.quantile(scores, np.linspace(0, 1, LEVELS), axis=(1, 2)).T
     return Fit(
         weight,
         correlation,
         head * whole[0],
         head * whole[1],
         quantiles,
+        usual,
         accuracy,
         _confused(beliefs[1], truth, judged, label),
     )
+
+
+def _usual(logs: Float, truth: Index) -> Float:
+    """How much more novel than all the things of each class are, (C,), by log-belief, (T, draws, C); 0 if not known.
+
+    Half of it: eight views, through one setup of a sensor, do not tell more.
+    """
+    scores, found = -logs.max(-1), np.zeros(logs.shape[-1])
+    for c in np.unique(truth):
+        found[c] = (scores[truth == c].mean() - scores.mean()) / 2
+    return found
 
 
 def _judged(views: Float, thing: Index, held_out: Float, where: Float) -> NDArray[np.float32]:

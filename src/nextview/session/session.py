@@ -400,7 +400,8 @@ class Session:
             return []
         if score is not None and score.joint:  # how badly all views are explained by what is known
             calibration, classes = self.models.recogniser.calibration, len(self.models.classes)
-            return [-float(calibration.log_belief(step.total, np.maximum(step.seen, 1), classes).max())]
+            seen = np.maximum(step.seen, 1)
+            return [score.of_belief(calibration.log_belief(step.total, seen, classes)[0], int(seen[0]))]
         return [] if evidence.novelty is None else [float(evidence.novelty[0])]
 
     def _scores(self, steps: Sequence[Step], observations: Sequence[Observation]) -> list[float]:
