@@ -174,6 +174,7 @@ def _teach(
             taught.append((source, arrays))
         else:
             waiting.append((source, stamp))
+    waiting.sort(key=lambda item: -item[0].path.stat().st_size)  # the longest first: none is left alone at the end
     # A thing alone takes all cores.
     threads = 1 if scheduler else max(1, count_workers(workers) // max(1, len(waiting)))
     work = partial(_teach_one, how, part, threads)

@@ -29,7 +29,7 @@ SETUP = 8  # views that share the errors of one setup: a wrong centre, a wrong s
 BATCH = 20
 NEAR = np.radians(30)  # a captured view teaches what the thing looks like from no farther than this
 GRID = ViewSphere(RINGS, AZIMUTHS)
-EVERY_OTHER = np.arange(len(GRID)) % 2 == 0  # azimuth
+SENSED = GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4, 4)  # poses of views through the sensor
 Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
 
 
@@ -51,7 +51,7 @@ def teach(
     with ThreadPoolExecutor(threads) as pool:
         held_out = _sensed(pool, mesh, look_at_origin(*directions), sensor, rng)
         clean = [_clean(pool, each) for each in lying]
-        sensed = [_sensed(pool, each, GRID.poses[EVERY_OTHER], sensor, rng) for each in lying]
+        sensed = [_sensed(pool, each, SENSED, sensor, rng) for each in lying]
         around = [_around(*both) for both in zip(clean, sensed, strict=True)]
         shown = np.concatenate(list(held_out))
     return {
@@ -67,10 +67,12 @@ def teach(
 def _around(clean: Parts, sensed: Parts) -> NDArray[np.float32]:
     """Embeddings of the views of the grid, (rings, azimuths, F): the mean without and with a sensor's errors."""
     ideal = np.concatenate(list(clean)).reshape(len(RINGS), AZIMUTHS, -1)
-    through = np.concatenate(list(sensed)).reshape(len(RINGS), AZIMUTHS // 2, -1)
-    # Every other azimuth is looked at through the sensor; between them the embeddings are interpolated.
-    whole = np.stack([through, unit(through + np.roll(through, -1, 1))], 2).reshape(ideal.shape)
-    return joined(ideal, whole)
+    through = np.zeros_like(ideal)
+    # Between the rings and azimuths that are looked at through the sensor the embeddings are interpolated.
+    through[::2, ::2] = np.concatenate(list(sensed)).reshape(len(RINGS[::2]), AZIMUTHS // 2, -1)
+    through[::2, 1::2] = unit(through[::2, ::2] + np.roll(through[::2, ::2], -1, 1))
+    through[1::2] = unit(through[:-1:2] + through[2::2])
+    return joined(ideal, through)
 
 
 def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> Parts:
