@@ -12,6 +12,7 @@ from msgspec.structs import replace as replace_record
 from safetensors.numpy import load_file, save_file
 
 from nextview.data.pool import WorkerDied, each
+from nextview.data.pool import count as count_workers
 from nextview.data.progress import Track, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, command, new_file, new_folder, only_one
@@ -173,7 +174,11 @@ def _teach(
             taught.append((source, arrays))
         else:
             waiting.append((source, stamp))
-    before, results = len(sources) - len(waiting), each(partial(_teach_one, how, part), waiting, workers, scheduler)
+    waiting.sort(key=lambda item: -item[0].path.stat().st_size)  # the longest first: none is left alone at the end
+    # A thing alone takes all cores.
+    threads = 1 if scheduler else max(1, count_workers(workers) // max(1, len(waiting)))
+    work = partial(_teach_one, how, part, threads)
+    before, results = len(sources) - len(waiting), each(work, waiting, workers, scheduler)
     yield before
     for count, ((source, _), result) in enumerate(results, before + 1):
         if isinstance(result, WorkerDied | str):
@@ -191,11 +196,11 @@ def _finished(file: Path, stamp: str) -> Arrays | None:
     return arrays if bytes(arrays.pop("stamp").tobytes()).decode() == stamp else None
 
 
-def _teach_one(how: How, part: Path, item: tuple[Source, str]) -> Arrays | str:
+def _teach_one(how: How, part: Path, threads: int, item: tuple[Source, str]) -> Arrays | str:
     """What is to be remembered of one thing; a sentence where it cannot be taught."""
     source, stamp = item
     try:
-        arrays = teach(source.path, source.name, how.unit, how.up, how.upright, how.sensor, how.seed)
+        arrays = teach(source.path, source.name, how.unit, how.up, how.upright, how.sensor, how.seed, threads)
     except NextviewError as error:
         return str(error)
     arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
@@ -231,7 +236,7 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
     things = tuple(Thing(source.name, str(source.path), n) for (source, _), n in zip(taught, poses, strict=True))
     features = find_card(FEATURES)
     calibration = Calibration(1.0, 1.0, None, fit.correlation, tuple(label[thing].tolist()))
-    novelty = tuple(map(tuple, np.round(fit.quantiles, 4).tolist()))
+    novelty, usual = (tuple(map(tuple, np.round(rows, 4).tolist())) for rows in (fit.quantiles, fit.usual))
     card = ModelCard(
         NAME,
         "recogniser",
@@ -244,7 +249,7 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
         size=size_evidence(stacked["radii"], label),
         training=Training(f"{len(taught)} things", commands=() if old is None else old.training.commands),
         scores={"held-out views": {str(k): round(a, 4) for k, a in zip(VIEWS, fit.accuracy, strict=True)}},
-        memory=Taught(things, features.sha256, fit.weight, novelty=novelty),
+        memory=Taught(things, features.sha256, fit.weight, novelty=novelty, usual=usual),
     ).made_by(command())
     with new_folder(out, overwrite=True) as part:
         sha256 = memory.save(part / f"{NAME}.safetensors")

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -17,10 +18,12 @@ def draw_learned(path: Path, pictures: Mapping[str, NDArray[np.uint8]], fit: Fit
     """Write it: the things, the share named right by the number of views, and the pairs that are confused most."""
     names = list(pictures)
     figure = Figure(figsize=(11, 6), dpi=120, facecolor="white")
+    page = figure.add_axes((0, 0, 1, 1))  # one for all pictures: axes take longer than what is in them
+    page.set_axis_off()
     figure.text(0.03, 0.94, f"{len(names)} things learned", size=17, color=INK, weight="bold")
     shown = names[:: max(1, -(-len(names) // THINGS))][:THINGS]
     for k, name in enumerate(shown):
-        _picture(figure, (0.03 + (k % 6) * 0.105, 0.66 - k // 6 * 0.26, 0.095, 0.19), pictures[name], name)
+        _picture(page, (0.03 + (k % 6) * 0.105, 0.66 - k // 6 * 0.26, 0.095, 0.19), pictures[name], name)
     axes = figure.add_axes((0.73, 0.47, 0.24, 0.38))
     bars = axes.bar([str(k) for k in VIEWS], [100 * a for a in fit.accuracy], color=BAR, width=0.6)
     axes.bar_label(bars, fmt="%.0f", color=INK, size=11)
@@ -37,15 +40,19 @@ def draw_learned(path: Path, pictures: Mapping[str, NDArray[np.uint8]], fit: Fit
     figure.text(0.03, 0.32, heading, size=11, color=INK, weight="bold")
     for k, (a, b, share) in enumerate(pairs):
         left = 0.03 + k * 0.245
-        _picture(figure, (left, 0.08, 0.095, 0.19), pictures[a], a)
-        _picture(figure, (left + 0.1, 0.08, 0.095, 0.19), pictures[b], b)
+        _picture(page, (left, 0.08, 0.095, 0.19), pictures[a], a)
+        _picture(page, (left + 0.1, 0.08, 0.095, 0.19), pictures[b], b)
         figure.text(left + 0.0975, 0.275, f"{share:.0%}", size=10, color=QUIET, ha="center")
+    page.set(xlim=(0, 1), ylim=(0, 1), aspect="auto")
     figure.savefig(path)
 
 
-def _picture(figure: Figure, place: tuple[float, float, float, float], picture: NDArray[np.uint8], name: str) -> None:
-    axes = figure.add_axes(place)
+def _picture(page: Axes, place: tuple[float, float, float, float], picture: NDArray[np.uint8], name: str) -> None:
+    left, bottom, width, _ = place
+    height = width * 11 / 6
     shade = np.where(picture > 0, 60 + 0.7 * picture.astype(float), 255)
-    axes.imshow(shade, cmap="gray", vmin=0, vmax=255, interpolation="bilinear")
-    axes.set_axis_off()
-    axes.set_title(name.replace("_", " ")[:18], size=7.5, color=INK, y=-0.17)
+    extent = (left, left + width, bottom, bottom + height)
+    page.imshow(shade, cmap="gray", vmin=0, vmax=255, interpolation="bilinear", extent=extent)
+    page.text(
+        left + width / 2, bottom - 0.025, name.replace("_", " ")[:18], size=7.5, color=INK, ha="center", va="center"
+    )

@@ -31,6 +31,7 @@ class Fit:
     head: Float
     head_bias: Float
     quantiles: Float
+    usual: Float  # see ``recognition.novelty.Quantiles``
     accuracy: tuple[float, ...]
     confused: tuple[tuple[int, int, float], ...]
 
@@ -62,24 +63,41 @@ def fit_memory(
     measured = radii * np.exp(rng.normal(0, SIZE_ERROR, len(radii)))  # as a sensor would measure it
     sizes = np.float32(0) if size is None else size.logits(measured)[judged, None]
     drawn = np.stack([np.stack([rng.permutation(held_out.shape[1]) for _ in range(DRAWS)]) for _ in judged])
-    grid = [(w, c, h) for h in (HEADS if several.any() else (0.0,)) for w in WEIGHTS for c in CORRELATIONS]
-    where, of_class = held_out_views[judged], label[thing]
-    scored = [(_belief(w * alike, h * heads + sizes, where, drawn, of_class, c), (w, c, h)) for w, c, h in grid]
+    where, of_class, scored = held_out_views[judged], label[thing], []
+    for h in HEADS if several.any() else (0.0,):
+        for w in WEIGHTS:
+            sums = _sums(w * alike, h * heads + sizes, where, drawn, VIEWS)
+            scored += [(_belief(sums, heads.shape[-1], of_class, c), (w, c, h)) for c in CORRELATIONS]
     truth = label[judged]
     loss = [-np.mean([of_true_class(logs, truth).mean() for logs in beliefs]) for beliefs, _ in scored]
     beliefs, (weight, correlation, head) = scored[int(np.argmin(loss))]
     accuracy = tuple(float((logs.argmax(-1) == truth[:, None]).mean()) for logs in beliefs)
-    each = _belief(weight * alike, head * heads + sizes, where, drawn, of_class, correlation, range(1, 1 + max(VIEWS)))
-    quantiles = np.stack([np.quantile(-logs.max(-1), np.linspace(0, 1, LEVELS)) for logs in each])
+    sums = _sums(weight * alike, head * heads + sizes, where, drawn, range(1, 1 + max(VIEWS)))
+    each = _belief(sums, heads.shape[-1], of_class, correlation)
+    usual = np.stack([_usual(logs, truth) for logs in each])
+    scores = [-logs.max(-1) - own[logs.argmax(-1)] for logs, own in zip(each, usual, strict=True)]
+    quantiles = np.quantile(scores, np.linspace(0, 1, LEVELS), axis=(1, 2)).T
     return Fit(
         weight,
         correlation,
         head * whole[0],
         head * whole[1],
         quantiles,
+        usual,
         accuracy,
         _confused(beliefs[1], truth, judged, label),
     )
+
+
+def _usual(logs: Float, truth: Index) -> Float:
+    """How much more novel than all the things of each class are, (C,), by log-belief, (T, draws, C); 0 if not known.
+
+    Half of it: eight views, through one setup of a sensor, do not tell more.
+    """
+    scores, found = -logs.max(-1), np.zeros(logs.shape[-1])
+    for c in np.unique(truth):
+        found[c] = (scores[truth == c].mean() - scores.mean()) / 2
+    return found
 
 
 def _judged(views: Float, thing: Index, held_out: Float, where: Float) -> NDArray[np.float32]:
@@ -120,23 +138,16 @@ def _ridge(x: Float, y: Index, classes: int) -> tuple[Float, Float]:
     return found.astype(np.float32), (-middle @ found).astype(np.float32)
 
 
-def _belief(
-    alike: Float,
-    logits: Float,
-    where: Float,
-    drawn: Index,
-    hypotheses: Index,
-    correlation: float,
-    after: Sequence[int] = VIEWS,
-) -> list[NDArray[np.float64]]:
-    """Log-belief ``after`` so many drawn views, up to a constant, (T, draws, classes) each."""
-    calibration = Calibration(1.0, 1.0, None, correlation, tuple(hypotheses.tolist()))
-    found = []
+def _sums(alike: Float, logits: Float, where: Float, drawn: Index, after: Sequence[int]) -> dict[int, Float]:
+    """Sums of log-evidence ``after`` so many drawn views, (T, draws, ...) each."""
     total = [log_evidence_of(x, a, z) for x, a, z in zip(logits, alike, where[..., 1], strict=True)]
-    for k in after:
-        sums = np.stack([t[d[:, :k]].sum(1) for t, d in zip(total, drawn, strict=True)])
-        found.append(calibration.log_belief(sums, k, logits.shape[-1]))
-    return found
+    return {k: np.stack([t[d[:, :k]].sum(1) for t, d in zip(total, drawn, strict=True)]) for k in after}
+
+
+def _belief(sums: dict[int, Float], classes: int, hypotheses: Index, correlation: float) -> list[NDArray[np.float64]]:
+    """Log-belief by sums of log-evidence of so many views, up to a constant, (T, draws, classes) each."""
+    calibration = Calibration(1.0, 1.0, None, correlation, tuple(hypotheses.tolist()))
+    return [calibration.log_belief(total, k, classes) for k, total in sums.items()]
 
 
 def _confused(logs: Float, truth: Index, judged: Index, label: Index) -> tuple[tuple[int, int, float], ...]:

@@ -1,7 +1,9 @@
 """Look at one thing from everywhere, without and with a sensor's errors, and note what its views are like."""
 
 import zlib
-from functools import lru_cache
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ from numpy.typing import NDArray
 
 from nextview.errors import NoViewLeftError, ObservationError
 from nextview.geometry.mesh import Mesh, load_mesh
-from nextview.geometry.observation import Observation
+from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import resting_poses, rotated
 from nextview.geometry.viewsphere import ViewSphere, angle_between, direction_of, look_at_origin
 from nextview.recognition.inference import Features
@@ -27,9 +29,13 @@ SETUP = 8  # views that share the errors of one setup: a wrong centre, a wrong s
 BATCH = 20
 NEAR = np.radians(30)  # a captured view teaches what the thing looks like from no farther than this
 GRID = ViewSphere(RINGS, AZIMUTHS)
+SENSED = GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4, 4)  # poses of views through the sensor
+Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
 
 
-def teach(path: Path, name: str, unit: str | None, up: str | None, upright: bool, sensor: str, seed: int) -> Arrays:
+def teach(
+    path: Path, name: str, unit: str | None, up: str | None, upright: bool, sensor: str, seed: int, threads: int = 1
+) -> Arrays:
     """What is to be remembered of one thing, by the names of the fields of ``recognition.memory.Memory``.
 
     Of a mesh file or a folder of captured frames; name and seed decide all random draws, the others are as of
@@ -42,36 +48,50 @@ def teach(path: Path, name: str, unit: str | None, up: str | None, upright: bool
     rotations = np.eye(3)[None] if upright else resting_poses(mesh)
     lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
     directions = np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), HELD_OUT)), rng.uniform(0, 2 * np.pi, HELD_OUT)
-    held_out = _sensed(mesh, look_at_origin(*directions), sensor, rng)
+    with ThreadPoolExecutor(threads) as pool:
+        held_out = _sensed(pool, mesh, look_at_origin(*directions), sensor, rng)
+        clean = [_clean(pool, each) for each in lying]
+        sensed = [_sensed(pool, each, SENSED, sensor, rng) for each in lying]
+        around = [_around(*both) for both in zip(clean, sensed, strict=True)]
+        shown = np.concatenate(list(held_out))
     return {
-        "views": np.stack([_around(each, sensor, rng) for each in lying]).astype(np.float16),
+        "views": np.stack(around).astype(np.float16),
         "rotations": rotations.astype(np.float32),
-        "held_out": held_out.astype(np.float16),
+        "held_out": shown.astype(np.float16),
         "held_out_views": np.stack(directions, 1).astype(np.float32),
         "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
         "pictures": _picture(SimulatedCamera(mesh, 64).observe(look_at_origin(np.radians(25), np.radians(35)))),
     }
 
 
-def _around(mesh: Mesh, sensor: str, rng: np.random.Generator) -> NDArray[np.float32]:
+def _around(clean: Parts, sensed: Parts) -> NDArray[np.float32]:
     """Embeddings of the views of the grid, (rings, azimuths, F): the mean without and with a sensor's errors."""
-    clean = SimulatedCamera(mesh)
-    ideal = embeddings([clean.observe(pose) for pose in GRID.poses])
-    sensed = _sensed(mesh, GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[:, ::2].reshape(-1, 4, 4), sensor, rng)
-    sensed = sensed.reshape(len(RINGS), AZIMUTHS // 2, -1)
-    # Every other azimuth is looked at through the sensor; between them the embeddings are interpolated.
-    whole = np.stack([sensed, unit(sensed + np.roll(sensed, -1, 1))], 2).reshape(len(RINGS), AZIMUTHS, -1)
-    return joined(ideal.reshape(whole.shape), whole)
+    ideal = np.concatenate(list(clean)).reshape(len(RINGS), AZIMUTHS, -1)
+    through = np.zeros_like(ideal)
+    # Between the rings and azimuths that are looked at through the sensor the embeddings are interpolated.
+    through[::2, ::2] = np.concatenate(list(sensed)).reshape(len(RINGS[::2]), AZIMUTHS // 2, -1)
+    through[::2, 1::2] = unit(through[::2, ::2] + np.roll(through[::2, ::2], -1, 1))
+    through[1::2] = unit(through[:-1:2] + through[2::2])
+    return joined(ideal, through)
 
 
-def _sensed(mesh: Mesh, poses: NDArray[np.float64], sensor: str, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Embeddings of a mesh from poses, (B, 4, 4), through a sensor, (B, F)."""
-    found = []
-    for k, pose in enumerate(poses):
-        if k % SETUP == 0:
-            camera = SensedCamera(mesh, sensor, rng.spawn(1)[0])
-        found.append(camera.observe(pose))
-    return embeddings(found)
+def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> Parts:
+    """Embeddings of the views of the grid without errors."""
+    camera = SimulatedCamera(mesh)
+    return pool.map(partial(_seen, camera), np.split(GRID.poses, len(GRID) // BATCH))
+
+
+def _sensed(
+    pool: ThreadPoolExecutor, mesh: Mesh, poses: NDArray[np.float64], sensor: str, rng: np.random.Generator
+) -> Parts:
+    """Embeddings of a mesh from poses, (B, 4, 4), through a sensor."""
+    parts = np.split(poses, range(SETUP, len(poses), SETUP))
+    cameras = (partial(SensedCamera, mesh, sensor, own) for own in rng.spawn(len(parts)))
+    return pool.map(lambda camera, part: _seen(camera(), part), cameras, parts)
+
+
+def _seen(camera: Camera, poses: NDArray[np.float64]) -> NDArray[np.float32]:
+    return embeddings([camera.observe(pose) for pose in poses])
 
 
 def _of_capture(folder: Path) -> Arrays:

@@ -115,7 +115,8 @@ class TaughtRecogniser(Recogniser):
         self._views = by_ring(self.memory.views)
         self._nearest = NearestViews(self._views) if is_large(self._views) else None
         judged = np.array([self.memory.held_out[..., 0].size])
-        self.novelty = Quantiles(np.array(about.novelty), judged, joint=True) if about.novelty else None
+        usual = np.array(about.usual) if about.usual else None
+        self.novelty = Quantiles(np.array(about.novelty), judged, joint=True, usual=usual) if about.novelty else None
 
     def from_inputs(self, inputs: NDArray[Any], elevations: Float | None = None) -> Evidence:
         """Evidence by shape alone, from what the network takes and the elevations of the cameras, radians, (B,)."""

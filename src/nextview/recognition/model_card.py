@@ -50,6 +50,7 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative log-likelihood of known things, given
     # the class that explains them best
     novelty: tuple[tuple[float, ...], ...] = ()
+    usual: tuple[tuple[float, ...], ...] = ()  # see ``novelty.Quantiles``
 
 
 class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="schema", tag=2):

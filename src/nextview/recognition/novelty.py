@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
+from scipy.special import ndtr
 
 from nextview.errors import ModelError
 from nextview.files import checked_bytes, new_file
@@ -33,12 +34,16 @@ class Quantiles:
         quantiles: scores of known objects after 1, 2, ... views, ascending, at even steps of probability from 0 to 1,
             (views, Q) float32.
         objects: how many known objects they are of, (1,) int64.
-        joint: whether a view's score is that of all views up to it; else the score of several is their mean.
+        joint: whether a view's score is that of all views up to it, see ``of_belief``; else the score of several is
+            their mean.
+        usual: how much more novel than others those of each class are after 1, 2, ... views, (views, classes): it is
+            taken off a joint score; None where that is not known.
     """
 
     quantiles: Float
     objects: NDArray[np.int64]
     joint: bool = field(default=False, kw_only=True)
+    usual: Float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.quantiles.ndim != 2 or self.quantiles.shape[1] < 2 or not (np.diff(self.quantiles) >= 0).all():
@@ -48,16 +53,25 @@ class Quantiles:
         """The share of known objects that are at least as novel after so many views, by the mean score over them.
 
         A conformal p-value (Vovk et al., 2005): an object of a known class falls below p in a share p of the cases.
-        Beyond the number of views for which there are quantiles, the last count. Shapes are broadcast; float64.
+        It cannot fall below one in all known objects and one. Few things have few known views, so a joint score beyond
+        all of these has the p-value of a normal distribution, if that is smaller. Beyond the number of views for which
+        there are quantiles, the last count. Shapes are broadcast; float64.
         """
         score, n_views = np.broadcast_arrays(np.asarray(score, np.float64), n_views)
         levels = np.linspace(0, 1, self.quantiles.shape[1])
-        found = np.empty(score.shape)
+        found, n = np.empty(score.shape), int(self.objects[0])
         for index in np.ndindex(score.shape):
             row = self.quantiles[min(int(n_views[index]), len(self.quantiles)) - 1]
-            found[index] = 1 - np.interp(score[index], row, levels)
-        n = int(self.objects[0])
-        return np.asarray((1 + n * found) / (n + 1))
+            found[index] = (1 + n * (1 - np.interp(score[index], row, levels))) / (n + 1)
+            if self.joint and score[index] > row[-1]:
+                found[index] = min(found[index], ndtr((row.mean() - score[index]) / max(row.std(), 1e-9)))
+        return found
+
+    def of_belief(self, log_belief: Float, n_views: int) -> float:
+        """The joint score of an object by the log-belief in each class, up to a constant, after so many views, (C,)."""
+        best = int(log_belief.argmax())
+        usual = 0.0 if self.usual is None else self.usual[min(n_views, len(self.usual)) - 1, best]
+        return float(-log_belief[best] - usual)
 
     def of_views(self, scores: Sequence[float]) -> float:
         """The p-value of one object by the scores of its views so far; 1 if there is none."""

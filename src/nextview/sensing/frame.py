@@ -9,6 +9,8 @@ from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.observation import LARGEST, array_of, numbers
 
+Part = tuple[slice, slice]  # rows and columns of a picture
+WHOLE = slice(None), slice(None)
 FARTHEST = 65.0  # metres: float depth beyond is nothing; uint16 millimetres reach as far
 LARGEST_MEDIAN = 20.0  # metres; a depth image beyond is of another unit: inches are 39 times as many
 ASPECTS = (4 / 3, 16 / 9, 16 / 10, 512 / 424, 640 / 576)  # width over height of whole pictures
@@ -99,11 +101,12 @@ class Frame:
         (x, y), z, pose = self.rays, self.depth[rows, columns].astype(np.float64), self.camera_to_world
         return (np.stack([x[columns], y[rows], np.ones(len(z))], 1) * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
 
-    def along(self, direction: NDArray[np.float64], offset: float = 0.0) -> NDArray[np.float32]:
+    def along(self, direction: NDArray[np.float64], offset: float = 0.0, part: Part = WHOLE) -> NDArray[np.float32]:
         """``direction @ position + offset`` of what every pixel shows, world, (H, W) float32; void at depth 0."""
         (x, y), pose = self.rays, self.camera_to_world
         a, b, c = (pose[:3, :3].T @ direction).astype(np.float32)
-        return self.depth * ((a * x)[None, :] + (b * y + c)[:, None]) + np.float32(direction @ pose[:3, 3] + offset)
+        towards = (a * x)[None, part[1]] + (b * y + c)[part[0], None]
+        return self.depth[part] * towards + np.float32(direction @ pose[:3, 3] + offset)
 
 
 def _metres(depth: ArrayLike) -> NDArray[np.float32]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.sensing.facets import Noise
-from nextview.sensing.frame import AXES, Frame
+from nextview.sensing.frame import AXES, WHOLE, Frame, Part
 from nextview.sensing.object_frame import Box
 
 Float = NDArray[np.float64]
@@ -158,10 +158,10 @@ def inside_box(frame: Frame, box: Box) -> Mask:
     return inside
 
 
-def inside_sphere(frame: Frame, centre: Float, radius: float) -> Mask:
-    """Pixels whose position lies in a sphere, (H, W) bool."""
-    x, y, z = (frame.along(axis, float(-at)) for axis, at in zip(np.eye(3), centre, strict=True))
-    return (frame.depth > 0) & (x * x + y * y + z * z < radius**2)
+def inside_sphere(frame: Frame, centre: Float, radius: float, part: Part = WHOLE) -> Mask:
+    """Pixels whose position lies in a sphere, (H, W) bool; or those of a part of the frame."""
+    x, y, z = (frame.along(axis, float(-at), part) for axis, at in zip(np.eye(3), centre, strict=True))
+    return (frame.depth[part] > 0) & (x * x + y * y + z * z < radius**2)
 
 
 def above_plane(frame: Frame, plane: Plane, noise: Noise) -> Mask:

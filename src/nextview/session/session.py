@@ -405,7 +405,8 @@ class Session:
             return None
         if score is not None and score.joint:  # how badly all views are explained by what is known
             calibration, classes = self.models.recogniser.calibration, len(self.models.classes)
-            value = -float(calibration.log_belief(step.total, np.maximum(step.seen, 1), classes).max())
+            seen = np.maximum(step.seen, 1)
+            value = score.of_belief(calibration.log_belief(step.total, seen, classes)[0], int(seen[0]))
             return ViewScore(observation, None, value)
         return None if evidence.novelty is None else evidence.novelty[0]
 

@@ -12,10 +12,11 @@ from nextview.geometry.observation import Observation, pinhole
 from nextview.geometry.viewsphere import DISTANCE
 from nextview.sensing import Frame, ObjectFrame, ObservedObject
 from nextview.sensing.facets import virtual_pose
+from nextview.sensing.frame import Part
 from nextview.sensing.observed_object import FEWEST, SIZE
 from nextview.sensing.segmentation import inside_sphere
 from nextview.simulation.scene import boxes_around
-from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, uniform_field
+from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, spans, uniform_field, within
 from nextview.simulation.simulated import SimulatedCamera
 
 Float = NDArray[np.float64]
@@ -92,16 +93,19 @@ class SensedCamera:
             true[:3, 3] += rng.normal(0, self.sensor.moved, 3)
         depth, whose = self._scene(true)
         measured, source = self.sensor.measure(depth, rng)
-        other = (whose.ravel()[source] != OBJECT) & (source >= 0)
+        part = within(measured)  # nothing is measured beside it
+        shown, mask = whose.ravel()[source[part]], measured > 0
+        other = (shown != OBJECT) & (source[part] >= 0)
         if self.sensor.table:
-            left_in = uniform_field(rng, depth.shape, LEFTOVER) < self.sensor.table
-            other &= (whose.ravel()[source] != TABLE_TOP) | ~left_in
+            left_in = uniform_field(rng, depth.shape, LEFTOVER, part) < self.sensor.table
+            other &= (shown != TABLE_TOP) | ~left_in
+        mask[part] &= ~other
         if self.sensor.crop:
-            measured = self._cropped(measured, (measured > 0) & ~other, rng)
+            measured = self._cropped(measured, mask, rng)
         if np.count_nonzero(measured) < FEWEST:
             return None
         frame = Frame(measured, self.sensor.intrinsics, believed, pixel_centre=0.5)
-        mask = inside_sphere(frame, self.object_frame.centre, REACH * self.object_frame.radius) & ~other
+        mask[part] &= inside_sphere(frame, self.object_frame.centre, REACH * self.object_frame.radius, part)
         return replace(frame, mask=mask, pixel_centre=0.5) if np.count_nonzero(mask) >= FEWEST else None
 
     def _scene(self, pose: Float) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -109,26 +113,32 @@ class SensedCamera:
         inside = self._truth.pose_in_object(pose)
         depth = self._camera.observe(inside).depth.copy()
         whose = np.full(depth.shape, OBJECT, np.uint8)
-        table = self._table(inside)
-        shown = np.isfinite(table) & (depth == 0)
-        depth[shown], whose[shown] = table[shown], TABLE_TOP
+        part, table = self._table(inside)
+        shown = np.isfinite(table) & (depth[part] == 0)
+        depth[part][shown], whose[part][shown] = table[shown], TABLE_TOP
         if self._around is not None:
             boxes = self._around.observe(inside).depth
             nearer = (boxes > 0) & ((depth == 0) | (boxes < depth))
             depth, whose = np.where(nearer, boxes, depth), np.where(nearer, np.uint8(BOX), whose)
         return depth * np.float32(self.sensor.radius), whose
 
-    def _table(self, pose: Float) -> Float:
-        """Depth of the table, object radii, infinite beside it and from below."""
+    def _table(self, pose: Float) -> tuple[Part, Float]:
+        """Depth of the table in a part of the picture that holds it, object radii; infinite beside and from below."""
         height, setup = pose[2, 3] - self._floor, self.sensor
-        x = (np.arange(setup.width) + 0.5 - setup.width / 2) / setup.focal
-        y = ((np.arange(setup.height) + 0.5 - setup.height / 2) / setup.focal)[:, None]
+        corners = [(a * self._reach, b * self._reach, self._floor) for a in (-1, 1) for b in (-1, 1)]
+        seen = (np.array(corners) - pose[:3, 3]) @ pose[:3, :3]  # of a square around it
+        part = slice(0, setup.height), slice(0, setup.width)
+        if seen[:, 2].min() > 0:
+            at = setup.focal * seen[:, 1::-1] / seen[:, 2:] + np.array(setup.shape) / 2  # row and column
+            part = spans(at.min(0) - 1, at.max(0) + 2, setup.shape)
+        x = ((np.arange(setup.width) + 0.5 - setup.width / 2) / setup.focal)[part[1]]
+        y = ((np.arange(setup.height) + 0.5 - setup.height / 2) / setup.focal)[part[0], None]
         falls = x * pose[2, 0] + y * pose[2, 1] + pose[2, 2]
         down = (falls < 0) & (height > 0)
         along = np.where(down, -height / np.where(down, falls, -1), np.inf)
         with np.errstate(invalid="ignore"):
             across = [pose[i, 3] + along * (x * pose[i, 0] + y * pose[i, 1] + pose[i, 2]) for i in (0, 1)]
-            return np.where(across[0] ** 2 + across[1] ** 2 < self._reach**2, along, np.inf)
+            return part, np.where(across[0] ** 2 + across[1] ** 2 < self._reach**2, along, np.inf)
 
     def _cropped(
         self, depth: NDArray[np.float32], mask: NDArray[np.bool_], rng: np.random.Generator

@@ -12,6 +12,7 @@ from nextview.checks import number, whole
 from nextview.errors import UsageError
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import DISTANCE
+from nextview.sensing.frame import Part
 
 Index = NDArray[np.int64]
 Image = NDArray[np.float64]
@@ -109,13 +110,11 @@ class Sensor:
             that of one nearby: row * width + column, int64, or -1 if it hangs in the air.
         """
         measured, sources = depth.copy(), np.arange(depth.size).reshape(depth.shape)
-        rows, columns = np.flatnonzero(depth.any(1)), np.flatnonzero(depth.any(0))
-        if not len(rows):
-            return measured, sources
-        top, left = max(rows[0] - MARGIN, 0), max(columns[0] - MARGIN, 0)
-        part = slice(top, rows[-1] + MARGIN + 1), slice(left, columns[-1] + MARGIN + 1)
+        part = within(depth, MARGIN)
         depth, source = depth[part], sources[part]
-        intrinsics = self.intrinsics - [[0, 0, left], [0, 0, top], [0, 0, 0]]
+        if not depth.size:
+            return measured, sources
+        intrinsics = self.intrinsics - [[0, 0, part[1].start], [0, 0, part[0].start], [0, 0, 0]]
         axial, lateral, grazing, flying, holes = rng.spawn(5)
         q = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
         slope = slopes(q)
@@ -302,19 +301,21 @@ def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
     column = np.arange(width) - disparity
     offset = int(np.ceil(abs(disparity).max(initial=0.0))) + 1
     lit = np.zeros((height, width + 2 * offset + 2))  # the largest disparity in each column of the projector
-    row, seen = np.broadcast_to(np.arange(height)[:, None], q.shape), q > 0
+    first_in_row, seen = np.arange(height)[:, None] * lit.shape[1] + offset, q > 0
     # A surface covers all projector columns from one of its pixels to the next.
     along, joined = _slope(q), np.zeros(q.shape, bool)
     bend = np.abs(q[:, 1:] - q[:, :-1] - along[:, :-1])
     joined[:, :-1] = seen[:, :-1] & seen[:, 1:] & (bend <= EDGE * q[:, :-1])
     last = np.where(joined, np.roll(column, -1, 1), column)
-    first_index, last_index = np.rint(column).astype(int) + offset, np.rint(last).astype(int) + offset
+    # One index into all rows: NumPy takes half the time.
+    first_index, last_index = (first_in_row + np.rint(at).astype(int) for at in (column, last))
+    flat = lit.reshape(-1)
     for k in range(WIDEST):
         at = first_index + k
         some = seen & ((k == 0) | (at < last_index))
-        np.maximum.at(lit, (row[some], at[some]), disparity[some])
+        np.maximum.at(flat, at[some], disparity[some])
     narrow = NARROWEST + focal * abs(baseline) * np.abs(along)
-    return seen & (lit[row, np.where(seen, first_index, 0)] > disparity + narrow)
+    return seen & (flat[np.where(seen, first_index, 0)] > disparity + narrow)
 
 
 def kinect_axial(depth: NDArray[np.floating], angle: NDArray[np.floating]) -> Image:
@@ -333,17 +334,36 @@ def kinect_lateral(angle: NDArray[np.floating]) -> Image:
     return 0.8 + 0.035 * angle / (np.pi / 2 - angle)
 
 
-def normal_field(rng: np.random.Generator, shape: tuple[int, int], grain: float) -> Image:
-    """White noise under a Gaussian window of ``grain`` pixels, of variance 1."""
+def within(depth: NDArray[np.float32], margin: int = 0) -> Part:
+    """Rows and columns of a depth image that hold all that it shows, and a margin."""
+    shown = [np.flatnonzero(depth.any(1 - axis)) for axis in (0, 1)]
+    low, high = zip(*((at[0], at[-1] + 1) if len(at) else (0, 0) for at in shown), strict=True)
+    return spans(np.array(low) - margin, np.array(high) + margin * bool(high[0]), depth.shape)
+
+
+def spans(low: NDArray[np.floating], high: NDArray[np.floating], shape: tuple[int, ...]) -> Part:
+    """Rows and columns of a picture from ``low``, (2,), to before ``high``, (2,)."""
+    first, last = (np.clip(np.floor(at), 0, shape).astype(int).tolist() for at in (low, high))
+    return slice(first[0], last[0]), slice(first[1], last[1])
+
+
+def normal_field(rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None) -> Image:
+    """White noise under a Gaussian window of ``grain`` pixels, of variance 1; or a part of it."""
     white = rng.standard_normal(shape)
     if grain < NO_GRAIN:
-        return white
+        return white if part is None else white[part]
     impulse = np.zeros(8 * int(np.ceil(grain)) + 17)
     impulse[len(impulse) // 2] = 1
     power = (gaussian_filter1d(impulse, grain) ** 2).sum()
-    return np.asarray(gaussian_filter(white, grain, mode="wrap")) / power
+    if part is None:
+        return np.asarray(gaussian_filter(white, grain, mode="wrap")) / power
+    far = int(4 * grain + 0.5) + 1  # as far as the window reaches
+    rows, columns = (np.arange(s.start - far, s.stop + far) % side for s, side in zip(part, shape, strict=True))
+    return np.asarray(gaussian_filter(white[np.ix_(rows, columns)], grain))[far:-far, far:-far] / power
 
 
-def uniform_field(rng: np.random.Generator, shape: tuple[int, int], grain: float) -> Image:
+def uniform_field(rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None) -> Image:
     """Numbers between 0 and 1, each as likely; neighbours are alike as in ``normal_field``."""
-    return rng.random(shape) if grain == 0 else np.asarray(ndtr(normal_field(rng, shape, grain)))
+    if grain == 0:
+        return rng.random(shape) if part is None else rng.random(shape)[part]
+    return np.asarray(ndtr(normal_field(rng, shape, grain, part)))
