@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
@@ -66,7 +67,7 @@ def test_a_next_command_is_there(name):
 
 def kinds(hint):
     """What an option takes: numbers, texts or a switch; and whether several."""
-    if is_dataclass(hint):
+    if is_dataclass(hint) or get_origin(hint) is Callable:
         return set()
     if get_origin(hint) is tuple:
         return {("several", kind) for part in get_args(hint) for kind in kinds(part)}
