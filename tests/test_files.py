@@ -54,7 +54,9 @@ def test_a_folder_is_new_or_empty_and_with_overwrite_only_its_own_files_are_repl
 def test_links_and_places_of_another_kind_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "link").symlink_to(tmp_path / "file")
+    os.mkfifo(tmp_path / "pipe")
     cases = ("link", False, "link"), ("file", True, "is a file"), ("file/x", False, "not a folder")
+    cases += (("pipe", False, "is a pipe or a device"), ("pipe", True, "is a pipe or a device"))
     for path, folder, words in cases:
         with pytest.raises(ResultsError, match=words):
             files.check_new(tmp_path / path, overwrite=True, folder=folder)

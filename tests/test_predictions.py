@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pipeline import SPHERE, some_predictions
+from scipy.special import softmax
 
 from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
@@ -138,6 +139,8 @@ def test_logits_of_ones_own_make_the_predictions_that_the_networks_make(views, m
         Predictions.from_logits(views, logits, made.classes, "test")
     with pytest.raises(DatasetError, match="does not know the class"):
         Predictions.from_logits(views, logits, ("a", "b", "c"))
+    with pytest.raises(PredictionsError, match="these are probabilities"):
+        Predictions.from_logits(views, softmax(logits, 2), made.classes)
 
 
 def test_the_same_mesh_under_two_labels_is_marked_across_splits(furniture, models, tmp_path):

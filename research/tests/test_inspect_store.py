@@ -62,14 +62,14 @@ def test_an_object_is_drawn_with_the_horizon_lowest(views):
 
 def test_the_command_draws_or_says_why_not(views, tmp_path):
     inspect(views, tmp_path / "store.png")
-    inspect(views, tmp_path / "thing.svg", object="thing_3")
+    inspect(views, tmp_path / "thing.svg", object_name="thing_3")
     assert (tmp_path / "store.png").read_bytes().startswith(b"\x89PNG")
     assert b"<svg" in (tmp_path / "thing.svg").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["store.png", "thing.svg"]
     with pytest.raises(DatasetError, match="has no object 'thin'; there are thing_"):
-        inspect(views, tmp_path / "x.png", object="thin")
+        inspect(views, tmp_path / "x.png", object_name="thin")
     with pytest.raises(DatasetError, match="broken is not rendered"):
-        inspect(views, tmp_path / "x.png", object="broken")
+        inspect(views, tmp_path / "x.png", object_name="broken")
     with pytest.raises(UsageError, match=r"\.png or \.pdf or \.svg"):
         inspect(views, tmp_path / "x.txt")
 

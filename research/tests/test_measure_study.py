@@ -86,3 +86,11 @@ def test_scipy_agrees_on_ranks():
     expected = [spearmanr(x, y).statistic for x, y in zip(a, b, strict=True)]
     np.testing.assert_allclose(STUDY["correlations"](a, b), expected)
     assert (STUDY["correlations"](np.ones((2, 40)), b[:2]) == 0).all()
+
+
+def test_the_table_and_the_figure_are_there_for_a_paper(made):
+    there = {path.name for path in (made / "out").iterdir()}
+    assert there == {*(f"measures.{kind}" for kind in ("csv", "md", "png", "pdf", "svg")), "table.csv", "table.tex"}
+    wide = pd.read_csv(made / "out" / "table.csv")
+    assert set(wide["measure"]) >= {"random", "view area", "confidence", "unidirectional"}
+    assert (made / "out" / "measures.pdf").read_bytes().startswith(b"%PDF")

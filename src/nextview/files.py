@@ -35,8 +35,9 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
     if path.is_symlink():
         raise ResultsError(f"{path}: is a link; give what it points to")
     if path.exists():
-        if path.is_dir() != folder:
-            raise ResultsError(f"{path}: is a {'folder' if path.is_dir() else 'file'}; give another name")
+        kind = "folder" if path.is_dir() else "file" if path.is_file() else "pipe or a device"
+        if kind != ("folder" if folder else "file"):
+            raise ResultsError(f"{path}: is a {kind}; give another name")
         if not overwrite and not (folder and not any(path.iterdir())):
             raise ResultsError(f"{path}: exists; give another name, or --overwrite to replace it")
     above = next(p for p in path.absolute().parents if p.exists())

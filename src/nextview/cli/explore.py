@@ -24,7 +24,7 @@ def explore(
     # address to serve the page at; 0.0.0.0 lets every machine that reaches this one see and drive the page
     host: str = "127.0.0.1",
     port: int = 8080,  # of the page; the next free one if it is taken
-    browser: bool = True,  # open the page in this machine's browser, where it has a screen
+    browser: bool = True,  # by default the page opens in this machine's browser, where it has a screen
 ) -> None:
     """Look at objects in the browser: click where to look from, or let a policy walk, and see what it believes.
 

@@ -172,6 +172,8 @@ class Predictions:
         objects = some_objects(store, split)
         logits = np.array(logits, np.float32)
         made = replace(cls.of_objects_in(store, objects, classes or store.classes), logits=logits)
+        if (logits >= 0).all() and np.allclose(logits.sum(2), 1, atol=1e-3):
+            raise PredictionsError("these are probabilities where logits are expected; hand in their logarithms")
         for row, i in enumerate(objects):
             logits[row, [not enough_shows(depth > 0) for depth in store.read("depth", i)]] = 0
         return made

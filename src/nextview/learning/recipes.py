@@ -50,8 +50,8 @@ class RecogniserRecipe:
     seed: int = 0  # decides everything random
     ensemble_seed: int = 0  # of one network of an ensemble: its first weights and draws; --seed: what validates all
     input: Literal["geometry", "image"] = "geometry"  # what the network sees: a depth camera's, or the shaded image
-    augment: bool = True  # whether views are varied: mirrored, shifted, scaled, partly hidden
-    balanced: bool = True  # draw rare classes more often; else every view comes once before any comes again
+    augment: bool = True  # by default views are varied: mirrored, shifted, scaled, partly hidden
+    balanced: bool = True  # by default rare classes are drawn more often; else every view comes once in turn
     lr_schedule: Literal["one-cycle", "halving"] = "one-cycle"  # of the rate: up and down, or halved every fifth epoch
     patience: int = 0  # stop after so many epochs without a better class mean on validation; 0 never stops early
     # how far the parameters go in the end, from the first to the trained ones. Less than 1 keeps more of what the
@@ -104,7 +104,7 @@ class MapRecipe:
     peak_weight: float = 0.0  # of the cross-entropy of the window's highest cell, beside the squared error of all
     peak_sharpness: float = 0.05  # of --peak-weight: values are divided by it to give log-odds
     peak_reach: int = 0  # of --peak-weight: 0 for the highest cell itself, 1 for its four neighbours too
-    mirror: bool = True  # whether left and right are exchanged in half of the views, in the map too
+    mirror: bool = True  # by default left and right are exchanged in half of the views, in the map too
     lr_schedule: Literal["one-cycle", "tenth"] = "one-cycle"  # of the rate: up and down, or a tenth every fifth epoch
     validation_share: float = 0.1  # part of the training split held out for validation
     seed: int = 0  # decides everything random
