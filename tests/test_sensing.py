@@ -126,6 +126,30 @@ def test_things_that_touch_or_nearly_touch_are_two(gap):
     assert_found(thing, one, 0.15, 0.12)
 
 
+def test_things_of_which_only_the_tops_show_are_two():
+    one, other = box((0.12, 0.12, 0.06), (0, 0, 0.03)), box((0.12, 0.16, 0.14), (0.125, 0, 0.07))
+    thing = ObservedObject(point=(0, 0, 0.05))
+    thing.add(frame([TABLE, one, other], pose_at(88, 0, 0.7, (0.06, 0, 0)), seed=0))
+    _, seen = cast([TABLE, one, other], pose_at(88, 0, 0.7, (0.06, 0, 0)))
+    assert not (thing.sightings[0].mask & (seen == 2)).any()
+    assert [warning.name for warning in thing.warnings] == ["outline"]
+    thing.add(frame([TABLE, one, other], pose_at(35, -80, 0.7), seed=1))
+    assert_found(thing, one, 0.15, 0.12)
+    assert thing.warnings == []
+
+
+@pytest.mark.parametrize("wider", [0.006, 0.012])
+def test_a_narrow_strip_of_what_is_behind_belongs_to_it(wider):
+    """The rear box shows all around the front one, a few pixels wide."""
+    front, rear = box((0.1, 0.1, 0.12), (0, 0, 0.06)), box((0.1, 0.1 + 2 * wider, 0.16), (-0.15, 0, 0.08))
+    thing = ObservedObject(point=(0, 0, 0.1))
+    thing.add(frame([TABLE, front, rear], pose_at(15, 0, 0.7, (0, 0, 0.06)), seed=0))
+    _, seen = cast([TABLE, front, rear], pose_at(15, 0, 0.7, (0, 0, 0.06)))
+    mask = thing.sightings[0].mask
+    assert (mask & (seen == 2)).sum() < 0.02 * mask.sum()
+    assert (mask & (seen == 1)).sum() > 0.85 * (seen == 1).sum()
+
+
 @pytest.mark.parametrize("parts", ["handle", "back", "bowl"])
 def test_concave_edges_within_one_thing_do_not_cut_it(parts):
     made = {

@@ -90,14 +90,16 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float) -> Footpri
 def clusters(footprints: Sequence[Footprint]) -> tuple[list[NDArray[np.int64]], Mask]:
     """Which pieces of some frames are of one object.
 
-    Pieces of one frame are joined where they overlap seen from above; and where they lie side by side and one does not
-    reach the plane: a handle, the back of a chair. Things that stand side by side stay apart. Pieces of two frames are
-    joined where half of the smaller one lies over the other, unless a frame shows both side by side.
+    Pieces of one frame are joined where they overlap seen from above; and where they touch and one does not reach the
+    plane: a handle, the back of a chair. Things that stand side by side stay apart, also where only their tops show.
+    Pieces of two frames are joined where half of the smaller one lies over the other, unless a frame shows both side by
+    side.
 
     Returns:
         The label of each pair in each footprint, (K,) int64 each: 1, 2, ... for the clusters; 0 for what lies far from
-        all that the first footprint shows. And for each label, (labels + 1,) bool, whether one frame joins to the
-        cluster what stands beside it in another one: it may be two things.
+        all that the first footprint shows. And for each label, (labels + 1,) bool, whether it may be two things, or a
+        part of one: one frame joins to the cluster what stands beside it in another one, or no frame shows whether
+        what is beside it stands for itself.
     """
     sizes = [len(f.cells) for f in footprints]
     if not sum(sizes):
@@ -109,10 +111,14 @@ def clusters(footprints: Sequence[Footprint]) -> tuple[list[NDArray[np.int64]], 
     here, around = _cells_over(cells[near], node[near], int(first[-1]))
     size = np.maximum(here.sum(1), 1)
     shared, beside = here @ here.T / np.minimum.outer(size, size), around @ here.T > 0
-    cluster, refused = _joined(*_links(footprints, shared, beside))
+    strength, apart, either = _links(footprints, shared, beside)
+    cluster, doubtful = _joined(strength, apart)
+    for a, b in np.argwhere(np.triu(either)):  # in doubt until a frame shows which
+        if cluster[a] != cluster[b] and not apart[np.ix_(cluster == cluster[a], cluster == cluster[b])].any():
+            doubtful.append((int(a), int(b)))
     two = np.zeros(cluster.max() + 2, bool)
     whole = np.bincount(cluster, size)
-    for a, b in refused:
+    for a, b in doubtful:
         if min(size[a], size[b]) > TWO * max(whole[cluster[a]], whole[cluster[b]]):
             two[[cluster[a] + 1, cluster[b] + 1]] = True
     return np.split(np.where(near, cluster[node] + 1, 0), np.cumsum(sizes)[:-1]), two
@@ -134,8 +140,8 @@ def _cells_over(cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int) -
     return here[:, :-1], around[:, :-1]
 
 
-def _links(footprints: Sequence[Footprint], shared: Float, beside: Mask) -> tuple[Float, Mask]:
-    """How strongly each two pieces are linked, 0 for not, and which stand apart, both (N, N), by what both share."""
+def _links(footprints: Sequence[Footprint], shared: Float, beside: Mask) -> tuple[Float, Mask, Mask]:
+    """How strongly each two pieces are linked, 0 for not, which stand apart and which may, (N, N) each."""
     frame = np.repeat(np.arange(len(footprints)), [len(f.stands) for f in footprints])
     same = np.equal.outer(frame, frame)
     stands = np.concatenate([f.stands for f in footprints])
@@ -143,9 +149,9 @@ def _links(footprints: Sequence[Footprint], shared: Float, beside: Mask) -> tupl
     inside |= inside.T
     both, neither = np.logical_and.outer(stands, stands), ~np.logical_or.outer(stands, stands)
     strength = np.where(shared >= np.where(same, OVERLAP, LIES_OVER), shared, 0)
-    strength[same & beside & neither] = OVERLAP
     strength[touch & ~both | inside] = 1
-    return strength, same & beside & both & (shared < OVERLAP) & ~inside
+    side_by_side = same & beside & (strength == 0)
+    return strength, same & beside & both & (shared < OVERLAP) & ~inside, side_by_side & neither
 
 
 def _joined(strength: Float, apart: Mask) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:

@@ -137,6 +137,7 @@ def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) ->
 
 def _enclosed(label: NDArray[np.int64]) -> Mask:
     """Which pieces have most of their border to which other one, (pieces + 1, pieces + 1) bool."""
+    label = np.pad(label, 1)  # a piece has a border where the part of the picture ends, too
     count = _borders(label, [np.ones(label[a].shape, bool) for a, _ in NEXT])
     inside = count > ENCLOSED * count.sum(1, keepdims=True)
     inside[0] = inside[:, 0] = False
