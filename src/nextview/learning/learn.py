@@ -73,6 +73,9 @@ class How:
     upright: bool = False  # the things only ever stand as their files have them; by default they may also lie
     sensor: str = "wrist"  # the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help
     any_size: bool = False  # take things of very different sizes as they are
+    # depth frames without poses, beside camera-intrinsics.txt: the camera stood still, and the thing turned once around
+    # by equal steps, counter-clockwise (ccw) or clockwise (cw) as seen from above
+    turntable: Literal["ccw", "cw"] | None = None
     seed: int = 0  # of all random draws
 
 
@@ -98,8 +101,8 @@ def learn_things(
     """Teach the things in a folder, and write a folder of models that recognises them.
 
     Each mesh in the folder is a thing of its own name, as is each folder of captured depth frames with poses (BOP, TUM
-    RGB-D or 7-Scenes); any other folder is a class, and the meshes in it are its things. A run that was stopped goes on
-    where it was. Use what it writes with --models OUT, or ``nextview.load(models=OUT)``.
+    RGB-D or 7-Scenes) or from a turntable; any other folder is a class, and the meshes in it are its things. A run that
+    was stopped goes on where it was. Use what it writes with --models OUT, or ``nextview.load(models=OUT)``.
 
     Raises:
         DatasetError: nothing can be taught; what is wrong, in one sentence.
@@ -200,7 +203,9 @@ def _teach_one(how: How, part: Path, threads: int, item: tuple[Source, str]) -> 
     """What is to be remembered of one thing; a sentence where it cannot be taught."""
     source, stamp = item
     try:
-        arrays = teach(source.path, source.name, how.unit, how.up, how.upright, how.sensor, how.seed, threads)
+        arrays = teach(
+            source.path, source.name, how.unit, how.up, how.upright, how.sensor, how.seed, how.turntable, threads
+        )
     except NextviewError as error:
         return str(error)
     arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.errors import NoViewLeftError, ObservationError
+from nextview.errors import DatasetError, NoViewLeftError, ObservationError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import resting_poses, rotated
@@ -18,10 +18,11 @@ from nextview.recognition.inference import Features
 from nextview.recognition.memory import AZIMUTHS, RINGS, joined
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import unit
-from nextview.simulation.captured import is_capture, read_capture
+from nextview.simulation.captured import Capture, is_capture, read_capture
 from nextview.simulation.captured_camera import CapturedCamera
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.simulation.turntable import read_turntable
 
 Arrays = dict[str, NDArray]
 HELD_OUT = 8  # views of each thing that are not remembered
@@ -34,7 +35,15 @@ Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
 
 
 def teach(
-    path: Path, name: str, unit: str | None, up: str | None, upright: bool, sensor: str, seed: int, threads: int = 1
+    path: Path,
+    name: str,
+    unit: str | None,
+    up: str | None,
+    upright: bool,
+    sensor: str,
+    seed: int,
+    turntable: str | None = None,
+    threads: int = 1,
 ) -> Arrays:
     """What is to be remembered of one thing, by the names of the fields of ``recognition.memory.Memory``.
 
@@ -42,8 +51,10 @@ def teach(
     ``learn.How``. MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
     """
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    if path.is_dir() and is_capture(path):
-        return _of_capture(path)
+    if path.is_dir():
+        if not is_capture(path) and turntable is None:
+            raise DatasetError(f"{path}: its frames have no poses; --turntable ccw or cw says how the thing turned")
+        return _of_capture(read_capture(path) if is_capture(path) else read_turntable(path, str(turntable)))
     mesh = load_mesh(path, up, unit)
     rotations = np.eye(3)[None] if upright else resting_poses(mesh)
     lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
@@ -94,9 +105,9 @@ def _seen(camera: Camera, poses: NDArray[np.float64]) -> NDArray[np.float32]:
     return embeddings([camera.observe(pose) for pose in poses])
 
 
-def _of_capture(folder: Path) -> Arrays:
+def _of_capture(capture: Capture) -> Arrays:
     """Of captured frames: each cell of the grid is what the nearest of them shows. Every fourth is held out."""
-    camera = CapturedCamera(read_capture(folder))
+    camera = CapturedCamera(capture)
     while True:
         try:
             frame = camera.observe(GRID.poses[0])
@@ -108,7 +119,7 @@ def _of_capture(folder: Path) -> Arrays:
             camera.refused(error)
     seen = [view for view in camera.object.observations if view.seen]
     if not seen:
-        raise ObservationError(f"{folder}: none of its frames shows an object")
+        raise ObservationError(f"{capture.folder}: none of its frames shows an object")
     directions, each = np.stack([direction_of(view.pose) for view in seen]), embeddings(seen)
     kept = np.arange(len(seen)) % 4 < 3 if len(seen) > 4 else np.ones(len(seen), bool)
     arc = angle_between(GRID.directions[:, None], directions[kept][None])
