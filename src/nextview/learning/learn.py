@@ -57,7 +57,8 @@ class Learned:
         """In words."""
         classes = "" if self.classes == self.things else f" of {self.classes} classes"
         one, two, three, _ = (f"{share:.0%}" for share in self.accuracy)
-        lines = [f"{self.things} things{classes} learned; named right after 1, 2, 3 views: {one}, {two}, {three}"]
+        thing = "thing" if self.things == 1 else "things"
+        lines = [f"{self.things} {thing}{classes} learned; named right after 1, 2, 3 views: {one}, {two}, {three}"]
         lines += [f"confused: {a} and {b} ({share:.0%} of the cases)" for a, b, share in self.confused[:5]]
         if len(self.confused) > 5:
             lines.append(f"and {len(self.confused) - 5} pairs less often")
