@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace as replace_record
@@ -18,7 +18,7 @@ from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, command, new_file, new_folder, only_one
 from nextview.learning.learned_picture import draw_learned
 from nextview.learning.memory_fit import VIEWS, fit_memory, size_evidence
-from nextview.learning.teaching import Arrays, teach
+from nextview.learning.teaching import Arrays, How, teach
 from nextview.learning.things import Found, Source, find_things
 from nextview.recognition.belief import Calibration
 from nextview.recognition.memory import AZIMUTHS, Memory, read_memory
@@ -63,21 +63,6 @@ class Learned:
         if len(self.confused) > 5:
             lines.append(f"and {len(self.confused) - 5} pairs less often")
         return "\n".join(lines + [*self.notes] + [f"left out: {phrase}" for phrase in self.left_out])
-
-
-@dataclass(frozen=True)
-class How:
-    """How things are looked at."""
-
-    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None  # of the mesh files; then size counts as evidence
-    up: Literal["y", "z"] | None = None  # the up axis of the mesh files; z by default, but y for GLB
-    upright: bool = False  # the things only ever stand as their files have them; by default they may also lie
-    sensor: str = "wrist"  # the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help
-    any_size: bool = False  # take things of very different sizes as they are
-    # depth frames without poses, beside camera-intrinsics.txt: the camera stood still, and the thing turned once around
-    # by equal steps, counter-clockwise (ccw) or clockwise (cw) as seen from above
-    turntable: Literal["ccw", "cw"] | None = None
-    seed: int = 0  # of all random draws
 
 
 def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
@@ -204,9 +189,7 @@ def _teach_one(how: How, part: Path, threads: int, item: tuple[Source, str]) -> 
     """What is to be remembered of one thing; a sentence where it cannot be taught."""
     source, stamp = item
     try:
-        arrays = teach(
-            source.path, source.name, how.unit, how.up, how.upright, how.sensor, how.seed, how.turntable, threads
-        )
+        arrays = teach(source.path, source.name, how, threads)
     except NextviewError as error:
         return str(error)
     arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}

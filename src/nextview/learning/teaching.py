@@ -3,8 +3,10 @@
 import zlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,35 +36,40 @@ SENSED = GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4,
 Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
 
 
-def teach(
-    path: Path,
-    name: str,
-    unit: str | None,
-    up: str | None,
-    upright: bool,
-    sensor: str,
-    seed: int,
-    turntable: str | None = None,
-    threads: int = 1,
-) -> Arrays:
+@dataclass(frozen=True)
+class How:
+    """How things are looked at."""
+
+    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None  # of the mesh files; then size counts as evidence
+    up: Literal["y", "z"] | None = None  # the up axis of the mesh files; z by default, but y for GLB
+    upright: bool = False  # the things only ever stand as their files have them; by default they may also lie
+    sensor: str = "wrist"  # the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help
+    any_size: bool = False  # take things of very different sizes as they are
+    # depth frames without poses, beside camera-intrinsics.txt: the camera stood still, and the thing turned once around
+    # by equal steps, counter-clockwise (ccw) or clockwise (cw) as seen from above
+    turntable: Literal["ccw", "cw"] | None = None
+    seed: int = 0  # of all random draws
+
+
+def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
     """What is to be remembered of one thing, by the names of the fields of ``recognition.memory.Memory``.
 
-    Of a mesh file or a folder of captured frames; name and seed decide all random draws, the others are as of
-    ``learn.How``. MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
+    Of a mesh file or a folder of captured frames; name and seed decide all random draws. MeshError, DatasetError,
+    ObservationError: why it cannot be looked at, in one sentence.
     """
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+    rng = np.random.default_rng([how.seed, zlib.crc32(name.encode())])
     if path.is_dir():
-        if not is_capture(path) and turntable is None:
+        if not is_capture(path) and how.turntable is None:
             raise DatasetError(f"{path}: its frames have no poses; --turntable ccw or cw says how the thing turned")
-        return _of_capture(read_capture(path) if is_capture(path) else read_turntable(path, str(turntable)))
-    mesh = load_mesh(path, up, unit)
-    rotations = np.eye(3)[None] if upright else resting_poses(mesh)
+        return _of_capture(read_capture(path) if is_capture(path) else read_turntable(path, str(how.turntable)))
+    mesh = load_mesh(path, how.up, how.unit)
+    rotations = np.eye(3)[None] if how.upright else resting_poses(mesh)
     lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
     directions = np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), HELD_OUT)), rng.uniform(0, 2 * np.pi, HELD_OUT)
     with ThreadPoolExecutor(threads) as pool:
-        held_out = _sensed(pool, mesh, look_at_origin(*directions), sensor, rng)
+        held_out = _sensed(pool, mesh, look_at_origin(*directions), how.sensor, rng)
         clean = [_clean(pool, each) for each in lying]
-        sensed = [_sensed(pool, each, SENSED, sensor, rng) for each in lying]
+        sensed = [_sensed(pool, each, SENSED, how.sensor, rng) for each in lying]
         around = [_around(*both) for both in zip(clean, sensed, strict=True)]
         shown = np.concatenate(list(held_out))
     return {
