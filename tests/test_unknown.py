@@ -18,7 +18,7 @@ from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
 from nextview.geometry.mesh import make_mesh
 from nextview.learning.unknown import quantiles
-from nextview.recognition.novelty import NEIGHBOUR, Novelty, read_novelty
+from nextview.recognition.novelty import NEIGHBOUR, Novelty, Quantiles, read_novelty
 from nextview.sensing import Frame, ObservedObject
 
 
@@ -66,6 +66,20 @@ def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
 
 
 # Files and cards
+
+
+def test_a_score_beyond_all_of_few_known_views_is_as_rare_as_a_normal_distribution_says():
+    rng = np.random.default_rng(0)
+    few, many = rng.normal(3, 2, 48), rng.normal(3, 2, 100_000)
+    table = np.quantile(few, np.linspace(0, 1, 101))[None]
+    score = Quantiles(table, np.array([48]), joint=True, usual=np.array([[0.0, 1.0], [0.5, 0.0]]))
+    assert score.of_belief(np.array([-9.0, -8.0]), 1) == 7.0
+    assert score.of_belief(np.array([-7.0, -8.0]), 5) == 6.5
+    assert score.p_value(few.max(), 1) == 1 / 49  # no more can be said by counting
+    far = 3 + 2 * 2.5
+    assert few.max() < far
+    assert score.p_value(far, 1) == pytest.approx((many > far).mean(), abs=0.01)
+    assert score.p_value(far, 1) < 1 / 49
 
 
 def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_another_is_refused(tmp_path):

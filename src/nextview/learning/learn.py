@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace as replace_record
@@ -18,7 +18,7 @@ from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, command, new_file, new_folder, only_one
 from nextview.learning.learned_picture import draw_learned
 from nextview.learning.memory_fit import VIEWS, fit_memory, size_evidence
-from nextview.learning.teaching import Arrays, teach
+from nextview.learning.teaching import Arrays, How, teach
 from nextview.learning.things import Found, Source, find_things
 from nextview.recognition.belief import Calibration
 from nextview.recognition.memory import AZIMUTHS, Memory, read_memory
@@ -57,23 +57,12 @@ class Learned:
         """In words."""
         classes = "" if self.classes == self.things else f" of {self.classes} classes"
         one, two, three, _ = (f"{share:.0%}" for share in self.accuracy)
-        lines = [f"{self.things} things{classes} learned; named right after 1, 2, 3 views: {one}, {two}, {three}"]
+        thing = "thing" if self.things == 1 else "things"
+        lines = [f"{self.things} {thing}{classes} learned; named right after 1, 2, 3 views: {one}, {two}, {three}"]
         lines += [f"confused: {a} and {b} ({share:.0%} of the cases)" for a, b, share in self.confused[:5]]
         if len(self.confused) > 5:
             lines.append(f"and {len(self.confused) - 5} pairs less often")
         return "\n".join(lines + [*self.notes] + [f"left out: {phrase}" for phrase in self.left_out])
-
-
-@dataclass(frozen=True)
-class How:
-    """How things are looked at."""
-
-    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None  # of the mesh files; then size counts as evidence
-    up: Literal["y", "z"] | None = None  # the up axis of the mesh files; z by default, but y for GLB
-    upright: bool = False  # the things only ever stand as their files have them; by default they may also lie
-    sensor: str = "wrist"  # the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help
-    any_size: bool = False  # take things of very different sizes as they are
-    seed: int = 0  # of all random draws
 
 
 def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
@@ -98,8 +87,8 @@ def learn_things(
     """Teach the things in a folder, and write a folder of models that recognises them.
 
     Each mesh in the folder is a thing of its own name, as is each folder of captured depth frames with poses (BOP, TUM
-    RGB-D or 7-Scenes); any other folder is a class, and the meshes in it are its things. A run that was stopped goes on
-    where it was. Use what it writes with --models OUT, or ``nextview.load(models=OUT)``.
+    RGB-D or 7-Scenes) or from a turntable; any other folder is a class, and the meshes in it are its things. A run that
+    was stopped goes on where it was. Use what it writes with --models OUT, or ``nextview.load(models=OUT)``.
 
     Raises:
         DatasetError: nothing can be taught; what is wrong, in one sentence.
@@ -200,7 +189,7 @@ def _teach_one(how: How, part: Path, threads: int, item: tuple[Source, str]) -> 
     """What is to be remembered of one thing; a sentence where it cannot be taught."""
     source, stamp = item
     try:
-        arrays = teach(source.path, source.name, how.unit, how.up, how.upright, how.sensor, how.seed, threads)
+        arrays = teach(source.path, source.name, how, threads)
     except NextviewError as error:
         return str(error)
     arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}

@@ -3,13 +3,15 @@
 import zlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.errors import NoViewLeftError, ObservationError
+from nextview.errors import DatasetError, NoViewLeftError, ObservationError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import resting_poses, rotated
@@ -18,10 +20,11 @@ from nextview.recognition.inference import Features
 from nextview.recognition.memory import AZIMUTHS, RINGS, joined
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import unit
-from nextview.simulation.captured import is_capture, read_capture
+from nextview.simulation.captured import Capture, is_capture, read_capture
 from nextview.simulation.captured_camera import CapturedCamera
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.simulation.turntable import read_turntable
 
 Arrays = dict[str, NDArray]
 HELD_OUT = 8  # views of each thing that are not remembered
@@ -33,25 +36,40 @@ SENSED = GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4,
 Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
 
 
-def teach(
-    path: Path, name: str, unit: str | None, up: str | None, upright: bool, sensor: str, seed: int, threads: int = 1
-) -> Arrays:
+@dataclass(frozen=True)
+class How:
+    """How things are looked at."""
+
+    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None  # of the mesh files; then size counts as evidence
+    up: Literal["y", "z"] | None = None  # the up axis of the mesh files; z by default, but y for GLB
+    upright: bool = False  # the things only ever stand as their files have them; by default they may also lie
+    sensor: str = "wrist"  # the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help
+    any_size: bool = False  # take things of very different sizes as they are
+    # depth frames without poses, beside camera-intrinsics.txt: the camera stood still, and the thing turned once around
+    # by equal steps, counter-clockwise (ccw) or clockwise (cw) as seen from above
+    turntable: Literal["ccw", "cw"] | None = None
+    seed: int = 0  # of all random draws
+
+
+def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
     """What is to be remembered of one thing, by the names of the fields of ``recognition.memory.Memory``.
 
-    Of a mesh file or a folder of captured frames; name and seed decide all random draws, the others are as of
-    ``learn.How``. MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
+    Of a mesh file or a folder of captured frames; name and seed decide all random draws. MeshError, DatasetError,
+    ObservationError: why it cannot be looked at, in one sentence.
     """
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    if path.is_dir() and is_capture(path):
-        return _of_capture(path)
-    mesh = load_mesh(path, up, unit)
-    rotations = np.eye(3)[None] if upright else resting_poses(mesh)
+    rng = np.random.default_rng([how.seed, zlib.crc32(name.encode())])
+    if path.is_dir():
+        if not is_capture(path) and how.turntable is None:
+            raise DatasetError(f"{path}: its frames have no poses; --turntable ccw or cw says how the thing turned")
+        return _of_capture(read_capture(path) if is_capture(path) else read_turntable(path, str(how.turntable)))
+    mesh = load_mesh(path, how.up, how.unit)
+    rotations = np.eye(3)[None] if how.upright else resting_poses(mesh)
     lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
     directions = np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), HELD_OUT)), rng.uniform(0, 2 * np.pi, HELD_OUT)
     with ThreadPoolExecutor(threads) as pool:
-        held_out = _sensed(pool, mesh, look_at_origin(*directions), sensor, rng)
+        held_out = _sensed(pool, mesh, look_at_origin(*directions), how.sensor, rng)
         clean = [_clean(pool, each) for each in lying]
-        sensed = [_sensed(pool, each, SENSED, sensor, rng) for each in lying]
+        sensed = [_sensed(pool, each, SENSED, how.sensor, rng) for each in lying]
         around = [_around(*both) for both in zip(clean, sensed, strict=True)]
         shown = np.concatenate(list(held_out))
     return {
@@ -94,9 +112,9 @@ def _seen(camera: Camera, poses: NDArray[np.float64]) -> NDArray[np.float32]:
     return embeddings([camera.observe(pose) for pose in poses])
 
 
-def _of_capture(folder: Path) -> Arrays:
+def _of_capture(capture: Capture) -> Arrays:
     """Of captured frames: each cell of the grid is what the nearest of them shows. Every fourth is held out."""
-    camera = CapturedCamera(read_capture(folder))
+    camera = CapturedCamera(capture)
     while True:
         try:
             frame = camera.observe(GRID.poses[0])
@@ -108,7 +126,7 @@ def _of_capture(folder: Path) -> Arrays:
             camera.refused(error)
     seen = [view for view in camera.object.observations if view.seen]
     if not seen:
-        raise ObservationError(f"{folder}: none of its frames shows an object")
+        raise ObservationError(f"{capture.folder}: none of its frames shows an object")
     directions, each = np.stack([direction_of(view.pose) for view in seen]), embeddings(seen)
     kept = np.arange(len(seen)) % 4 < 3 if len(seen) > 4 else np.ones(len(seen), bool)
     arc = angle_between(GRID.directions[:, None], directions[kept][None])

@@ -7,6 +7,7 @@ from nextview.data.folders import scan_dataset
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import FORMATS
 from nextview.simulation.captured import is_capture
+from nextview.simulation.turntable import is_turntable
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ def find_things(folder: Path) -> Found:
     if not folder.is_dir():
         raise DatasetError(f"{folder}: there is no such folder")
     inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    captures = [path for path in inside if path.is_dir() and is_capture(path)]
+    captures = [path for path in inside if path.is_dir() and (is_capture(path) or is_turntable(path))]
     things = [Source(path.name, path.name, path) for path in captures]
     things += [Source(path.stem, path.stem, path) for path in inside if path.suffix.lower() in FORMATS]
     pictures = [path for path in inside if path.is_file() and path.suffix.lower() in PICTURES]

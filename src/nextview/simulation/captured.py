@@ -111,7 +111,7 @@ def read_capture(
     if isinstance(intrinsics, tuple):
         k, said = pinhole_of(*intrinsics), ["intrinsics as given"]
     elif intrinsics is not None or path.exists():
-        k, said = _table(path, "the pinhole matrix", 3), [f"intrinsics of {path.name}"]
+        k, said = read_table(path, "the pinhole matrix", 3), [f"intrinsics of {path.name}"]
     frames, notes = LAYOUTS[layout][1](folder, k, object_id)
     if not frames:
         raise DatasetError(f"{folder}: no image shows the object")
@@ -244,7 +244,7 @@ def _read_seven_scenes(folder: Path, intrinsics: Float | None, _: int | None) ->
     for depth in sorted(folder.glob("frame-*.depth.png")):
         name = depth.name.removeprefix("frame-").removesuffix(".depth.png")
         path, mask = folder / f"frame-{name}.pose.txt", folder / f"frame-{name}.mask.png"
-        pose = _rigid(_table(path, "the camera's pose", 4), str(path))
+        pose = _rigid(read_table(path, "the camera's pose", 4), str(path))
         frames.append(CapturedFrame(name, depth, MILLIMETRES, intrinsics, pose, mask if mask.exists() else None))
     return frames, notes
 
@@ -320,7 +320,7 @@ def _numbers(path: Path, words: list[list[str]]) -> Float:
     return values
 
 
-def _table(path: Path, what: str, side: int) -> Float:
+def read_table(path: Path, what: str, side: int) -> Float:
     """A square table of numbers."""
     values = _numbers(path, _lines(path, side, what))
     if len(values) != side:

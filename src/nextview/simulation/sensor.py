@@ -350,13 +350,12 @@ def spans(low: NDArray[np.floating], high: NDArray[np.floating], shape: tuple[in
 def normal_field(rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None) -> Image:
     """White noise under a Gaussian window of ``grain`` pixels, of variance 1; or a part of it."""
     white = rng.standard_normal(shape)
+    part = part or (slice(0, shape[0]), slice(0, shape[1]))
     if grain < NO_GRAIN:
-        return white if part is None else white[part]
+        return white[part]
     impulse = np.zeros(8 * int(np.ceil(grain)) + 17)
     impulse[len(impulse) // 2] = 1
     power = (gaussian_filter1d(impulse, grain) ** 2).sum()
-    if part is None:
-        return np.asarray(gaussian_filter(white, grain, mode="wrap")) / power
     far = int(4 * grain + 0.5) + 1  # as far as the window reaches
     rows, columns = (np.arange(s.start - far, s.stop + far) % side for s, side in zip(part, shape, strict=True))
     return np.asarray(gaussian_filter(white[np.ix_(rows, columns)], grain))[far:-far, far:-far] / power
@@ -365,5 +364,5 @@ def normal_field(rng: np.random.Generator, shape: tuple[int, int], grain: float,
 def uniform_field(rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None) -> Image:
     """Numbers between 0 and 1, each as likely; neighbours are alike as in ``normal_field``."""
     if grain == 0:
-        return rng.random(shape) if part is None else rng.random(shape)[part]
+        return rng.random(shape)[part or ...]
     return np.asarray(ndtr(normal_field(rng, shape, grain, part)))
