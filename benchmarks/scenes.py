@@ -1,19 +1,17 @@
 """Choose and judge policies in scenes: objects among others, half hidden.
 
     python benchmarks/scenes.py choose learning.npz [--policies random-all visibility@0 visible-gain@0]
-    nextview plan scenes.zarr volumetric    # of the store that scenes.npz was predicted from
+    python -m research.plan scenes.zarr volumetric    # of the store that scenes.npz was predicted from
     python benchmarks/scenes.py judge scenes.npz ... --ours visible-gain [--policies ...] [--figure scenes_travel.png]
     python benchmarks/scenes.py calibration scenes.npz ... --alone single-objects.npz ...
 
-``choose``: what policies reach on scenes for learning, classes weighted evenly: the mean log-belief in the truth and
-the accuracy after 2 to 5 views, by which ``nextview train gain`` judges as well. ``judge``: by level the accuracy and
-the travel after 2, 3 and 5 views, the points over random, and those of ours over each of its rivals, with 95 %
-bootstrap intervals over scenes. Tested is what is claimed, ours against its rivals, with one Holm correction for all
-levels and numbers of views. Then how much of what one step of foresight gains is had; and, as a figure, accuracy
-against travel in cells, and in seconds of a robot that takes ``SECONDS`` for each view and ``TURN`` for a turn of the
-camera around the object by one radian. ``calibration``: how far the belief after 1, 2, 3 and 5 random views can be
-trusted, by level and by how much of the target those views show, beside the belief after the very same views of the
-target alone.
+``choose``: what policies reach on scenes for learning, classes weighted evenly: mean log-belief in the truth and
+accuracy after 2 to 5 views, as ``nextview train gain`` judges. ``judge``: by level accuracy and travel after 2, 3 and
+5 views, points over random, and those of ours over each rival, with 95 % bootstrap intervals over scenes and one Holm
+correction for all that is claimed; the share of what one step of foresight gains; as a figure, accuracy against travel
+in cells and in seconds of a robot that takes ``SECONDS`` for a view and ``TURN`` for a radian around the object.
+``calibration``: how far the belief after 1, 2, 3 and 5 random views can be trusted, by level and by how much of the
+target they show.
 """
 
 from __future__ import annotations

@@ -90,8 +90,7 @@ def main(updates: int = 200, threads: int = 2, cpu: bool = False, seed: int = 0,
     Args:
         updates: how many are timed, after one session that is not.
         threads: of ONNX Runtime.
-        cpu: count the time of the processor, not that of the clock on the wall: for a machine that is busy otherwise,
-            with one thread.
+        cpu: count the time of the processor, not that of the clock on the wall; with one thread.
         seed: of the places and the noise.
         threshold: of the sessions; 0.97 is that of use.
     """

@@ -7,9 +7,8 @@
 
 Each predictions file is a draw of the sensor's noise: all are judged. Writes things.md (the table) and things.csv
 (every number) into the folder. The bootstrap is over things, whose runs and draws belong together; p is McNemar's test
-over things, corrected by Holm's method for all policies, numbers of views and both sets of things. ``foresight`` sees
-what each view will say, its noise too. The fair ceiling knows the thing and its azimuth, but of the noise only other
-draws: it goes where the true thing is believed most in their mean.
+over things, with one Holm correction. ``foresight`` sees what each view will say, its noise too. The fair ceiling
+knows the thing and its azimuth, but of the noise only other draws: it goes where these believe in the truth most.
 """
 
 from __future__ import annotations
@@ -170,8 +169,7 @@ def main(
     """Run all policies and write the table.
 
     Args:
-        card: of the memory.
-        out: folder to write.
+        card: of the memory; ``out`` is the folder to write.
         predictions: made by it, of one draw of the noise each.
         by_shape: as if sizes were not known.
         runs: random first views of each thing in each draw.

@@ -4,11 +4,10 @@
     nextview render data/PSB unseen.zarr
     python benchmarks/unknown.py views.zarr unseen.zarr [--split test]
 
-The classes of the second store must not be among the recogniser's; that is up to you. Prints the area under the ROC
-curve of the novelty score after one, two, three and five random views, the share of known objects that are taken for
-unknown at the rates that were asked for (calibrated on held-out training objects: the test split shows whether they
-hold), the share of unknown ones that are caught, and what each unknown class is taken for. In brackets: 95 % of the
-bootstrap over objects.
+The classes of the second store must not be among the recogniser's. Prints, after one, two, three and five random views,
+the area under the ROC curve of the novelty score, the share of known objects that are taken for unknown at the rates
+that were asked for (calibrated on held-out training objects), the share of unknown ones that are caught, and what each
+unknown class is taken for. In brackets: 95 % of the bootstrap over objects.
 """
 
 from __future__ import annotations
