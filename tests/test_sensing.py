@@ -12,6 +12,7 @@ from pipeline import INTRINSICS, SAMPLE_FILES, SHAPE, TABLE, box, cast, meshed, 
 from scipy.spatial.transform import Rotation
 
 from nextview import Observation, SimulatedCamera
+from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.recognition.inference import Recogniser
@@ -53,6 +54,17 @@ def assert_found(thing, mesh, centre, radius):
 def rendered(mesh, frame_: ObjectFrame, pose) -> Observation:
     """What a camera sees of the mesh alone, level, from three true radii."""
     return SimulatedCamera(meshed(mesh)).observe(virtual_pose(frame_.pose_in_object(pose)))
+
+
+def test_what_was_found_in_part_from_above_is_found_whole_in_the_same_place():
+    chair = sample_mesh("chair")
+    vertices = 0.12 * (chair.vertices - [0, 0, chair.vertices[:, 2].min()])
+    scene = [TABLE, trimesh.Trimesh(vertices, chair.faces, process=False)]
+    thing = ObservedObject()
+    thing.add(frame(scene, pose_at(72, 135, 0.6, (0, 0, 0.1)), 1))  # its seat; the back stands on legs of its own
+    assert thing.object_frame.radius < 0.1
+    thing.add(frame(scene, pose_at(40, 155, 0.6, (0, 0, 0.1)), 2))
+    assert thing.object_frame.radius == pytest.approx(0.12, rel=0.1)
 
 
 # The virtual view

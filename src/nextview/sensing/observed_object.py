@@ -336,7 +336,12 @@ class ObservedObject:
         count = np.bincount(votes)
         count[0] = 0
         if count.any():
-            return int(count.argmax())
+            target, here = int(count.argmax()), labels[-1]
+            if target not in here:  # what was found was a part: the whole stands in the same place
+                off = np.linalg.norm(footprints[-1].cells + 0.5 - to_cells @ self.object_frame.centre, axis=1)
+                there = here[(off < self.object_frame.radius * np.linalg.norm(to_cells[0])) & (here > 0)]
+                target = int(np.bincount(there).argmax()) if len(there) else 0
+            return target
         if self.sightings:
             return clusters.nearest(footprints[-1:], labels[-1:], to_cells @ self.object_frame.centre)
         return clusters.largest(footprints[-1], labels[-1], ground)
