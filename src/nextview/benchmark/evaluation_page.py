@@ -69,8 +69,7 @@ def write_evaluation(
     with new_folder(out, overwrite) as part:
         for name, frame in found.tables().items():
             frame.to_csv(part / f"{name}.csv", index=False)
-        notes = {"settings": made, "left_out": found.left_out}
-        (part / "evaluate.json").write_text(json.dumps(notes, indent=1) + "\n")
+        (part / "evaluate.json").write_text(json.dumps({"settings": made, "left_out": found.left_out}, indent=1) + "\n")
         (part / "evaluate.html").write_text(page(found, p, made), encoding="utf-8")
     if figures is not None:
         write_figures(figures, _figures(found, p), found.tables(), overwrite)

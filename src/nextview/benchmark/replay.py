@@ -60,8 +60,7 @@ def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
     starts = rng.integers(len(predictions.sphere), size=runs * n)
     objects = np.tile(np.arange(n), runs)
     if scenes is not None:
-        draws = rng.random((len(objects), len(predictions.sphere)))
-        starts = np.where(scenes.reachable[objects], draws, -1).argmax(1)
+        starts = np.where(scenes.reachable[objects], rng.random((len(objects), len(predictions.sphere))), -1).argmax(1)
     return EpisodeSpecs(predictions, objects, starts, scenes)
 
 

@@ -115,8 +115,7 @@ class OffGrid:
     def _nearest_to(self, cells: NDArray[np.int64], state: EpisodeState) -> NDArray[np.int64]:
         """The free view nearest to a cell of the turned grid, (B,)."""
         towards = self._grid_directions(state)[np.arange(len(cells)), cells]
-        arc = angle_between(towards[:, None], self.sphere.directions[None])
-        return np.where(state.free, arc, np.inf).argmin(1)
+        return np.where(state.free, angle_between(towards[:, None], self.sphere.directions[None]), np.inf).argmin(1)
 
     def _here(self, state: EpisodeState) -> Float:
         """Unit vectors towards the cameras, (B, 3)."""
@@ -135,6 +134,5 @@ class OffGrid:
         for ring, of_ring in ((low, 1 - up), (np.minimum(low + 1, len(heights) - 1), up)):
             for step, of_step in ((left, 1 - right), (left + 1, right)):
                 share = of_ring * of_step
-                corner = values[rows, order[ring] * n + step % n]
-                found += np.where(share > 1e-6, share * corner, 0.0)
+                found += np.where(share > 1e-6, share * values[rows, order[ring] * n + step % n], 0.0)
         return found

@@ -50,5 +50,4 @@ def _is_one_picture(first: Observation, second: Observation) -> bool:
     if not first.seen:
         return False
     near = angle_between(direction_of(first.pose), direction_of(second.pose)) <= VISITED
-    turned = np.allclose(first.pose[2], second.pose[2], atol=LEVEL)
-    return bool(near or not turned or check_views(first, second))
+    return bool(near or not np.allclose(first.pose[2], second.pose[2], atol=LEVEL) or check_views(first, second))

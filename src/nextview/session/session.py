@@ -237,8 +237,7 @@ class Session:
             for observer in self.observers:
                 observer(self)
         else:  # with frames it begins where the camera is
-            episodes = self._begin_nearest(reach) if self.object is None else self._episodes
-            self._reach, self._episodes = reach, episodes
+            self._reach, self._episodes = reach, self._begin_nearest(reach) if self.object is None else self._episodes
 
     def _begin_nearest(self, reach: Reach) -> Episodes:
         """Before the first view: begin at the nearest view that can be reached. A callable is not asked yet."""
@@ -252,8 +251,7 @@ class Session:
     ) -> EpisodeState:
         """The state with where the camera can go from here, by default from where the last view was taken."""
         if here is None:
-            seen = self.views[-1].observation
-            here = seen.pose if object is None else object.sightings[-1].frame.camera_to_world
+            here = self.views[-1].observation.pose if object is None else object.sightings[-1].frame.camera_to_world
         return reach.constrain(state, self.sphere, here, lambda: self._poses_around(object))
 
     # What is seen
@@ -308,8 +306,7 @@ class Session:
             else:
                 object.add(frame)
             self._check_distance(object.object_frame.radius)
-            observations = object.observations[self._before :]
-            return self._take(observations, object.warnings, frame.camera_to_world, object)
+            return self._take(object.observations[self._before :], object.warnings, frame.camera_to_world, object)
         except BaseException:
             object.state = before
             raise
@@ -383,11 +380,10 @@ class Session:
         azimuth = self.sphere.azimuth[[nearest]] if there else azimuth_of(direction[None])
         classes, evidence = len(self.models.classes), step.evidence
         bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), classes, azimuth)
-        alone = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth)
         return View(
             int(step.views[0]),
             observation,
-            alone=calibration.belief(alone, 1, classes)[0],
+            alone=calibration.belief(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), 1, classes)[0],
             belief=step.belief[0],
             maps={name: values[0] for name, values in step.evidence.maps.items()},
             next_view=None,

@@ -46,14 +46,13 @@ class WalkScene:
             self._object = server.scene.add_mesh_simple(
                 f"{name}/object", vertices, mesh.faces, color=rgb(WOOD), flat_shading=flat, side="double"
             )
-        floor = -1.0 if mesh is None else float(mesh.vertices[:, 2].min())
         server.scene.add_cylinder(
             f"{name}/table",
             TABLE,
             0.04,
             (255, 246, 230),
             radial_segments=96,
-            position=(0, 0, floor - 0.03),
+            position=(0, 0, (-1.0 if mesh is None else float(mesh.vertices[:, 2].min())) - 0.03),
             cast_shadow=False,
         )
         server.scene.add_line_segments(
