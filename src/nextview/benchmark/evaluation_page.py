@@ -59,12 +59,8 @@ def write_evaluation(
         what = f"{'shapes' if settings.deduplicate else 'objects'}{'' if p.of_size is None else ', of known size'}"
         scores = {f"{settings.split or p.splits[0] or 'all'} ({len(p)} {what})": scores_for_card(card, p)}
         noted[card.path.with_suffix(".json")] = card.sha256, scores
-    made = asdict(settings) | {
-        "predictions": predictions.name,
-        "predictions_sha256": sha256_of(predictions),
-        "models": p.models,
-        "objects": len(p),
-    }
+    made = asdict(settings) | {"predictions": predictions.name, "predictions_sha256": sha256_of(predictions)}
+    made |= {"models": p.models, "objects": len(p)}
     found = evaluate(p, settings.samples, np.random.default_rng([settings.seed, 0]))
     with new_folder(out, overwrite) as part:
         for name, frame in found.tables().items():
@@ -83,7 +79,6 @@ def write_evaluation(
 
 
 def _figures(e: Evaluation, p: Predictions) -> dict[str, Figure]:
-    """Every figure by its name on the page."""
     return {
         "fusion": draw.fusion_curve(e),
         "reliability": draw.evaluated_reliability(e),

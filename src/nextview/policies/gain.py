@@ -93,7 +93,8 @@ def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], fra
     for name in maps_of(inputs):
         values = np.asarray(state.evidence.maps[name])
         if name.endswith(SPHERE):  # its columns are counted from the camera
-            values = np.take_along_axis(values, ((np.arange(n) - ahead[:, None]) % n)[:, None], 2)
+            columns = (np.arange(n) - ahead[:, None]) % n
+            values = np.take_along_axis(values, columns[:, None], 2)
         parts.append(values)
     if "azimuth_bin" in inputs:
         parts += [np.eye(n)[ahead]] if frame == "object" else []

@@ -94,16 +94,8 @@ class OffGrid:
         if visibility is not None:  # that of the view nearest to each cell
             near = self._grid_directions(state) @ self.sphere.directions.T
             visibility = np.take_along_axis(visibility, near.argmax(2), 1)
-        turned = replace(
-            state,
-            current=current,
-            visited=visited,
-            reachable=reachable,
-            travel=None,
-            places=None,
-            visibility=visibility,
-        )
-        return turned, ahead
+        turned = replace(state, current=current, visited=visited, reachable=reachable, visibility=visibility)
+        return replace(turned, travel=None, places=None), ahead
 
     def _grid_directions(self, state: EpisodeState) -> Float:
         """Unit vectors towards the views of the turned grid, (B, grid, 3)."""

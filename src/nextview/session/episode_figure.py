@@ -46,8 +46,7 @@ def draw_episode(
     valued = any(view.values is not None for view in views)
     light, path = SoftLight([view.observation for view in views]), np.array([view.direction for view in views])
     seen_from = _best_side(path)
-    rows = [("", WIDE), ("what it believes", 1.5), ("values of views (dark: high)", WIDE)]
-    rows = rows if valued else rows[:2]
+    rows = [("", WIDE), ("what it believes", 1.5), *[("values of views (dark: high)", WIDE)][: int(valued)]]
     large = LARGE if valued else LARGE - 1
     width = GAP + len(views) * (WIDE + GAP) + large + GAP
     said, _, more = heading.rpartition(" (") if heading.endswith(")") else (heading, "", "")
@@ -189,7 +188,8 @@ def _draw_path(axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light:
     def line(points: NDArray[np.float64], colour: str, width: float) -> None:
         flat, plain = place(points)
         for share in np.unique(plain):
-            shown = np.where(((plain == share) | np.append(False, plain[:-1] == share))[:, None], flat, np.nan)
+            part = (plain == share) | np.append(False, plain[:-1] == share)
+            shown = np.where(part[:, None], flat, np.nan)
             axis.plot(*shown.T, color=colour, linewidth=width, alpha=share, solid_capstyle="butt")
 
     around = np.linspace(0, 2 * np.pi, 181)

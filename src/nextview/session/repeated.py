@@ -15,9 +15,8 @@ from nextview.session.episode import VISITED
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObjectState
 
-REPEATED = ViewWarning(
-    "repeated", "this picture was handed in before, to the last bit, and counts once: does the camera hang?"
-)
+ADVICE = "this picture was handed in before, to the last bit, and counts once: does the camera hang?"
+REPEATED = ViewWarning("repeated", ADVICE)
 LEVEL = 1e-4  # difference of the third rows of two poses that differ by a turn about the vertical alone
 
 

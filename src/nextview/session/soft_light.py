@@ -71,7 +71,8 @@ class SoftLight:
         with np.errstate(divide="ignore", invalid="ignore"):
             down = (self.floor - pose[2, 3]) / rays[:, 2]
         below = np.where((down > 0) & np.isfinite(down), down, 0)[:, None] * rays + origins
-        light = map_coordinates(self._ground, ((below[:, 1::-1] / REACH + 1) * (GRID - 1) / 2).T, order=1, cval=1.0)
+        at = (below[:, 1::-1] / REACH + 1) * (GRID - 1) / 2
+        light = map_coordinates(self._ground, at.T, order=1, cval=1.0)
         colours *= 1 - np.outer((down > 0) * np.clip(0.97 - light, 0, 1), SHADE)
         normals = hits["Ng"][hit] / np.maximum(np.linalg.norm(hits["Ng"][hit], axis=1, keepdims=True), 1e-12)
         normals *= -np.sign((normals * rays[hit]).sum(1, keepdims=True))
