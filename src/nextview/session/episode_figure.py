@@ -46,7 +46,8 @@ def draw_episode(
     valued = any(view.values is not None for view in views)
     light, path = SoftLight([view.observation for view in views]), np.array([view.direction for view in views])
     seen_from = _best_side(path)
-    rows = [("", WIDE), ("what it believes", 1.5), *[("values of views (dark: high)", WIDE)][: int(valued)]]
+    rows = [("", WIDE), ("what it believes", 1.5), ("values of views (dark: high)", WIDE)]
+    rows = rows if valued else rows[:2]
     large = LARGE if valued else LARGE - 1
     width = GAP + len(views) * (WIDE + GAP) + large + GAP
     said, _, more = heading.rpartition(" (") if heading.endswith(")") else (heading, "", "")

@@ -236,7 +236,8 @@ class Session:
             for observer in self.observers:
                 observer(self)
         else:  # with frames it begins where the camera is
-            self._reach, self._episodes = reach, self._begin_nearest(reach) if self.object is None else self._episodes
+            episodes = self._begin_nearest(reach) if self.object is None else self._episodes
+            self._reach, self._episodes = reach, episodes
 
     def _begin_nearest(self, reach: Reach) -> Episodes:
         """Before the first view: begin at the nearest view that can be reached. A callable is not asked yet."""
