@@ -308,10 +308,8 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         wheres = [members[cohort.episodes.running] for cohort, members in self._cohorts]
         parts = [cohort.step(actions[where]) for (cohort, _), where in zip(self._cohorts, wheres, strict=True)]
         order = np.argsort(np.concatenate(wheres))
-        joined = {
-            name: np.concatenate([getattr(part, name) for part in parts])[order]
-            for name in ("observation", "change", "price", "ended")
-        }
+        names = ("observation", "change", "price", "ended")
+        joined = {name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names}
         info = {name: np.concatenate([part.info[name] for part in parts])[order] for name in parts[0].info}
         seen = Seen(**joined, info=info)
         self._cohorts = [(cohort, members) for cohort, members in self._cohorts if len(cohort.episodes.running)]

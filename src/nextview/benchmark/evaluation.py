@@ -72,8 +72,7 @@ def fused_views(
     shuffled = np.take_along_axis(log_evidence.astype(np.float64), order[:, :, None], axis=1)
     right, confidence = np.empty((v, n, v), bool), np.empty((v, n, v), np.float32)
     for turn in range(v):
-        total = np.roll(shuffled, -turn, axis=1).cumsum(1)
-        belief = calibration.belief(total, np.arange(1, v + 1), classes)
+        belief = calibration.belief(np.roll(shuffled, -turn, axis=1).cumsum(1), np.arange(1, v + 1), classes)
         right[:, :, turn] = (belief.argmax(2) == labels[:, None]).T
         confidence[:, :, turn] = belief.max(2).T
     return right, confidence

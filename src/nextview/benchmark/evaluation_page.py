@@ -59,18 +59,13 @@ def write_evaluation(
         what = f"{'shapes' if settings.deduplicate else 'objects'}{'' if p.of_size is None else ', of known size'}"
         scores = {f"{settings.split or p.splits[0] or 'all'} ({len(p)} {what})": scores_for_card(card, p)}
         noted[card.path.with_suffix(".json")] = card.sha256, scores
-    made = asdict(settings) | {
-        "predictions": predictions.name,
-        "predictions_sha256": sha256_of(predictions),
-        "models": p.models,
-        "objects": len(p),
-    }
+    made = asdict(settings) | {"predictions": predictions.name, "predictions_sha256": sha256_of(predictions)}
+    made |= {"models": p.models, "objects": len(p)}
     found = evaluate(p, settings.samples, np.random.default_rng([settings.seed, 0]))
     with new_folder(out, overwrite) as part:
         for name, frame in found.tables().items():
             frame.to_csv(part / f"{name}.csv", index=False)
-        notes = {"settings": made, "left_out": found.left_out}
-        (part / "evaluate.json").write_text(json.dumps(notes, indent=1) + "\n")
+        (part / "evaluate.json").write_text(json.dumps({"settings": made, "left_out": found.left_out}, indent=1) + "\n")
         (part / "evaluate.html").write_text(page(found, p, made), encoding="utf-8")
     if figures is not None:
         write_figures(figures, _figures(found, p), found.tables(), overwrite)
@@ -84,7 +79,6 @@ def write_evaluation(
 
 
 def _figures(e: Evaluation, p: Predictions) -> dict[str, Figure]:
-    """Every figure by its name on the page."""
     return {
         "fusion": draw.fusion_curve(e),
         "reliability": draw.evaluated_reliability(e),

@@ -62,8 +62,7 @@ def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure
         axes.plot(x, rows["value"], marker="o", markersize=3.5, label=name, **look)
         axes.vlines(x, rows["low"], rows["high"], color=look["color"], linewidth=0.8, alpha=0.55)
     axes.set_xticks(np.arange(len(ticks)), [f"{t:g}" for t in ticks])
-    axes.set_xlabel("confidence threshold")
-    axes.set_ylabel(words(measure))
+    axes.set(xlabel="confidence threshold", ylabel=words(measure))
     percent_axis(axes.yaxis)
     legend(axes)
     return figure
@@ -75,8 +74,7 @@ def budget_curve(results: Results, budget: str) -> Figure:
     for name in compared(results):
         rows = results.tables.sweep[results.tables.sweep["policy"] == name]
         axes.plot(rows[budget], rows["accuracy"], label=name, **look_of(name, results))
-    axes.set_xlabel({"n_views": "mean views", "travel_all": "mean travel, grid cells"}[budget])
-    axes.set_ylabel("accuracy")
+    axes.set(xlabel={"n_views": "mean views", "travel_all": "mean travel, grid cells"}[budget], ylabel="accuracy")
     percent_axis(axes.yaxis)
     legend(axes)
     return figure

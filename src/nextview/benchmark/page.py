@@ -52,12 +52,10 @@ def words(name: str) -> str:
 
 def render(template: str, **given: Any) -> str:
     """A whole page by a template of this package. All that is given is text and never markup."""
-    templates = PackageLoader("nextview.benchmark", "templates")
-    environment = Environment(
-        loader=templates, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.tests["oracle"] = knows_truth
-    environment.filters |= {
+    loader = PackageLoader("nextview.benchmark", "templates")
+    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    pages.tests["oracle"] = knows_truth
+    pages.filters |= {
         "percent": percent,
         "points": points,
         "words": words,
@@ -66,7 +64,7 @@ def render(template: str, **given: Any) -> str:
         "between": lambda number: f"{100 * number.low:.1f} {NONE} {percent(number.high)}",
         "p_value": lambda p: NONE if np.isnan(p) else "< 0.001" if p < 0.001 else f"{p:.3f}",
     }
-    return environment.get_template(template).render(given)
+    return pages.get_template(template).render(given)
 
 
 def picture(figure: Figure) -> str:

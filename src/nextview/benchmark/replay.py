@@ -60,8 +60,7 @@ def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
     starts = rng.integers(len(predictions.sphere), size=runs * n)
     objects = np.tile(np.arange(n), runs)
     if scenes is not None:
-        draws = rng.random((len(objects), len(predictions.sphere)))
-        starts = np.where(scenes.reachable[objects], draws, -1).argmax(1)
+        starts = np.where(scenes.reachable[objects], rng.random((len(objects), len(predictions.sphere))), -1).argmax(1)
     return EpisodeSpecs(predictions, objects, starts, scenes)
 
 
@@ -88,10 +87,8 @@ def replay_policy(
 ) -> Trajectories:
     """Run a policy of any kind through all episodes, until a rule ends them; ``name`` is for messages."""
     p, objects = specs.predictions, specs.objects
-    maps = {
-        name: true_map(p, name.removeprefix(TRUE)) if name.startswith(TRUE) else p.maps[name]
-        for name in maps_among(policy.needs)
-    }
+    needs = maps_among(policy.needs)
+    maps = {m: true_map(p, m.removeprefix(TRUE)) if m.startswith(TRUE) else p.maps[m] for m in needs}
     p = replace(p, maps=maps)
 
     def observe(which: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:

@@ -133,7 +133,6 @@ def _title(test: Mapping[Any, Any] | None, best: str, reference: str, at: float)
 
 
 def _figures(results: Results, best: str, at: float) -> dict[str, Figure]:
-    """The figures by what they show."""
     sweep, reference = results.tables.sweep, results.settings["reference"]
     figures = {} if results.tables.tests.empty else {"differences": draw.differences(results, at)}
     figures |= {measure: draw.threshold_curve(results, measure) for measure in ("class_accuracy", "accuracy")}
@@ -170,9 +169,8 @@ def _failures(results: Results, best: str, at: float, store: ViewStore | None) -
         episode = episodes[(names == name) & (episodes["run"] == failure["run"])].iloc[0]
         views = [int(v) for v in episode["views"]]
         images = _images(store, name, views) if store is not None and name in store.names else {}
-        conflicting = bool(p.conflicting[p.names.index(name)])
         shown = {"answer": episode["answer"], "views": views, "images": images}
-        found.append(failure | shown | {"conflicting": conflicting})
+        found.append(failure | shown | {"conflicting": bool(p.conflicting[p.names.index(name)])})
     return found
 
 

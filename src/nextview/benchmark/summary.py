@@ -188,8 +188,7 @@ def _risks(summary: pd.DataFrame, promised: Mapping[float, float]) -> pd.DataFra
 
 def _frame(rows: list, columns: list[str]) -> pd.DataFrame:
     table = pd.DataFrame(rows, columns=columns)
-    numbers = [c for c in columns if c in ("threshold", "published")]
-    return table.astype(dict.fromkeys(numbers, "float64"))
+    return table.astype(dict.fromkeys([c for c in columns if c in ("threshold", "published")], "float64"))
 
 
 def levels_of(names: Sequence[str]) -> NDArray[np.str_]:
@@ -237,8 +236,7 @@ def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator)
 
 def _after(values: NDArray, views: NDArray[np.int64], counts: list[int]) -> NDArray:
     """Values after so many views, or after the last one where an episode ended before, (E, counts)."""
-    taken = (views >= 0).sum(1)
-    return values[np.arange(len(values))[:, None], np.minimum(taken[:, None], counts) - 1]
+    return values[np.arange(len(values))[:, None], np.minimum((views >= 0).sum(1)[:, None], counts) - 1]
 
 
 def grid_mean(grid: Grid, values: NDArray) -> Float:

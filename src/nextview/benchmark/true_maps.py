@@ -50,8 +50,7 @@ def stored_rows(p: Predictions, name: str) -> NDArray:
         objects = store.rows_of(p.names)
         if (objects < 0).any():
             raise EntryError(f"{p.store}: holds no object {p.names[objects.argmin()]}, for which {name} is needed")
-        entropy = np.array([store.read("measures/depth_entropy", i) for i in objects])
-        if not np.array_equal(entropy, p.depth_entropy):
+        if not np.array_equal(np.array([store.read("measures/depth_entropy", i) for i in objects]), p.depth_entropy):
             raise EntryError(f"{p.store}: holds other views than those that these predictions were made from")
         return np.array([store.read(name, i) for i in objects])
     except DatasetError as error:

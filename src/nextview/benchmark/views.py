@@ -58,8 +58,7 @@ def measured(grid: Grid, n_views: Sequence[int], samples: int, references: Seque
             share = value[name, f"to_{references[0]}"] / gap if gap > 0 else np.nan
             rows.append((name, k, "share_of_gap", share, np.nan, np.nan, np.nan))
     table = pd.DataFrame(rows, columns=COLUMNS[:-1])
-    blind = ~table["policy"].map(knows_truth).astype(bool)
-    table["p_holm"] = holm(np.where(blind, table["p"], np.nan))
+    table["p_holm"] = holm(np.where(~table["policy"].map(knows_truth).astype(bool), table["p"], np.nan))
     return table
 
 

@@ -90,7 +90,6 @@ def print_evaluation(found: Evaluation) -> None:
 
 
 def _cell(number: Number, digits: int) -> Text:
-    """A number and its interval."""
     if not isfinite(number.value):
         return Text("-")
     interval = f" {number.low:.{digits}f}-{number.high:.{digits}f}" if number.high > number.low else ""

@@ -68,8 +68,7 @@ def demo(
     from nextview.data.samples import sample_mesh
 
     check_file(figure, overwrite)
-    camera = simulated(sample_mesh(shape))
-    show(camera, f"the sample {shape}", load(), Output(figure, overwrite=overwrite), start)
+    show(simulated(sample_mesh(shape)), f"the sample {shape}", load(), Output(figure, overwrite=overwrite), start)
 
 
 def show(

@@ -158,6 +158,5 @@ def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.f
     stuck = ~free.any(1)
     if stuck.any():
         near = np.where(state.free[stuck], travel_from(sphere, state)[stuck], np.inf)
-        left = np.isfinite(near).any(1)
-        chosen[stuck] = np.where(left, near.argmin(1), window[stuck, flat[stuck].argmax(1)])
+        chosen[stuck] = np.where(np.isfinite(near).any(1), near.argmin(1), window[stuck, flat[stuck].argmax(1)])
     return chosen

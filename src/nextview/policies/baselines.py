@@ -48,8 +48,7 @@ class Furthest(Baseline):
     """The unvisited view of the local window with the largest grid distance; equal ones with equal chance."""
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        window = self.sphere.windows[state.current]
-        distance = self.sphere.travel[state.current[:, None, None], window]
+        distance = self.sphere.travel[state.current[:, None, None], self.sphere.windows[state.current]]
         return best_in_window(self.sphere, state, distance + 1e-6 * rng.random(distance.shape))
 
 
@@ -101,8 +100,7 @@ class Visibility:
         return visibility_of(state) - self.travel_weight * travel_from(self.sphere, state)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        values = self.view_values(state) + 1e-6 * rng.random(state.visited.shape)
-        return best_view(self.sphere, state, values)
+        return best_view(self.sphere, state, self.view_values(state) + 1e-6 * rng.random(state.visited.shape))
 
 
 @dataclass(frozen=True)

@@ -56,8 +56,7 @@ class Discriminate:
             raise PolicyError(f"{path}: is no memory of things")
         if classes is not None and card.classes != tuple(classes):
             raise OtherUseError(f"{path}: discriminates other things ({', '.join(card.classes[:10])})")
-        views = read_memory(card.path, card.sha256).views
-        return cls(viewpoints, views, np.array(card.calibration.hypotheses))
+        return cls(viewpoints, read_memory(card.path, card.sha256).views, np.array(card.calibration.hypotheses))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         values = self.view_values(state)
@@ -105,5 +104,4 @@ class Discriminate:
         hypothesis, azimuth = np.divmod(of_two.reshape(2, -1).argmax(1), AZIMUTHS)
         ring, bins = self._remembered(azimuth, here)
         shown = self.views[hypothesis[:, None], ring, bins].astype(np.float64)
-        alike = np.where(shown.any(2).all(0), (shown[0] * shown[1]).sum(1), np.nan)
-        return Rivals(two, hypothesis, ring, bins, alike)
+        return Rivals(two, hypothesis, ring, bins, np.where(shown.any(2).all(0), (shown[0] * shown[1]).sum(1), np.nan))

@@ -85,8 +85,7 @@ def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], fra
     if "belief" in inputs:
         parts += _facets(state.belief)
     if "view" in inputs:
-        shifted = state.evidence.logits - state.evidence.logits.max(1, keepdims=True)
-        alone = np.exp(shifted.astype(np.float64))
+        alone = np.exp((state.evidence.logits - state.evidence.logits.max(1, keepdims=True)).astype(np.float64))
         parts += _facets(alone / alone.sum(1, keepdims=True))
     if "place" in inputs:
         parts.append(np.eye(sphere.rings)[sphere.ring[state.current]])
@@ -100,8 +99,7 @@ def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], fra
     if "azimuth_bin" in inputs:
         parts += [np.eye(n)[ahead]] if frame == "object" else []
         azimuth_bins = _bin_belief(sphere, state)
-        over_all = (state.belief[:, :, None] * azimuth_bins).sum(1)
-        for believed in (_most_believed(state.belief, azimuth_bins), over_all):
+        for believed in (_most_believed(state.belief, azimuth_bins), (state.belief[:, :, None] * azimuth_bins).sum(1)):
             parts.append(np.take_along_axis(believed, (np.arange(n) + ahead[:, None]) % n, 1))
     if VISIBILITY in inputs:
         parts.append(visibility_of(state)[rows[:, None], cells_from(sphere)[start]])
@@ -171,8 +169,7 @@ class Gain:
 
     def gains(self, state: EpisodeState) -> Float:
         """The predicted value of each view, (B, V) float64; only differences between views mean anything."""
-        given = features(self.sphere, state, self.inputs, self.frame).astype(np.float32)
-        cells = self.score(given).astype(np.float64)
+        cells = self.score(features(self.sphere, state, self.inputs, self.frame).astype(np.float32)).astype(np.float64)
         cells -= 1e-9 * np.arange(len(self.sphere))  # cells that are mirror images may tie; the first of them is taken
         return np.take_along_axis(cells, cells_to(self.sphere)[origin(self.sphere, state, self.frame)], 1)
 

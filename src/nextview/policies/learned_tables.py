@@ -81,8 +81,7 @@ class FixedRing:
         order = np.concatenate([[0], np.arange(1, n) * self.steps, np.arange(1, n)])
         ahead = self.ring * n + (self.sphere.azimuth_index[state.current][:, None] + order) % n
         free = state.free[rows[:, None], ahead]
-        chosen = ahead[rows, free.argmax(1)]
-        return np.where(free.any(1), chosen, Spread(self.sphere).next_views(state, rng))
+        return np.where(free.any(1), ahead[rows, free.argmax(1)], Spread(self.sphere).next_views(state, rng))
 
 
 @dataclass(frozen=True)

@@ -14,15 +14,13 @@ def local_peaks(maps: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Cells of maps, (B, rows, columns), that no neighbour exceeds (3x3 maximum filter; nothing beyond the border)."""
     # As SciPy's maximum_filter; recognising an object imports no SciPy, which keeps its start short.
     padded = np.pad(maps, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
-    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2))
-    return np.asarray(maps) >= around.max((-2, -1))
+    return np.asarray(maps) >= np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2)).max((-2, -1))
 
 
 def peaks_first(maps: NDArray[np.floating]) -> NDArray[np.float64]:
     """Scores that put every local peak before every other cell, each group by value; same shape as the maps."""
     maps = np.asarray(maps, np.float64)
-    span = np.ptp(maps, axis=(1, 2), keepdims=True) + 1.0
-    return maps + span * local_peaks(maps)
+    return maps + (np.ptp(maps, axis=(1, 2), keepdims=True) + 1.0) * local_peaks(maps)
 
 
 def sphere_peaks(values: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -63,8 +61,7 @@ class MapPeak:
         if maps.shape[1:] != (self.sphere.rings, 3):
             there = f"the sphere has {self.sphere.rings} rings"
             raise PolicyError(f"the map {self.map_name!r} is {maps.shape[1:]}, but {there}")
-        valley = np.isin(state.belief.argmax(1), self.valley_classes)
-        return peaks_first(np.where(valley[:, None, None], -maps, maps))
+        return peaks_first(np.where(np.isin(state.belief.argmax(1), self.valley_classes)[:, None, None], -maps, maps))
 
 
 @dataclass(frozen=True)

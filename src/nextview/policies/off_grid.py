@@ -94,16 +94,8 @@ class OffGrid:
         if visibility is not None:  # that of the view nearest to each cell
             near = self._grid_directions(state) @ self.sphere.directions.T
             visibility = np.take_along_axis(visibility, near.argmax(2), 1)
-        turned = replace(
-            state,
-            current=current,
-            visited=visited,
-            reachable=reachable,
-            travel=None,
-            places=None,
-            visibility=visibility,
-        )
-        return turned, ahead
+        turned = replace(state, current=current, visited=visited, reachable=reachable, visibility=visibility)
+        return replace(turned, travel=None, places=None), ahead
 
     def _grid_directions(self, state: EpisodeState) -> Float:
         """Unit vectors towards the views of the turned grid, (B, grid, 3)."""
@@ -115,8 +107,7 @@ class OffGrid:
     def _nearest_to(self, cells: NDArray[np.int64], state: EpisodeState) -> NDArray[np.int64]:
         """The free view nearest to a cell of the turned grid, (B,)."""
         towards = self._grid_directions(state)[np.arange(len(cells)), cells]
-        arc = angle_between(towards[:, None], self.sphere.directions[None])
-        return np.where(state.free, arc, np.inf).argmin(1)
+        return np.where(state.free, angle_between(towards[:, None], self.sphere.directions[None]), np.inf).argmin(1)
 
     def _here(self, state: EpisodeState) -> Float:
         """Unit vectors towards the cameras, (B, 3)."""
@@ -135,6 +126,5 @@ class OffGrid:
         for ring, of_ring in ((low, 1 - up), (np.minimum(low + 1, len(heights) - 1), up)):
             for step, of_step in ((left, 1 - right), (left + 1, right)):
                 share = of_ring * of_step
-                corner = values[rows, order[ring] * n + step % n]
-                found += np.where(share > 1e-6, share * corner, 0.0)
+                found += np.where(share > 1e-6, share * values[rows, order[ring] * n + step % n], 0.0)
         return found

@@ -301,8 +301,7 @@ class Episodes:
 
     @property
     def _name(self) -> str:
-        policy = self.policy.policy if isinstance(self.policy, OffGrid) else self.policy
-        return type(policy).__name__
+        return type(self.policy.policy if isinstance(self.policy, OffGrid) else self.policy).__name__
 
     def _first_to_fail(self, state: EpisodeState) -> int | None:
         """The first episode for which the policy raises even if asked for it alone."""

@@ -184,8 +184,7 @@ def _draw_path(axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light:
         inside = (DOME * points - pose[:3, 3]) @ pose[:3, :3]
         flat = inside[:, :2] / inside[:, 2:] * focal + intrinsics[:2, 2]
         row, column = np.clip(flat[:, ::-1].astype(int), 0, np.array(shape) - 1).T
-        back = np.where(points @ pose[:3, 3] < 0, 0.45, 1.0)
-        return flat, np.where(far[row, column] < inside[:, 2], 0.15, back)
+        return flat, np.where(far[row, column] < inside[:, 2], 0.15, np.where(points @ pose[:3, 3] < 0, 0.45, 1.0))
 
     def line(points: NDArray[np.float64], colour: str, width: float) -> None:
         flat, plain = place(points)
@@ -195,8 +194,7 @@ def _draw_path(axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light:
             axis.plot(*shown.T, color=colour, linewidth=width, alpha=share, solid_capstyle="butt")
 
     around = np.linspace(0, 2 * np.pi, 181)
-    rings = sphere.elevations if isinstance(sphere, ViewSphere) else (0, 30, 60)
-    for up in np.radians(rings):
+    for up in np.radians(sphere.elevations if isinstance(sphere, ViewSphere) else (0, 30, 60)):
         ring = [np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), 0 * around + np.sin(up)]
         line(np.stack(ring, 1), RING, 0.9)
     for turn in np.arange(8) * np.pi / 4:  # meridians

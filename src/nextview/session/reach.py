@@ -46,9 +46,8 @@ class Reach:
         views = views[self.can_reach(views, poses)]
         if self.cost is not None:
             if callable(self.cost):
-                cost = np.array(
-                    [_cost(_ask("travel_cost", self.cost, here, pose)) for pose in poses()[views]], np.float64
-                )
+                costs = [_cost(_ask("travel_cost", self.cost, here, pose)) for pose in poses()[views]]
+                cost = np.array(costs, np.float64)
             else:
                 cost = self.cost[state.current[0], views]
             views, cost = views[cost < np.inf], cost[cost < np.inf]

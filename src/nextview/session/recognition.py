@@ -53,8 +53,7 @@ class Recognition:
         """Whether the object is called one of no known class: too novel, or of another size than the class believed."""
         if not self.unknown_rate or not self.seen:
             return False
-        novel = self.novelty is not None and self.novelty < self.unknown_rate
-        return novel or self.most_like in self.impossible
+        return (self.novelty is not None and self.novelty < self.unknown_rate) or self.most_like in self.impossible
 
     @property
     def none_of_them(self) -> str:

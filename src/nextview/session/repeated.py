@@ -15,9 +15,8 @@ from nextview.session.episode import VISITED
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObjectState
 
-REPEATED = ViewWarning(
-    "repeated", "this picture was handed in before, to the last bit, and counts once: does the camera hang?"
-)
+ADVICE = "this picture was handed in before, to the last bit, and counts once: does the camera hang?"
+REPEATED = ViewWarning("repeated", ADVICE)
 LEVEL = 1e-4  # difference of the third rows of two poses that differ by a turn about the vertical alone
 
 
@@ -50,5 +49,4 @@ def _is_one_picture(first: Observation, second: Observation) -> bool:
     if not first.seen:
         return False
     near = angle_between(direction_of(first.pose), direction_of(second.pose)) <= VISITED
-    turned = np.allclose(first.pose[2], second.pose[2], atol=LEVEL)
-    return bool(near or not turned or check_views(first, second))
+    return bool(near or not np.allclose(first.pose[2], second.pose[2], atol=LEVEL) or check_views(first, second))

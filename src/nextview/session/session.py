@@ -116,9 +116,8 @@ class Session:
     ) -> None:
         _check_needs(policy, models)
         if object is not None and not hasattr(object, "sightings"):
-            raise UsageError(
-                f"what to find in frames is a nextview.sensing.ObservedObject, not {one_line(repr(object))}"
-            )
+            wanted = "what to find in frames is a nextview.sensing.ObservedObject"
+            raise UsageError(f"{wanted}, not {one_line(repr(object))}")
         if number(unknown, "the share of known objects called unknown", 0) >= 1:
             raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
         if distance is not None:
@@ -252,8 +251,7 @@ class Session:
     ) -> EpisodeState:
         """The state with where the camera can go from here, by default from where the last view was taken."""
         if here is None:
-            seen = self.views[-1].observation
-            here = seen.pose if object is None else object.sightings[-1].frame.camera_to_world
+            here = self.views[-1].observation.pose if object is None else object.sightings[-1].frame.camera_to_world
         return reach.constrain(state, self.sphere, here, lambda: self._poses_around(object))
 
     # What is seen
@@ -308,8 +306,7 @@ class Session:
             else:
                 object.add(frame)
             self._check_distance(object.object_frame.radius)
-            observations = object.observations[self._before :]
-            return self._take(observations, object.warnings, frame.camera_to_world, object)
+            return self._take(object.observations[self._before :], object.warnings, frame.camera_to_world, object)
         except BaseException:
             object.state = before
             raise
@@ -337,25 +334,19 @@ class Session:
         once = np.array([REPEATED not in (warnings if k == last else self.views[k].warnings) for k in changed])
         found = replace(found, seen=once if found.seen is None else found.seen & once)
         evidence = {k: found.select([row]) for row, k in enumerate(changed)}
-        at = [
-            (direction, *self.sphere.nearest(direction)) for direction in (direction_of(o.pose) for o in observations)
-        ]
-        directions = [self.sphere.directions[view] if there else direction for direction, view, there in at]
+        at = [(towards, *self.sphere.nearest(towards)) for towards in (direction_of(o.pose) for o in observations)]
+        directions = [self.sphere.directions[view] if there else towards for towards, view, there in at]
         episodes = self._episodes
         if changed != [last]:
             episodes = self._begin(self.view)
             for k, step in enumerate(self._episodes.steps):
                 episodes.take(evidence.get(k, step.evidence), directions[k][None])
-        reach = self._reach
+        reach, doubtful = self._reach, bool(warnings) or self._contradicted(last + 1)
         taken = episodes.next_step(
             evidence[last],
             directions[last][None],
             lambda state: self._constrained(state, reach, object, here),
-            hold=lambda step: (
-                bool(warnings)
-                or self._contradicted(last + 1)
-                or self._suspicious([*episodes.steps, step], observations)
-            ),
+            hold=lambda step: doubtful or self._suspicious([*episodes.steps, step], observations),
         )
         steps, views = [*episodes.steps, taken.step], list(self.views)
         travel = self._travelled([int(step.views[0]) for step in steps], directions)
@@ -383,11 +374,10 @@ class Session:
         azimuth = self.sphere.azimuth[[nearest]] if there else azimuth_of(direction[None])
         classes, evidence = len(self.models.classes), step.evidence
         bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), classes, azimuth)
-        alone = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth)
         return View(
             int(step.views[0]),
             observation,
-            alone=calibration.belief(alone, 1, classes)[0],
+            alone=calibration.belief(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), 1, classes)[0],
             belief=step.belief[0],
             maps={name: values[0] for name, values in step.evidence.maps.items()},
             next_view=None,
@@ -435,7 +425,6 @@ class Session:
         return found
 
     def _values(self, step: Step) -> Float | None:
-        """What the policy valued the views at when it chose."""
         chooser = self._chooser
         if step.stopped[0] or step.state is None or not isinstance(self.policy, ValuesViews):
             return None
@@ -506,7 +495,6 @@ def _new_object() -> ObservedObject:
 
 
 def _check_needs(policy: Policy, models: Models) -> None:
-    """See that the models give what a policy needs."""
     if not (hasattr(policy, "needs") and hasattr(policy, "next_views")):
         raise UsageError(f"a policy has needs and next_views, see nextview.Policy, not {one_line(repr(policy))}")
     if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:

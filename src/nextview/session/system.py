@@ -200,8 +200,7 @@ def load(
     if policy is None:
         policy, made = _default_policy(found.policies, sphere, recogniser)
     else:
-        name = with_cards(str(policy), found.policies)
-        made = make_policy_anywhere(name, sphere, (), recogniser.classes, found.maps)
+        made = make_policy_anywhere(with_cards(str(policy), found.policies), sphere, (), recogniser.classes, found.maps)
     opened = Models(recogniser, open_maps(found.maps, made.needs, threads))
     if policy in opened.maps:  # a map's own policy goes to the valley for some classes, which the map's card names
         made = make_policy_anywhere(policy, sphere, opened.valley_classes(policy), recogniser.classes, found.maps)

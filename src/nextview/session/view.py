@@ -17,9 +17,8 @@ class View:
 
     index: int  # candidate viewpoint that it was taken from, or the nearest one to where the camera stood
     observation: Observation = field(repr=False)
-    alone: NDArray[np.float64] = field(
-        repr=False
-    )  # belief by this view alone, (classes,); even if nothing is seen in it
+    # belief by this view alone, (classes,); even if nothing is seen in it
+    alone: NDArray[np.float64] = field(repr=False)
     belief: NDArray[np.float64] = field(repr=False)  # fused over all views so far, (classes,)
     maps: dict[str, NDArray[np.floating]] = field(repr=False)  # predicted local maps by name, each (rings, 3)
     next_view: int | None  # where to look next; None where the episode ends

@@ -84,7 +84,6 @@ def _figures(walk: Walk, view: View) -> str:
 
 
 def _maps(view: View) -> str:
-    """The maps predicted from a view."""
     found = [(name, _image(heat(values[::-1]), CELL * values.shape[1])) for name, values in view.maps.items()]
     return f"<p>Maps of the views around this one:</p>{_captioned(found)}" if found else ""
 

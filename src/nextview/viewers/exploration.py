@@ -80,8 +80,7 @@ class Walk:
     def __init__(self, system: System, camera: Camera, start: int, seed: int = 0) -> None:
         self.system, self.camera, self.start, self.seed = system, camera, start, seed
         self.sphere, self.stopping = system.sphere, system.stopping
-        endless = FixedLength(max_views=len(system.sphere))
-        self.session: Session = replace(system, stopping=endless).session(start, seed)
+        self.session: Session = replace(system, stopping=FixedLength(max_views=len(system.sphere))).session(start, seed)
 
     @property
     def views(self) -> list[View]:
@@ -144,8 +143,7 @@ class Walk:
         """Take a view: from a candidate viewpoint, or from a pose, (4, 4), object frame."""
         if self.session.done:
             raise UsageError("every candidate view was taken: start over")
-        pose = self.sphere.poses[where] if isinstance(where, int) else where
-        return self.session.update(self.camera.observe(pose))
+        return self.session.update(self.camera.observe(self.sphere.poses[where] if isinstance(where, int) else where))
 
     def step(self) -> View:
         """Take the view that the policy asks for."""
@@ -251,5 +249,4 @@ class Exploration:
     def pose_towards(self, position: Float) -> Float:
         """A level pose, (4, 4), in the direction of a position, (3,), as far away as the candidate views are."""
         length = np.linalg.norm(position)
-        outward = position / length if length > 0 else np.array([1.0, 0, 0])
-        return level_pose(outward, self.walks[0].sphere.distance)
+        return level_pose(position / length if length > 0 else np.array([1.0, 0, 0]), self.walks[0].sphere.distance)

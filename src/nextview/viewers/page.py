@@ -30,6 +30,7 @@ from nextview.viewers.walk_scene import WalkScene
 SAND = "#e9dfd0"  # at the foot of the background
 NOTHING, CLEAN = "nothing", "clean renders"
 APART = 8.5  # between two objects side by side, object radii
+LAMP = (-4.0, -5.0, 8.0)  # where it hangs
 PAUSE = 0.5  # between the views of a policy that walks, seconds: long enough to see each
 HELP = """Click a **ball** to look from there, or drag the **arrows**. The large **red** ball is where the policy would
 look next. Yellow views promise most, violet ones least; small dark ones are done."""
@@ -47,18 +48,16 @@ class Page:
         self._scenes: list[WalkScene] = []
         self._cards: list[viser.GuiHtmlHandle] = []
         self._panels: list[viser.PanelHandle] = []
-        gui = self.server.gui
+        gui, scene = self.server.gui, self.server.scene
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(209, 73, 91))
         gui.set_panel_label("nextview explore")
-        scene = self.server.scene
         scene.set_up_direction("+z")
-        scene.set_background_image(_sky())
+        sky = np.linspace(rgb(PAPER), rgb(SAND), 256)  # darkens a little towards the ground
+        scene.set_background_image(sky.astype(np.uint8)[:, None])
         scene.configure_default_lights(False)
         scene.configure_environment_map(None)
         scene.add_light_hemisphere("/sky", sky_color=rgb(PAPER), ground_color=rgb(GROUND), intensity=3.0)
-        scene.add_light_directional(
-            "/lamp", color=rgb(GROUND), intensity=2.0, cast_shadow=True, position=(-4.0, -5.0, 8.0)
-        )
+        scene.add_light_directional("/lamp", color=rgb(GROUND), intensity=2.0, cast_shadow=True, position=LAMP)
         self._controls(gui)
         self._rebuild()
 
@@ -127,7 +126,6 @@ class Page:
             self._quiet = False
 
     def _show_choices(self) -> None:
-        """Show the exploration's object, policies and sensor."""
         exploration = self.exploration
         name, _, strength = (exploration.sensor or CLEAN).partition(":")
         self._object.value, self._sensor.value = exploration.shown.name, name
@@ -210,11 +208,6 @@ class Page:
             for walk, scene, card in zip(self.exploration.walks, self._scenes, self._cards, strict=True):
                 scene.draw(walk, bool(self._hide.value))
                 card.content = walk_card(walk)
-
-
-def _sky() -> NDArray[np.uint8]:
-    """The background: paper that darkens a little towards the ground, (H, 1, 3)."""
-    return np.linspace(rgb(PAPER), rgb(SAND), 256).astype(np.uint8)[:, None]
 
 
 def _listed(value: object, options: Collection[str]) -> str:

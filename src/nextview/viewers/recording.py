@@ -110,8 +110,7 @@ class Recorder:
         considered = np.flatnonzero(np.isfinite(values))
         self._stream.log("values", rr.BarChart(values[considered], abscissa=considered))
         best, to = int(view.belief.argmax()), view.next_view
-        chosen = places[[] if to is None else [to]]
-        self._stream.log("world/next", rr.Points3D(chosen, colors=rgb(ACCENT), radii=0.1))
+        self._stream.log("world/next", rr.Points3D(places[[] if to is None else [to]], colors=rgb(ACCENT), radii=0.1))
         onward = "the end" if to is None else f"next view {to}"
         believed = f"{session.models.classes[best]} {view.belief[best]:.3f}"
         self._log_text(f"step {step}: view {view.index}, {believed}, {view.travel:.2f} cells of travel, {onward}")

@@ -46,29 +46,21 @@ class WalkScene:
             self._object = server.scene.add_mesh_simple(
                 f"{name}/object", vertices, mesh.faces, color=rgb(WOOD), flat_shading=flat, side="double"
             )
-        floor = -1.0 if mesh is None else float(mesh.vertices[:, 2].min())
+        floor = (-1.0 if mesh is None else float(mesh.vertices[:, 2].min())) - 0.03
         server.scene.add_cylinder(
-            f"{name}/table",
-            TABLE,
-            0.04,
-            (255, 246, 230),
-            radial_segments=96,
-            position=(0, 0, floor - 0.03),
-            cast_shadow=False,
+            f"{name}/table", TABLE, 0.04, (255, 246, 230), radial_segments=96, position=(0, 0, floor), cast_shadow=False
         )
-        server.scene.add_line_segments(
-            f"{name}/rings", _rings(walk.sphere.poses[:, :3, 3]), rgb(FAINT), thickness=0.015
-        )
+        places = walk.sphere.poses[:, :3, 3]
+        server.scene.add_line_segments(f"{name}/rings", _rings(places), rgb(FAINT), thickness=0.015)
         plain: dict[str, Any] = {"subdivisions": 2, "cast_shadow": False, "receive_shadow": False}
         self._balls = [
             server.scene.add_icosphere(f"{name}/views/{view}", BALL, position=place, **plain)
-            for view, place in enumerate(walk.sphere.poses[:, :3, 3])
+            for view, place in enumerate(places)
         ]
         for view, ball in enumerate(self._balls):
             ball.on_click(lambda event, view=view: look(view))
-        first = walk.sphere.poses[walk.start]
         self._handle = server.scene.add_transform_controls(
-            f"{name}/handle", 0.7, disable_rotations=True, position=first[:3, 3], depth_test=False
+            f"{name}/handle", 0.7, disable_rotations=True, position=places[walk.start], depth_test=False
         )
         self._handle.on_update(self._dragged)
 
