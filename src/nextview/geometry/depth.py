@@ -64,12 +64,6 @@ def visible_points(
         return np.zeros((POINTS, 3), np.float32)
     chosen = np.resize(chosen, POINTS)
     rows, columns = np.divmod(chosen, depth.shape[1])
-    rays = np.stack(
-        [
-            (columns + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0],
-            (rows + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1],
-            np.ones(POINTS),
-        ],
-        -1,
-    )
+    (fx, _, cx), (_, fy, cy) = intrinsics[:2]
+    rays = np.stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones(POINTS)], -1)
     return ((rays * flat[chosen, None]) @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)

@@ -67,8 +67,7 @@ def make_mesh(
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     if not used.all():
-        faces = (np.cumsum(used) - 1)[faces]
-        vertices = vertices[used]
+        faces, vertices = (np.cumsum(used) - 1)[faces], vertices[used]
     if not np.isfinite(vertices).all():
         raise MeshError(f"{name}: {int((~np.isfinite(vertices)).any(1).sum())} vertices are NaN or infinite")
     low, high = vertices.min(0), vertices.max(0)

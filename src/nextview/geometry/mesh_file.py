@@ -190,8 +190,7 @@ def _guard_glb(data: bytes) -> bytes:
     if data[:4] != b"glTF" or int.from_bytes(data[8:12], "little") != len(data):
         raise MeshError("it does not begin with glTF, or is not as long as it announces")
     gltf = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    accessors, nodes = gltf.get("accessors", []), gltf.get("nodes", [])
-    views = gltf.get("bufferViews", [])
+    accessors, nodes, views = (gltf.get(key, []) for key in ("accessors", "nodes", "bufferViews"))
     taken = [a["count"] for a in accessors if "bufferView" not in a or "byteStride" in views[a["bufferView"]]]
     if sum(taken) > len(data) or sum(view["byteLength"] for view in views) > 2 * len(data):
         raise MeshError("it announces more numbers than its bytes hold")

@@ -40,8 +40,6 @@ class RayCaster:
 
 def pixel_rays(intrinsics: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:
     """Rays through the pixels of a pinhole camera, camera frame, (H, W, 3), z = 1: their lengths are depths."""
-    across, down = (
-        (np.arange(side) + 0.5 - intrinsics[axis, 2]) / intrinsics[axis, axis] for axis, side in enumerate(shape[::-1])
-    )
-    x, y = np.meshgrid(across, down)
+    (height, width), (fx, _, cx), (_, fy, cy) = shape, *intrinsics[:2]
+    x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
     return np.stack([x, y, np.ones_like(x)], -1).astype(np.float32)

@@ -35,10 +35,7 @@ def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = D
     outward = np.stack([ce * ca, ce * sa, se], -1)
     right = np.stack([-sa, ca, np.zeros_like(sa)], -1)
     pose = np.zeros((*elevation.shape, 4, 4))
-    pose[..., :3, 0] = right
-    pose[..., :3, 1] = np.cross(-outward, right)
-    pose[..., :3, 2] = -outward
-    pose[..., :3, 3] = distance * outward
+    pose[..., :3, :] = np.stack([right, np.cross(-outward, right), -outward, distance * outward], -1)
     pose[..., 3, 3] = 1.0
     return pose
 

@@ -7,10 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LARGE = 20_000  # remembered views of a ring, from which looking at all of them takes more than 10 ms
-INDEX, PROBED = (
-    "PCA64,IVF256,SQ8",
-    16,
-)  # 64 numbers of a byte for each view, in 256 cells, of which so many are searched
+INDEX, PROBED = "PCA64,IVF256,SQ8", 16  # 64 numbers of a byte for each view; so many of 256 cells are searched
 SAMPLE = 10_240  # views from which an index learns its cells
 NEAREST = 1000  # views of a ring that are compared exactly
 

@@ -125,9 +125,8 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     def __post_init__(self) -> None:
         numbers = (self.correlation, self.bin_correlation or 0.0)
         if not 0 < self.temperature < np.inf or not all(0 <= x < np.inf for x in numbers):
-            of_bins = f"of azimuth bins {self.bin_correlation}"
-            given = f"temperature {self.temperature}, correlation {self.correlation}, {of_bins}"
-            raise ModelError(f"no calibration: {given}")
+            given = f"temperature {self.temperature}, correlation {self.correlation}"
+            raise ModelError(f"no calibration: {given}, of azimuth bins {self.bin_correlation}")
         if self.hypotheses and not (set(np.diff((-1, *self.hypotheses)).tolist()) <= {0, 1}):
             raise ModelError("no calibration: the hypotheses are not of every class in order")
 
@@ -144,9 +143,8 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         """Log-belief in each class up to a constant, (..., classes), by a sum of ``log_evidence_of`` so many views."""
         if not np.isfinite(total).all():
             raise ModelError("the recogniser said something that is not a finite number")
-        more = np.asarray(n_views)[..., None] - 1
         total = np.asarray(total, np.float64)
-        logs = total[..., :classes] / (self.temperature * (1 + self.correlation * more))
+        logs = total[..., :classes] / self.temperature_after(np.asarray(n_views)[..., None])
         if self.bin_correlation is None or total.shape[-1] == classes:
             return logs
         pointing = self._pointing(total, n_views, classes)

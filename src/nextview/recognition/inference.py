@@ -93,13 +93,10 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
     session = open_onnx(card.path, card.sha256, threads)
     kind = "tensor(float)" if card.input.kind == "cloud" else "tensor(uint8)"
     ends = {end.name: end for end in session.get_outputs()}
-    shapes: dict[str, Shape]
+    shapes: dict[str, Shape] = {"map": (None, 3)} | ({"sphere": (None, None)} if card.output == "sphere" else {})
     if card.is_recogniser:
-        shapes = {"logits": (len(card.classes),)}
-        if card.azimuth_bins:
-            shapes[BINS_OUTPUT] = (len(card.classes), card.azimuth_bins)
-    else:
-        shapes = {"map": (None, 3)} | ({"sphere": (None, None)} if card.output == "sphere" else {})
+        bins = {BINS_OUTPUT: (len(card.classes), card.azimuth_bins)} if card.azimuth_bins else {}
+        shapes = {"logits": (len(card.classes),), **bins}
     taken, called = session.get_inputs(), f" called {INPUT}" if card.is_recogniser else ""
     if len(taken) != 1 or (called and taken[0].name != INPUT):
         wants = ", ".join(end.name for end in taken) or "nothing"
@@ -123,8 +120,7 @@ class Recogniser:
         self.card = find_card(model)
         if not self.card.is_recogniser:
             raise ModelError(f"model {self.card.name} is a {self.card.kind}, not a recogniser")
-        self.classes = self.card.classes
-        self.azimuth_bins = self.card.azimuth_bins
+        self.classes, self.azimuth_bins = self.card.classes, self.card.azimuth_bins
         self.calibration = self.card.calibration
         self._session = open_weights(self.card, threads)
         self._known: Features | None = None
@@ -203,9 +199,8 @@ class MapNetwork:
 
     def from_inputs(self, inputs: NDArray[Any]) -> dict[str, NDArray[np.float32]]:
         """The same from what the network takes, see ``network_input``."""
-        names = self.card.maps
-        outputs = run_onnx(self.card.path, self._session, ["map", "sphere"][: len(names)], inputs)
-        return dict(zip(names, outputs, strict=True))
+        ends = ["map", "sphere"][: len(self.card.maps)]
+        return dict(zip(self.card.maps, run_onnx(self.card.path, self._session, ends, inputs), strict=True))
 
 
 @dataclass(frozen=True)

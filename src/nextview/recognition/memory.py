@@ -100,8 +100,7 @@ class TaughtRecogniser(Recogniser):
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:
         self.card = find_card(model)
-        about = self.card.memory
-        if about is None:
+        if (about := self.card.memory) is None:
             raise ModelError(f"model {self.card.name} is no memory of things")
         self.classes, self.azimuth_bins = self.card.classes, self.card.azimuth_bins
         self.calibration = self.card.calibration
@@ -130,9 +129,8 @@ class TaughtRecogniser(Recogniser):
         if self._nearest is None:
             alike = similarities(self._views, embeddings, elevations)
         else:
-            alike = self._nearest.similarities(embeddings, ring_shares(elevations)).reshape(
-                len(embeddings), -1, AZIMUTHS
-            )
+            alike = self._nearest.similarities(embeddings, ring_shares(elevations))
+            alike = alike.reshape(len(embeddings), -1, AZIMUTHS)
         logits = embeddings @ self.memory.head + self.memory.head_bias
         return Evidence(logits, azimuth_bins=self.card.memory.weight * alike)
 

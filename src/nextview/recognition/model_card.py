@@ -168,8 +168,7 @@ def find_models(models: str | Path) -> Collection:
     if not folder.is_dir():
         known = ", ".join(COLLECTIONS)
         raise ModelError(f"{folder}: is neither a folder with models nor the name of bundled ones ({known})")
-    networks: dict[str, list[Path]] = {}
-    policies: dict[str, Path] = {}
+    networks, policies = dict[str, list[Path]](), dict[str, Path]()
     for path in sorted(folder.glob("*.json")):
         regular_file(path, "a card", ModelError)
         # A policy's card names the viewpoints that it was learned for.

@@ -20,10 +20,8 @@ from nextview.geometry.observation import Observation
 
 Float = NDArray[np.floating]
 
-ARRAYS = ("quantiles", "objects", "neighbours", "standard")
-"""In the file of a novelty score."""
-NEIGHBOUR = 10
-"""The distance to this one of the nearest known views counts."""
+ARRAYS = ("quantiles", "objects", "neighbours", "standard")  # in the file of a novelty score
+NEIGHBOUR = 10  # the distance to this one of the nearest known views counts
 
 
 @dataclass(frozen=True)

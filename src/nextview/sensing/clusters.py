@@ -71,17 +71,14 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float) -> Footpri
     within = (i >= 0) & (i < side) & (j >= 0) & (j < side)
     rows, columns, z = rows[within], columns[within], z[within]
     place = i[within] * side + j[within]
-    used = np.flatnonzero(np.bincount(place, minlength=side**2))
-    number, many = np.zeros(side**2, np.int64), len(pieces.stands)
-    number[used] = many * np.arange(len(used))
-    key = number[place] + pieces.label[rows, columns]
+    shown, many = np.bincount(place, minlength=side**2) > 0, len(pieces.stands)
+    used = np.flatnonzero(shown)
+    key = many * (np.cumsum(shown) - 1)[place] + pieces.label[rows, columns]
     count = np.bincount(key, minlength=many * len(used))
     pairs = np.flatnonzero(count)
     area = np.bincount(key, z * z, len(count))[pairs] / (frame.intrinsics[0, 0] * frame.intrinsics[1, 1])
-    order = np.zeros(len(count), np.int64)
-    order[pairs] = np.arange(len(pairs))
     pair_of = np.full(frame.shape, -1, np.int32)
-    pair_of[rows, columns] = order[key]
+    pair_of[rows, columns] = (np.cumsum(count > 0) - 1)[key]
     at, piece = np.divmod(pairs, many)
     cells, pixels = np.stack(np.divmod(used[at], side), 1) + low, count[pairs]
     return Footprint(cells, piece, pieces.stands, pieces.touch, pieces.inside, area, pixels, pair_of)
@@ -129,11 +126,9 @@ def _cells_over(cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int) -
     at = cells - cells.min(0) + BESIDE
     width = int(at[:, 1].max()) + 1 + BESIDE
     place = at[:, 0] * width + at[:, 1]
-    number = np.full((int(at[:, 0].max()) + 1 + BESIDE) * width, -1, np.int32)
-    number[place] = 0
-    used = np.flatnonzero(number == 0)
-    number[used] = np.arange(len(used))
-    here, around = np.zeros((2, nodes, len(used) + 1))  # the last is that of -1
+    used = np.bincount(place, minlength=(int(at[:, 0].max()) + 1 + BESIDE) * width) > 0
+    number = np.where(used, np.cumsum(used) - 1, -1)
+    here, around = np.zeros((2, nodes, used.sum() + 1))  # the last is that of -1
     here[node, number[place]] = 1
     steps = np.arange(-BESIDE, BESIDE + 1)
     around[node[:, None], number[place[:, None] + np.add.outer(width * steps, steps).ravel()]] = 1
@@ -189,8 +184,7 @@ def largest(foot: Footprint, labels: NDArray[np.int64], plane: Float) -> int:
         return 0
     area = np.bincount(labels, foot.area)
     middles = np.stack([np.bincount(labels, foot.area * x) for x in foot.cells.T], 1) / np.maximum(area, 1e-30)[:, None]
-    area[~on_ground(middles, plane)] = 0
-    area[0] = 0
+    area[~on_ground(middles, plane)] = area[0] = 0
     return int(area.argmax()) if area.max() > 0 else 0
 
 

@@ -213,8 +213,7 @@ def _fit(sums: Float, radius: int, enough: float) -> Float:
     for square, a, b in ((xx, x, x), (xy, x, y), (yy, y, y), (xq, x, q), (yq, y, q), (qq, q, q)):
         square -= a * b
     ridge = 1e-5 * max(float(xx.max()), float(yy.max())) + 1e-30  # pixels in one line have no plane: a level one
-    xx += ridge
-    yy += ridge
+    xx, yy = xx + ridge, yy + ridge
     determinant = xx * yy - xy * xy
     along_x = (xq * yy - yq * xy) / determinant
     along_y = (yq * xx - xq * xy) / determinant
@@ -320,14 +319,12 @@ def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[N
             np.minimum.at(best, row[it] * size + column[hit], key)
     shown = np.flatnonzero(best < np.iinfo(np.int64).max)
     facet = np.full(size * size, -1)
-    facet[shown] = best[shown] & 0xFFFFFFFF
-    chosen = facet[shown]
+    facet[shown] = chosen = best[shown] & 0xFFFFFFFF
     rays = np.stack([(shown % size + 0.5) / focal, (shown // size + 0.5) / focal, np.ones(len(shown))], 1)
     rays[:, :2] -= size / 2 / focal
     with np.errstate(divide="ignore"):
         meets = offset[chosen] / (normals[chosen] * rays).sum(1)
-    # A plane seen edge-on runs away within a pixel: stay near the facet.
-    near = np.abs(meets - z[chosen]) < LAYER
     depth = np.zeros(size * size, np.float32)
-    depth[shown] = np.where(near, meets, z[chosen])
+    # A plane seen edge-on runs away within a pixel: stay near the facet.
+    depth[shown] = np.where(np.abs(meets - z[chosen]) < LAYER, meets, z[chosen])
     return depth.reshape(size, size), facet.reshape(size, size)

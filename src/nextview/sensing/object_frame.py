@@ -131,8 +131,7 @@ def smallest_circle(points: Float) -> tuple[Float, float]:
 
     The farthest point joins those that hold the circle, at most three, until none is outside; each time it grows.
     """
-    corners = points[:1]
-    centre, radius = points[0], 0.0
+    corners, centre, radius = points[:1], points[0], 0.0
     while True:
         distance = np.linalg.norm(points - centre, axis=1)
         farthest = int(distance.argmax())

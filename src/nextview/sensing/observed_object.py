@@ -15,34 +15,21 @@ from nextview.checks import one_line
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.observation import Observation, SceneView, pinhole
 from nextview.geometry.viewsphere import DISTANCE
-from nextview.sensing import clusters, segmentation
+from nextview.sensing import clusters, plausibility, segmentation
 from nextview.sensing.clusters import Footprint
-from nextview.sensing.facets import ROWS, Facets, Noise, estimate_noise, fit_facets, look_again, virtual_pose
+from nextview.sensing.facets import ROWS, Facets, Index, Noise, estimate_noise, fit_facets, look_again, virtual_pose
 from nextview.sensing.frame import Frame
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
 from nextview.sensing.pieces import STANDS, cut
-from nextview.sensing.plausibility import (
-    ViewWarning,
-    check_frame,
-    check_observation,
-    check_point,
-    check_pose_moved,
-    check_views,
-    refuse_far,
-)
-from nextview.sensing.segmentation import (
-    Plane,
-    Samples,
-    find_plane,
-    lies_better_as_range,
-    mistake_in_pose,
-    refine_plane,
-    sample,
-)
+from nextview.sensing.plausibility import ViewWarning, check_frame, check_observation, check_views
+from nextview.sensing.segmentation import Plane, Samples, find_plane, refine_plane, sample
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Found = tuple[list["Sighting"], float, bool]
+"""The sightings so far, mended where a cluster has changed, and that of a new frame; the side of a cell; and whether
+the object may be two things."""
 
 SIZE = 224  # side of the observations' images: what the bundled networks take
 FEWEST = 60  # pixels that an object has to have in a frame
@@ -172,7 +159,6 @@ class ObservedObject:
         return self.state.observations[-1]
 
     def _after(self, frame: Frame) -> ObjectState:
-        """The state after one more frame."""
         before = self.state
         if not isinstance(frame, Frame):
             raise ObservationError(f"what a depth camera gave is a Frame, not {one_line(repr(frame))}")
@@ -180,7 +166,7 @@ class ObservedObject:
             raise ObservationError("a second frame needs a pose, and the first one too: how else do they fit together?")
         target, radius = (self.point, 0.0) if self.known is None else (self.known.centre, self.known.radius)
         last = before.sightings[-1].frame if before.sightings else None
-        refuse_far(frame, last, target, radius)
+        plausibility.refuse_far(frame, last, target, radius)
         few = slice(None, None, max(1, frame.shape[0] // ROWS))
         noise = estimate_noise(frame.depth[few], frame.depth[few] > 0)
         seen = frame.depth > 0 if frame.mask is None else (frame.depth > 0) & ~frame.mask
@@ -194,9 +180,8 @@ class ObservedObject:
             plane = refine_plane(earlier[0], samples, loose=2) if earlier else self._plane(frame, samples, up, rng)
         if up is None:
             if plane is None:
-                raise ObservationError(
-                    "no support plane is seen, so there is no telling where up is: give it, and the camera's pose"
-                )
+                why = "no support plane is seen, so there is no telling where up is"
+                raise ObservationError(f"{why}: give it, and the camera's pose")
             up = plane.normal
         ahead, down = frame.camera_to_world[:3, 2], frame.camera_to_world[:3, 1]
         front = -ahead if abs(ahead @ up) < 0.99 else down  # from above the bottom of the image
@@ -213,9 +198,10 @@ class ObservedObject:
         made.append(self._observe(sightings[-1], latest))
         warnings = check_frame(frame) + check_observation(made[-1]) + [MAY_BE_TWO] * two
         if last is not None:
-            warnings += check_pose_moved(frame, last)
+            warnings += plausibility.check_pose_moved(frame, last)
         if self.point is not None:
-            warnings += check_point(upright_axes(up)[:2] @ (self.point - latest.centre), latest.radius)
+            aside = upright_axes(up)[:2] @ (self.point - latest.centre)
+            warnings += plausibility.check_point(aside, latest.radius)
         warnings += [NO_PLANE] * (self.support and plane is None and self.known is None)
         for view in made[-4:-1]:
             warnings = warnings or check_views(view, made[-1])
@@ -233,10 +219,10 @@ class ObservedObject:
                 plane, share = under, more
         if up is not None and frame.mask is None and share < 1 / 3:  # else no other is twice as large
             largest = find_plane(samples, rng)
-            mistake = None if largest is None else mistake_in_pose(largest, frame.camera_to_world, up)
+            mistake = None if largest is None else segmentation.mistake_in_pose(largest, frame.camera_to_world, up)
             if largest is not None and mistake and largest.holds(samples).mean() > 2 * share:
                 raise ObservationError(f"the largest plane in view is not level: {mistake} Or up is another direction")
-        if lies_better_as_range(frame, plane, samples, rng, up, self._above()):
+        if segmentation.lies_better_as_range(frame, plane, samples, rng, up, self._above()):
             raise ObservationError("the depth is measured along the rays, a range: give it along the optical axis")
         return plane
 
@@ -248,13 +234,7 @@ class ObservedObject:
             return quarter @ self.box.axes
         return self.point if self.known is None else self.known.centre - 0.2 * self.known.radius * self.known.axes[2]
 
-    def _find(
-        self, frame: Frame, axes: Float, plane: Plane | None, samples: Samples, noise: Noise
-    ) -> tuple[list[Sighting], float, bool]:
-        """The sightings so far, mended where a cluster has changed, and that of a new frame.
-
-        And the side of a cell, and whether the object may be two things.
-        """
+    def _find(self, frame: Frame, axes: Float, plane: Plane | None, samples: Samples, noise: Noise) -> Found:
         if frame.mask is not None:
             mask = frame.mask
             if self.known is None:  # else its size does not hang on pixels at the edge
@@ -274,15 +254,11 @@ class ObservedObject:
         elif plane is not None:
             return self._on_the_plane(frame, axes, plane, samples, noise)
         else:
-            raise ObservationError(
-                "no support plane is seen below the camera: give a mask or a box, or check the pose (inverse? OpenGL "
-                "axes?) and which way is up"
-            )
+            what = "give a mask or a box, or check the pose (inverse? OpenGL axes?) and which way is up"
+            raise ObservationError(f"no support plane is seen below the camera: {what}")
         return [*self.state.sightings, self._sighting(frame, mask, plane, noise)], self.state.cell, False
 
-    def _on_the_plane(
-        self, frame: Frame, axes: Float, plane: Plane, samples: Samples, noise: Noise
-    ) -> tuple[list[Sighting], float, bool]:
+    def _on_the_plane(self, frame: Frame, axes: Float, plane: Plane, samples: Samples, noise: Noise) -> Found:
         earlier, cell = self.state.sightings, self.state.cell
         above = segmentation.above_plane(frame, plane, noise)
         ground = plane.extent(samples) @ axes[:2].T
@@ -310,8 +286,7 @@ class ObservedObject:
         if target == 0 or mask.sum() < FEWEST:
             where = "of the object known so far" if earlier else "on the support plane"
             raise ObservationError(f"this frame shows nothing {where}: check its pose, or aim the camera at the object")
-        sightings: list[Sighting] = []
-        old_labels = iter(labels[:-1])
+        sightings, old_labels = list[Sighting](), iter(labels[:-1])
         for s in earlier:
             if s.footprint is not None and s.chosen is not None:
                 now = next(old_labels) == target
@@ -323,9 +298,7 @@ class ObservedObject:
         latest = replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)
         return [*sightings, latest], cell, bool(two[target])
 
-    def _target(
-        self, labels: list[NDArray[np.int64]], footprints: list[Footprint], ground: Float, to_cells: Float
-    ) -> int:
+    def _target(self, labels: list[Index], footprints: list[Footprint], ground: Float, to_cells: Float) -> int:
         """The object's label: by the point; else that of most cells that were the object's before; else the largest."""
         if self.point is not None:
             asked, here = to_cells @ self.point, labels[-1]
@@ -368,20 +341,17 @@ class ObservedObject:
             return self.known
         points = np.concatenate([s.hull for s in sightings])
         planes = [s.plane for s in sightings if s.plane is not None]
-        floor = None
-        if planes:
-            # Height of the planes along up, where the object is: they may lean a little.
-            here = points.mean(0)
+        floor, here = None, points.mean(0)
+        if planes:  # their height along up, where the object is: they may lean a little
             floor = float(np.median([axes[2] @ here - p.height(here) / (p.normal @ axes[2]) for p in planes]))
         return enclose(points, axes, floor)
 
     def _observe(self, sighting: Sighting, latest: ObjectFrame) -> Observation:
         pose = latest.pose_in_object(sighting.frame.camera_to_world)
         depth, facet = look_again(sighting.facets, pose, latest.radius, SIZE)
-        image = None
-        if sighting.frame.image is not None:
-            facets = sighting.facets
-            image = np.where(facet >= 0, sighting.frame.image[facets.rows[facet], facets.columns[facet]], 0)
+        image, facets = sighting.frame.image, sighting.facets
+        if image is not None:
+            image = np.where(facet >= 0, image[facets.rows[facet], facets.columns[facet]], 0)
         radius, scene = latest.radius if self.life_size else None, _scene(sighting, pose, latest.radius)
         return Observation(depth, virtual_pose(pose), pinhole(SIZE, DISTANCE), radius, image, scene)
 

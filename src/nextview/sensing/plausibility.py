@@ -47,10 +47,8 @@ def refuse_far(frame: Frame, last: Frame | None, target: Float | None, radius: f
             raise ObservationError(f"{what}: is the pose in millimetres?")
     distance = 0.0 if target is None or frame.mask is not None else np.linalg.norm(target - camera)
     if distance - radius > TOO_FAR * farthest:
-        raise ObservationError(
-            f"the target is {distance:.0f} m away, and nothing in the frame is farther than {farthest:.1f} m: is the "
-            "pose in millimetres, or are target and pose of different worlds?"
-        )
+        what = f"the target is {distance:.0f} m away, and nothing in the frame is farther than {farthest:.1f} m"
+        raise ObservationError(f"{what}: is the pose in millimetres, or are target and pose of different worlds?")
 
 
 def check_frame(frame: Frame) -> list[ViewWarning]:
@@ -168,11 +166,9 @@ def _seen_through(first: Observation, second: Observation) -> float:
     if len(seen) == 0 or not second.depth.any():
         return 0.0
     scene = second.scene
-    depth, pose, k = (
-        (second.depth, second.pose, second.intrinsics)
-        if scene is None
-        else (np.where(scene.depth > 0, scene.depth, -np.inf), scene.pose, scene.intrinsics)
-    )
+    depth, pose, k = second.depth, second.pose, second.intrinsics
+    if scene is not None:
+        depth, pose, k = np.where(scene.depth > 0, scene.depth, -np.inf), scene.pose, scene.intrinsics
     points = _surface(first, seen) @ first.pose[:3, :3].T + first.pose[:3, 3]
     points = (points - pose[:3, 3]) @ pose[:3, :3]
     points = points[points[:, 2] > 0.1]

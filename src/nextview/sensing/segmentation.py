@@ -124,8 +124,7 @@ def lies_better_as_range(
     """Whether more of a frame lies on a plane if its depth is taken for the distance along each ray."""
     along = samples.points - samples.camera
     depth = along @ frame.camera_to_world[:3, 2]
-    points = samples.camera + along * (depth / np.linalg.norm(along, axis=1))[:, None]
-    nearer = replace(samples, points=points)
+    nearer = replace(samples, points=samples.camera + along * (depth / np.linalg.norm(along, axis=1))[:, None])
     other = find_plane(nearer, deepcopy(rng), up, above)
     share = 0.0 if plane is None else plane.holds(samples).mean()
     return other is not None and bool(other.holds(nearer).mean() > RANGE * share)

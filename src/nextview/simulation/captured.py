@@ -33,6 +33,7 @@ KINECT = (585.0, 585.0, 320.0, 240.0)  # fx, fy, cx, cy of the depth camera of 7
 Float = NDArray[np.float64]
 Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
 Nine = Annotated[list[float], Meta(min_length=9, max_length=9)]
+Intrinsics = tuple[float, float, float, float] | str | Path | None  # as given by hand, see ``read_capture``
 
 
 @dataclass(frozen=True)
@@ -81,11 +82,7 @@ class Capture:
         return f"{self.folder}: {self.layout} layout, {len(self.frames)} frames; " + "; ".join(self.notes)
 
 
-def read_capture(
-    folder: str | Path,
-    intrinsics: tuple[float, float, float, float] | str | Path | None = None,
-    object_id: int | None = None,
-) -> Capture:
+def read_capture(folder: str | Path, intrinsics: Intrinsics = None, object_id: int | None = None) -> Capture:
     """Find out which layout a folder has, and read its poses and intrinsics; the images are read when they are used.
 
     ``intrinsics``: fx, fy, cx, cy, pixels, first pixel's centre at 0, or a file with the pinhole matrix; by default
@@ -146,9 +143,6 @@ def read_box(path: Path) -> Box:
 def pinhole_of(fx: float, fy: float, cx: float, cy: float) -> Float:
     """Pinhole matrix, (3, 3), of focal lengths and principal point, pixels."""
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-
-
-# The three layouts
 
 
 class _Camera(Struct):

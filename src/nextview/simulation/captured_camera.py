@@ -46,8 +46,7 @@ class CapturedCamera:
         life_size: bool = True,
     ) -> None:
         self.capture, self.taken, self.left_out = capture, list[Taken](), dict[str, str]()
-        self._masked = point is None and box is None
-        self._left = list(capture.frames)
+        self._masked, self._left = point is None and box is None, list(capture.frames)
         up = capture.up if up is None else up
         same: dict[str, Any] = {"denoise": denoise, "life_size": life_size}
         if box is not None:

@@ -41,9 +41,7 @@ def write_capture(
         raise UsageError(f"the camera sees {farthest:.3g} m far, the depth images end at {STEP * NOTHING:.3g} m")
     height = -radius * float(mesh.vertices[:, 2].min())
     vertices = radius * mesh.vertices + np.array([0, 0, height])
-    things = [(vertices, mesh.faces)]
-    if table:
-        things.append(square(TABLE * radius, 0.0))
+    things = [(vertices, mesh.faces)] + [square(TABLE * radius, 0.0)] * table
     caster, rays = RayCaster(things), pixel_rays(pinhole_of(525.0, 525.0, 320.0, 240.0), SHAPE).reshape(-1, 3)
     # The box has an inside, even that of a flat mesh.
     low, high = vertices.min(0) - 1e-6 * radius, vertices.max(0) + 1e-6 * radius

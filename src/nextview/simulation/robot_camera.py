@@ -55,8 +55,7 @@ class RobotCamera:
             "mask": {},
         }[named]
         self.object = ObservedObject(denoise=denoise, life_size=False, **asked)  # type: ignore[arg-type]
-        self._refused: list[Float] = []
-        self._taken: list[Float] = []
+        self._refused, self._taken = list[Float](), list[Float]()
 
     def reachable(self, pose: Float) -> bool:
         """Whether the camera can be brought to a pose of the scene, (4, 4), metres: for ``Session.reachable``."""
@@ -73,8 +72,7 @@ class RobotCamera:
             used = any(angle_between(direction, other) < SAME for other in tried)
             if used or not self.scene.reachable(there[None, :3, 3])[0]:
                 continue
-            frame = self._camera.frame(there)
-            if frame is not None:
+            if (frame := self._camera.frame(there)) is not None:
                 self._taken.append(direction)
                 return frame if self.named in ("known", "mask") else replace(frame, mask=None, pixel_centre=0.5)
             self._refused.append(direction)

@@ -20,6 +20,7 @@ from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, spans, u
 from nextview.simulation.simulated import SimulatedCamera
 
 Float = NDArray[np.float64]
+Depth = NDArray[np.float32]
 TABLE = 1.5  # radius of the table that the object stands on, if nothing else is said, object radii
 REACH = 1.3  # the object is looked for in a sphere so many radii large: with a wrong pose it sticks out of its own
 LEFTOVER = 4.0  # size of the patches of the table that are taken for the object, pixels
@@ -108,7 +109,7 @@ class SensedCamera:
         mask[part] &= inside_sphere(frame, self.object_frame.centre, REACH * self.object_frame.radius, part)
         return replace(frame, mask=mask, pixel_centre=0.5) if np.count_nonzero(mask) >= FEWEST else None
 
-    def _scene(self, pose: Float) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    def _scene(self, pose: Float) -> tuple[Depth, NDArray[np.uint8]]:
         """True depth of object, boxes and table, metres, and what each pixel shows."""
         inside = self._truth.pose_in_object(pose)
         depth = self._camera.observe(inside).depth.copy()
@@ -140,9 +141,7 @@ class SensedCamera:
             across = [pose[i, 3] + along * (x * pose[i, 0] + y * pose[i, 1] + pose[i, 2]) for i in (0, 1)]
             return part, np.where(across[0] ** 2 + across[1] ** 2 < self._reach**2, along, np.inf)
 
-    def _cropped(
-        self, depth: NDArray[np.float32], mask: NDArray[np.bool_], rng: np.random.Generator
-    ) -> NDArray[np.float32]:
+    def _cropped(self, depth: Depth, mask: NDArray[np.bool_], rng: np.random.Generator) -> Depth:
         """The picture without what lies beyond a line across the object, parallel to one of its borders."""
         side, share = int(rng.integers(4)), float(rng.uniform(0, self.sensor.crop))
         lines = np.flatnonzero(mask.any(axis=1 - side // 2))

@@ -54,24 +54,20 @@ class SimulatedCamera:
         self.intrinsics = pinhole(size, distance) if intrinsics is None else checked_intrinsics(intrinsics, self.shape)
         self.radius = mesh.metres
         vertices = mesh.vertices.astype(np.float32)
-        self._corners = np.ascontiguousarray(vertices.T)
-        self._faces = mesh.faces
+        self._corners, self._faces = np.ascontiguousarray(vertices.T), mesh.faces
         self._scene = embree_scene([(vertices, mesh.faces)])
-        across, down = (
-            (np.arange(side, dtype=np.float32) + np.float32(0.5 - self.intrinsics[axis, 2]))
-            / self.intrinsics[axis, axis].astype(np.float32)
-            for axis, side in enumerate(self.shape[::-1])
-        )
-        self._rays = np.empty((*self.shape, 3), np.float32)  # z = 1, so that Embree's distance is the depth
-        self._rays[..., 0], self._rays[..., 1], self._rays[..., 2] = across[None, :], down[:, None], 1.0
+        (fx, _, cx), (_, fy, cy) = self.intrinsics[:2]
+        y, x = np.indices(self.shape, np.float32, sparse=True)
+        self._rays = np.ones((*self.shape, 3), np.float32)  # z = 1, so that Embree's distance is the depth
+        self._rays[..., 0] = (x + np.float32(0.5 - cx)) / np.float32(fx)
+        self._rays[..., 1] = (y + np.float32(0.5 - cy)) / np.float32(fy)
         self._ray_length = np.linalg.norm(self._rays, axis=-1)
 
     def observe(self, pose: NDArray[np.float64]) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object radii."""
         pose = checked_pose(pose)
         rotation, origin = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
-        image = np.zeros(self.shape, np.uint8)
-        depth = np.zeros(self.shape, np.float32)
+        image, depth = np.zeros(self.shape, np.uint8), np.zeros(self.shape, np.float32)
         # Only pixels inside the object's projected bound can hit anything: cast no others.
         bound = self._bound(rotation, origin)
         height, width = depth[bound].shape
@@ -80,13 +76,11 @@ class SimulatedCamera:
             origins = np.tile(np.tile(origin, width), height).reshape(-1, 3)  # row by row: ten times as fast
             hits = self._scene.run(origins, rays, output=1)
             hit, normals = hits["primID"] >= 0, hits["Ng"]
-            cosine = np.abs(_dot(normals, rays))
-            squared = _dot(normals, normals)
+            cosine, squared = np.abs(_dot(normals, rays)), _dot(normals, normals)
             cosine /= np.sqrt(squared) * self._ray_length[bound].ravel() + 1e-18  # not 0 where that square is
             doubtful = np.flatnonzero(hit & ((cosine < EDGE_ON) | (squared < SLIVER**2)))
             where = hits["tfar"][doubtful, None] * self._rays[bound].reshape(-1, 3)[doubtful]
-            corners = self._corners.T[self._faces[hits["primID"][doubtful]]]  # (n, 3, xyz)
-            corners = (corners - origin) @ rotation
+            corners = (self._corners.T[self._faces[hits["primID"][doubtful]]] - origin) @ rotation  # (n, 3, xyz)
             hit[doubtful] = ((where > corners.min(1) - STRAY) & (where < corners.max(1) + STRAY)).all(1)
             shade = np.where(hit, 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5, 0)
             image[bound] = shade.reshape(height, width)
