@@ -246,7 +246,8 @@ class Predictions:
 
         if "format" not in f or f["format"].tolist() != FORMAT:
             raise PredictionsError(f"not a predictions file of format {FORMAT}; make it again")
-        arrays: dict[str, Any] = {name: f[name] for name in ("logits", "depth_entropy", *KINDS)}
+        needed = ("logits", "depth_entropy", "labels", "splits", "conflicting")
+        arrays: dict[str, Any] = {name: f[name] for name in needed}
         trust = str(f.get("calibration", "{}")).encode()
         return cls(
             **arrays,

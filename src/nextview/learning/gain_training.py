@@ -117,18 +117,15 @@ def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np
 def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
     """Train the networks: after every epoch, the policy as it then is, at travel weight 0 and over all views."""
     rng, data = np.random.default_rng([recipe.seed, fold]), table.data
-    sphere, n, c = data.sphere, len(data), len(data.classes)
+    sphere, n, c, e = data.sphere, len(data), len(data.classes), recipe.networks_per_fold
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     features_flip = mirrored_features(sphere, c, recipe.inputs, recipe.frame)
     widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)]))
     scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
-    first = [
-        scale * torch.randn(recipe.networks_per_fold, *width, generator=generator)
-        for scale, width in zip(scales, widths, strict=True)
-    ]
-    biases = [torch.zeros(recipe.networks_per_fold, 1, outputs) for _, outputs in widths]
+    first = [scale * torch.randn(e, *width, generator=generator) for scale, width in zip(scales, widths, strict=True)]
+    biases = [torch.zeros(e, 1, outputs) for _, outputs in widths]
     networks = Perceptrons(first, biases, features_flip, mirrored(sphere))
-    drawn = rng.multinomial(n, np.full(n, 1 / n), size=recipe.networks_per_fold)
+    drawn = rng.multinomial(n, np.full(n, 1 / n), size=e)
     weights = torch.from_numpy(drawn * data.weights).float()
     optimiser = torch.optim.AdamW(networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay)
     batches = -(-recipe.episodes * (recipe.max_views - 1) * n // recipe.batch)
@@ -183,8 +180,9 @@ def write_gain(card: Path, policy: Gain, about: PolicyCard, features: NDArray[np
         answers = open_onnx(made, sha256, threads=1).run(["cells"], {FEATURES_INPUT: features.astype(np.float32)})[0]
         difference = float(np.abs(answers - expected).max())
         if not difference <= BOUND * max(1.0, float(np.abs(expected).max())):
-            differ = f"differ by {difference:.2g} from the networks'"
-            raise ModelError(f"{weights}: ONNX Runtime's answers {differ}; not written")
+            raise ModelError(
+                f"{weights}: ONNX Runtime's answers differ by {difference:.2g} from the networks'; not written"
+            )
         table = msgspec.to_builtins(GainTable(policy.classes, policy.inputs, policy.travel_weight, policy.frame))
         about = msgspec.structs.replace(about, sha256=sha256, table=table, scope=policy.scope)
         write_policy_card(part / card.name, about)
@@ -331,6 +329,7 @@ def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
     if VISIBILITY in recipe.inputs and scenes_of(p) is None:
         raise PredictionsError(f"{path}: is of no scenes, in which all would show; choose other --inputs")
     if p.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
-        other = "give --frame camera and --inputs without azimuth_bin"
-        hint = f"train the recogniser with --azimuth-bins-weight, or {other}"
+        hint = (
+            "train the recogniser with --azimuth-bins-weight, or give --frame camera and --inputs without azimuth_bin"
+        )
         raise PredictionsError(f"{path}: holds no azimuth bins; {hint}")
