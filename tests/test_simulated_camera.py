@@ -26,8 +26,7 @@ def assert_as_every_ray(mesh: Mesh, pose: np.ndarray, size: int) -> None:
     """Equal to casting every ray, except where rounding decides whether a ray just touches an edge."""
     camera = SimulatedCamera(mesh, size)
     depth, (other, _) = camera.observe(pose).depth, cast([mesh], pose, camera.intrinsics, (size, size))
-    differs = np.abs(depth - other) > 1e-4
-    assert differs.mean() < 2e-3
+    assert (np.abs(depth - other) > 1e-4).mean() < 2e-3
     assert np.abs((depth > 0).sum(0) - (other > 0).sum(0)).max() <= 3
 
 

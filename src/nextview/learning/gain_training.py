@@ -180,9 +180,8 @@ def write_gain(card: Path, policy: Gain, about: PolicyCard, features: NDArray[np
         answers = open_onnx(made, sha256, threads=1).run(["cells"], {FEATURES_INPUT: features.astype(np.float32)})[0]
         difference = float(np.abs(answers - expected).max())
         if not difference <= BOUND * max(1.0, float(np.abs(expected).max())):
-            raise ModelError(
-                f"{weights}: ONNX Runtime's answers differ by {difference:.2g} from the networks'; not written"
-            )
+            differ = f"differ by {difference:.2g} from the networks'"
+            raise ModelError(f"{weights}: ONNX Runtime's answers {differ}; not written")
         table = msgspec.to_builtins(GainTable(policy.classes, policy.inputs, policy.travel_weight, policy.frame))
         about = msgspec.structs.replace(about, sha256=sha256, table=table, scope=policy.scope)
         write_policy_card(part / card.name, about)
@@ -329,7 +328,6 @@ def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
     if VISIBILITY in recipe.inputs and scenes_of(p) is None:
         raise PredictionsError(f"{path}: is of no scenes, in which all would show; choose other --inputs")
     if p.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
-        hint = (
-            "train the recogniser with --azimuth-bins-weight, or give --frame camera and --inputs without azimuth_bin"
-        )
+        other = "give --frame camera and --inputs without azimuth_bin"
+        hint = f"train the recogniser with --azimuth-bins-weight, or {other}"
         raise PredictionsError(f"{path}: holds no azimuth bins; {hint}")

@@ -243,9 +243,8 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
             faults += ["other first weights"] * (before.weights != run.weights)
             faults += ["other objects"] * (before.held_out != run.held_out)
             if faults:
-                raise ModelError(
-                    f"{out}: holds a run of {faults[0]}; give the same options to resume it, or another folder"
-                )
+                again = "give the same options to resume it, or another folder"
+                raise ModelError(f"{out}: holds a run of {faults[0]}; {again}")
         elif is_first():
             other = [path.name for path in (out.iterdir() if out.is_dir() else ()) if not path.name.startswith(".")]
             if other:
