@@ -129,13 +129,8 @@ def make_map_network(folder: Path, name: str = "lem", rings: int = 5, valleys: t
     inputs = [helper.make_tensor_value_info("cloud", TensorProto.FLOAT, ["batch", "points", 3])]
     outputs = [helper.make_tensor_value_info("map", TensorProto.FLOAT, ["batch", rings, 3])]
     constants = {"weights": weights, "points": np.array([1]), "shape": np.array([-1, rings, 3])}
-    card = {
-        "kind": name,
-        "measure": measure_of(name),
-        "input": {"kind": "cloud"},
-        "output": "window",
-        "valley_classes": list(valleys),
-    }
+    card = {"kind": name, "measure": measure_of(name), "valley_classes": list(valleys)}
+    card |= {"input": {"kind": "cloud"}, "output": "window"}
     return _save(folder / f"tiny-{name}.json", nodes, inputs, outputs, constants, card)
 
 
@@ -145,9 +140,8 @@ def _save(path: Path, nodes: list, inputs: list, outputs: list, constants: dict,
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
     weights = path.with_suffix(".onnx")
     onnx.save(model, weights)
-    path.write_text(
-        json.dumps({"schema": 2, "name": path.stem, "sha256": hashlib.sha256(weights.read_bytes()).hexdigest(), **card})
-    )
+    sha256 = hashlib.sha256(weights.read_bytes()).hexdigest()
+    path.write_text(json.dumps({"schema": 2, "name": path.stem, "sha256": sha256, **card}))
     return path
 
 
@@ -162,18 +156,11 @@ def some_predictions(n: int = 6, seed: int = 0) -> Predictions:
     """Random logits and maps of ``n`` objects of three classes."""
     rng = np.random.default_rng(seed)
     return Predictions(
-        rng.normal(size=(n, 40, 3)).astype(np.float32),
-        {"lem": rng.random((n, 40, 5, 3)).astype(np.float32)},
-        rng.random((n, 40)).astype(np.float32),
-        tuple(f"thing_{i}" for i in range(n)),
-        np.arange(n) % 3,
-        tuple(CLASSES),
-        np.array(["test"] * n),
-        np.zeros(n, bool),
-        SPHERE,
-        {"recogniser": ("r", "0" * 64), "lem": ("l", "1" * 64)},
+        rng.normal(size=(n, 40, 3)).astype(np.float32), {"lem": rng.random((n, 40, 5, 3)).astype(np.float32)},
+        rng.random((n, 40)).astype(np.float32), tuple(f"thing_{i}" for i in range(n)), np.arange(n) % 3, tuple(CLASSES),
+        np.array(["test"] * n), np.zeros(n, bool), SPHERE, {"recogniser": ("r", "0" * 64), "lem": ("l", "1" * 64)},
         {"lem": ("box",)},
-    )
+    )  # fmt: skip
 
 
 def train_predictions(logits, labels, sphere, classes, azimuth_bins=None, **fields) -> Predictions:
@@ -242,10 +229,8 @@ def cast(meshes: Sequence[trimesh.Trimesh], pose, intrinsics=INTRINSICS, shape=S
     origins = np.tile(np.asarray(pose)[:3, 3].astype(np.float32), (len(directions), 1))
     hits = scene.run(origins, directions, output=1)
     hit = hits["primID"] >= 0
-    return (
-        np.where(hit, hits["tfar"], 0).reshape(shape).astype(np.float32),
-        np.where(hit, hits["geomID"], -1).reshape(shape),
-    )
+    depth, which = np.where(hit, hits["tfar"], 0), np.where(hit, hits["geomID"], -1)
+    return depth.reshape(shape).astype(np.float32), which.reshape(shape)
 
 
 def ball_depth(pose, intrinsics, size, radius=1.0, centre=(0, 0, 0)) -> np.ndarray:

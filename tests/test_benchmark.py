@@ -102,8 +102,7 @@ def test_a_stopping_rule_of_ones_own_decides_in_the_command(predictions, tmp_pat
           "--samples", "20", "--thresholds", "0.6", "--stopping", "test_replay:uncertain"])  # fmt: skip
     specs, rule = make_specs(predictions, runs=2, seed=0), own_stopping("test_replay:uncertain", 0.6, 5)
     ends = truncate(replay("lem", specs, 5, 0, beliefs=True), rule)
-    rows = load(tmp_path / "out").episodes("lem", 0.6)
-    np.testing.assert_array_equal(ends.n_views, rows["n_views"])
+    np.testing.assert_array_equal(ends.n_views, load(tmp_path / "out").episodes("lem", 0.6)["n_views"])
     assert len(set(ends.n_views)) > 1
     wrong = ("benchmark", tmp_path / "p.npz", tmp_path / "no", "--stopping", "test_replay:nothing")
     assert "stopping rule test_replay:nothing cannot be made" in refused(capsys, *wrong)
@@ -122,8 +121,7 @@ def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes
 
 def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(results, predictions, tmp_path):
     bounds = RiskBounds((0.6, 0.8), tuple((0.2, 0.1) for _ in range(5)), 0.1)
-    calibrated = replace(predictions, calibration=Calibration(0.7, 0.5, bounds))
-    calibrated.save(tmp_path / "c.npz")
+    replace(predictions, calibration=Calibration(0.7, 0.5, bounds)).save(tmp_path / "c.npz")
     settings = {"policies": ("random",), "thresholds": (0.9,), "runs": 2, "samples": 20}
     benchmark(tmp_path / "c.npz", tmp_path / "risk", risks=(0.15,), **settings)
     found = load(tmp_path / "risk")

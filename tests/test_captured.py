@@ -149,15 +149,13 @@ def test_every_request_gets_the_nearest_view_that_is_left(captured):
             position = left[i].pose[:3, 3] - box.object_frame.centre
             return position @ pose[:3, 3] / np.linalg.norm(position)
 
-        best = max(left, key=cosine)
-        assert camera.taken[-1].frame.name == left.pop(best).name
+        assert camera.taken[-1].frame.name == left.pop(max(left, key=cosine)).name
     assert len(camera.taken) == 4
 
 
 def test_views_that_do_not_show_the_object_are_left_out(captured, tmp_path, system):
     shutil.copytree(captured, tmp_path / "some")
-    empty = tmp_path / "some" / "depth" / "000004.png"
-    write_png(empty, np.zeros((480, 640)))
+    write_png(tmp_path / "some" / "depth" / "000004.png", np.zeros((480, 640)))
     camera = CapturedCamera(read_capture(tmp_path / "some"))
     result = system.recognise(camera, start=4)
     assert list(camera.left_out) == ["000004"]

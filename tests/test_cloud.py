@@ -77,8 +77,7 @@ def test_every_visible_pixel_has_the_same_chance():
 
 
 def test_clouds_are_scaled_by_their_own_global_extent():
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-1, 1, (5, 100, 3)).astype(np.float32)
+    points = np.random.default_rng(0).uniform(-1, 1, (5, 100, 3)).astype(np.float32)
     poses = look_at_origin(np.linspace(0, 1, 5), np.zeros(5))  # at azimuth 0 nothing is turned
     clouds = cloud_input(points, poses)
     assert (clouds.shape, clouds.dtype) == ((5, 100, 3), np.float32)
@@ -94,9 +93,8 @@ def test_turning_object_and_camera_together_changes_nothing(azimuth, elevation):
     c, s = np.cos(azimuth), np.sin(azimuth)
     turned = points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
     ahead = cloud_input(points.astype(np.float32), look_at_origin([elevation], [0.0]))
-    np.testing.assert_allclose(
-        cloud_input(turned.astype(np.float32), look_at_origin([elevation], [azimuth])), ahead, atol=1e-5
-    )
+    found = cloud_input(turned.astype(np.float32), look_at_origin([elevation], [azimuth]))
+    np.testing.assert_allclose(found, ahead, atol=1e-5)
 
 
 def test_the_camera_stands_at_azimuth_zero():

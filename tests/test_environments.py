@@ -77,8 +77,7 @@ def test_the_vectorised_environment_is_many_single_ones(options):
 
     def begin(row):
         """The single environment on the same object, from the same first view."""
-        begun = {"object": info["object"][row], "start": info["view"][row]}
-        return singles[row].reset(options=begun)[0]
+        return singles[row].reset(options={"object": info["object"][row], "start": info["view"][row]})[0]
 
     for row in range(n):
         np.testing.assert_array_equal(begin(row), observation[row])
@@ -145,8 +144,7 @@ def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
     system = load(policy="spread", max_views=2)
     camera = simulated(sample_mesh(next(iter(SAMPLES))))
     session: Session = system.session(start=3)
-    view = session.update(camera.observe(session.pose))
-    np.testing.assert_allclose(observation[:10], view.belief, atol=1e-5)
+    np.testing.assert_allclose(observation[:10], session.update(camera.observe(session.pose)).belief, atol=1e-5)
     with pytest.raises(DatasetError, match="no such folder"):
         gymnasium.make("nextview/RecogniseMesh-v0", meshes=str(tmp_path / "none"))
     (tmp_path / "spoon/train").mkdir(parents=True)
@@ -158,7 +156,6 @@ def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
 def test_the_page_does_what_it_says(tmp_path, monkeypatch):
     learnable().save(tmp_path / "validation.npz")
     monkeypatch.chdir(tmp_path)
-    page = Path(__file__).parents[1] / "docs/environments.md"
-    failed, tried = doctest.testfile(str(page), module_relative=False)
+    failed, tried = doctest.testfile(str(Path(__file__).parents[1] / "docs/environments.md"), module_relative=False)
     assert tried > 12
     assert failed == 0

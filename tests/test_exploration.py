@@ -42,8 +42,7 @@ def test_a_policy_walks_as_it_does_in_an_episode(policy, start):
 def test_a_view_by_hand_counts_from_where_it_was_taken(chair):
     walk = chair.walks[0]
     walk.look(5)
-    pose = chair.pose_towards(np.array([2.0, -1.0, 1.5]))
-    view = walk.look(pose)
+    view = walk.look(chair.pose_towards(np.array([2.0, -1.0, 1.5])))
     assert walk.visited[0] == 5
     np.testing.assert_allclose(view.direction, np.array([2.0, -1.0, 1.5]) / np.sqrt(7.25))
     assert view.travel == pytest.approx(float(walk.sphere.travel_between(walk.sphere.directions[5], view.direction)))

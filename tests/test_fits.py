@@ -170,8 +170,7 @@ def telling(sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, se
 def test_what_tells_most_is_found(scope):
     data = telling(SMALL, [[2], [2]])
     assert fit_ring(data, scope, 4, PLAIN_SUM)[0] == 2
-    moves = fit_sequence(data, scope, 3, PLAIN_SUM)
-    assert (SMALL.ring[moves] == 2).all()
+    assert (SMALL.ring[fit_sequence(data, scope, 3, PLAIN_SUM)] == 2).all()
     by_class = fit_class_table(telling(SMALL, [[0], [2]]), 4, 0.0, PLAIN_SUM, np.random.default_rng(0))
     assert (SMALL.ring[by_class[0].argmax(1)] == 0).all()
     assert (SMALL.ring[by_class[1].argmax(1)] == 2).all()

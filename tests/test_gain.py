@@ -52,8 +52,7 @@ def some_gain(sphere=SPHERE, inputs=INPUTS, networks=2, seed=0, frame="camera", 
     weights = [torch.from_numpy(rng.normal(size=(networks, a, b)) / a**0.5).float() for a, b in widths]
     biases = [torch.from_numpy(rng.normal(size=(networks, 1, b))).float() for _, b in widths]
     flips = mirrored_features(sphere, CLASSES, inputs, frame), mirrored(sphere)
-    score = Score(Perceptrons(weights, biases, *flips))
-    return Gain(sphere, CLASSES, score, inputs, frame=frame, **rest)
+    return Gain(sphere, CLASSES, Score(Perceptrons(weights, biases, *flips)), inputs, frame=frame, **rest)
 
 
 def some_state(sphere=SPHERE, episodes=60, seed=0):

@@ -157,8 +157,7 @@ def test_classes_of_several_things_and_one_alone(tmp_path, scans):
     found = learn(folder, tmp_path / "two", upright=True, workers=0)
     assert (found.things, found.classes) == (4, 2)
     assert found.accuracy[2] > 0.9  # by the other things of the class
-    card = read_card(tmp_path / "two/memory.json")
-    assert card.calibration.hypotheses == (0, 0, 1, 1)
+    assert read_card(tmp_path / "two/memory.json").calibration.hypotheses == (0, 0, 1, 1)
 
 
 def test_belief_in_classes_is_the_sum_over_their_things_and_azimuths():

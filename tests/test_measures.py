@@ -52,8 +52,7 @@ def test_scikit_image_agrees_on_the_quantised_image(dtype):
 
 
 def test_differences_below_the_quantum_do_not_count():
-    rng = np.random.default_rng(1)
-    depth = 2.5 + rng.uniform(-0.4, 0.4, (50, 50)) * QUANTUM
+    depth = 2.5 + np.random.default_rng(1).uniform(-0.4, 0.4, (50, 50)) * QUANTUM
     assert depth_entropy(depth) == 0
     assert depth_entropy(np.where(np.arange(50) % 2, depth, depth + QUANTUM)) == pytest.approx(1)
 

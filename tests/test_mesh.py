@@ -19,20 +19,7 @@ from nextview.geometry.mesh import BYTES_PER_FACE, FORMATS, Mesh, load_mesh, mak
 from nextview.geometry.mesh_file import read_off
 
 SQUARE = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]
-PYRAMID = """OFF
-5 6 9
-0 0 0
-2 0 0
-2 2 0
-0 2 0
-1 1 3
-3 0 2 1
-3 0 3 2
-3 0 1 4
-3 1 2 4
-3 2 3 4
-3 3 0 4
-"""
+PYRAMID = "OFF\n5 6 9\n0 0 0\n2 0 0\n2 2 0\n0 2 0\n1 1 3\n3 0 2 1\n3 0 3 2\n3 0 1 4\n3 1 2 4\n3 2 3 4\n3 3 0 4\n"
 GOOD = "0 0 0\n1 0 0\n0 1 1"
 FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 1\nendloop\nendfacet\n"
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 1]], "<f4").tobytes() + np.arange(3, dtype="<u4").tobytes()

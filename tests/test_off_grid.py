@@ -31,8 +31,7 @@ def evidence(rng, b=1) -> Evidence:
 
 
 def direction(elevation, azimuth):
-    pose = look_at_origin(np.radians(elevation), np.radians(azimuth), 1.0)
-    return pose[..., :3, 3]
+    return look_at_origin(np.radians(elevation), np.radians(azimuth), 1.0)[..., :3, 3]
 
 
 # Layouts
@@ -65,8 +64,7 @@ def test_a_list_of_directions_or_poses_gives_its_views(angles, distance):
 
 def test_travel_of_directions_is_counted_in_the_cells_of_the_40_views():
     np.testing.assert_allclose(Directions(SPHERE.directions).travel, SPHERE.travel, atol=1e-9)
-    between = SPHERE.travel_between(direction(27, 350), direction(36, 10))
-    assert between == pytest.approx(np.hypot(0.5, 20 / 45))
+    assert SPHERE.travel_between(direction(27, 350), direction(36, 10)) == pytest.approx(np.hypot(0.5, 20 / 45))
     assert viewpoints_of("12").travel_between(direction(45, 5), direction(45, 350)) == pytest.approx(0.5)
 
 

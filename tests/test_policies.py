@@ -222,8 +222,7 @@ def test_map_peak_is_the_highest_free_peak_of_scikit_image(seed):
 
 def test_a_valley_is_chosen_by_the_believed_class():
     state = state_of(SPHERE, [11, 11], belief=[[0.9, 0.1], [0.2, 0.8]], lem=[HILLS, HILLS])
-    policy = MapPeak(SPHERE, "lem", valley_classes=(1,))
-    peak, valley = policy.next_views(state, np.random.default_rng(0))
+    peak, valley = MapPeak(SPHERE, "lem", valley_classes=(1,)).next_views(state, np.random.default_rng(0))
     assert peak == 3
     assert HILLS[SPHERE.ring[valley]][[2, 3, 4].index(SPHERE.azimuth_index[valley])] == 0.1
     both = MapPeak(SPHERE, "lem", valley_classes=(0, 1)).next_views(state, np.random.default_rng(0))

@@ -22,8 +22,7 @@ def chair():
 
 def test_json_holds_the_whole_episode(chair, capsys):
     main(["recognise", str(chair), "--json", "--start", "3", "--threshold", "1", "--max-views", "4"])
-    episode = json.loads(capsys.readouterr().out)
-    views = episode["views"]
+    views = json.loads(capsys.readouterr().out)["views"]
     assert next(view["view"] for view in views) == 3
     assert len(views) == len({view["view"] for view in views}) == 4
     assert [view["next_view"] for view in views] == [view["view"] for view in views[1:]] + [None]
@@ -54,9 +53,8 @@ def test_several_are_a_line_of_json_each_and_what_cannot_be_used_is_named(chair,
 
 
 def test_a_rule_of_ones_own_shows_no_threshold_that_it_does_not_have(chair, tmp_path, monkeypatch, capsys):
-    (tmp_path / "own_rule.py").write_text(
-        "def second(seen, threshold):\n    return seen.n_views >= 2 + 0 * seen.highest\n"
-    )
+    rule = "def second(seen, threshold):\n    return seen.n_views >= 2 + 0 * seen.highest\n"
+    (tmp_path / "own_rule.py").write_text(rule)
     monkeypatch.chdir(tmp_path)
     command = ["recognise", str(chair), "--stopping", "own_rule:second", "--start", "3"]
     main([*command, "--figure", "episode.svg"])

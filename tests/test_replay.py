@@ -55,8 +55,7 @@ def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(specs, na
     for field in ("answer", "confidence", "n_views", "confident", "travel", "arc"):
         np.testing.assert_allclose(getattr(ends, field), getattr(episodes, field), atol=1e-12, err_msg=field)
     taken = np.arange(5) < ends.n_views[:, None]
-    width = episodes.views.shape[1]
-    np.testing.assert_array_equal(np.where(taken, paths.views, -1)[:, :width], episodes.views)
+    np.testing.assert_array_equal(np.where(taken, paths.views, -1)[:, : episodes.views.shape[1]], episodes.views)
 
 
 def uncertain(seen, threshold):
@@ -110,11 +109,8 @@ def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(specs, knows_
         for e in range(0, len(views), 7):
             i, seen = specs.objects[e], list(views[e, :2])
             around = range(40) if everywhere else p.sphere.windows[seen[-1]].ravel()
-            belief = {
-                v: calibration.belief(p.log_evidence[i, [*seen, v]].astype(float).sum(0), 3, 3)[p.labels[i]]
-                for v in around
-                if v not in seen
-            }
+            sums = {v: p.log_evidence[i, [*seen, v]].astype(float).sum(0) for v in around if v not in seen}
+            belief = {v: calibration.belief(total, 3, 3)[p.labels[i]] for v, total in sums.items()}
             assert belief[views[e, 2]] == pytest.approx(max(belief.values()), abs=1e-9)
 
 

@@ -100,10 +100,8 @@ def test_a_better_object_frame_changes_what_the_earlier_views_say(tiny):
         assert view.observation is observation
         e = tiny.evidence([observation])
         x, y, _ = observation.pose[:3, 3]
-        azimuth = np.array([np.arctan2(y, x)])
-        total = total + log_evidence_of(e.logits, e.azimuth_bins, azimuth).astype(np.float64)
-    expected = tiny.recogniser.calibration.belief(total, k, 3)[0]
-    np.testing.assert_allclose(session.views[-1].belief, expected, atol=1e-6)
+        total = total + log_evidence_of(e.logits, e.azimuth_bins, np.array([np.arctan2(y, x)])).astype(np.float64)
+    np.testing.assert_allclose(session.views[-1].belief, tiny.recogniser.calibration.belief(total, k, 3)[0], atol=1e-6)
 
 
 @settings(deadline=None, max_examples=5)

@@ -207,11 +207,9 @@ def test_views_without_the_target_are_no_evidence(predictions):
     hidden = ~predictions.seen
     assert hidden.any()
     scene, view = np.argwhere(hidden)[0]
-    evidence = predictions.evidence(np.array([scene]), np.array([view]))
-    assert not evidence.seen[0]
-    sized = replace(
-        predictions, logits=predictions.logits + 0.3, of_size=np.full((len(predictions), 10), np.float32(0.3))
-    )
+    assert not predictions.evidence(np.array([scene]), np.array([view])).seen[0]
+    of_size = np.full((len(predictions), 10), np.float32(0.3))
+    sized = replace(predictions, logits=predictions.logits + 0.3, of_size=of_size)
     np.testing.assert_array_equal(sized.seen, predictions.seen)
 
 
@@ -224,11 +222,9 @@ def test_gain_learns_in_scenes_what_to_make_of_what_shows(predictions, tmp_path)
     recipe = GainRecipe(("belief", "place", "visibility"), "camera", epochs=1, episodes=1, networks_per_fold=1)
     made = train_gain(tmp_path / "p.npz", tmp_path / "in-scenes.json", recipe=recipe, folds=2, travel_weight=0.01)
     assert made.objects == len(predictions)
-    policy = make_policy(str(made.card), GRID, classes=predictions.classes)
-    assert policy.needs == ("visibility",)
+    assert make_policy(str(made.card), GRID, classes=predictions.classes).needs == ("visibility",)
     specs = make_specs(predictions, 1, 0)
-    views = replay(str(made.card), specs, 4, 0).views
-    assert specs.scenes.reachable[specs.objects[:, None], views].all()
+    assert specs.scenes.reachable[specs.objects[:, None], replay(str(made.card), specs, 4, 0).views].all()
     replace(some_predictions(), splits=train).save(tmp_path / "alone.npz")
     with pytest.raises(PredictionsError, match="of no scenes"):
         train_gain(tmp_path / "alone.npz", tmp_path / "alone.json", recipe=recipe, folds=2)
@@ -284,6 +280,5 @@ def test_a_robot_sees_around_a_box(named):
     session.reachable = camera.reachable
     while not session.done:
         session.update(camera.observe(session.pose))
-    first = session.views[0]
-    assert first.observation.scene is not None
+    assert session.views[0].observation.scene is not None
     assert truth[[view.index for view in session.views[1:]]].min() > 0.9

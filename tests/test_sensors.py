@@ -185,8 +185,7 @@ def test_errors_of_the_object_frame_have_their_strength():
 
 
 def test_the_camera_is_not_where_it_believes_to_be():
-    sensor = replace(SENSORS["none"], moved=0.01)
-    camera = SensedCamera(BALL, sensor, rng(19))
+    camera = SensedCamera(BALL, replace(SENSORS["none"], moved=0.01), rng(19))
     off = []
     for view in range(40):
         frame = camera.frame(SPHERE.poses[view])

@@ -42,8 +42,7 @@ def test_it_asks_for_views_until_it_is_done(system, camera):
 
 
 def test_travel_and_belief_are_those_of_the_views(system, camera):
-    session = Session(system.models, system.policy, system.sphere, 9, Stopping(1.0, 4))
-    result = session.run(camera)
+    result = Session(system.models, system.policy, system.sphere, 9, Stopping(1.0, 4)).run(camera)
     path = [view.index for view in result.views]
     assert len(set(path)) == 4
     assert result.travel == pytest.approx(sum(system.sphere.travel[a, b] for a, b in itertools.pairwise(path)))
@@ -70,8 +69,7 @@ class Margin(Stopping):
 
 
 def test_a_stopping_rule_of_ones_own(camera):
-    rule = Margin(max_views=6, lead=0.95)
-    system = nextview.load(stopping=rule)
+    system = nextview.load(stopping=Margin(max_views=6, lead=0.95))
     assert len(pickle.dumps(system)) < 1000  # as how it was loaded
     for again in (system, pickle.loads(pickle.dumps(system))):
         result = again.recognise(camera, start=20)
@@ -120,8 +118,7 @@ def test_the_two_sides_of_a_symmetric_object_are_two_views(system, tmp_path):
 def test_a_copy_of_a_session_goes_on_alike_and_apart(camera, policy, again):
     session = nextview.load(policy=policy, threshold=1, max_views=3).session(start=20)
     session.update(camera.observe(session.pose))
-    copied = again(session)
-    result = copied.run(camera)
+    result = again(session).run(camera)
     assert len(session.views) == 1
     assert repr(session.run(camera)) == repr(result)
 

@@ -26,8 +26,7 @@ def assert_as_every_ray(mesh: Mesh, pose: np.ndarray, size: int) -> None:
     """Equal to casting every ray, except where rounding decides whether a ray just touches an edge."""
     camera = SimulatedCamera(mesh, size)
     depth, (other, _) = camera.observe(pose).depth, cast([mesh], pose, camera.intrinsics, (size, size))
-    differs = np.abs(depth - other) > 1e-4
-    assert differs.mean() < 2e-3
+    assert (np.abs(depth - other) > 1e-4).mean() < 2e-3
     assert np.abs((depth > 0).sum(0) - (other > 0).sum(0)).max() <= 3
 
 
@@ -64,8 +63,7 @@ def test_casting_only_inside_the_bound_loses_nothing(mesh):
 
 @settings(deadline=None, max_examples=60)
 @given(
-    st.tuples(*[st.floats(-2.5, 2.5)] * 3),
-    st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
+    st.tuples(*[st.floats(-2.5, 2.5)] * 3), st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
 )
 def test_any_pose_sees_what_casting_every_ray_sees(position, quaternion):
     pose = trimesh.transformations.quaternion_matrix(quaternion)

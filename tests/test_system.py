@@ -41,8 +41,7 @@ def test_a_folder_of_ones_own_models(tmp_path, capsys):
     assert system.policy_name == "spread"  # no gain policy was learned for these classes
     assert system.recognise(SAMPLE).answer in system.classes
     make_map_network(tmp_path)
-    mine = nextview.load(tmp_path, policy="lem-peak")
-    assert mine.models.maps["lem"].card.path.parent == tmp_path
+    assert nextview.load(tmp_path, policy="lem-peak").models.maps["lem"].card.path.parent == tmp_path
     main(["recognise", str(SAMPLE), "--models", str(tmp_path), "--json"])
     assert json.loads(capsys.readouterr().out)["answer"] in system.classes
 

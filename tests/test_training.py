@@ -61,8 +61,7 @@ def test_the_published_recipe_sees_every_view_once_an_epoch_in_a_new_order():
     first, second = orders
     assert sorted(first) == sorted(second) == list(range(6 * V))
     assert first != second
-    labels = np.concatenate([label for _, label in views])
-    assert (labels == np.array(second) // V % 2).all()
+    assert (np.concatenate([label for _, label in views]) == np.array(second) // V % 2).all()
 
 
 def test_balanced_draws_even_out_the_classes():
@@ -80,9 +79,8 @@ def test_objects_without_a_deformed_twin_are_seen_as_they_are():
     recipe = RecogniserRecipe(views_per_object=2000, batch=50, deformed_share=0.5, balanced=False)
     sources = [Source(own, np.arange(2)), Source(twins, np.array([-1, 0]))]
     views = Views(sources, np.arange(2), np.arange(2), recipe)
-    images, labels = (
-        np.concatenate(part).ravel() for part in zip(*([x.numpy() for x in drawn] for drawn in views), strict=True)
-    )
+    drawn = [[x.numpy() for x in batch] for batch in views]
+    images, labels = (np.concatenate(part).ravel() for part in zip(*drawn, strict=True))
     assert not images[labels == 0].any()
     assert 0 < images[labels == 1].mean() < 1
 
@@ -151,16 +149,14 @@ def test_the_mirror_plane_is_the_one_that_maps_the_views_into_each_other(tmp_pat
     names = [f"object_{i}" for i in range(15)]
     store = store_of(tmp_path / "views.zarr", names, labels, SPHERE, depth_entropy=np.array(values))
     assert training.mirror_planes(store, np.arange(15)).tolist() == [0, 1, 2]
-    assert training.azimuth_bins(store, 8, np.array([0.0, 1.0, 2.0])).reshape(15, 2, 8)[:, :, 0].tolist() == [
-        [(-label) % 8] * 2 for label in labels
-    ]
+    bins = training.azimuth_bins(store, 8, np.array([0.0, 1.0, 2.0])).reshape(15, 2, 8)
+    assert bins[:, :, 0].tolist() == [[(-label) % 8] * 2 for label in labels]
 
 
 def test_a_turned_object_is_seen_from_the_side_that_its_turn_says():
     """The mesh is turned back by the angle and views as if it had never been turned."""
-    mesh = make_mesh(
-        np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0.7]], float), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3]])
-    )
+    corners = np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0.7]], float)
+    mesh = make_mesh(corners, np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3]]))
     turned = Deform(rotated=True)(mesh, 5, "chair_1")
     _, angle = Deform(rotated=True).draw(5, "chair_1")
     c, s = np.cos(-angle), np.sin(-angle)
@@ -194,9 +190,8 @@ class SmallNet(torch.nn.Module):
 
     def __init__(self, recipe, classes, azimuths):
         super().__init__()
-        self.features = torch.nn.Sequential(
-            torch.nn.Conv2d(4, 8, 5, 4), torch.nn.BatchNorm2d(8), torch.nn.ReLU(), torch.nn.AdaptiveAvgPool2d(1)
-        )
+        layers = torch.nn.Conv2d(4, 8, 5, 4), torch.nn.BatchNorm2d(8), torch.nn.ReLU(), torch.nn.AdaptiveAvgPool2d(1)
+        self.features = torch.nn.Sequential(*layers)
         self.fc = torch.nn.Linear(8, classes)
 
     def forward(self, x):

@@ -134,9 +134,8 @@ def test_an_object_more_novel_than_the_rate_allows_has_no_answer(capsys):
     assert (novel.answer, novel.unknown, novel.novelty) == (None, True, 0.03)
     assert novel.most_like == "chair"
     assert novel.confidence == 0.0
-    assert repr(novel).startswith(
-        "none of the 10 classes it knows (most like a chair): 3 % of known objects are as novel"
-    )
+    told = "none of the 10 classes it knows (most like a chair): 3 % of known objects are as novel"
+    assert repr(novel).startswith(told)
     assert "\n" not in repr(novel)
     told = json.loads(episode_as_json(novel, "chair"))
     assert (told["answer"], told["unknown"], told["novelty"], told["most_like"]) == (None, True, 0.03, "chair")

@@ -44,8 +44,7 @@ class Listing:
         for path, reason in self.left_out:
             reasons.setdefault(reason, []).append(str(path))
         parts = [
-            f"{len(paths)} ({reason}): {', '.join(paths[:FEW])}" + (", ..." if len(paths) > FEW else "")
-            for reason, paths in reasons.items()
+            f"{len(p)} ({why}): {', '.join(p[:FEW])}{', ...' if len(p) > FEW else ''}" for why, p in reasons.items()
         ]
         return f"{text}; left out: {'; '.join(parts)}" if parts else text
 

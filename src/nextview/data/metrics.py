@@ -39,10 +39,8 @@ def accuracy(answers: NDArray[np.int64], labels: NDArray[np.int64]) -> dict[str,
 def recogniser_scores(logits: NDArray[np.floating], labels: NDArray[np.int64]) -> dict[str, dict[str, float]]:
     """Accuracy from one view, over all views, and with all views' logits (N, V, classes) of an object summed."""
     spread = np.broadcast_to(labels[:, None], logits.shape[:2])
-    return {
-        "single_view": accuracy(logits.argmax(2), spread),
-        "all_views_fused": accuracy(logits.sum(1).argmax(1), labels),
-    }
+    fused = accuracy(logits.sum(1).argmax(1), labels)
+    return {"single_view": accuracy(logits.argmax(2), spread), "all_views_fused": fused}
 
 
 def reliability(confidence: Float, right: NDArray[np.bool_], bins: int = 15) -> tuple[Float, Float, NDArray[np.int64]]:

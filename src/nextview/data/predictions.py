@@ -63,8 +63,7 @@ class Predictions:
             "azimuth_bins": (n, v, h, *bins), "of_size": (n, c),
         }  # fmt: skip
         for name, values in (self._arrays() | {f"map {name}": values for name, values in self.maps.items()}).items():
-            columns = self.sphere.azimuths if name.endswith("-sphere") else 3
-            shape = shapes.get(name, (n, v, self.sphere.rings, columns))
+            shape = shapes.get(name, (n, v, self.sphere.rings, self.sphere.azimuths if name.endswith("-sphere") else 3))
             if values.shape != shape:
                 raise PredictionsError(f"{name} of these predictions has the shape {values.shape}, not {shape}")
             if values.dtype.kind not in KINDS.get(name, "f"):

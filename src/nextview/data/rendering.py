@@ -47,8 +47,7 @@ class Deform:
         """The factors of the three axes, (3,), and the angle, radians, of the object of that name."""
         rng = np.random.default_rng([seed, *name.encode()])
         reach = np.log1p(self.stretch)
-        factors = np.exp(rng.uniform(-reach, reach, 3))
-        return factors, rng.uniform(0, 2 * np.pi) if self.rotated else 0.0
+        return np.exp(rng.uniform(-reach, reach, 3)), rng.uniform(0, 2 * np.pi) if self.rotated else 0.0
 
     def __call__(self, mesh: Mesh, seed: int, name: str) -> Mesh:
         """The new object, normalised again."""
@@ -123,8 +122,7 @@ def render(
         if (made_by := command()) not in store.commands:
             store.note(commands=[*store.commands, made_by])
         # Largest files first, so that no worker is left with a long one at the end.
-        todo = np.flatnonzero(~store.done).tolist()
-        todo.sort(key=lambda i: -entries[i].path.stat().st_size)
+        todo = sorted(np.flatnonzero(~store.done).tolist(), key=lambda i: -entries[i].path.stat().st_size)
         items = [(i, entries[i]) for i in todo]
         for (i, entry), reason in each(partial(_render_entry, path, options, sensor), items, workers, scheduler):
             others = {name: said for name, said in store.attributes.failures.items() if name != entry.name}
@@ -236,5 +234,4 @@ def _rendered(store: ViewStore, options: RenderOptions, sensor: AnySensor, entry
         return render_object(camera, sphere, size) | {"radius": np.array(mesh.radius)}
     scene = build_scene(SceneLayout.load(entry.path), Path(options.meshes).absolute(), options.max_faces)
     camera = OccludedCamera(scene, size, sphere.distance) if sensor is None else sensed_camera(scene, sensor, rng)
-    shown = render_object(camera, sphere, size) | render_scene(scene, sphere)
-    return shown | {"radius": np.array(scene.target.radius)}
+    return render_object(camera, sphere, size) | render_scene(scene, sphere) | {"radius": np.array(scene.target.radius)}

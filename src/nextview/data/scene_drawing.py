@@ -162,8 +162,7 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
     others = [others[i] for i in rng.permutation(len(others))[:POOL]]
     hiding = _Hiding(mesh)
     for _ in range(LAYOUTS_TRIED):
-        goal = LEVELS[level] + rng.uniform(-SPREAD, SPREAD)
-        placed = _layout(mesh, others, meshes.folder, hiding, level, goal, rng)
+        placed = _layout(mesh, others, meshes.folder, hiding, level, LEVELS[level] + rng.uniform(-SPREAD, SPREAD), rng)
         if placed is not None:
             scene = Scene(mesh, tuple(item for _, item in placed))
             objects = tuple(thing for thing, _ in placed if isinstance(thing, Placement))
@@ -222,8 +221,7 @@ def _layout(
             return placed
         if len(placed) == MOST:
             return None
-        objects = sum(isinstance(thing, Placement) for thing, _ in placed)
-        short = bool(others) and objects < FEWEST_OBJECTS
+        short = bool(others) and sum(isinstance(thing, Placement) for thing, _ in placed) < FEWEST_OBJECTS
         thing = _wall(rng) if len(placed) < walls else _thing(others, folder, level, short, rng)
         item = _stood(thing, folder, floor)
         if item is None or np.abs(item.footprint).max() > TABLE:

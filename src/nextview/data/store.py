@@ -118,8 +118,7 @@ class ViewStore:
         if content.get("format") != FORMAT:
             raise DatasetError(f"{path}: not a view store of format {FORMAT}; render it again")
         content.setdefault("rotated", content.get("turn", False))  # its name before
-        attributes = decode_record(content, Attributes, f"{path}: zarr.json is damaged", DatasetError)
-        return cls(path, group, attributes)
+        return cls(path, group, decode_record(content, Attributes, f"{path}: zarr.json is damaged", DatasetError))
 
     @property
     def rendered(self) -> tuple[str, ...]:
@@ -184,7 +183,6 @@ class ViewStore:
         return array
 
     def _remedy(self, name: str) -> str:
-        """What makes an array that is missing or damaged."""
         if name in self.rendered:
             return "remove the store and render again"
         kind, _, rest = name.partition("/")
@@ -270,8 +268,8 @@ class ViewStore:
     @property
     def dataset(self) -> str:
         """Name of the dataset folder, in lower case; that of the store if it is not known."""
-        name = self.attributes.dataset or self.path.stem
-        return re.sub(r"[^a-z0-9_.]+", "-", name.lower()).strip("-") or "objects"
+        name = (self.attributes.dataset or self.path.stem).lower()
+        return re.sub(r"[^a-z0-9_.]+", "-", name).strip("-") or "objects"
 
     @property
     def commands(self) -> tuple[str, ...]:

@@ -129,8 +129,7 @@ def fit_temperature(data: Predictions, rng: Generator, n_views: int = 5, walks: 
 
     begin = np.array([1.0, 0.5] if data.azimuth_bins is None else [1.0, 0.5, 0.1])
     bounds = [(0.01, 100.0), (0.0, 5.0), (0.0, 5.0)][: len(begin)]
-    fitted = minimize(lost, begin, method="L-BFGS-B", bounds=bounds)
-    return calibration(np.round(fitted.x, 4))
+    return calibration(np.round(minimize(lost, begin, method="L-BFGS-B", bounds=bounds).x, 4))
 
 
 def calibration_of(data: Predictions, rng: Generator, walks: int = 4) -> Calibration:

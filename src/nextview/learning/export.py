@@ -4,6 +4,7 @@ import logging
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -198,14 +199,9 @@ def _recogniser(folders: Sequence[Path], store: Path, name: str | None, note: st
         held_out=tuple(sorted(held_out)),
     ).made_by(*views.commands, *(line for each in runs for line in each.commands), command())
     inputs, judging = load_inputs(store, spec.size, spec.kind), deduplicate(views, validation)
-    return _Candidate(
-        card,
-        shipped,
-        np.stack([inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]]),
-        judging,
-        lambda i: inputs[i],
-        lambda logits: recogniser_scores(logits, views.labels[judging]),
-    )
+    sample = np.stack([inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]])
+    scores = partial(recogniser_scores, labels=views.labels[judging])
+    return _Candidate(card, shipped, sample, judging, lambda i: inputs[i], scores)
 
 
 def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet | LiteNet:
@@ -234,8 +230,7 @@ def _map(run: Path, store: Path, predictions: Path | None, name: str | None, not
     kind, shape = map_name(recipe.measure), (-1, views.sphere.rings, 3)
     good: Good = "peak" if recipe.measure == CONFIDENCE else find_measure(recipe.measure).good
     values, there = target_of(recipe.measure, views, None if predictions is None else Predictions.load(predictions))
-    usable = views.done & there & (views.splits == "train")
-    validation = np.flatnonzero(usable & np.isin(views.names, noted.held_out))
+    validation = np.flatnonzero(views.done & there & (views.splits == "train") & np.isin(views.names, noted.held_out))
     if len(validation) == 0:
         raise ModelError(f"{run}: was not trained on {store}")
     shipped = ShippedMap(load_run(map_network(recipe, views.sphere), run)).eval()
@@ -255,14 +250,9 @@ def _map(run: Path, store: Path, predictions: Path | None, name: str | None, not
     ).made_by(*noted.commands, command())
     judging = deduplicate(views, validation)
     true = values[judging][:, views.sphere.windows].reshape(shape)
-    return _Candidate(
-        card,
-        shipped,
-        from_store(spec, views, int(validation[0]))[3:11],
-        judging,
-        lambda i: from_store(spec, views, i),
-        lambda maps: map_scores(maps.reshape(shape), true),
-    )
+    seen = partial(from_store, spec, views)
+    sample = seen(int(validation[0]))[3:11]
+    return _Candidate(card, shipped, sample, judging, seen, lambda maps: map_scores(maps.reshape(shape), true))
 
 
 def _training(views: ViewStore, held_out: Iterable[str], recipes: Sequence[Any], usable: Any = True) -> Training:

@@ -117,18 +117,15 @@ def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np
 def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
     """Train the networks: after every epoch, the policy as it then is, at travel weight 0 and over all views."""
     rng, data = np.random.default_rng([recipe.seed, fold]), table.data
-    sphere, n, c = data.sphere, len(data), len(data.classes)
+    sphere, n, c, e = data.sphere, len(data), len(data.classes), recipe.networks_per_fold
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     features_flip = mirrored_features(sphere, c, recipe.inputs, recipe.frame)
     widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)]))
     scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
-    first = [
-        scale * torch.randn(recipe.networks_per_fold, *width, generator=generator)
-        for scale, width in zip(scales, widths, strict=True)
-    ]
-    biases = [torch.zeros(recipe.networks_per_fold, 1, outputs) for _, outputs in widths]
+    first = [scale * torch.randn(e, *width, generator=generator) for scale, width in zip(scales, widths, strict=True)]
+    biases = [torch.zeros(e, 1, outputs) for _, outputs in widths]
     networks = Perceptrons(first, biases, features_flip, mirrored(sphere))
-    drawn = rng.multinomial(n, np.full(n, 1 / n), size=recipe.networks_per_fold)
+    drawn = rng.multinomial(n, np.full(n, 1 / n), size=e)
     weights = torch.from_numpy(drawn * data.weights).float()
     optimiser = torch.optim.AdamW(networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay)
     batches = -(-recipe.episodes * (recipe.max_views - 1) * n // recipe.batch)

@@ -88,8 +88,7 @@ def _compute(path: Path, target: Path, spec: InputSpec) -> Iterator[int]:
 
 
 def _packed(path: Path, spec: InputSpec, i: int) -> list[bytes]:
-    views = from_store(spec, ViewStore.open(path), i)
-    return [PACKING.encode(np.ascontiguousarray(view)) for view in views]
+    return [PACKING.encode(np.ascontiguousarray(view)) for view in from_store(spec, ViewStore.open(path), i)]
 
 
 def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedViews:

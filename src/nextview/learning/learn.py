@@ -95,22 +95,21 @@ def learn_things(
         ResultsError: ``out`` is there, and neither ``add`` nor ``overwrite``.
     """
     folder, out = Path(folder), Path(out)
-    card_path, old, known = out / f"{NAME}.json", None, list[Pair]()
+    card_path, old, taught = out / f"{NAME}.json", None, list[Pair]()
     if add or remove:
         old = read_card(card_path)
-        known = _known(old, read_memory(old.path, old.sha256), remove)
+        taught = _known(old, read_memory(old.path, old.sha256), remove)
     elif card_path.exists() and not overwrite:
         raise UsageError(f"{out}: knows things already; --add puts others beside them, --overwrite replaces them")
     else:
         check_new(out, overwrite, folder=True)
     found = Found([], []) if remove and folder.resolve() == out.resolve() else find_things(folder)
-    names, left_out = {source.name for source, _ in known}, list(found.left_out)
+    names, left_out = {source.name for source, _ in taught}, list(found.left_out)
     for thing in found.things:
         if thing.name in names:
             raise UsageError(f"{thing.path}: something called {thing.name} is known already; --remove it, or rename it")
     part = out.with_name(f".{out.name}.part")
     with only_one(out):
-        taught = known
         track(_teach(found.things, how, part, taught, left_out, workers, scheduler), len(found.things), "things")
         if not taught:
             raise DatasetError(f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})")
@@ -243,8 +242,7 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
     with new_folder(out, overwrite=True) as part:
         sha256 = memory.save(part / f"{NAME}.safetensors")
         write_card(part / f"{NAME}.json", replace_record(card, sha256=sha256))
-        pictures = {source.name: arrays["pictures"] for source, arrays in taught}
-        draw_learned(part / "learned.png", pictures, fit)
+        draw_learned(part / "learned.png", {source.name: arrays["pictures"] for source, arrays in taught}, fit)
     names = [source.name for source, _ in taught]
     confused = tuple((names[a], names[b], share) for a, b, share in fit.confused)
     return Learned(out, len(taught), len(classes), fit.accuracy, confused, _notes(taught), tuple(left_out))

@@ -53,6 +53,5 @@ def _picture(page: Axes, place: tuple[float, float, float, float], picture: NDAr
     shade = np.where(picture > 0, 60 + 0.7 * picture.astype(float), 255)
     extent = (left, left + width, bottom, bottom + height)
     page.imshow(shade, cmap="gray", vmin=0, vmax=255, interpolation="bilinear", extent=extent)
-    page.text(
-        left + width / 2, bottom - 0.025, name.replace("_", " ")[:18], size=7.5, color=INK, ha="center", va="center"
-    )
+    below = left + width / 2, bottom - 0.025
+    page.text(*below, name.replace("_", " ")[:18], size=7.5, color=INK, ha="center", va="center")

@@ -104,9 +104,8 @@ class MapModule(L.LightningModule):
         if self.recipe.extent == "sphere":
             error = (error + F.mse_loss(predicted, true)) / 2
         if self.recipe.peak_weight:
-            error = error + self.recipe.peak_weight * peak_loss(
-                near / self.recipe.peak_sharpness, goal, self.recipe.peak_reach
-            )
+            lost = peak_loss(near / self.recipe.peak_sharpness, goal, self.recipe.peak_reach)
+            error = error + self.recipe.peak_weight * lost
         return error + self.recipe.orthogonality_weight * sum(orthogonality(t.float()) for t in transforms)
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:

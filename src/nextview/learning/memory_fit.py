@@ -77,16 +77,8 @@ def fit_memory(
     usual = np.stack([_usual(logs, truth) for logs in each])
     scores = [-logs.max(-1) - own[logs.argmax(-1)] for logs, own in zip(each, usual, strict=True)]
     quantiles = np.quantile(scores, np.linspace(0, 1, LEVELS), axis=(1, 2)).T
-    return Fit(
-        weight,
-        correlation,
-        head * whole[0],
-        head * whole[1],
-        quantiles,
-        usual,
-        accuracy,
-        _confused(beliefs[1], truth, judged, label),
-    )
+    confused = _confused(beliefs[1], truth, judged, label)
+    return Fit(weight, correlation, head * whole[0], head * whole[1], quantiles, usual, accuracy, confused)
 
 
 def _usual(logs: Float, truth: Index) -> Float:
@@ -111,13 +103,10 @@ def _heads(
 ) -> tuple[NDArray[np.float32], tuple[Float, Float]]:
     """What heads that have not seen a thing say of its held-out views, (T, K, C); and the head of all things."""
     classes, f = int(label.max()) + 1, views.shape[-1]
-    if not several.any():
-        return np.zeros((len(judged), held_out.shape[1], classes), np.float32), (
-            np.zeros((f, classes), np.float32),
-            np.zeros(classes, np.float32),
-        )
-    x, y = views[:, :, ::4].reshape(len(thing), -1, f), label[thing]
     found = np.zeros((len(judged), held_out.shape[1], classes), np.float32)
+    if not several.any():
+        return found, (np.zeros((f, classes), np.float32), np.zeros(classes, np.float32))
+    x, y = views[:, :, ::4].reshape(len(thing), -1, f), label[thing]
     for k in range(FOLDS):
         others = (fold[thing] != k) | ~several[thing]
         weights, bias = _ridge(x[others], y[others], classes)

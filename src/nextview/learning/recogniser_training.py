@@ -115,8 +115,7 @@ class RecogniserModule(L.LightningModule):
         logits, *likely = self.net(x)
         loss = F.cross_entropy(logits.float(), label, label_smoothing=self.recipe.smoothing)
         if likely:
-            side = torch.where(mirrored, -batch[2] % likely[0].shape[2], batch[2])
-            lost = side_loss(likely[0].float(), label, side)
+            lost = side_loss(likely[0].float(), label, torch.where(mirrored, -batch[2] % likely[0].shape[2], batch[2]))
             self.log("side_loss", lost, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))
             loss = loss + self.recipe.azimuth_bins_weight * lost
         self.log("loss", loss, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))

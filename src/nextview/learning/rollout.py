@@ -98,8 +98,7 @@ def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Fl
     """The value of looking from every view next, (N, V) float64."""
     counts = table.data.seen.astype(np.float64)  # a view in which nothing is seen has no weight in the sum
     n_views = np.maximum(moment.seen[:, None] + counts, 1)
-    evidence = counts[..., None] * table.data.log_evidence
-    return value_after(table, moment.total[:, None] + evidence, n_views, kind)
+    return value_after(table, moment.total[:, None] + counts[..., None] * table.data.log_evidence, n_views, kind)
 
 
 class Value(NamedTuple):

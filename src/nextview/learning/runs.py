@@ -220,12 +220,10 @@ def new_run(recipe: Any, weights: Path | None, held_out: Sequence[str], made: It
     """A run by the command that runs now, from stores and predictions; what is held out validates it."""
     before = [line for source in made for line in source.commands]
     if weights is not None and weights.is_dir():
-        earlier, wanted = read_run(weights), set(held_out)
-        seen = sorted(wanted - set(earlier.held_out))
-        if 0 < len(seen) < len(wanted):
-            what = (
-                f"{len(seen)} of the {len(wanted)} objects that this network must not have seen, {seen[0]} among them"
-            )
+        earlier, own = read_run(weights), set(held_out)
+        seen = sorted(own - set(earlier.held_out))
+        if 0 < len(seen) < len(own):
+            what = f"{len(seen)} of the {len(own)} objects that this network must not have seen, {seen[0]} among them"
             raise ModelError(f"{weights}: was trained on {what}; take its --seed and --validation-share")
         before += earlier.commands
         weights /= "network.pt"

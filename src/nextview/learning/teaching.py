@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from nextview.errors import DatasetError, NoViewLeftError, ObservationError
@@ -99,9 +100,7 @@ def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> Parts:
     return pool.map(partial(_seen, camera), np.split(GRID.poses, len(GRID) // BATCH))
 
 
-def _sensed(
-    pool: ThreadPoolExecutor, mesh: Mesh, poses: NDArray[np.float64], sensor: str, rng: np.random.Generator
-) -> Parts:
+def _sensed(pool: ThreadPoolExecutor, mesh: Mesh, poses: NDArray[np.float64], sensor: str, rng: Generator) -> Parts:
     """Embeddings of a mesh from poses, (B, 4, 4), through a sensor."""
     parts = np.split(poses, range(SETUP, len(poses), SETUP))
     cameras = (partial(SensedCamera, mesh, sensor, own) for own in rng.spawn(len(parts)))
