@@ -29,6 +29,7 @@ EXAMPLES = {
     "workflow": "import snakemake",
     "explore": "import viser; from nextview.viewers.exploration import Exploration",
     "browser": "import playwright",
+    "large": "import faiss",
     "record": "import rerun; from nextview.viewers.recording import Recorder",
     "envs": "import gymnasium, nextview.benchmark.environments; gymnasium.spec('nextview/Recognise-v0')",
     "docs": "import material, mkdocs, mkdocs_jupyter, mkdocstrings_handlers.python",
