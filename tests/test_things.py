@@ -61,7 +61,7 @@ def test_things_are_compared_from_meshes_on_under_the_same_azimuth_and_other_noi
     first, again = (ViewStore.open(tmp_path / f"{k}.zarr") for k in range(2))
     np.testing.assert_array_equal(rotations(first), rotations(again))
     assert not np.array_equal(first.depth(0), again.depth(0))
-    THINGS["main"](taught / "memory.json", tuple(tables), tmp_path / "out", runs=3, views=(1, 2))
+    THINGS["main"](taught / "memory.json", tmp_path / "out", tuple(tables), runs=3, views=(1, 2))
     found = pd.read_csv(tmp_path / "out" / "things.csv").set_index(["things", "policy", "n_views"])
     draws = [Predictions.load(path) for path in tables]
     specs = make_specs(THINGS["together"](draws), 3, 0)
