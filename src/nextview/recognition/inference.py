@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,6 @@ FEATURES_OUTPUT = "features"
 EMBEDDING_OUTPUT = "embedding"
 """Ends of a recogniser's ONNX file: the last is what its last layers make the logits of, (B, F)."""
 LONGEST = 300  # letters of what the runtime says
-_opening = Lock()  # while the features of a novelty score are opened; of no object, so that these can be pickled
 Shape = tuple[int | None, ...]  # without the batch; None for a size that is free
 
 
@@ -149,16 +147,10 @@ class Recogniser:
         """How novel B views are, (B,), by the features that know no classes; ModelError if that was not fitted."""
         if not isinstance(self.novelty, Novelty):
             raise ModelError(f"{self.card.path}: has no novelty score of views")
-        known = self.open_features()
-        inputs = np.concatenate([from_observations(known.card.input, [o]) for o in observations])
-        return self.novelty.scores(known(inputs), np.array([o.exact for o in observations]))
-
-    def open_features(self) -> "Features":
-        """The features of the novelty score, opened once: in good time by a thread, or where they are needed."""
-        with _opening:
-            if self._known is None:
-                self._known = Features(self._threads)
-        return self._known
+        if self._known is None:
+            self._known = Features(self._threads)
+        inputs = np.concatenate([from_observations(self._known.card.input, [o]) for o in observations])
+        return self.novelty.scores(self._known(inputs), np.array([o.exact for o in observations]))
 
     def features(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
         """What the last layer makes the logits of, (B, F), from what the network takes."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
-from scipy.special import ndtr
 
 from nextview.errors import ModelError
 from nextview.files import checked_bytes, new_file
@@ -62,7 +62,8 @@ class Quantiles:
             row = self.quantiles[min(int(n_views[index]), len(self.quantiles)) - 1]
             found[index] = (1 + n * (1 - np.interp(score[index], row, levels))) / (n + 1)
             if self.joint and score[index] > row[-1]:
-                found[index] = min(found[index], ndtr((row.mean() - score[index]) / max(row.std(), 1e-9)))
+                off = float((score[index] - row.mean()) / max(row.std(), 1e-9))
+                found[index] = min(float(found[index]), math.erfc(off / math.sqrt(2)) / 2)
         return found
 
     def of_belief(self, log_belief: Float, n_views: int) -> float:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from nextview.recognition.inference import MapNetwork, Models, Recogniser, open_
 from nextview.recognition.map_names import SPHERE
 from nextview.recognition.memory import open_recogniser
 from nextview.recognition.model_card import DISCRIMINATE, find_models
-from nextview.recognition.novelty import Novelty
 from nextview.recognition.own_stopping import Rule, own_stopping
 from nextview.session.recognition import Recognition
 from nextview.session.session import FrameCamera, Session
@@ -195,8 +193,6 @@ def load(
         unknown = 0.0 if recogniser.novelty is None else UNKNOWN
     if not unknown:
         recogniser.novelty = None  # it takes time
-    elif isinstance(recogniser.novelty, Novelty):  # by the end of an episode they are there
-        Thread(target=recogniser.open_features).start()
     if policy is None:
         policy, made = _default_policy(found.policies, sphere, recogniser)
     else:
