@@ -3,8 +3,7 @@
     nextview render data/PSB unseen.zarr
     python benchmarks/unseen_classes.py unseen.zarr [--model lem-modelnet10]
 
-The store's classes must not be among those that the network was trained on; that is up to you. Prints the scores over
-all views, beside a baseline: the mean map of these very objects, the same for every view.
+The store's classes are up to you. Prints the scores beside those of the mean map of these very objects, over all views.
 """
 
 from __future__ import annotations
