@@ -87,6 +87,10 @@ class Facets:
         """Where the rays meet the planes, camera frame, (N, 3) float64, metres."""
         return self.rays / np.einsum("ni,ni->n", self.planes, self.rays)[:, None]
 
+    def some(self, which: slice) -> "Facets":
+        """Those of some of the pixels."""
+        return Facets(self.planes[which], self.rays[which], self.rows[which], self.columns[which], self.pitch)
+
 
 def drop_flying(depth: NDArray[np.float32], usable: Mask, noise: float, pitch: float) -> Mask:
     """The usable pixels, (H, W) bool, without those that hang in the air between two surfaces.

@@ -40,6 +40,7 @@ SAME = 0.01  # change of the centre or the radius, in object radii, below which 
 
 BELOW = 0.02
 """Metres below the support plane at which the point of an object may lie: on it, but for what a pose is off."""
+TOO_LITTLE = "too little is seen of the object"
 NO_PLANE = ViewWarning(
     "support", "no support plane is seen, so where the object ends below is guessed: support=False if it stands on none"
 )
@@ -65,6 +66,11 @@ class Sighting:
     plane: Plane | None
     footprint: Footprint | None = None
     chosen: Mask | None = None
+
+    @property
+    def of_nothing(self) -> Sighting:
+        """The same frame, if it shows nothing of the object."""
+        return replace(self, facets=self.facets.some(slice(0)), mask=np.zeros_like(self.mask), hull=np.zeros((0, 3)))
 
 
 @dataclass(frozen=True)
@@ -291,8 +297,10 @@ class ObservedObject:
             if s.footprint is not None and s.chosen is not None:
                 now = next(old_labels) == target
                 changed = s.footprint.pixels[now != s.chosen].sum()
-                if changed > MENDED * s.footprint.pixels[s.chosen].sum() and now.any():
-                    mended = self._sighting(s.frame, s.footprint.pixels_over(now), s.plane, s.noise)
+                if changed > MENDED * s.footprint.pixels[s.chosen].sum():
+                    mended = s.of_nothing
+                    with suppress(ObservationError):  # what was taken for the object was what hid it
+                        mended = self._sighting(s.frame, s.footprint.pixels_over(now), s.plane, s.noise)
                     s = replace(mended, footprint=s.footprint, chosen=now)
             sightings.append(s)
         latest = replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)
@@ -320,6 +328,8 @@ class ObservedObject:
         return clusters.largest(footprints[-1], labels[-1], ground)
 
     def _sighting(self, frame: Frame, mask: Mask, plane: Plane | None, noise: Noise) -> Sighting:
+        if mask.sum() < FEWEST:
+            raise ObservationError(TOO_LITTLE)
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         height, width = frame.shape
         top, bottom = max(rows[0] - 2, 0), min(rows[-1] + 3, height)
@@ -328,10 +338,10 @@ class ObservedObject:
         coarse = max(1, max(bottom - top, right - left) // SIZE)
         facets = fit_facets(frame.depth[part], mask[part], frame.intrinsics, (top, left), self.denoise, coarse, noise)
         if len(facets.planes) * coarse**2 < FEWEST:
-            raise ObservationError("too little is seen of the object")
+            raise ObservationError(TOO_LITTLE)
         pose = frame.camera_to_world
         few = slice(None, None, max(1, len(facets.planes) // 3000))
-        points = replace(facets, planes=facets.planes[few], rays=facets.rays[few]).points @ pose[:3, :3].T + pose[:3, 3]
+        points = facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
         with suppress(QhullError):  # all in one plane: they do as they are
             points = points[ConvexHull(points).vertices]
         return Sighting(frame, noise, facets, mask, points, plane)
@@ -350,7 +360,9 @@ class ObservedObject:
         pose = latest.pose_in_object(sighting.frame.camera_to_world)
         depth, facet = look_again(sighting.facets, pose, latest.radius, SIZE)
         image, facets = sighting.frame.image, sighting.facets
-        if image is not None:
+        if image is not None and not len(facets.rows):
+            image = np.zeros((SIZE, SIZE, 3), image.dtype)
+        elif image is not None:
             image = np.where(facet >= 0, image[facets.rows[facet], facets.columns[facet]], 0)
         radius, scene = latest.radius if self.life_size else None, _scene(sighting, pose, latest.radius)
         return Observation(depth, virtual_pose(pose), pinhole(SIZE, DISTANCE), radius, image, scene)
