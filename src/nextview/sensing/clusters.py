@@ -23,6 +23,12 @@ Mask = NDArray[np.bool_]
 CELL = 0.01  # side of a cell of the footprint, in distances of the camera from the object
 OVERLAP = 0.25
 """Share of the cells of a piece that lie over another one of the same frame, from which they are one thing."""
+TOUCH = 0.45
+"""How strong a link it is that two pieces touch: what lies over each other in two frames is joined first."""
+BRIDGE = 0.25
+"""Share of the smaller one of two clusters that a piece has at least by which they are joined: else a leg, or pixels in
+the air, would join what stands to both sides of it."""
+FEWEST = 0.15  # share of the pixels of a level cell that a piece shows over it, at least
 LIES_OVER = 0.5
 """Share of the cells of a piece that lie over, or beside, one of another frame, from which they are one thing."""
 BESIDE = 2  # cells up to which two pieces stand side by side
@@ -37,22 +43,23 @@ class Footprint:
     """The cells, seen from above, over which the pieces of a frame lie: K pairs of a cell and a piece, each once.
 
     ``cells`` are the indices of the cells, (K, 2), ``piece`` the labels of the pieces, (K,). ``area`` is that of the
-    surface of each pair, square metres, ``pixels`` how many show it, ``pair_of`` the pair of each pixel of the frame,
-    (H, W) int32, -1 for none. For the rest see ``Pieces``.
+    surface of each pair, square metres, ``pixels`` how many show it, ``label`` the piece of each pixel of the frame, with
+    those at edges, (H, W) int32, 0 for none. For the rest see ``Pieces``.
     """
 
     cells: NDArray[np.int64]
     piece: NDArray[np.int64]
     stands: Mask
     touch: Mask
+    low: Mask
     inside: Mask
     area: Float
     pixels: NDArray[np.int64]
-    pair_of: NDArray[np.int32]
+    label: NDArray[np.int32]
 
-    def pixels_over(self, chosen: Mask) -> Mask:
-        """Pixels of the chosen pairs, (H, W) bool."""
-        return np.append(chosen, False)[self.pair_of]  # the last is that of -1
+    def pixels_of(self, chosen: Mask) -> Mask:
+        """Pixels of the pieces that have one of the chosen pairs, (H, W) bool."""
+        return np.isin(np.arange(len(self.stands)), self.piece[chosen])[self.label]
 
 
 def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float) -> Footprint:
@@ -75,20 +82,21 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float) -> Footpri
     used = np.flatnonzero(shown)
     key = many * (np.cumsum(shown) - 1)[place] + pieces.label[rows, columns]
     count = np.bincount(key, minlength=many * len(used))
-    pairs = np.flatnonzero(count)
+    level = (cell / np.median(z)) ** 2 * frame.intrinsics[0, 0] * frame.intrinsics[1, 1] if len(z) else 0.0
+    pairs = np.flatnonzero(count > FEWEST * level)
     area = np.bincount(key, z * z, len(count))[pairs] / (frame.intrinsics[0, 0] * frame.intrinsics[1, 1])
-    pair_of = np.full(frame.shape, -1, np.int32)
-    pair_of[rows, columns] = (np.cumsum(count > 0) - 1)[key]
     at, piece = np.divmod(pairs, many)
     cells, pixels = np.stack(np.divmod(used[at], side), 1) + low, count[pairs]
-    return Footprint(cells, piece, pieces.stands, pieces.touch, pieces.inside, area, pixels, pair_of)
+    found = pieces.stands, pieces.touch, pieces.low, pieces.inside
+    return Footprint(cells, piece, *found, area, pixels, pieces.grown)
 
 
 def clusters(footprints: Sequence[Footprint]) -> tuple[list[NDArray[np.int64]], Mask]:
     """Which pieces of some frames are of one object.
 
-    Pieces of one frame are joined where they overlap seen from above; and where they touch and one does not reach the
-    plane: a handle, the back of a chair. Things that stand side by side stay apart, also where only their tops show.
+    Pieces of one frame are joined where they overlap seen from above; and where they touch, unless both stand on the
+    plane and their border comes down to it: a handle and the back of a chair are joined. Things that stand side by side
+    stay apart, also where only their tops show.
     Pieces of two frames are joined where half of the smaller one lies over the other, unless a frame shows both side by
     side.
 
@@ -109,7 +117,7 @@ def clusters(footprints: Sequence[Footprint]) -> tuple[list[NDArray[np.int64]], 
     size = np.maximum(here.sum(1), 1)
     shared, beside = here @ here.T / np.minimum.outer(size, size), around @ here.T > 0
     strength, apart, either = _links(footprints, shared, beside)
-    cluster, doubtful = _joined(strength, apart)
+    cluster, doubtful = _joined(strength, apart, size)
     for a, b in np.argwhere(np.triu(either)):  # in doubt until a frame shows which
         if cluster[a] != cluster[b] and not apart[np.ix_(cluster == cluster[a], cluster == cluster[b])].any():
             doubtful.append((int(a), int(b)))
@@ -140,25 +148,29 @@ def _links(footprints: Sequence[Footprint], shared: Float, beside: Mask) -> tupl
     frame = np.repeat(np.arange(len(footprints)), [len(f.stands) for f in footprints])
     same = np.equal.outer(frame, frame)
     stands = np.concatenate([f.stands for f in footprints])
-    touch, inside = (block_diag(*(getattr(f, name) for f in footprints)) > 0 for name in ("touch", "inside"))
+    of_two = ("touch", "low", "inside")
+    touch, low, inside = (block_diag(*(getattr(f, name) for f in footprints)) > 0 for name in of_two)
     inside |= inside.T
     both, neither = np.logical_and.outer(stands, stands), ~np.logical_or.outer(stands, stands)
     strength = np.where(shared >= np.where(same, OVERLAP, LIES_OVER), shared, 0)
-    strength[touch & ~both | inside] = 1
+    touch &= ~(both & low)
+    strength[touch | inside] = TOUCH
     side_by_side = same & beside & (strength == 0)
-    return strength, same & beside & both & (shared < OVERLAP) & ~inside, side_by_side & neither
+    return strength, same & beside & both & (shared < OVERLAP) & ~inside & ~touch, side_by_side & neither
 
 
-def _joined(strength: Float, apart: Mask) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
-    """Cluster of each of N pieces by links of a strength, (N, N), 0 for none, strong ones first.
+def _joined(strength: Float, apart: Mask, size: Float) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+    """Cluster of each of N pieces, of a size (N,), by links of a strength, (N, N), 0 for none, strong ones first.
 
-    A link that would join two pieces that stand apart is refused; these links are given too.
+    A link that would join two pieces that stand apart is refused; these links are given too. A piece that is small
+    beside two clusters does not join them.
     """
     cluster, refused = np.arange(len(strength)), []
     a, b = np.nonzero(np.triu(strength, 1))
     for k in np.argsort(-strength[a, b], kind="stable"):
         one, other = cluster[a[k]], cluster[b[k]]
-        if one == other:
+        largest = min(size[cluster == one].max(), size[cluster == other].max())
+        if one == other or min(size[a[k]], size[b[k]]) < BRIDGE * largest:
             continue
         if apart[np.ix_(cluster == one, cluster == other)].any():
             refused.append((int(a[k]), int(b[k])))

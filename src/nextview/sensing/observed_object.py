@@ -286,7 +286,7 @@ class ObservedObject:
         labels, two = clusters.clusters(footprints)
         target = self._target(labels, footprints, ground / cell, axes[:2] / cell)
         chosen = labels[-1] == target
-        mask = foot.pixels_over(chosen)
+        mask = foot.pixels_of(chosen)
         if (labels[-1][~chosen] > 0).any():  # cells at the border may hold pixels of a neighbour
             mask = trimmed(frame.depth, mask, height > STANDS * frame.depth)
         if target == 0 or mask.sum() < FEWEST:
@@ -300,7 +300,7 @@ class ObservedObject:
                 if changed > MENDED * s.footprint.pixels[s.chosen].sum():
                     mended = s.of_nothing
                     with suppress(ObservationError):  # what was taken for the object was what hid it
-                        mended = self._sighting(s.frame, s.footprint.pixels_over(now), s.plane, s.noise)
+                        mended = self._sighting(s.frame, s.footprint.pixels_of(now), s.plane, s.noise)
                     s = replace(mended, footprint=s.footprint, chosen=now)
             sightings.append(s)
         latest = replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)

@@ -23,6 +23,8 @@ LAG = 4  # pixels from an edge at which the surfaces to both sides of it are loo
 VALLEY = 0.004  # depth of a concave edge, as a part of the distance, from which it cuts
 STEP = 0.08  # part of the distance by which a pixel lies behind another one LAG away, from which it is cut at an end
 LEAST = 12  # pixels of a piece
+GROWN = 12  # pixels that a piece grows at its edges, at most
+LED = 2, 5  # pixels from a border that tell to which depth a surface leads at it
 STANDS = 0.02  # height over the plane, as a part of the distance, down to which a piece is seen if it stands there
 BOTTOM = 0.002  # height of a bottom over the plane, as a part of the distance, from which it is no hole
 CONTACT = 0.3  # pixels in which two pieces touch, as a part of the root of those of the smaller one: fewer are a corner
@@ -31,29 +33,33 @@ ENCLOSED = 0.7
 NEXT: Any = ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))
 """All pairs of pixels side by side: the first of each, and the second."""
 LOWEST = 5  # pixels of a piece that may be so low by noise
+LOW = 2  # pixels, that low, of the border of two things that stand side by side
 
 
 @dataclass(frozen=True)
 class Pieces:
     """Pieces of what stands on a plane.
 
-    ``label`` is that of each pixel, (H, W) int32, 0 for none, ``stands`` tells which pieces reach down to the plane,
-    (pieces + 1,) bool, by label. Of each two pieces ``touch`` tells whether they touch in space, and ``inside`` whether
-    the first lies inside the outline of the second, (pieces + 1, pieces + 1) bool.
+    ``label`` is that of each pixel, (H, W) int32, 0 for none; ``grown`` with those of edges, that are less sure.
+    ``stands`` tells which pieces reach down to the plane, (pieces + 1,) bool, by label. Of each two pieces ``touch``
+    tells whether they touch in space, ``low`` whether their border comes down to the plane, and ``inside`` whether the
+    first lies inside the outline of the second, (pieces + 1, pieces + 1) bool.
     """
 
     label: NDArray[np.int32]
+    grown: NDArray[np.int32]
     stands: Mask
     touch: Mask
+    low: Mask
     inside: Mask
 
 
 def cut(depth: NDArray[np.float32], above: Mask, height: NDArray[np.float32], noise: Noise) -> Pieces:
     """Cut the pixels ``above`` a plane, (H, W) bool, of a depth image, metres, with their heights over it, metres."""
-    label = np.zeros(depth.shape, np.int32)
+    label, grown = np.zeros((2, *depth.shape), np.int32)
     rows, columns = np.flatnonzero(above.any(1)), np.flatnonzero(above.any(0))
     if not len(rows):
-        return Pieces(label, np.zeros(1, bool), *np.zeros((2, 1, 1), bool))
+        return Pieces(label, grown, np.zeros(1, bool), *np.zeros((3, 1, 1), bool))
     part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     step = max(1, round(depth.shape[1] / WIDTH))
     few = (slice(None, None, step),) * 2
@@ -75,12 +81,31 @@ def cut(depth: NDArray[np.float32], above: Mask, height: NDArray[np.float32], no
     with np.errstate(invalid="ignore"):
         joins = mask & close & (np.abs(inverse[tuple(nearest)] - inverse) < 4 * tolerance)
     found = np.where(joins, found_near, 0)
-    low = found[high / usual - 2 * error < STANDS]
-    stands = np.bincount(low, minlength=kept.sum() + 1) > LOWEST
+    low = mask & (high / usual - 2 * error < STANDS)
+    stands = np.bincount(found[low], minlength=kept.sum() + 1) > LOWEST
     stands[0] = False
-    own, whole = (_enlarged(a, step, above[part].shape) for a in (bottom, found))
-    label[part] = np.where(above[part] | own, whole, 0)
-    return Pieces(label, stands, _touching(found, inverse, tolerance), _enclosed(around))
+    for shown, small in ((label, found), (grown, _grown(found, mask, inverse, tolerance))):
+        own, whole = (_enlarged(a, step, above[part].shape) for a in (bottom, small))
+        shown[part] = np.where(above[part] | own, whole, 0)
+    whole = _grown(found, mask, inverse, 4 * tolerance)
+    at_plane = _borders(whole, [low[a] | low[b] for a, b in NEXT]) >= LOW
+    return Pieces(label, grown, stands, _touching(whole, inverse, 2 * tolerance), at_plane, _enclosed(around))
+
+
+def _grown(label: NDArray[np.int64], mask: Mask, inverse: Inverse, tolerance: Inverse) -> NDArray[np.int64]:
+    """Pieces with the pixels of edges: each goes to the piece beside it from whose pixel it differs least in depth."""
+    label = label.copy()
+    for _ in range(GROWN):
+        least, taken, bare = tolerance.copy(), np.zeros_like(label), mask & (label == 0)
+        for one, other in (*NEXT, *((b, a) for a, b in NEXT)):
+            with np.errstate(invalid="ignore"):
+                off = np.abs(inverse[one] - inverse[other])
+                nearer = bare[one] & (label[other] > 0) & (off < least[one])
+            least[one][nearer], taken[one][nearer] = off[nearer], label[other][nearer]
+        if not taken.any():
+            break
+        label += taken
+    return label
 
 
 def _enlarged(small: NDArray[Any], step: int, shape: tuple[int, ...]) -> NDArray[Any]:
@@ -126,11 +151,28 @@ def _concave(inverse: Inverse, tolerance: Inverse) -> Mask:
 
 
 def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) -> Mask:
-    """Which two pieces have pixels side by side that are as near to the camera, (pieces + 1, pieces + 1) bool."""
-    with np.errstate(invalid="ignore"):
-        count = _borders(label, [np.abs(inverse[a] - inverse[b]) < tolerance[a] for a, b in NEXT])
-    size = np.sqrt(np.bincount(label.ravel(), minlength=len(count)))
-    touch = count > np.maximum(CONTACT * np.minimum.outer(size, size), 2)
+    """Which two pieces meet in space, (pieces + 1, pieces + 1) bool: both surfaces lead to one depth at their border.
+
+    The pixels of the border itself do not tell: where one thing hides another one, a sensor gives a slope between them.
+    """
+    n, (near, far) = int(label.max()) + 1, LED
+    wide, deep = np.pad(label, far), np.pad(inverse, far, constant_values=np.nan)
+    count = np.zeros((n, n), np.int64)
+    for (one, other), (down, right) in zip(NEXT, ((0, 1), (1, 0)), strict=True):
+        a, b = label[one], label[other]
+        row, column = np.nonzero((a != b) & (a > 0) & (b > 0))
+        a, b, limit = a[row, column], b[row, column], tolerance[row, column]
+        led = []
+        for piece, start, way in ((a, 0, -1), (b, 1, 1)):
+            at = [(far + row + down * k, far + column + right * k) for k in (start + way * np.array([0, near, far]))]
+            there = (wide[at[1]] == piece) & (wide[at[2]] == piece)
+            slope = (deep[at[1]] - deep[at[2]]) / (far - near)
+            led.append(np.where(there, deep[at[1]] + (near + 0.5) * slope, deep[at[0]]))
+        with np.errstate(invalid="ignore"):
+            meet = np.abs(led[0] - led[1]) < limit
+        count += np.bincount(a[meet] * n + b[meet], minlength=n * n).reshape(n, n)
+    size = np.sqrt(np.bincount(label.ravel(), minlength=n))
+    touch = count + count.T > np.maximum(CONTACT * np.minimum.outer(size, size), 2)
     touch[0] = touch[:, 0] = False
     return touch
 
