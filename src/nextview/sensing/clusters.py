@@ -23,11 +23,9 @@ Mask = NDArray[np.bool_]
 CELL = 0.01  # side of a cell of the footprint, in distances of the camera from the object
 OVERLAP = 0.25
 """Share of the cells of a piece that lie over another one of the same frame, from which they are one thing."""
-TOUCH = 0.45
-"""How strong a link it is that two pieces touch: what lies over each other in two frames is joined first."""
+TOUCH = 0.45  # strength of the link of two pieces that touch: what lies over each other in two frames is joined first
 BRIDGE = 0.25
-"""Share of the smaller one of two clusters that a piece has at least by which they are joined: else a leg, or pixels in
-the air, would join what stands to both sides of it."""
+"""Share of the smaller of two clusters that a piece which joins them has at least: else a leg would join neighbours."""
 FEWEST = 0.15  # share of the pixels of a level cell that a piece shows over it, at least
 LIES_OVER = 0.5
 """Share of the cells of a piece that lie over, or beside, one of another frame, from which they are one thing."""
@@ -43,8 +41,8 @@ class Footprint:
     """The cells, seen from above, over which the pieces of a frame lie: K pairs of a cell and a piece, each once.
 
     ``cells`` are the indices of the cells, (K, 2), ``piece`` the labels of the pieces, (K,). ``area`` is that of the
-    surface of each pair, square metres, ``pixels`` how many show it, ``label`` the piece of each pixel of the frame, with
-    those at edges, (H, W) int32, 0 for none. For the rest see ``Pieces``.
+    surface of each pair, square metres, ``pixels`` how many show it, ``label`` the piece of each pixel of the frame,
+    also at edges, (H, W) int32, 0 for none. For the rest see ``Pieces``.
     """
 
     cells: NDArray[np.int64]
@@ -87,8 +85,7 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float) -> Footpri
     area = np.bincount(key, z * z, len(count))[pairs] / (frame.intrinsics[0, 0] * frame.intrinsics[1, 1])
     at, piece = np.divmod(pairs, many)
     cells, pixels = np.stack(np.divmod(used[at], side), 1) + low, count[pairs]
-    found = pieces.stands, pieces.touch, pieces.low, pieces.inside
-    return Footprint(cells, piece, *found, area, pixels, pieces.grown)
+    return Footprint(cells, piece, pieces.stands, pieces.touch, pieces.low, pieces.inside, area, pixels, pieces.grown)
 
 
 def clusters(footprints: Sequence[Footprint]) -> tuple[list[NDArray[np.int64]], Mask]:
@@ -148,8 +145,7 @@ def _links(footprints: Sequence[Footprint], shared: Float, beside: Mask) -> tupl
     frame = np.repeat(np.arange(len(footprints)), [len(f.stands) for f in footprints])
     same = np.equal.outer(frame, frame)
     stands = np.concatenate([f.stands for f in footprints])
-    of_two = ("touch", "low", "inside")
-    touch, low, inside = (block_diag(*(getattr(f, name) for f in footprints)) > 0 for name in of_two)
+    touch, low, inside = (block_diag(*(getattr(f, a) for f in footprints)) > 0 for a in ("touch", "low", "inside"))
     inside |= inside.T
     both, neither = np.logical_and.outer(stands, stands), ~np.logical_or.outer(stands, stands)
     strength = np.where(shared >= np.where(same, OVERLAP, LIES_OVER), shared, 0)

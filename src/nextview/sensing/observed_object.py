@@ -67,11 +67,6 @@ class Sighting:
     footprint: Footprint | None = None
     chosen: Mask | None = None
 
-    @property
-    def of_nothing(self) -> Sighting:
-        """The same frame, if it shows nothing of the object."""
-        return replace(self, facets=self.facets.some(slice(0)), mask=np.zeros_like(self.mask), hull=np.zeros((0, 3)))
-
 
 @dataclass(frozen=True)
 class ObjectState:
@@ -285,6 +280,11 @@ class ObservedObject:
         footprints = [*(s.footprint for s in earlier if s.footprint is not None), foot]
         labels, two = clusters.clusters(footprints)
         target = self._target(labels, footprints, ground / cell, axes[:2] / cell)
+        for now, s in zip(labels, (s for s in earlier if s.footprint is not None), strict=False):
+            was = int(np.bincount(now[s.chosen], minlength=1).argmax())
+            if was and not any(was in label and target in label for label in labels):  # another side of the object
+                for label in labels:
+                    label[label == was] = target
         chosen = labels[-1] == target
         mask = foot.pixels_of(chosen)
         if (labels[-1][~chosen] > 0).any():  # cells at the border may hold pixels of a neighbour
@@ -298,7 +298,7 @@ class ObservedObject:
                 now = next(old_labels) == target
                 changed = s.footprint.pixels[now != s.chosen].sum()
                 if changed > MENDED * s.footprint.pixels[s.chosen].sum():
-                    mended = s.of_nothing
+                    mended = replace(s, facets=s.facets.some(slice(0)), mask=s.mask & False, hull=s.hull[:0])
                     with suppress(ObservationError):  # what was taken for the object was what hid it
                         mended = self._sighting(s.frame, s.footprint.pixels_of(now), s.plane, s.noise)
                     s = replace(mended, footprint=s.footprint, chosen=now)

@@ -151,10 +151,8 @@ def _concave(inverse: Inverse, tolerance: Inverse) -> Mask:
 
 
 def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) -> Mask:
-    """Which two pieces meet in space, (pieces + 1, pieces + 1) bool: both surfaces lead to one depth at their border.
-
-    The pixels of the border itself do not tell: where one thing hides another one, a sensor gives a slope between them.
-    """
+    """Which two pieces meet in space, (pieces + 1, pieces + 1) bool: both lead to one depth at their border."""
+    # Its own pixels do not tell: where one thing hides another one, a sensor gives a slope between them.
     n, (near, far) = int(label.max()) + 1, LED
     wide, deep = np.pad(label, far), np.pad(inverse, far, constant_values=np.nan)
     count = np.zeros((n, n), np.int64)
