@@ -94,18 +94,19 @@ def cut(depth: NDArray[np.float32], above: Mask, height: NDArray[np.float32], no
 
 def _grown(label: NDArray[np.int64], mask: Mask, inverse: Inverse, tolerance: Inverse) -> NDArray[np.int64]:
     """Pieces with the pixels of edges: each goes to the piece beside it from whose pixel it differs least in depth."""
-    label = label.copy()
+    wide, deep, limit = np.pad(label, 1), np.pad(inverse, 1).ravel(), np.pad(tolerance, 1).ravel()
+    flat, row = wide.ravel(), wide.shape[1]
+    bare = np.flatnonzero(np.pad(mask & (label == 0), 1))
     for _ in range(GROWN):
-        least, taken, bare = tolerance.copy(), np.zeros_like(label), mask & (label == 0)
-        for one, other in (*NEXT, *((b, a) for a, b in NEXT)):
-            with np.errstate(invalid="ignore"):
-                off = np.abs(inverse[one] - inverse[other])
-                nearer = bare[one] & (label[other] > 0) & (off < least[one])
-            least[one][nearer], taken[one][nearer] = off[nearer], label[other][nearer]
-        if not taken.any():
+        beside = bare[:, None] + (1, row, -1, -row)
+        off = np.where(flat[beside] > 0, np.abs(deep[beside] - deep[bare, None]), np.inf)
+        nearest = np.arange(len(bare)), off.argmin(1)
+        joins = off[nearest] < limit[bare]
+        if not joins.any():
             break
-        label += taken
-    return label
+        flat[bare[joins]] = flat[beside[nearest][joins]]
+        bare = bare[~joins]
+    return wide[1:-1, 1:-1]
 
 
 def _enlarged(small: NDArray[Any], step: int, shape: tuple[int, ...]) -> NDArray[Any]:
