@@ -382,6 +382,17 @@ def test_correct_views_get_no_warning(elevation, distance):
     assert check_views(views[0], views[1]) == check_views(views[1], views[2]) == []
 
 
+@pytest.mark.parametrize(("screen", "seen"), [(True, False), (False, True)])
+def test_what_hid_the_object_shows_nothing_of_it_and_another_side_does(screen, seen):
+    """The first frame shows a screen before a cube, or a cube's front alone; the second one the cube from behind."""
+    scene = [TABLE, box((0.1, 0.1, 0.1), (0, 0, 0.05))] + [box((0.04, 0.3, 0.3), (0.2, 0, 0.15))] * screen
+    thing = ObservedObject(point=(0, 0, 0.05), life_size=False)
+    for k, (elevation, azimuth) in enumerate(((5, 0), (40, 180))):
+        thing.add(frame(scene, pose_at(elevation, azimuth, 0.8, (0, 0, 0.05)), seed=k))
+    assert [view.seen for view in thing.observations] == [seen, True]
+    assert thing.object_frame.radius == pytest.approx(0.05 * np.sqrt(3), rel=0.1)
+
+
 @pytest.mark.parametrize(
     ("name", "wrong"),
     [
