@@ -93,9 +93,8 @@ def clusters(footprints: Sequence[Footprint]) -> tuple[list[NDArray[np.int64]], 
 
     Pieces of one frame are joined where they overlap seen from above; and where they touch, unless both stand on the
     plane and their border comes down to it: a handle and the back of a chair are joined. Things that stand side by side
-    stay apart, also where only their tops show.
-    Pieces of two frames are joined where half of the smaller one lies over the other, unless a frame shows both side by
-    side.
+    stay apart, also where only their tops show. Pieces of two frames are joined where half of the smaller one lies over
+    the other, unless a frame shows both side by side.
 
     Returns:
         The label of each pair in each footprint, (K,) int64 each: 1, 2, ... for the clusters; 0 for what lies far from

@@ -298,7 +298,7 @@ class ObservedObject:
                 now = next(old_labels) == target
                 changed = s.footprint.pixels[now != s.chosen].sum()
                 if changed > MENDED * s.footprint.pixels[s.chosen].sum():
-                    mended = replace(s, facets=s.facets.some(slice(0)), mask=s.mask & False, hull=s.hull[:0])
+                    mended = replace(s, facets=s.facets.some(slice(0)), mask=np.zeros_like(s.mask), hull=s.hull[:0])
                     with suppress(ObservationError):  # what was taken for the object was what hid it
                         mended = self._sighting(s.frame, s.footprint.pixels_of(now), s.plane, s.noise)
                     s = replace(mended, footprint=s.footprint, chosen=now)

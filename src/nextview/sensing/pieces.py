@@ -154,11 +154,12 @@ def _concave(inverse: Inverse, tolerance: Inverse) -> Mask:
 def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) -> Mask:
     """Which two pieces meet in space, (pieces + 1, pieces + 1) bool: both lead to one depth at their border."""
     # Its own pixels do not tell: where one thing hides another one, a sensor gives a slope between them.
-    n, (near, far) = int(label.max()) + 1, LED
+    near, far = LED
     wide, deep = np.pad(label, far), np.pad(inverse, far, constant_values=np.nan)
-    count = np.zeros((n, n), np.int64)
+    meeting = []
     for (one, other), (down, right) in zip(NEXT, ((0, 1), (1, 0)), strict=True):
         a, b = label[one], label[other]
+        meet = np.zeros(a.shape, bool)
         row, column = np.nonzero((a != b) & (a > 0) & (b > 0))
         a, b, limit = a[row, column], b[row, column], tolerance[row, column]
         led = []
@@ -168,10 +169,10 @@ def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) ->
             slope = (deep[at[1]] - deep[at[2]]) / (far - near)
             led.append(np.where(there, deep[at[1]] + (near + 0.5) * slope, deep[at[0]]))
         with np.errstate(invalid="ignore"):
-            meet = np.abs(led[0] - led[1]) < limit
-        count += np.bincount(a[meet] * n + b[meet], minlength=n * n).reshape(n, n)
-    size = np.sqrt(np.bincount(label.ravel(), minlength=n))
-    touch = count + count.T > np.maximum(CONTACT * np.minimum.outer(size, size), 2)
+            meet[row, column] = np.abs(led[0] - led[1]) < limit
+        meeting.append(meet)
+    size = np.sqrt(np.bincount(label.ravel()))
+    touch = _borders(label, meeting) > np.maximum(CONTACT * np.minimum.outer(size, size), 2)
     touch[0] = touch[:, 0] = False
     return touch
 
