@@ -34,8 +34,8 @@ from nextview.geometry.viewsphere import look_at_origin
 from nextview.learning.architectures import LiteNet
 from nextview.learning.export import export_onnx
 from nextview.learning.runs import start_from
-from nextview.recognition.inference import Recogniser, open_onnx
-from nextview.recognition.model_card import BUNDLED, RECOGNISER, read_card
+from nextview.recognition.inference import FEATURES_OUTPUT, OnnxFile, open_onnx
+from nextview.recognition.model_card import BUNDLED, RECOGNISER, find_card, read_card
 from nextview.recognition.network_input import from_observations
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
@@ -61,8 +61,9 @@ class LiteFeatures(nn.Module):
 
 
 @lru_cache(maxsize=1)
-def networks(lite: Path) -> tuple[Recogniser, object]:
-    return Recogniser(RECOGNISER, 1), open_onnx(lite, sha256_of(lite), 1)
+def networks(lite: Path) -> tuple[OnnxFile, OnnxFile]:
+    card = find_card(RECOGNISER)
+    return open_onnx(card.path, card.sha256, 1), open_onnx(lite, sha256_of(lite), 1)
 
 
 def look(lite: Path, mesh: Path, seed: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
@@ -79,10 +80,11 @@ def look(lite: Path, mesh: Path, seed: int) -> tuple[NDArray, NDArray, NDArray, 
         cameras = [SensedCamera(thing, str(sensor), child) for child in rng.spawn(VIEWS // SETUP)]
         seen.append([cameras[k // SETUP].observe(pose) for k, pose in enumerate(poses)])
     recogniser, session = networks(lite)
+    takes = find_card(RECOGNISER).input
     found = []
     for views in seen:
-        inputs = from_observations(recogniser.card.input, views)
-        own = [recogniser.features(inputs), session.run(None, {"input": inputs})[0]]  # type: ignore[attr-defined]
+        inputs = {"input": from_observations(takes, views)}
+        own = [recogniser.run([FEATURES_OUTPUT], inputs)[0], session.run(None, inputs)[0]]
         found.append(np.concatenate(own, 1))
     shown = np.array([[view.seen for view in views] for views in seen[1:]]).all(0)
     return found[0], np.stack(found[1:]), shown, elevation

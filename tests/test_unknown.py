@@ -17,8 +17,9 @@ from nextview.cli.episode_table import episode_as_json, print_episode
 from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
 from nextview.geometry.mesh import make_mesh
+from nextview.geometry.observation import SceneView
 from nextview.learning.unknown import quantiles
-from nextview.recognition.novelty import NEIGHBOUR, Novelty, Quantiles, read_novelty
+from nextview.recognition.novelty import NEIGHBOUR, Novelty, Quantiles, hidden_share, read_novelty
 from nextview.sensing import Frame, ObservedObject
 
 
@@ -98,6 +99,15 @@ def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_anothe
         path.write_bytes(content)
         with pytest.raises(ModelError, match="not a novelty score"):
             read_novelty(path, hashlib.sha256(content).hexdigest())
+
+
+@pytest.mark.parametrize(("beside", "share"), [(5.0, 0), (2.7, 0), (1.0, 24 / 76), (0.0, 0)])
+def test_the_share_of_an_outline_that_is_hidden_is_that_beside_something_nearer(beside, share):
+    depth, target = np.full((60, 60), 3.0, np.float32), np.zeros((60, 60), bool)
+    target[20:40, 20:40] = True  # with 76 pixels of outline: 20 to each side, and 4 near a corner
+    depth[20:40, 40:] = beside
+    depth[20:40, 42:] = 5.0
+    assert hidden_share(SceneView(depth, target, np.eye(4), np.eye(3))) == pytest.approx(share, abs=1e-9)
 
 
 # Sessions

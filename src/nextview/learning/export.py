@@ -170,10 +170,7 @@ def export_recogniser(
         ModelError: a run is not finished or of another store, runs do not fit together, or the file's answers differ.
         ResultsError: the model exists.
     """
-    return _export(_recogniser((run, *ensemble), store, name, note), out, bits, overwrite, track)
-
-
-def _recogniser(folders: Sequence[Path], store: Path, name: str | None, note: str) -> _Candidate:
+    folders = run, *ensemble
     views, runs = ViewStore.open(store), [read_run(each) for each in folders]
     recipes = [read_recipe(each, RecogniserRecipe) for each in folders]
     if len({(recipe.input, recipe.size) for recipe in recipes}) > 1:
@@ -201,7 +198,8 @@ def _recogniser(folders: Sequence[Path], store: Path, name: str | None, note: st
     inputs, judging = load_inputs(store, spec.size, spec.kind), deduplicate(views, validation)
     sample = np.stack([inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]])
     scores = partial(recogniser_scores, labels=views.labels[judging])
-    return _Candidate(card, shipped, sample, judging, lambda i: inputs[i], scores)
+    candidate = _Candidate(card, shipped, sample, judging, lambda i: inputs[i], scores)
+    return _export(candidate, out, bits, overwrite, track)
 
 
 def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet | LiteNet:
@@ -222,10 +220,6 @@ def export_map(
     track: Track = silently,
 ) -> Exported:
     """Export a trained map network: ONNX, with a card of its validation scores."""
-    return _export(_map(run, store, predictions, name, note), out, bits, overwrite, track)
-
-
-def _map(run: Path, store: Path, predictions: Path | None, name: str | None, note: str) -> _Candidate:
     views, recipe, noted = ViewStore.open(store), read_recipe(run, MapRecipe), read_run(run)
     kind, shape = map_name(recipe.measure), (-1, views.sphere.rings, 3)
     good: Good = "peak" if recipe.measure == CONFIDENCE else find_measure(recipe.measure).good
@@ -252,7 +246,8 @@ def _map(run: Path, store: Path, predictions: Path | None, name: str | None, not
     true = values[judging][:, views.sphere.windows].reshape(shape)
     seen = partial(from_store, spec, views)
     sample = seen(int(validation[0]))[3:11]
-    return _Candidate(card, shipped, sample, judging, seen, lambda maps: map_scores(maps.reshape(shape), true))
+    candidate = _Candidate(card, shipped, sample, judging, seen, lambda maps: map_scores(maps.reshape(shape), true))
+    return _export(candidate, out, bits, overwrite, track)
 
 
 def _training(views: ViewStore, held_out: Iterable[str], recipes: Sequence[Any], usable: Any = True) -> Training:

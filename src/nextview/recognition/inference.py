@@ -24,7 +24,7 @@ INPUT = "input"
 BINS_OUTPUT = "sides"
 FEATURES_OUTPUT = "features"
 EMBEDDING_OUTPUT = "embedding"
-"""Ends of a recogniser's ONNX file: the last is what its last layers make the logits of, (B, F)."""
+"""Ends of ONNX files; "features" are what the last layers of a recogniser make the logits of, (B, F)."""
 LONGEST = 300  # letters of what the runtime says
 Shape = tuple[int | None, ...]  # without the batch; None for a size that is free
 
@@ -151,12 +151,6 @@ class Recogniser:
             self._known = Features(self._threads)
         inputs = np.concatenate([from_observations(self._known.card.input, [o]) for o in observations])
         return self.novelty.scores(self._known(inputs), np.array([o.exact for o in observations]))
-
-    def features(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
-        """What the last layer makes the logits of, (B, F), from what the network takes."""
-        if FEATURES_OUTPUT not in [end.name for end in self._session.get_outputs()]:
-            raise ModelError(f"{self.card.path}: gives no {FEATURES_OUTPUT}; export the recogniser again")
-        return run_onnx(self.card.path, self._session, [FEATURES_OUTPUT], inputs)[0]
 
 
 class Features:

@@ -42,11 +42,13 @@ class Recognition:
     def novelty(self) -> float | None:
         """Share of known objects that are at least as novel (a p-value); None if the recogniser has no score.
 
-        It holds for objects seen as the known ones were, see ``nextview.recognition.novelty``.
+        It holds for objects seen as the known ones were, see ``nextview.recognition.novelty``. What is to be expected
+        of a view in which something hides a part of the object is not counted.
         """
         if self.score is None or not self.seen:
             return None
-        return self.score.of_views(values_of([view.score for view in self.views if view.score is not None]))
+        views = [view.score for view in self.views if view.score is not None]
+        return self.score.of_views(values_of(views, whole=not self.score.joint))
 
     @property
     def unknown(self) -> bool:
