@@ -281,20 +281,6 @@ def test_reach_and_cost_are_asked_in_the_world(tiny):
         np.testing.assert_allclose(pose, first, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["reachable", "travel_cost"])
-def test_what_a_callback_raises_passes_and_says_which_it_was(tiny, name):
-    def planner(*poses):
-        raise TimeoutError("no plan")
-
-    session = begin(tiny)
-    setattr(session, name, planner)
-    with pytest.raises(TimeoutError, match="no plan") as raised:
-        session.update(frame(pose_at(35, 40, 0.7, (0, 0, 0.08))))
-    assert f"session's {name}, " in raised.value.__notes__[0]
-    assert "planner" in raised.value.__notes__[0]
-    assert not session.views
-
-
 @pytest.mark.parametrize(("distance", "words"), [(0.15, "outside of it"), (700, "in millimetres")])
 def test_a_distance_that_cannot_be_is_refused_once_the_radius_is_known(tiny, distance, words):
     session = begin(tiny, distance=distance)

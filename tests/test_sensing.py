@@ -138,6 +138,25 @@ def test_things_that_touch_or_nearly_touch_are_two(gap):
     assert_found(thing, one, 0.15, 0.12)
 
 
+def test_what_touches_an_object_is_a_part_of_it_where_that_is_much_less_novel():
+    one, other = box((0.1, 0.1, 0.12), (0, 0, 0.06)), box((0.12, 0.12, 0.08), (0, 0.11, 0.04))
+    thing = ObservedObject(point=(0, 0, 0.1))
+    for k, azimuth in enumerate((60, 100, 20)):
+        thing.add(frame([TABLE, one, other], pose_at(35, azimuth, 0.7), seed=k))
+    apart = thing.object_frame.radius
+
+    def by_radius(weight):
+        return lambda seen: weight * seen[-1].radius / apart
+
+    thing.reconsider(by_radius(-1))  # 1 is too little: the joint radius is less than twice as large
+    assert thing.object_frame.radius == apart
+    thing.reconsider(by_radius(-9))
+    assert thing.object_frame.radius > 1.3 * apart
+    assert len(thing.observations) == 3
+    thing.reconsider(by_radius(9))
+    assert thing.object_frame.radius == pytest.approx(apart, rel=0.01)
+
+
 def test_things_of_which_only_the_tops_show_are_two():
     one, other = box((0.12, 0.12, 0.06), (0, 0, 0.03)), box((0.12, 0.16, 0.14), (0.125, 0, 0.07))
     thing = ObservedObject(point=(0, 0, 0.05))

@@ -28,7 +28,7 @@ console = Terminal(stderr=True)
 
 
 def track(done: Iterable[int], total: int, what: str, /) -> None:
-    """Exhaust an iterable of growing counts, and show how far it is, the speed and the time left."""
+    """Exhaust an iterable of growing counts, and show how far it is, and the time left."""
     (_show_bar if console.is_terminal else _print_lines)(done, total, what)
 
 
@@ -41,15 +41,10 @@ def follow(steps: Iterator[tuple[int, int]], what: str) -> None:
 def _show_bar(done: Iterable[int], total: int, what: str) -> None:
     from rich import progress  # takes as long to import as all the rest of rich
 
-    class Speed(progress.ProgressColumn):
-        def render(self, task: progress.Task) -> Text:
-            speed = task.finished_speed or task.speed
-            return Text(f"{speed:.1f}/s" if speed else "", no_wrap=True)
-
     width = Column(no_wrap=True, max_width=24, overflow="ellipsis")
     name = progress.TextColumn("{task.description}", table_column=width, markup=False)
     left = progress.TimeRemainingColumn(elapsed_when_finished=True)
-    columns = (name, progress.BarColumn(8), progress.MofNCompleteColumn(), left, Speed())
+    columns = (name, progress.BarColumn(8), progress.MofNCompleteColumn(), left)
     with progress.Progress(*columns, console=console) as shown:
         task = None
         for n in done:

@@ -6,7 +6,6 @@ import numpy as np
 
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
-from nextview.simulation.scene import upright_boxes
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # two opposite corners, centimetres, z up
 
@@ -45,6 +44,10 @@ def sample_mesh(name: str) -> Mesh:
 
 def boxes_mesh(boxes: list[Box], name: str) -> Mesh:
     """A mesh of axis-aligned boxes, each closed by twelve triangles."""
-    low, high = np.sort(np.array(boxes, float), axis=1).transpose(1, 0, 2)
-    joint = upright_boxes(high - low, np.zeros(len(boxes)), (low + high)[:, :2] / 2, low[:, 2:])
-    return make_mesh(joint.vertices, joint.faces, name)
+    corner = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
+    sides = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)])
+    triangles = np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
+    spans = np.sort(np.array(boxes, float), axis=1)  # (boxes, low and high, xyz)
+    vertices = np.where(corner[None], spans[:, 1:2], spans[:, 0:1])
+    faces = triangles[None] + 8 * np.arange(len(boxes))[:, None, None]
+    return make_mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3), name)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from nextview.sensing.pieces import Pieces
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Joins = Literal["by their border", "never", "always"]  # whether things that touch are one thing
 
 CELL = 0.01  # side of a cell of the footprint, in distances of the camera from the object
 OVERLAP = 0.25
@@ -41,23 +43,18 @@ class Footprint:
     """The cells, seen from above, over which the pieces of a frame lie: K pairs of a cell and a piece, each once.
 
     ``cells`` are the indices of the cells, (K, 2), ``piece`` the labels of the pieces, (K,). ``area`` is that of the
-    surface of each pair, square metres, ``pixels`` how many show it, ``label`` the piece of each pixel of the frame,
-    also at edges, (H, W) int32, 0 for none. For the rest see ``Pieces``.
+    surface of each pair, square metres, ``pixels`` how many show it.
     """
 
     cells: NDArray[np.int64]
     piece: NDArray[np.int64]
-    stands: Mask
-    touch: Mask
-    low: Mask
-    inside: Mask
+    pieces: Pieces
     area: Float
     pixels: NDArray[np.int64]
-    label: NDArray[np.int32]
 
     def pixels_of(self, chosen: Mask) -> Mask:
         """Pixels of the pieces that have one of the chosen pairs, (H, W) bool."""
-        return np.isin(np.arange(len(self.stands)), self.piece[chosen])[self.label]
+        return np.isin(np.arange(len(self.pieces.stands)), self.piece[chosen])[self.pieces.grown]
 
 
 def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float) -> Footprint:
@@ -85,16 +82,16 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float) -> Footpri
     area = np.bincount(key, z * z, len(count))[pairs] / (frame.intrinsics[0, 0] * frame.intrinsics[1, 1])
     at, piece = np.divmod(pairs, many)
     cells, pixels = np.stack(np.divmod(used[at], side), 1) + low, count[pairs]
-    return Footprint(cells, piece, pieces.stands, pieces.touch, pieces.low, pieces.inside, area, pixels, pieces.grown)
+    return Footprint(cells, piece, pieces, area, pixels)
 
 
-def clusters(footprints: Sequence[Footprint]) -> tuple[list[NDArray[np.int64]], Mask]:
+def clusters(footprints: Sequence[Footprint], joins: Joins = "by their border") -> tuple[list[NDArray[np.int64]], Mask]:
     """Which pieces of some frames are of one object.
 
     Pieces of one frame are joined where they overlap seen from above; and where they touch, unless both stand on the
     plane and their border comes down to it: a handle and the back of a chair are joined. Things that stand side by side
     stay apart, also where only their tops show. Pieces of two frames are joined where half of the smaller one lies over
-    the other, unless a frame shows both side by side.
+    the other, unless a frame shows both side by side. ``joins``: those that touch are "never" one, or "always".
 
     Returns:
         The label of each pair in each footprint, (K,) int64 each: 1, 2, ... for the clusters; 0 for what lies far from
@@ -105,14 +102,14 @@ def clusters(footprints: Sequence[Footprint]) -> tuple[list[NDArray[np.int64]], 
     sizes = [len(f.cells) for f in footprints]
     if not sum(sizes):
         return [np.zeros(n, np.int64) for n in sizes], np.zeros(1, bool)
-    first = np.cumsum([0, *(len(f.stands) for f in footprints)])
+    first = np.cumsum([0, *(len(f.pieces.stands) for f in footprints)])
     node = np.concatenate([f.piece + start for f, start in zip(footprints, first, strict=False)])
     cells = np.concatenate([f.cells for f in footprints])
     near = np.abs(cells - cells[0]).max(1) <= FAR
     here, around = _cells_over(cells[near], node[near], int(first[-1]))
     size = np.maximum(here.sum(1), 1)
     shared, beside = here @ here.T / np.minimum.outer(size, size), around @ here.T > 0
-    strength, apart, either = _links(footprints, shared, beside)
+    strength, apart, either = _links(footprints, shared, beside, joins)
     cluster, doubtful = _joined(strength, apart, size)
     for a, b in np.argwhere(np.triu(either)):  # in doubt until a frame shows which
         if cluster[a] != cluster[b] and not apart[np.ix_(cluster == cluster[a], cluster == cluster[b])].any():
@@ -139,16 +136,15 @@ def _cells_over(cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int) -
     return here[:, :-1], around[:, :-1]
 
 
-def _links(footprints: Sequence[Footprint], shared: Float, beside: Mask) -> tuple[Float, Mask, Mask]:
+def _links(footprints: Sequence[Footprint], shared: Float, beside: Mask, joins: Joins) -> tuple[Float, Mask, Mask]:
     """How strongly each two pieces are linked, 0 for not, which stand apart and which may, (N, N) each."""
-    frame = np.repeat(np.arange(len(footprints)), [len(f.stands) for f in footprints])
-    same = np.equal.outer(frame, frame)
-    stands = np.concatenate([f.stands for f in footprints])
-    touch, low, inside = (block_diag(*(getattr(f, a) for f in footprints)) > 0 for a in ("touch", "low", "inside"))
+    every = [f.pieces for f in footprints]
+    same, stands = block_diag(*(np.ones_like(p.touch) for p in every)) > 0, np.concatenate([p.stands for p in every])
+    touch, low, inside = (block_diag(*(getattr(p, a) for p in every)) > 0 for a in ("touch", "low", "inside"))
     inside |= inside.T
     both, neither = np.logical_and.outer(stands, stands), ~np.logical_or.outer(stands, stands)
     strength = np.where(shared >= np.where(same, OVERLAP, LIES_OVER), shared, 0)
-    touch &= ~(both & low)
+    touch &= ~(both & low) if joins == "by their border" else joins == "always"
     strength[touch | inside] = TOUCH
     side_by_side = same & beside & (strength == 0)
     return strength, same & beside & both & (shared < OVERLAP) & ~inside & ~touch, side_by_side & neither

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from copy import deepcopy
+from copy import copy, deepcopy
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +36,7 @@ SIZE = 224  # side of the observations' images: what the bundled networks take
 FEWEST = 60  # pixels that an object has to have in a frame
 NEAREST = 0.01  # metres between the camera and the point that names an object: nothing nearer can be measured
 MENDED = 0.03  # share of an object's pixels in an earlier frame that has to change before they are looked at again
+LESS_NOVEL = 1.0  # the novelty score has to be so much lower for an object to be joined or taken apart otherwise
 FINEST = 1 / 32  # object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``
 SAME = 0.01  # change of the centre or the radius, in object radii, below which the object frame is left as it is
 
@@ -70,7 +72,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class ObjectState:
-    """All that is known of an object after some frames; ``cell`` is the side of a cell of the footprints, metres."""
+    """All that is known of an object after some frames."""
 
     rng: np.random.Generator
     frame: ObjectFrame | None = None
@@ -78,7 +80,8 @@ class ObjectState:
     observations: tuple[Observation, ...] = ()
     warnings: tuple[ViewWarning, ...] = ()
     revision: int = 0
-    cell: float = 0.0
+    cell: float = 0.0  # side of a cell of the footprints, metres
+    joins: clusters.Joins = "by their border"  # whether what touches it is a part of it
 
 
 class ObservedObject:
@@ -159,6 +162,31 @@ class ObservedObject:
         self.state = self._after(frame)
         return self.state.observations[-1]
 
+    def reconsider(self, novelty: Callable[[Sequence[Observation]], float]) -> None:
+        """Count what touches the object as a part of it, or do not, where its observations are less novel then."""
+        found = [(novelty(self.observations), self.state)]
+        for joins in self.other_joins():
+            other = copy(self)
+            other.state = ObjectState(self.state.rng, self.known, joins=joins)
+            with suppress(ObservationError):
+                for sighting in self.sightings:
+                    other.add(sighting.frame)
+                state = replace(other.state, revision=self.revision + 1)
+                found.append((novelty(other.observations) + LESS_NOVEL, state))
+        self.state = min(found, key=lambda pair: pair[0])[1]
+
+    def other_joins(self) -> list[clusters.Joins]:
+        """Other rules for what touches the object, by which it has other pixels."""
+        old = [(s.footprint, s.chosen) for s in self.sightings if s.footprint is not None and s.chosen is not None]
+        found: list[clusters.Joins] = []
+        for joins in (j for j in get_args(clusters.Joins) if old and j != self.state.joins):
+            labels, _ = clusters.clusters([foot for foot, _ in old], joins)
+            votes = np.concatenate([label[was] for label, (_, was) in zip(labels, old, strict=True)])
+            target = np.bincount(votes, minlength=1).argmax()
+            if any(_changed(*pair, label == target) for pair, label in zip(old, labels, strict=True)):
+                found.append(joins)
+        return found
+
     def _after(self, frame: Frame) -> ObjectState:
         before = self.state
         if not isinstance(frame, Frame):
@@ -206,7 +234,7 @@ class ObservedObject:
         warnings += [NO_PLANE] * (self.support and plane is None and self.known is None)
         for view in made[-4:-1]:
             warnings = warnings or check_views(view, made[-1])
-        return ObjectState(rng, latest, tuple(sightings), tuple(made), tuple(warnings), revision, cell)
+        return ObjectState(rng, latest, tuple(sightings), tuple(made), tuple(warnings), revision, cell, before.joins)
 
     def _plane(self, frame: Frame, samples: Samples, up: Float | None, rng: np.random.Generator) -> Plane | None:
         """The support plane of the first frame."""
@@ -278,7 +306,7 @@ class ObservedObject:
         pieces = cut(frame.depth, above, height, noise)
         foot = clusters.footprint(frame, pieces, axes, cell)
         footprints = [*(s.footprint for s in earlier if s.footprint is not None), foot]
-        labels, two = clusters.clusters(footprints)
+        labels, two = clusters.clusters(footprints, self.state.joins)
         target = self._target(labels, footprints, ground / cell, axes[:2] / cell)
         for now, s in zip(labels, (s for s in earlier if s.footprint is not None), strict=False):
             was = int(np.bincount(now[s.chosen], minlength=1).argmax())
@@ -296,8 +324,7 @@ class ObservedObject:
         for s in earlier:
             if s.footprint is not None and s.chosen is not None:
                 now = next(old_labels) == target
-                changed = s.footprint.pixels[now != s.chosen].sum()
-                if changed > MENDED * s.footprint.pixels[s.chosen].sum():
+                if _changed(s.footprint, s.chosen, now):
                     mended = replace(s, facets=s.facets.some(slice(0)), mask=np.zeros_like(s.mask), hull=s.hull[:0])
                     with suppress(ObservationError):  # what was taken for the object was what hid it
                         mended = self._sighting(s.frame, s.footprint.pixels_of(now), s.plane, s.noise)
@@ -376,6 +403,11 @@ def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
     k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
     few = (slice(step // 2, None, step),) * 2
     return SceneView(sighting.frame.depth[few] / np.float32(radius), sighting.mask[few], pose, k)
+
+
+def _changed(foot: Footprint, old: Mask, new: Mask) -> bool:
+    """Whether so much of an object changes in a frame that it is to be looked at again."""
+    return bool(foot.pixels[new != old].sum() > MENDED * foot.pixels[old].sum())
 
 
 def _same(new: ObjectFrame, old: ObjectFrame) -> bool:

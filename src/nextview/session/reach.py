@@ -35,7 +35,7 @@ class Reach:
         if callable(self.reachable):
             at = poses()
             for k in np.flatnonzero(there):
-                there[k] = _truth(_ask("reachable", self.reachable, at[views[k]]))
+                there[k] = _truth(self.reachable(at[views[k]]))
         elif self.reachable is not None:
             there &= self.reachable[views]
         return there
@@ -46,7 +46,7 @@ class Reach:
         views = views[self.can_reach(views, poses)]
         if self.cost is not None:
             if callable(self.cost):
-                costs = [_cost(_ask("travel_cost", self.cost, here, pose)) for pose in poses()[views]]
+                costs = [_cost(self.cost(here, pose)) for pose in poses()[views]]
                 cost = np.array(costs, np.float64)
             else:
                 cost = self.cost[state.current[0], views]
@@ -61,15 +61,6 @@ class Reach:
         if reachable[state.free[0]].all() and self.cost is None:
             return state
         return replace(state, reachable=reachable[None])
-
-
-def _ask(what: str, function: Callable[..., Any], *poses: Float) -> Any:
-    """What a user's function answers. What it raises passes, with a note that says whose it is."""
-    try:
-        return function(*poses)
-    except Exception as raised:
-        raised.add_note(f"raised by the session's {what}, {getattr(function, '__qualname__', function)}")
-        raise
 
 
 def _cost(answer: Any) -> float:

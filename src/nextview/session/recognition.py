@@ -42,8 +42,7 @@ class Recognition:
     def novelty(self) -> float | None:
         """Share of known objects that are at least as novel (a p-value); None if the recogniser has no score.
 
-        It holds for objects seen as the known ones were, see ``nextview.recognition.novelty``. What is to be expected
-        of a view in which something hides a part of the object is not counted.
+        It holds for objects seen as the known ones were; what is hidden of one is allowed for, see ``values_of``.
         """
         if self.score is None or not self.seen:
             return None

@@ -22,7 +22,7 @@ from nextview.policies.off_grid import anywhere
 from nextview.recognition.belief import MUCH, Stopping, log_evidence_of
 from nextview.recognition.inference import Models
 from nextview.recognition.map_names import maps_among
-from nextview.recognition.novelty import ViewScore, values_of
+from nextview.recognition.novelty import Novelty, ViewScore, values_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.plausibility import ViewWarning, check_observation, check_views
 from nextview.session.episode import Episodes, Step
@@ -305,11 +305,26 @@ class Session:
                 object.state = repeated
             else:
                 object.add(frame)
+                self._reconsider(object)
             self._check_distance(object.object_frame.radius)
             return self._take(object.observations[self._before :], object.warnings, frame.camera_to_world, object)
         except BaseException:
             object.state = before
             raise
+
+    def _reconsider(self, object: ObservedObject) -> None:
+        """See ``ObservedObject.reconsider``: where the last view is suspiciously novel."""
+        recogniser = self.models.recogniser
+        score = recogniser.novelty
+        if not self.unknown or not isinstance(score, Novelty) or not object.other_joins():
+            return
+
+        def novelty(seen: Sequence[Observation]) -> float:
+            found = [ViewScore(o, recogniser.novelty_scores) for o in seen if o.seen]
+            return float(np.mean(values_of(found, whole=True))) if found else np.inf
+
+        if score.of_views([novelty(object.observations[-1:])]) < SUSPICIOUS * self.unknown:
+            object.reconsider(novelty)
 
     def _check_distance(self, radius: float) -> None:
         """Refuse targets inside the object or far from it, as soon as its radius is known."""

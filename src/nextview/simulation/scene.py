@@ -145,8 +145,8 @@ def square(half: float, height: float) -> tuple[Float, NDArray[np.int32]]:
     return corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
 
-def upright_boxes(size: Float, azimuth: Float, at: Float, floor: float | Float) -> Mesh:
-    """Boxes of width, depth and height, (N, 3), from some height on, one or (N, 1), as one mesh, not normalised."""
+def upright_boxes(size: Float, azimuth: Float, at: Float, floor: float) -> Mesh:
+    """Boxes of width, depth and height, (N, 3), on the ground at some height, as one mesh, not normalised."""
     corners = _CORNERS * size[:, None]
     c, s = np.cos(azimuth)[:, None], np.sin(azimuth)[:, None]
     x = c * corners[..., 0] - s * corners[..., 1] + at[:, :1]
