@@ -40,23 +40,9 @@ from nextview.errors import UsageError
 from nextview.session.style import GREY, STYLE, to_png
 
 POLICIES = (
-    "random",
-    "random-all",
-    "lem",
-    "lcm-peak",
-    "furthest",
-    "spread",
-    "fixed-sequence",
-    "fixed-sequence-near",
-    "class-table",
-    "gain@0",
-    "gain",
-    "gain@0.005",
-    "gain@0.01",
-    "gain@0.02",
-    "gain@0.05",
-    "oracle-gain",
-)
+    "random", "random-all", "lem", "lcm-peak", "furthest", "spread", "fixed-sequence", "fixed-sequence-near",
+    "class-table", "gain@0", "gain", "gain@0.005", "gain@0.01", "gain@0.02", "gain@0.05", "oracle-gain",
+)  # fmt: skip
 REFERENCES = ("random", "random-all")
 
 
@@ -87,10 +73,8 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
     text_of = {name: Path(name).name for name in names}
     for own, (family, members) in zip(OWN * len(travel_weights), travel_weights.items(), strict=False):
         for travel_weight, name in members:
-            colour[name], text_of[name] = (
-                own,
-                f"{Path(family).name}@{travel_weight:g}" if name == family else f"@{travel_weight:g}",
-            )
+            colour[name] = own
+            text_of[name] = f"{Path(family).name if name == family else ''}@{travel_weight:g}"
         if family not in text_of:
             text_of[members[0][1]] = Path(members[0][1]).name
     with matplotlib.rc_context(STYLE):
@@ -122,12 +106,8 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
             axes.annotate("\n".join(above), (0, 1), xytext=(0, 5), xycoords="axes fraction",
                           textcoords="offset points", fontsize=8, va="bottom")  # fmt: skip
         panels[0].set_ylabel("accuracy")
-        figure.supxlabel(
-            "filled: differs from random by McNemar's test, corrected for all comparisons (p < 0.05)",
-            fontsize=8,
-            x=0.99,
-            ha="right",
-        )
+        filled = "filled: differs from random by McNemar's test, corrected for all comparisons (p < 0.05)"
+        figure.supxlabel(filled, fontsize=8, x=0.99, ha="right")
         figure.canvas.draw()  # settles where the points are
         figure.set_layout_engine("none")
         for axes, k in zip(panels, n_views, strict=True):
