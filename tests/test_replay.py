@@ -171,7 +171,7 @@ class Raises(Asked):
         ("Missing", "cannot be made"),
     ],
 )
-def test_a_policy_that_fails_is_named_with_the_object_and_the_others_are_kept(specs, name, sentence):
+def test_a_policy_that_fails_is_named_and_the_others_are_kept(specs, name, sentence):
     grid = Grid(specs, 4, (0.9,), 5, 0)
     path = f"test_replay:{name}"
     assert list(run_grid(grid, ["furthest", path, "test_replay:Asked"])) == [1, 2, 3]

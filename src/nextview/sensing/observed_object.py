@@ -36,6 +36,7 @@ SIZE = 224  # side of the observations' images: what the bundled networks take
 FEWEST = 60  # pixels that an object has to have in a frame
 NEAREST = 0.01  # metres between the camera and the point that names an object: nothing nearer can be measured
 MENDED = 0.03  # share of an object's pixels in an earlier frame that has to change before they are looked at again
+PART = 0.1  # of the most pixels that a frame shows of an object: others say too little of its size
 LESS_NOVEL = 1.0  # the novelty score has to be so much lower for an object to be joined or taken apart otherwise
 FINEST = 1 / 32  # object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``
 SAME = 0.01  # change of the centre or the radius, in object radii, below which the object frame is left as it is
@@ -89,9 +90,10 @@ class ObservedObject:
 
     The object is found in each frame: by the frame's mask; else as what lies in a ``box``; else as the cluster on the
     support plane that is nearest to a ``point``, or the largest in the first frame. Its centre and radius are those of
-    the box, or estimated from all frames so far. When they get better the earlier frames are expressed anew:
-    ``observations`` are always all in the same, latest object frame, and ``revision`` counts how often it changed. Its
-    x axis points to the side from which the first frame was taken, unless a box or a known frame says otherwise.
+    the box, or estimated from all frames that show enough of it. When they get better the earlier frames are expressed
+    anew: ``observations`` are always all in the same, latest object frame, and ``revision`` counts how often it
+    changed. Its x axis points to the side from which the first frame was taken, unless a box or a known frame says
+    otherwise.
 
     >>> thing = ObservedObject()                                                # doctest: +SKIP
     >>> observation = thing.add(Frame(depth, intrinsics, pose))                 # doctest: +SKIP
@@ -167,12 +169,11 @@ class ObservedObject:
         found = [(novelty(self.observations), self.state)]
         for joins in self.other_joins():
             other = copy(self)
-            other.state = ObjectState(self.state.rng, self.known, joins=joins)
+            other.state = ObjectState(self.state.rng, self.known, revision=self.revision + 1, joins=joins)
             with suppress(ObservationError):
                 for sighting in self.sightings:
                     other.add(sighting.frame)
-                state = replace(other.state, revision=self.revision + 1)
-                found.append((novelty(other.observations) + LESS_NOVEL, state))
+                found.append((novelty(other.observations) + LESS_NOVEL, other.state))
         self.state = min(found, key=lambda pair: pair[0])[1]
 
     def other_joins(self) -> list[clusters.Joins]:
@@ -376,7 +377,8 @@ class ObservedObject:
     def _estimate(self, sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:
         if self.known is not None:
             return self.known
-        points = np.concatenate([s.hull for s in sightings])
+        shown = np.array([s.mask.sum() for s in sightings])
+        points = np.concatenate([s.hull for s, n in zip(sightings, shown, strict=True) if n >= PART * shown.max()])
         planes = [s.plane for s in sightings if s.plane is not None]
         floor, here = None, points.mean(0)
         if planes:  # their height along up, where the object is: they may lean a little
