@@ -92,8 +92,7 @@ class ObservedObject:
     support plane that is nearest to a ``point``, or the largest in the first frame. Its centre and radius are those of
     the box, or estimated from all frames that show enough of it. When they get better the earlier frames are expressed
     anew: ``observations`` are always all in the same, latest object frame, and ``revision`` counts how often it
-    changed. Its x axis points to the side from which the first frame was taken, unless a box or a known frame says
-    otherwise.
+    changed. Its x axis points towards the first camera, unless a box or a known frame says otherwise.
 
     >>> thing = ObservedObject()                                                # doctest: +SKIP
     >>> observation = thing.add(Frame(depth, intrinsics, pose))                 # doctest: +SKIP
