@@ -157,6 +157,15 @@ def test_what_touches_an_object_is_a_part_of_it_where_that_is_much_less_novel():
     assert thing.object_frame.radius == pytest.approx(apart, rel=0.01)
 
 
+def test_a_frame_that_shows_next_to_nothing_says_nothing_of_the_size():
+    one, thing = box((0.1, 0.1, 0.12), (0, 0, 0.06)), ObservedObject()
+    for k, azimuth in enumerate((0, 30)):
+        owner = cast([TABLE, one], pose_at(35, azimuth, 0.7))[1]
+        mask = (owner == 1 - k) & ((owner == 1) | (np.cumsum(owner == 0).reshape(owner.shape) < 300))  # some table
+        thing.add(replace(frame([TABLE, one], pose_at(35, azimuth, 0.7), seed=k), mask=mask, pixel_centre=0.5))
+        assert_found(thing, one, 0.05, 0.05)
+
+
 def test_things_of_which_only_the_tops_show_are_two():
     one, other = box((0.12, 0.12, 0.06), (0, 0, 0.03)), box((0.12, 0.16, 0.14), (0.125, 0, 0.07))
     thing = ObservedObject(point=(0, 0, 0.05))
