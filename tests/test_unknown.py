@@ -204,15 +204,16 @@ def test_a_suspicious_object_gets_no_confident_answer_and_is_looked_at_longer():
 
 def test_what_a_later_frame_shows_in_another_light_is_not_held_against_the_object(monkeypatch):
     """From the front a long box is half as long: novel. The frame from the side corrects that, also of the first."""
-    scores = iter([9.0, 0.0])
-    monkeypatch.setattr(Novelty, "scores", lambda self, embeddings, exact: np.full(len(embeddings), next(scores)))
+    scores = []
+    monkeypatch.setattr(Novelty, "scores", lambda self, embeddings, exact: np.full(len(embeddings), scores[-1]))
     monkeypatch.setattr(Novelty, "of_views", lambda self, scores: float(np.mean(scores) < 1))
     session = nextview.load(threshold=0.1).session(object=ObservedObject(life_size=False))
     for k, pose in enumerate((pose_at(4, 0, 0.8, (0, 0, 0.06)), pose_at(45, 90, 0.8, (0, 0, 0.06)))):
         assert not session.done
+        scores.append((9.0, 0.0)[k])
         depth = cast([TABLE, box((0.4, 0.12, 0.12), (0, 0, 0.06))], pose)[0]
         session.update(Frame(depth, INTRINSICS, pose, pixel_centre=0.5))
-        assert session.views[0].novelty == (9.0, 0.0)[k]
+        assert session.views[0].novelty == scores[k]
     assert session.done
     assert session.result.confident
     assert not session.result.stranded
