@@ -147,7 +147,7 @@ class Broken:
 @pytest.mark.parametrize(
     ("fault", "part", "episode"),
     [
-        ("raises", "raised KeyError: 'no such map'", None),
+        ("raises", "raised KeyError: 'no such map'", 7),
         ("stays", "which was visited before", 7),
         ("too high", "chose view 40, which is not on the sphere", 7),
         ("fractions", "has to return 20 integers", None),

@@ -123,6 +123,7 @@ BROKEN = {
     "truncated": lambda path: (checkpoint(path), path.write_bytes(path.read_bytes()[: 2 << 20])),
     "another network": lambda path: torch.save({"features.0.weight": torch.zeros(3)}, path),
     "wrong shape": lambda path: damaged(path, "layer2.0.conv1.weight", torch.zeros(128, 64, 1, 1)),
+    "not finite": lambda path: damaged(path, "layer1.0.bn1.weight", torch.full((64,), torch.nan)),
 }
 
 

@@ -167,11 +167,11 @@ class Raises(Asked):
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("Raises", r"raised RuntimeError: no idea, at test_replay.py:\d+"),
+        ("Raises", r"raised RuntimeError: no idea, at test_replay.py:\d+ \(object thing_11\)"),
         ("Missing", "cannot be made"),
     ],
 )
-def test_a_policy_that_fails_is_named_and_the_others_are_kept(specs, name, sentence):
+def test_a_policy_that_fails_is_named_with_the_object_and_the_others_are_kept(specs, name, sentence):
     grid = Grid(specs, 4, (0.9,), 5, 0)
     path = f"test_replay:{name}"
     assert list(run_grid(grid, ["furthest", path, "test_replay:Asked"])) == [1, 2, 3]

@@ -149,7 +149,11 @@ def regular_file(path: Path, what: str, error: type[NextviewError], largest: int
 def read_record(path: Path, record: type[T], what: str, error: type[NextviewError] = ModelError) -> T:
     """A typed record from a JSON file; an ``error`` if the file is missing, too large, or no such record."""
     regular_file(path, what, error, LARGEST_RECORD)
-    return decode_record(path.read_bytes(), record, f"{path}: not {what}", error)
+    try:
+        content = path.read_bytes()
+    except OSError as raised:
+        raise error(f"{path}: cannot be read ({raised.strerror})") from None
+    return decode_record(content, record, f"{path}: not {what}", error)
 
 
 def decode_record(content: bytes | dict[str, Any], record: type[T], where: str, error: type[NextviewError]) -> T:

@@ -323,6 +323,9 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
     faults += [f"{name} is {there}, not {shape}" for name, shape, there in both if there != shape]
     if faults:
         raise ModelError(f"{path}: not the weights of this {network.name} ({faults[0]})")
+    for name, value in state.items():
+        if not torch.isfinite(value).all():
+            raise ModelError(f"{path}: {name} holds numbers that are not finite; download the checkpoint again")
     network.load_state_dict(state)
 
 

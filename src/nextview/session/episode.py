@@ -290,7 +290,7 @@ class Episodes:
     def _ask(self, state: EpisodeState) -> NDArray[np.int64]:
         """What the policy answers: views of the sphere, whichever."""
         name = self._name
-        with plugin_errors(lambda said: PolicyError(f"policy {name} raised {said}")):
+        with plugin_errors(lambda said: PolicyError(f"policy {name} raised {said}", self._first_to_fail(state))):
             chosen = np.asarray(self.policy.next_views(state, self.rng))
         if chosen.shape != state.current.shape or not np.issubdtype(chosen.dtype, np.integer):
             raise PolicyError(f"policy {name} has to return {len(state.current)} integers, one for each episode")
@@ -302,6 +302,16 @@ class Episodes:
     @property
     def _name(self) -> str:
         return type(self.policy.policy if isinstance(self.policy, OffGrid) else self.policy).__name__
+
+    def _first_to_fail(self, state: EpisodeState) -> int | None:
+        """The first episode for which the policy raises even if asked for it alone."""
+        for episode in state.episodes:
+            alone = state.select(state.episodes == episode)
+            try:
+                self.policy.next_views(alone, self.rng)
+            except (Exception, SystemExit):
+                return int(episode)
+        return None
 
     @property
     def outcome(self) -> Outcome:

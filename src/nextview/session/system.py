@@ -181,6 +181,8 @@ def load(
     whole(threads, "the number of threads", 0, MOST_THREADS)
     if risk is not None:
         number(risk, "the risk")
+    if unknown is not None and number(unknown, "the share of known objects called unknown", 0) >= 1:
+        raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
     Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
     found = find_models(models)
     sphere = viewpoints_of(viewpoints)
