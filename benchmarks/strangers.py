@@ -47,9 +47,11 @@ def main(
 
     def work():
         for done, entry in enumerate(entries, 1):
-            mesh, own = nextview.load_mesh(entry.path, unit=unit), np.random.default_rng([seed, done])
-            camera = nextview.SimulatedCamera(mesh) if sensor is None else SensedCamera(mesh, sensor, own)
-            if around is not None:
+            own = np.random.default_rng([seed, done])
+            if around is None:
+                mesh = nextview.load_mesh(entry.path, unit=unit)
+                camera = nextview.SimulatedCamera(mesh) if sensor is None else SensedCamera(mesh, sensor, own)
+            else:
                 try:
                     layout = draw_scene(place[entry.name], others, around, seed, f"{entry.name}@{around}-0")
                 except DatasetError:  # no scene of this level is found around it
