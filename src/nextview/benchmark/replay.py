@@ -20,7 +20,7 @@ from nextview.policies.baselines import ViewList
 from nextview.recognition.belief import FixedLength, Stopping
 from nextview.recognition.map_names import maps_among
 from nextview.recognition.own_stopping import Rule, own_stopping
-from nextview.session.episode import run_episodes
+from nextview.session.episode import Outcome, run_episodes
 
 THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)  # the thesis's (section 5.3)
 PART = 4096  # episodes of fixed views that are run at once
@@ -38,18 +38,6 @@ class Trajectories:
     seen: NDArray[np.int64]  # views so far that showed anything
     fixed: bool
     beliefs: NDArray[np.float64] | None = None  # in all classes, (E, K, classes), for rules that look at more than one
-
-
-@dataclass(frozen=True)
-class Outcomes:
-    """How E episodes ended under one rule: as ``nextview.session.episode.Outcome``, each (E,)."""
-
-    answer: NDArray[np.int64]
-    confidence: NDArray[np.float64]
-    n_views: NDArray[np.int64]
-    confident: NDArray[np.bool_]
-    travel: NDArray[np.float64]
-    arc: NDArray[np.float64]
 
 
 def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
@@ -115,7 +103,7 @@ def replay_policy(
     return Trajectories(views, answers, confidences, travel, arc, seen, fixed=False, beliefs=kept)
 
 
-def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcomes:
+def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcome:
     """The episodes as a rule ends them, as it would in live use: never after a view in which nothing is seen."""
     e, count = np.arange(len(paths.views)), (paths.views >= 0).sum(1)
     if stopping is None or paths.fixed:
@@ -132,7 +120,8 @@ def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcomes:
         confident = np.asarray(reached.any(1))
         at = np.where(confident, reached.argmax(1), np.minimum(count, last) - 1)
     moved = paths.travel[e, at], paths.arc[e, at]
-    return Outcomes(paths.answers[e, at], paths.confidences[e, at], at + 1, confident, *moved)
+    views = np.where(np.arange(paths.views.shape[1]) <= at[:, None], paths.views, -1)
+    return Outcome(paths.answers[e, at], paths.confidences[e, at], at + 1, confident, *moved, views)
 
 
 @dataclass(frozen=True)
@@ -156,11 +145,11 @@ class Grid:
         rule = Stopping.of(self.specs.predictions.calibration, threshold, max_views=self.max_views)
         return rule if self.threshold_decay is None else replace(rule, threshold_decay=self.threshold_decay)
 
-    def ends(self, name: str, threshold: float | None) -> Outcomes:
+    def ends(self, name: str, threshold: float | None) -> Outcome:
         """The episodes of an entry under a threshold; None takes all views."""
         return truncate(self.paths[name], None if threshold is None else self.stopping(threshold))
 
-    def cells(self) -> Iterator[tuple[str, float | None, Outcomes]]:
+    def cells(self) -> Iterator[tuple[str, float | None, Outcome]]:
         """Every entry under every threshold; fixed views once, with threshold None."""
         for name, paths in self.paths.items():
             for threshold in (None,) if paths.fixed else self.thresholds:

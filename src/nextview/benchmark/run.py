@@ -175,7 +175,7 @@ def _write_episodes(path: Path, grid: Grid) -> None:
     writer = None
     for policy, threshold, ends in grid.cells():
         paths = grid.paths[policy]
-        taken = paths.views[np.arange(paths.views.shape[1]) < ends.n_views[:, None]].astype(np.int16)
+        taken = ends.views[ends.views >= 0].astype(np.int16)
         begins = np.concatenate([[0], np.cumsum(ends.n_views)]).astype(np.int32)
         table = pa.table(
             {

@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 from nextview.benchmark import statistics as st
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.published import comparable_classes, published
-from nextview.benchmark.replay import Grid, Outcomes
+from nextview.benchmark.replay import Grid
 from nextview.benchmark.views import COLUMNS, measured
 from nextview.data import metrics
+from nextview.session.episode import Outcome
 from nextview.simulation.scene_layout import LEVELS, clutter_level
 
 Float = NDArray[np.float64]
 Drawn = dict[tuple, NDArray[np.float64]]  # what resampling gives, by policy, threshold and measure
-Cell = tuple[str, float | None, Outcomes]
+Cell = tuple[str, float | None, Outcome]
 TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
 SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)  # from the first view for all to the last for most
 LEVEL_VIEWS = (2, 3, 5)  # after so many views the policies are compared
@@ -70,7 +71,7 @@ def summarise(
     )
 
 
-def _measures(grid: Grid, ends: Outcomes) -> dict[str, tuple[Float, Float]]:
+def _measures(grid: Grid, ends: Outcome) -> dict[str, tuple[Float, Float]]:
     """Each measure of a cell as a sum for each object and what to divide it by, (N,) each."""
     right = grid.right(ends.answer).astype(np.float64)
     clean = np.where(grid.specs.predictions.conflicting, 0.0, 1.0)

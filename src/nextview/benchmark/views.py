@@ -11,16 +11,17 @@ import numpy as np
 import pandas as pd
 
 from nextview.benchmark.entries import knows_truth
-from nextview.benchmark.replay import Grid, Outcomes, Trajectories, truncate
+from nextview.benchmark.replay import Grid, Trajectories, truncate
 from nextview.benchmark.statistics import holm, interval, mcnemar, resample
 from nextview.data.metrics import ratio
+from nextview.session.episode import Outcome
 
 CEILING = "oracle-gain"
 COLUMNS = ["policy", "n_views", "measure", "value", "low", "high", "p", "p_holm"]
 Numbers = dict[tuple[str, int, str], tuple[float, float, float, float, float]]  # value, low, high, p, Holm's p
 
 
-def after(paths: Trajectories, n_views: int) -> Outcomes:
+def after(paths: Trajectories, n_views: int) -> Outcome:
     """How the episodes stand after so many views."""
     fields = ("views", "answers", "confidences", "travel", "arc")
     return truncate(replace(paths, **{name: getattr(paths, name)[:, :n_views] for name in fields}), None)

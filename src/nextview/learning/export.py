@@ -198,8 +198,8 @@ def export_recogniser(
     inputs, judging = load_inputs(store, spec.size, spec.kind), deduplicate(views, validation)
     sample = np.stack([inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]])
     scores = partial(recogniser_scores, labels=views.labels[judging])
-    candidate = _Candidate(card, shipped, sample, judging, lambda i: inputs[i], scores)
-    return _export(candidate, out, bits, overwrite, track)
+    made = _Candidate(card, shipped, sample, judging, lambda i: inputs[i], scores)
+    return _export(made, out, bits, overwrite, track)
 
 
 def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet | LiteNet:
@@ -246,8 +246,8 @@ def export_map(
     true = values[judging][:, views.sphere.windows].reshape(shape)
     seen = partial(from_store, spec, views)
     sample = seen(int(validation[0]))[3:11]
-    candidate = _Candidate(card, shipped, sample, judging, seen, lambda maps: map_scores(maps.reshape(shape), true))
-    return _export(candidate, out, bits, overwrite, track)
+    made = _Candidate(card, shipped, sample, judging, seen, lambda maps: map_scores(maps.reshape(shape), true))
+    return _export(made, out, bits, overwrite, track)
 
 
 def _training(views: ViewStore, held_out: Iterable[str], recipes: Sequence[Any], usable: Any = True) -> Training:

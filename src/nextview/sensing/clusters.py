@@ -23,14 +23,11 @@ Mask = NDArray[np.bool_]
 Joins = Literal["by their border", "never", "always"]  # whether things that touch are one thing
 
 CELL = 0.01  # side of a cell of the footprint, in distances of the camera from the object
-OVERLAP = 0.25
-"""Share of the cells of a piece that lie over another one of the same frame, from which they are one thing."""
+OVERLAP = 0.25  # share of the cells of a piece that lie over another one of the same frame, from which they are one
 TOUCH = 0.45  # strength of the link of two pieces that touch: what lies over each other in two frames is joined first
-BRIDGE = 0.25
-"""Share of the smaller of two clusters that a piece which joins them has at least: else a leg would join neighbours."""
+BRIDGE = 0.25  # share of the smaller of two clusters that a piece which joins them has at least: no leg joins two
 FEWEST = 0.15  # share of the pixels of a level cell that a piece shows over it, at least
-LIES_OVER = 0.5
-"""Share of the cells of a piece that lie over, or beside, one of another frame, from which they are one thing."""
+LIES_OVER = 0.5  # share of the cells of a piece that lie over, or beside, one of another frame, from which they are one
 BESIDE = 2  # cells up to which two pieces stand side by side
 TWO = 0.25  # share of the cells of an object that a part of it has which may be another thing
 REACH, FAR = 250, 1000

@@ -109,6 +109,19 @@ class Frame:
         return self.depth[part] * towards + np.float32(direction @ pose[:3, 3] + offset)
 
 
+def within(shown: NDArray[np.float32 | np.bool_], margin: int = 0) -> Part:
+    """Rows and columns of a depth image, or a mask, that hold all that it shows, and a margin."""
+    at = [np.flatnonzero(shown.any(1 - axis)) for axis in (0, 1)]
+    low, high = zip(*((k[0], k[-1] + 1) if len(k) else (0, 0) for k in at), strict=True)
+    return spans(np.array(low) - margin, np.array(high) + margin * bool(high[0]), shown.shape)
+
+
+def spans(low: NDArray[np.floating], high: NDArray[np.floating], shape: tuple[int, ...]) -> Part:
+    """Rows and columns of a picture from ``low``, (2,), to before ``high``, (2,)."""
+    first, last = (np.clip(np.floor(at), 0, shape).astype(int).tolist() for at in (low, high))
+    return slice(first[0], last[0]), slice(first[1], last[1])
+
+
 def _metres(depth: ArrayLike) -> NDArray[np.float32]:
     depth = numbers(depth, "the depth")
     if depth.ndim != 2 or min(depth.shape) < 2:

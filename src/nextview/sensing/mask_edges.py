@@ -4,6 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, binary_fill_holes, label, minimum_filter
 
+from nextview.sensing.frame import within
+
 EDGE = 6  # a segmenter's edge may be off by so many pixels
 STEP = 0.01  # neighbouring pixels of one surface differ by at most this part of their depth, and THICK
 THICK = 0.004  # metres
@@ -24,10 +26,9 @@ def trimmed(depth: NDArray[np.float32], mask: Mask, high: Mask | None = None) ->
         high: pixels that show no edge of what lies on the plane, (H, W) bool.
     """
     measured = mask & (depth > 0)
-    rows, columns = np.flatnonzero(measured.any(1)), np.flatnonzero(measured.any(0))
-    if not len(rows):
+    part = within(measured)
+    if not measured[part].size:
         return mask
-    part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     own, z = measured[part], depth[part].astype(np.float64)
     whole = np.pad(mask[part] | binary_fill_holes(own) & (z == 0), 1)
     for width in range(EDGE, 0, -1):

@@ -19,7 +19,7 @@ from nextview.geometry.viewsphere import DISTANCE
 from nextview.sensing import clusters, plausibility, segmentation
 from nextview.sensing.clusters import Footprint
 from nextview.sensing.facets import ROWS, Facets, Index, Noise, estimate_noise, fit_facets, look_again, virtual_pose
-from nextview.sensing.frame import Frame
+from nextview.sensing.frame import Frame, within
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
 from nextview.sensing.pieces import STANDS, cut
@@ -28,9 +28,7 @@ from nextview.sensing.segmentation import Plane, Samples, find_plane, refine_pla
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Found = tuple[list["Sighting"], float, bool]
-"""The sightings so far, mended where a cluster has changed, and that of a new frame; the side of a cell; and whether
-the object may be two things."""
+Found = tuple[list["Sighting"], float, bool]  # earlier and new, the side of a cell, whether it may be two things
 
 SIZE = 224  # side of the observations' images: what the bundled networks take
 FEWEST = 60  # pixels that an object has to have in a frame
@@ -40,9 +38,7 @@ PART = 0.1  # of the most pixels that a frame shows of an object: others say too
 LESS_NOVEL = 1.0  # the novelty score has to be so much lower for an object to be joined or taken apart otherwise
 FINEST = 1 / 32  # object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``
 SAME = 0.01  # change of the centre or the radius, in object radii, below which the object frame is left as it is
-
-BELOW = 0.02
-"""Metres below the support plane at which the point of an object may lie: on it, but for what a pose is off."""
+BELOW = 0.02  # metres below the support plane at which the point of an object may lie: on it, but for a pose's error
 TOO_LITTLE = "too little is seen of the object"
 NO_PLANE = ViewWarning(
     "support", "no support plane is seen, so where the object ends below is guessed: support=False if it stands on none"
@@ -357,13 +353,9 @@ class ObservedObject:
     def _sighting(self, frame: Frame, mask: Mask, plane: Plane | None, noise: Noise) -> Sighting:
         if mask.sum() < FEWEST:
             raise ObservationError(TOO_LITTLE)
-        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        height, width = frame.shape
-        top, bottom = max(rows[0] - 2, 0), min(rows[-1] + 3, height)
-        left, right = max(columns[0] - 2, 0), min(columns[-1] + 3, width)
-        part = slice(top, bottom), slice(left, right)
-        coarse = max(1, max(bottom - top, right - left) // SIZE)
-        facets = fit_facets(frame.depth[part], mask[part], frame.intrinsics, (top, left), self.denoise, coarse, noise)
+        part = within(mask, 2)
+        corner, coarse = (part[0].start, part[1].start), max(1, max(mask[part].shape) // SIZE)
+        facets = fit_facets(frame.depth[part], mask[part], frame.intrinsics, corner, self.denoise, coarse, noise)
         if len(facets.planes) * coarse**2 < FEWEST:
             raise ObservationError(TOO_LITTLE)
         pose = frame.camera_to_world

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.sensing.facets import Noise
+from nextview.sensing.frame import within
 
 Mask = NDArray[np.bool_]
 Inverse = NDArray[np.float32]
@@ -57,10 +58,9 @@ class Pieces:
 def cut(depth: NDArray[np.float32], above: Mask, height: NDArray[np.float32], noise: Noise) -> Pieces:
     """Cut the pixels ``above`` a plane, (H, W) bool, of a depth image, metres, with their heights over it, metres."""
     label, grown = np.zeros((2, *depth.shape), np.int32)
-    rows, columns = np.flatnonzero(above.any(1)), np.flatnonzero(above.any(0))
-    if not len(rows):
+    part = within(above)
+    if not above[part].size:
         return Pieces(label, grown, np.zeros(1, bool), *np.zeros((3, 1, 1), bool))
-    part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     step = max(1, round(depth.shape[1] / WIDTH))
     few = (slice(None, None, step),) * 2
     z, mask, high = depth[part][few], above[part][few], height[part][few]

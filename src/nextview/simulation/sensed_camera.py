@@ -12,11 +12,11 @@ from nextview.geometry.observation import Observation, pinhole
 from nextview.geometry.viewsphere import DISTANCE
 from nextview.sensing import Frame, ObjectFrame, ObservedObject
 from nextview.sensing.facets import virtual_pose
-from nextview.sensing.frame import Part
+from nextview.sensing.frame import Part, spans, within
 from nextview.sensing.observed_object import FEWEST, SIZE
 from nextview.sensing.segmentation import inside_sphere
 from nextview.simulation.scene import boxes_around
-from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, spans, uniform_field, within
+from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, uniform_field
 from nextview.simulation.simulated import SimulatedCamera
 
 Float = NDArray[np.float64]

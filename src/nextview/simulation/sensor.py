@@ -12,7 +12,7 @@ from nextview.checks import number, whole
 from nextview.errors import UsageError
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import DISTANCE
-from nextview.sensing.frame import Part
+from nextview.sensing.frame import Part, within
 
 Index = NDArray[np.int64]
 Image = NDArray[np.float64]
@@ -332,19 +332,6 @@ def kinect_lateral(angle: NDArray[np.floating]) -> Image:
     """Standard deviation of where a Kinect (v1) sees an edge, pixels; same source."""
     angle = np.minimum(angle, STEEPEST)
     return 0.8 + 0.035 * angle / (np.pi / 2 - angle)
-
-
-def within(depth: NDArray[np.float32], margin: int = 0) -> Part:
-    """Rows and columns of a depth image that hold all that it shows, and a margin."""
-    shown = [np.flatnonzero(depth.any(1 - axis)) for axis in (0, 1)]
-    low, high = zip(*((at[0], at[-1] + 1) if len(at) else (0, 0) for at in shown), strict=True)
-    return spans(np.array(low) - margin, np.array(high) + margin * bool(high[0]), depth.shape)
-
-
-def spans(low: NDArray[np.floating], high: NDArray[np.floating], shape: tuple[int, ...]) -> Part:
-    """Rows and columns of a picture from ``low``, (2,), to before ``high``, (2,)."""
-    first, last = (np.clip(np.floor(at), 0, shape).astype(int).tolist() for at in (low, high))
-    return slice(first[0], last[0]), slice(first[1], last[1])
 
 
 def normal_field(rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None) -> Image:
