@@ -1,10 +1,9 @@
 """What whole episodes say of objects: of known classes, or of none; "most like" counts what is unknown too.
 
-    python benchmarks/strangers.py data/ModelNet10 --split test --objects 250 [--sensor wrist]
+    python benchmarks/strangers.py data/ModelNet10 --split test --objects 250 [--sensor wrist] [--around heavy]
     python benchmarks/strangers.py data/PSB --objects 300 --every-second; YCB --unit m [--models mine]
-    python benchmarks/strangers.py data/ModelNet10 --split test --sensor wrist --around heavy [--named point]
 
-With all defaults, from a random first view; ``around``: each among others of the folder, in drawn scenes of this level.
+With all defaults, from a random first view; ``--around``: each among others of the folder, in drawn scenes of a level.
 """
 
 from pathlib import Path
