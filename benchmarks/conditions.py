@@ -201,9 +201,9 @@ def main(settings: Settings) -> None:
     found: list[list[list[tuple[float, ...]]]] = []
 
     def run() -> Iterator[int]:
-        for _, rows in each(partial(episodes, settings), list(enumerate(entries)), settings.workers):
+        for (_, entry), rows in each(partial(episodes, settings), list(enumerate(entries)), settings.workers):
             if isinstance(rows, WorkerDied):
-                raise rows
+                raise nextview.NextviewError(f"{entry.path}: cannot be recognised ({rows})")
             found.append(rows)
             yield len(found)
 

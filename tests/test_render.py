@@ -159,6 +159,42 @@ def test_an_item_that_kills_its_process_is_the_only_one_lost():
     assert results == {i: i * i for i in range(8) if i != 3}
 
 
+KILLER = """
+import multiprocessing, os, sys
+
+def hook(event, arguments):
+    if event == "open" and str(arguments[0]).endswith("chair_1.off") and multiprocessing.parent_process():
+        os._exit(9)
+
+sys.addaudithook(hook)
+"""
+"""As sitecustomize.py: a worker that opens this mesh dies, as one does that runs out of memory."""
+
+
+def test_a_mesh_that_kills_its_worker_twice_is_left_out_and_listed_and_the_others_are_rendered(meshes, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(KILLER)
+    for mesh in (meshes / "chair/train").glob("chair_[23].off"):
+        mesh.unlink()
+    path = tmp_path / "views.zarr"
+    place = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-m", "nextview", "render", meshes, path, "--viewpoints", "12", "--size", "16"]
+    ran = subprocess.run(
+        [*command, "--workers", "2"], env=os.environ | {"PYTHONPATH": place}, capture_output=True, text=True
+    )
+    assert ran.returncode == 0, ran.stderr
+    said = " ".join((ran.stdout + ran.stderr).split())
+    assert "Traceback" not in said
+    assert "chair_1.off: the process that worked on it died, twice" in said
+
+    store = ViewStore.open(path)
+    assert store.attributes.failures.keys() == {"chair_1"}
+    assert {name for name, done in zip(store.names, store.done, strict=True) if done} == set(store.names) - {"chair_1"}
+
+    # Where nothing kills the worker, the next run renders it, and its reason goes.
+    assert dict(render(meshes, path, ViewSphere.named("12"), 16, workers=0)) == {"chair_1": None}
+    assert not ViewStore.open(path).attributes.failures
+
+
 def test_a_dask_cluster_renders_the_same(furniture, whole, tmp_path):
     distributed = pytest.importorskip("distributed")
     path = tmp_path / "views.zarr"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from pipeline import INTRINSICS, TABLE, box, cast, meshed, pose_at
+from safetensors.numpy import load_file, save_file
 from scipy.spatial.distance import cdist
 from scipy.stats import kstest
 
@@ -16,6 +17,7 @@ from nextview import ModelError, SimulatedCamera, Stopping
 from nextview.cli.episode_table import episode_as_json, print_episode
 from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
+from nextview.files import sha256_of
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import SceneView
 from nextview.learning.unknown import quantiles
@@ -99,6 +101,65 @@ def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_anothe
         path.write_bytes(content)
         with pytest.raises(ModelError, match="not a novelty score"):
             read_novelty(path, hashlib.sha256(content).hexdigest())
+
+
+def with_value(values, value):
+    changed = values.copy()
+    changed.flat[1 % changed.size] = value
+    return changed
+
+
+MUTATIONS = {
+    "gone": lambda values: None,
+    "0-d": lambda values: values.ravel()[0],
+    "one dimension less": lambda values: values[0],
+    "one dimension more": lambda values: values[None],
+    "empty": lambda values: values[:0],
+    "of another type": lambda values: values.astype(np.int32 if values.dtype.kind == "f" else np.float32),
+    "complex": lambda values: values.astype(np.complex64),
+    "NaN": lambda values: with_value(values, np.nan),
+    "infinite": lambda values: with_value(values, np.inf),
+    "minus infinite": lambda values: with_value(values, -np.inf),
+}
+OF_ONE = {
+    ("quantiles", "descending"): lambda values: values[:, ::-1],
+    ("quantiles", "a pair out of order"): lambda values: values[:, [1, 0, *range(2, values.shape[1])]],
+    ("quantiles", "a single one"): lambda values: values[:, :1],
+    ("objects", "none"): lambda values: values * 0,
+    ("objects", "negative"): lambda values: -values,
+    ("objects", "two"): lambda values: np.repeat(values, 2),
+    ("neighbours", "too few"): lambda values: values[: NEIGHBOUR - 1],
+    ("neighbours", "half as long"): lambda values: values / 2,
+    ("neighbours", "a zero vector"): lambda values: np.vstack([values[1:], 0 * values[:1]]),
+    ("standard", "no deviation"): lambda values: values * (1, 0),
+    ("standard", "a negative deviation"): lambda values: values * (1, -1),
+    ("standard", "three"): lambda values: np.vstack([values, values[:1]]),
+}
+FLOATS = ("quantiles", "neighbours", "standard")
+
+
+def mutations():
+    for name in (*FLOATS, "objects"):
+        for how, change in MUTATIONS.items():
+            if name in FLOATS or ("infinite" not in how and how != "NaN"):
+                yield name, how, change
+    for (name, how), change in OF_ONE.items():
+        yield name, how, change
+
+
+@pytest.mark.parametrize(("name", "how", "change"), [pytest.param(*m, id="-".join(m[:2])) for m in mutations()])
+def test_every_value_of_a_novelty_file_is_checked_though_its_hash_is_right(tmp_path, name, how, change):
+    path = tmp_path / "a.novelty.safetensors"
+    some_score(np.random.default_rng(7)).save(path)
+    arrays = load_file(path)
+    read_novelty(path, sha256_of(path))
+
+    changed = change(arrays.pop(name))
+    if changed is not None:
+        arrays[name] = changed
+    save_file({key: np.array(values, order="C") for key, values in arrays.items()}, path)
+    with pytest.raises(ModelError, match=r"^\S+/a\.novelty\.safetensors: not a novelty score \(it\S* .*\)$"):
+        read_novelty(path, sha256_of(path))
 
 
 @pytest.mark.parametrize(("beside", "share"), [(5.0, 0), (2.7, 0), (1.0, 24 / 76), (0.0, 0)])

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.errors import NextviewError, UsageError
+from nextview.errors import ModelError, NextviewError, UsageError
 
 TRACEBACK = "NEXTVIEW_TRACEBACK"  # an environment variable: set, the whole traceback of a plugin's error is printed too
 _NOT_PLUGINS = (f"{Path(__file__).parent}{os.sep}", "<frozen ", *map(sysconfig.get_path, ("stdlib", "purelib")))
@@ -55,6 +55,39 @@ def number(value: Any, what: str, least: float = -np.inf, most: float = np.inf, 
         reach += [f"of at most {most:g}"] * (most < np.inf)
         raise UsageError(f"{what} is a number{' ' if reach else ''}{', '.join(reach)}, not {one_line(repr(value))}")
     return float(value)
+
+
+def check_array(
+    what: str,
+    values: Any,
+    kind: Any,
+    shape: tuple[int | None, ...],
+    finite: bool = True,
+) -> None:
+    """Check an array that was read from a file of weights.
+
+    Args:
+        what: The array in words ("its quantiles"), for the sentence.
+        values: The array.
+        kind: The kind of its numbers: ``np.floating``, ``np.integer`` or one dtype.
+        shape: Its shape; None where any size but zero will do.
+        finite: Whether all values have to be finite.
+
+    Raises:
+        ModelError: it is none, or has other numbers or another shape, or a value is not finite.
+    """
+    if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, kind):
+        raise ModelError(f"{what} are no array of the type {kind.__name__}")
+
+    fits = values.ndim == len(shape)
+    for wanted, there in zip(shape, values.shape, strict=False):
+        fits = fits and (there > 0 if wanted is None else there == wanted)
+    if not fits:
+        sizes = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ModelError(f"{what} have the shape {values.shape}, not ({sizes})")
+
+    if finite and not np.isfinite(values).all():
+        raise ModelError(f"{what} are not all finite numbers")
 
 
 def points(value: Any, what: str) -> NDArray[np.float64]:

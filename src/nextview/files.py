@@ -11,7 +11,7 @@ import shlex
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -194,6 +194,36 @@ def checked_bytes(path: Path, sha256: str, what: str = "weights") -> bytes:
     if hashlib.sha256(content).hexdigest() != sha256:
         raise ModelError(f"{path}: is not the file that its card describes (the SHA-256 differs)")
     return content
+
+
+def arrays_in(content: bytes, names: Sequence[str], where: str) -> dict[str, np.ndarray]:
+    """The arrays of these names in the content of a safetensors file.
+
+    Args:
+        content: What the file holds.
+        names: The arrays that have to be there; others are left out.
+        where: How the sentence of an error begins ("a.safetensors: not a memory").
+
+    Returns:
+        The arrays by name, of any shape and type: whoever asks checks these.
+
+    Raises:
+        ModelError: it is no such file, or an array is missing.
+    """
+    from safetensors import SafetensorError  # here, as most of what imports this module reads no arrays
+    from safetensors.numpy import load
+
+    try:
+        arrays = load(content)
+    except SafetensorError as error:
+        raise ModelError(f"{where} ({error})") from None
+    except KeyError as error:  # a type that NumPy does not have, such as BF16
+        raise ModelError(f"{where} (it holds numbers of the type {error})") from None
+
+    for name in names:
+        if name not in arrays:
+            raise ModelError(f"{where} (it holds no {name})")
+    return {name: arrays[name] for name in names}
 
 
 def command() -> str:

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -21,8 +22,18 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class WorkerDied(str):
-    """The process that worked on an item was killed, or crashed, again when it worked on that item alone; in words."""
+@dataclass(frozen=True)
+class WorkerDied:
+    """The process that worked on an item was killed, or crashed, again when it worked on that item alone.
+
+    Attributes:
+        reason: What happened, in words. ``str`` gives it, too.
+    """
+
+    reason: str
+
+    def __str__(self) -> str:
+        return self.reason
 
 
 def count(workers: int | None) -> int:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nextview.checks import number, whole
 from nextview.data.folders import Entry, Listing, scan_dataset, select
 from nextview.data.measures import depth_entropy
-from nextview.data.pool import count, each
+from nextview.data.pool import WorkerDied, count, each
 from nextview.data.scene_views import SIDE, render_scene
 from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, Attributes, ViewStore, describe, opened, writing
 from nextview.errors import DatasetError, MeshError, UsageError
@@ -124,7 +124,8 @@ def render(
         # Largest files first, so that no worker is left with a long one at the end.
         todo = sorted(np.flatnonzero(~store.done).tolist(), key=lambda i: -entries[i].path.stat().st_size)
         items = [(i, entries[i]) for i in todo]
-        for (i, entry), reason in each(partial(_render_entry, path, options, sensor), items, workers, scheduler):
+        for (i, entry), result in each(partial(_render_entry, path, options, sensor), items, workers, scheduler):
+            reason = f"{entry.path}: {result}" if isinstance(result, WorkerDied) else result
             others = {name: said for name, said in store.attributes.failures.items() if name != entry.name}
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is done.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from nextview.checks import whole
 from nextview.data.folders import list_dataset, select
-from nextview.data.pool import each
+from nextview.data.pool import WorkerDied, each
 from nextview.data.store import writing
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.files import check_new
@@ -108,7 +108,8 @@ def draw_scenes(
         files.setdefault(entry.split, []).append(entry.path.relative_to(dataset).as_posix())
     meshes = {name: Meshes(dataset.absolute(), tuple(sorted(found))) for name, found in files.items()}
     with writing(out):
-        for task, reason in each(partial(_draw, meshes, seed), todo, workers, scheduler):
+        for task, result in each(partial(_draw, meshes, seed), todo, workers, scheduler):
+            reason = f"{task.name}: {result}" if isinstance(result, WorkerDied) else result
             yield task.name, reason
 
 

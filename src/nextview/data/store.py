@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from nextview.data.folders import Entry
-from nextview.data.pool import each
+from nextview.data.pool import WorkerDied, each
 from nextview.errors import DatasetError
 from nextview.files import decode_record, new_folder, only_one
 from nextview.geometry.depth import POINTS
@@ -356,7 +356,8 @@ def check(path: Path, workers: int | None = None, scheduler: str | None = None) 
     for name in store.rendered:
         store.array(name)  # says what is wrong
     objects = np.flatnonzero(store.done).tolist()
-    for i, problem in each(partial(_check_object, path.absolute()), objects, workers, scheduler):
+    for i, result in each(partial(_check_object, path.absolute()), objects, workers, scheduler):
+        problem = f"{path}: {store.names[i]}: {result}" if isinstance(result, WorkerDied) else result
         yield store.names[i], problem
 
 

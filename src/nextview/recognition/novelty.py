@@ -11,17 +11,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
+from safetensors.numpy import save
 
+from nextview.checks import check_array
 from nextview.errors import ModelError
-from nextview.files import checked_bytes, new_file
+from nextview.files import arrays_in, checked_bytes, new_file
 from nextview.geometry.observation import Observation, SceneView
 
 Float = NDArray[np.floating]
 
 ARRAYS = ("quantiles", "objects", "neighbours", "standard")  # in the file of a novelty score
 NEIGHBOUR = 10  # the distance to this one of the nearest known views counts
+ROUNDED = 0.01  # by how much the length of a unit vector in half precision may be off
 HIDDEN = 2.0  # novelty by the share of an outline that is hidden: the least that keeps half hidden objects known
 NEARER, WINDOW = 0.4, 7  # what hides an outline is nearer by so much, object radii, in a window of so many pixels
 
@@ -44,6 +45,20 @@ class Quantiles:
     objects: NDArray[np.int64]
     joint: bool = field(default=False, kw_only=True)
     usual: Float | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        check_array("its quantiles", self.quantiles, np.floating, (None, None))
+        if self.quantiles.shape[1] < 2:
+            raise ModelError("its quantiles are too few")
+        if (np.diff(self.quantiles, axis=1) < 0).any():
+            raise ModelError("its quantiles do not ascend")
+
+        check_array("its objects", self.objects, np.integer, (1,))
+        if self.objects[0] < 1:
+            raise ModelError(f"it is of {self.objects[0]} known objects")
+
+        if self.usual is not None:
+            check_array("its usual", self.usual, np.floating, (None, None))
 
     def p_value(self, score: Float | float, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
         """The share of known objects that are at least as novel after so many views, by the mean score over them.
@@ -91,6 +106,20 @@ class Novelty(Quantiles):
 
     neighbours: Float
     standard: Float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+
+        check_array("its neighbours", self.neighbours, np.floating, (None, None))
+        if len(self.neighbours) < NEIGHBOUR:
+            raise ModelError(f"its neighbours are {len(self.neighbours)}, fewer than {NEIGHBOUR}")
+        lengths = np.linalg.norm(self.neighbours.astype(np.float32), axis=1)
+        if np.abs(lengths - 1).max() > ROUNDED:
+            raise ModelError("its neighbours are no unit vectors")
+
+        check_array("its standard", self.standard, np.floating, (2, 2))
+        if (self.standard[:, 1] <= 0).any():
+            raise ModelError("its standard deviations are not above zero")
 
     def scores(self, embeddings: Float, exact: NDArray[np.bool_] | bool = False) -> NDArray[np.float64]:
         """The novelty score of each view, (B,) float64, from embeddings (B, F): the higher, the more novel.
@@ -154,10 +183,17 @@ def novelty_path(weights: Path) -> Path:
 
 
 def read_novelty(path: Path, sha256: str) -> Novelty:
-    """Read what ``Novelty.save`` wrote."""
+    """Read what ``Novelty.save`` wrote.
+
+    Raises:
+        ModelError: the file is missing, is not that of this hash, or one of its values makes no sense.
+    """
+    content = checked_bytes(path, sha256, "a novelty score")
+    arrays: dict[str, Any] = arrays_in(content, ARRAYS, f"{path}: not a novelty score")
+    if np.issubdtype(arrays["neighbours"].dtype, np.floating):
+        arrays["neighbours"] = arrays["neighbours"].astype(np.float32)
+
     try:
-        arrays = load(checked_bytes(path, sha256, "a novelty score"))
-        read: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
-    except (SafetensorError, KeyError) as error:
+        return Novelty(**arrays)
+    except ModelError as error:
         raise ModelError(f"{path}: not a novelty score ({error})") from None
-    return Novelty(**read | {"neighbours": read["neighbours"].astype(np.float32)})
