@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import box, refused, write_off
+from pipeline import refused, write_off
 from scipy.special import logsumexp
 
 import nextview
@@ -15,8 +15,7 @@ from nextview.cli.main import main
 from nextview.data.predictions import Predictions
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError, NextviewError, UsageError
-from nextview.geometry.mesh import UNITS, load_mesh, make_mesh
-from nextview.geometry.resting import resting_poses, rotated
+from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.learning.learn import learn
 from nextview.policies.base import EpisodeState
@@ -217,15 +216,3 @@ def test_the_policy_goes_where_two_things_differ(place):
     rivals = policy.rivals(joint[0], FORTY.azimuth[current])
     np.testing.assert_array_equal(rivals.classes, [0, 1])
     np.testing.assert_array_equal(rivals.alike, np.arange(40) != place)
-
-
-def test_a_box_rests_on_its_faces_and_keeps_its_size():
-    shape = box((3, 2, 1))
-    brick = make_mesh(shape.vertices, shape.faces, unit="cm")
-    found = resting_poses(brick)
-    np.testing.assert_array_equal(found[0], np.eye(3))
-    ups = np.abs(found[:, 2])
-    assert all(np.isclose(up.max(), 1, atol=1e-6) for up in ups)  # a face is down, never an edge
-    for rotation in found:
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
-        assert rotated(brick, rotation).metres == pytest.approx(np.sqrt(14) / 2 * UNITS["cm"])

@@ -1,0 +1,139 @@
+"""In which poses things rest: each kind of pose once, and none that is likely is forgotten."""
+
+import logging
+
+import numpy as np
+import pytest
+from pipeline import box
+from scipy.spatial import QhullError
+from scipy.spatial.transform import Rotation
+from trimesh import Trimesh, creation
+
+from nextview.geometry.mesh import UNITS, make_mesh
+from nextview.geometry.resting import resting_poses, rotated
+
+SIDE = 24  # faces around things that are round
+
+
+def of(shape):
+    return make_mesh(shape.vertices, shape.faces)
+
+
+def cup(height=2.0, top=1.0, bottom=0.8):
+    """A cup without a handle: a closed frustum of a cone."""
+    shape = creation.cylinder(1, height, sections=SIDE)
+    shape.vertices[:, :2] *= np.where(shape.vertices[:, 2:] > 0, top, bottom)
+    return shape
+
+
+def with_handle():
+    return Trimesh(*_joined(cup(), creation.box((0.9, 0.25, 1.2)).apply_translation((1.2, 0, 0))))
+
+
+def _joined(first, second):
+    faces = np.concatenate([first.faces, second.faces + len(first.vertices)])
+    return np.concatenate([first.vertices, second.vertices]), faces
+
+
+def plate(points):
+    """A sheet without thickness, cut along a polygon that is seen whole from its first corner."""
+    fan = [(0, k, k + 1) for k in range(1, len(points) - 1)]
+    return Trimesh(np.pad(np.array(points, float), ((0, 0), (0, 1))), fan, process=False)
+
+
+def test_a_box_rests_on_its_faces_and_keeps_its_size():
+    shape = box((3, 2, 1))
+    brick = make_mesh(shape.vertices, shape.faces, unit="cm")
+    found = resting_poses(brick)
+    assert len(found) == 3  # of its six sides two and two look alike
+    np.testing.assert_array_equal(found[0], np.eye(3))
+    np.testing.assert_allclose(sorted(np.abs(found[:, 2]).tolist()), np.eye(3)[::-1], atol=1e-6)
+    for rotation in found:
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+        assert rotated(brick, rotation).metres == pytest.approx(np.sqrt(14) / 2 * UNITS["cm"])
+
+
+@pytest.mark.parametrize(
+    ("shape", "tilts"),  # between the axis of the shape and the vertical, in each pose, degrees
+    [
+        (creation.cylinder(1, 2, sections=SIDE), [0, 90]),
+        (creation.cylinder(1, 0.1, sections=SIDE), [0]),
+        (cup(1.6), [0, 0, 83]),  # upside down, too
+        (plate([(0, 0), (2, 0), (2, 1), (0, 1)]), [0]),
+        (
+            plate([(0, 0), (3, 0), (3, 0.5), (0.5, 0.5), (0.5, 1.5), (0, 1.5)]),
+            [0, 0],
+        ),  # its back is a mirror image
+    ],
+)
+@pytest.mark.parametrize("turn", [(0, 0, 0), (40, 30, 70)])
+def test_poses_that_look_alike_are_one_however_the_file_has_the_thing(shape, tilts, turn):
+    away = Rotation.from_euler("zxz", turn, degrees=True)
+    mesh = of(Trimesh(away.apply(shape.vertices), shape.faces, process=False))
+    upwards = np.abs(resting_poses(mesh) @ away.apply((0, 0, 1)))[:, 2]
+    found = np.degrees(np.arccos(upwards.clip(max=1)))
+    expected = [turn[1], *tilts] if any(turn) else tilts  # its own pose is always among them, and the first
+    np.testing.assert_allclose(sorted(found), sorted(expected), atol=5)
+    assert found[0] == pytest.approx(expected[0], abs=1e-3)
+
+
+@pytest.mark.parametrize("shape", [creation.icosphere(3), creation.box((1, 1, 1)), creation.icosphere(1)])
+def test_a_ball_and_a_die_have_one_pose(shape):
+    assert len(resting_poses(of(shape))) == 1
+
+
+def test_a_handle_makes_sides_different():
+    round_one = resting_poses(of(cup()))
+    handled = resting_poses(of(with_handle()))
+    lying = [rotation for rotation in handled if abs(rotation[2, 2]) < 0.5]
+    assert len(lying) > sum(abs(rotation[2, 2]) < 0.5 for rotation in round_one) == 1
+
+
+def test_what_falls_on_its_side_in_most_throws_has_that_pose():
+    """Dropped from random directions, by brute force: what points down decides on which face it lands."""
+    rng = np.random.default_rng(3)
+    for shape in (cup(1.5), creation.cylinder(0.4, 2, sections=SIDE), with_handle()):
+        mesh = of(shape)
+        ups = resting_poses(mesh)[:, 2]
+        hull = Trimesh(mesh.vertices).convex_hull
+        landed = [_rest(hull, direction) for direction in rng.normal(size=(300, 3))]
+        tilts = np.arccos(np.clip(landed @ np.array([0, 0, 1.0]), -1, 1))
+        covered = np.abs(tilts[:, None] - np.arccos(ups[:, 2])[None]).min(1) < np.radians(20)
+        assert covered.mean() > 0.7
+
+
+def _rest(hull, down):
+    """The direction up after a thing fell with ``down`` ahead: it rolls over edges until its weight is above a face."""
+    for _ in range(100):
+        face = int((hull.face_normals @ down / np.linalg.norm(down)).argmax())
+        corners, normal = hull.triangles[face], hull.face_normals[face]
+        foot = hull.center_mass + normal * ((corners[0] - hull.center_mass) @ normal)
+        edges = np.roll(corners, -1, 0) - corners
+        inside = np.cross(edges, foot - corners) @ normal
+        if inside.min() >= -1e-9:
+            return -normal
+        worst = int(inside.argmin())
+        pair = (hull.face_adjacency == face).any(1)
+        shared = hull.face_adjacency_edges[pair]
+        ends = {tuple(np.round(corners[worst], 6)), tuple(np.round(corners[(worst + 1) % 3], 6))}
+        for faces, edge in zip(hull.face_adjacency[pair], shared, strict=True):
+            if {tuple(np.round(point, 6)) for point in hull.vertices[edge]} == ends:
+                down = hull.face_normals[int(faces[faces != face][0])]
+    return -normal
+
+
+def test_a_fallback_is_logged(monkeypatch, caplog):
+    def fails(self):
+        raise QhullError("QH6154 initial simplex is flat\nmore lines")
+
+    monkeypatch.setattr(Trimesh, "convex_hull", property(fails))
+    with caplog.at_level(logging.WARNING, "nextview"):
+        np.testing.assert_array_equal(resting_poses(of(cup())), np.eye(3)[None])
+    assert "no convex hull (QH6154 initial simplex is flat); it is taken to lie only as in its file" in caplog.text
+
+    def another(self):
+        raise RuntimeError("a fault of another kind")
+
+    monkeypatch.setattr(Trimesh, "convex_hull", property(another))
+    with pytest.raises(RuntimeError, match="another kind"):
+        resting_poses(of(cup()))
