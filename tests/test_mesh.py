@@ -228,7 +228,7 @@ def test_a_mesh_is_the_same_with_copies_of_its_triangles():
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 MANY_TIMES = one_triangle(scenes=[{"nodes": list(range(101))}], nodes=101 * [{"mesh": 0}])
 BROKEN = {
-    "no faces": ("a.off", "OFF\n3 0 0\n" + GOOD, "no faces"),
+    "no faces": ("a.off", "OFF\n3 0 0\n" + GOOD, "holds 3 points and no faces"),
     "index too high": ("a.off", off(GOOD, "3 0 1 3"), "outside of the 3"),
     "too few corners": ("a.off", off(GOOD, "3 0 1"), "face 0 has 2 of 3 corners"),
     "NaN": ("a.off", off("0 0 nan\n1 0 0\n0 1 0", "3 0 1 2"), "1 vertices are NaN or infinite"),
@@ -248,7 +248,7 @@ BROKEN = {
     "OBJ index of no vertex yet": ("a.obj", f"f -1 1 2\n{OBJ}", "0 come before it"),
     "OBJ cut in a face": ("a.obj", OBJ + "f 1 2 3\nf 1 2", "cut short"),
     "PLY index too high": ("a.ply", ply(1, GOOD + "\n3 0 1 3\n"), "vertex 3"),
-    "PLY points": ("a.ply", trimesh.PointCloud(np.eye(3)).export(file_type="ply"), "no vertices"),
+    "PLY points": ("a.ply", trimesh.PointCloud(np.eye(3)).export(file_type="ply"), "holds 3 points and no faces"),
     "PLY of more rows than lines": ("a.ply", ply(BIG, GOOD + "\n3 0 1 2\n"), "cut short"),
     "PLY of a list longer than the file": ("a.ply", ply(1, GOOD + f"\n{BIG} 0 1 2\n"), ""),
     "STL cut in its second solid": ("a.stl", 2 * exported(wedge(), "stl_ascii")[:-30] + b"\n", "cut short"),

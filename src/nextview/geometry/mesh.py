@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from nextview.checks import one_line, whole
 from nextview.errors import MeshError
 from nextview.files import regular_file
-from nextview.geometry.mesh_file import check_faces, read_by_trimesh, read_obj, read_off
+from nextview.geometry.mesh_file import READERS
+from nextview.geometry.triangles import MAX_FACES, check_faces, no_faces
 
-MAX_FACES = 10_000_000  # triangles that a mesh may have if nothing else is asked for
 BYTES_PER_FACE = 60  # how many bytes a mesh file may have for each triangle that it may have
-FORMATS = (".off", ".obj", ".ply", ".stl", ".glb")
+FORMATS = tuple(READERS)
 UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}  # of length, metres
 FLAT = 1e-12  # twice the area, square object radii, below which a face counts as a line: rounding makes up to 1e-15
 
@@ -122,18 +122,17 @@ def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None, 
         data = path.read_bytes()
         if not data.strip():
             raise MeshError("the file is empty")
-        if suffix in (".off", ".obj"):
-            vertices, faces = read_off(data) if suffix == ".off" else read_obj(data)
-        else:
-            vertices, faces = read_by_trimesh(data, suffix[1:], max_faces)
+        vertices, faces = READERS[suffix](data, max_faces)
         check_faces(len(faces), max_faces)
+        if len(faces) == 0 and len(vertices):
+            raise MeshError(no_faces(len(vertices)))
     except OSError as error:
         raise MeshError(f"{path}: cannot be read ({error.strerror})") from None
     except MemoryError:
         raise MeshError(f"{path}: too large for this machine's memory") from None
-    except Exception as error:  # trimesh raises whatever a broken file leads to
+    except (ValueError, OverflowError) as error:  # MeshErrors, and numbers that are none or too large
         reason = str(error) if isinstance(error, MeshError) else f"{type(error).__name__}: {error}"
-        raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({one_line(reason, 160)})") from None
+        raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({one_line(reason, 240)})") from None
     if (up or ("y" if suffix == ".glb" else "z")) == "y":
         vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)
     return make_mesh(vertices, faces, str(path), unit)

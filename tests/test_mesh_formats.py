@@ -1,0 +1,262 @@
+"""Mesh files as editors save them and exporters write them: encodings, line ends, kinds of PLY and STL."""
+
+import codecs
+import itertools
+import re
+
+import numpy as np
+import pytest
+
+from nextview.errors import MeshError
+from nextview.geometry.mesh import load_mesh
+
+# A house: a box with a ridge on it, of triangles, quads and pentagons. Its last vertex is used by no face.
+POINTS = np.array(
+    [(x, y, z) for x in (0.0, 3.0) for y, z in ((0, 0), (2, 0), (2, 1), (1, 2), (0, 1))] + [(9.0, 9.0, 9.0)]
+)
+SIDES = [[k, 5 + k, 5 + (k + 1) % 5, (k + 1) % 5] for k in range(5)]
+FACES = [[0, 1, 2, 3, 4], [9, 8, 7, 6, 5], *SIDES[:-1], [4, 9, 5], [4, 5, 0]]
+AREA = 2 * 3.0 + 3 * (2 + 1 + 1 + 2 * np.sqrt(2))
+
+
+def same_house(mesh) -> None:
+    """Whether a mesh is the house, which is closed, in the units of the file."""
+    assert len(mesh.vertices) in (10, 3 * len(mesh.faces))
+    a, b, c = (mesh.vertices[corner] * mesh.radius for corner in mesh.faces.T)
+    assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(AREA, rel=1e-5)
+    np.testing.assert_allclose(mesh.centre, (1.5, 1, 1), atol=1e-6)
+
+
+def numbers(row) -> str:
+    return " ".join(f"{value:g}" for value in row)
+
+
+def triangles() -> list[list[int]]:
+    return [[face[0], b, c] for face in FACES for b, c in itertools.pairwise(face[1:])]
+
+
+def as_obj(name="") -> str:
+    rows = [f"v {numbers(p)}" for p in POINTS] + [f"o {name}"] * bool(name)
+    return "\n".join(rows + ["f " + numbers(np.add(face, 1)) for face in FACES]) + "\n"
+
+
+def as_off(name="") -> str:
+    rows = [*map(numbers, POINTS), *(numbers([len(face), *face]) for face in FACES)]
+    return "\n".join([f"OFF # {name}", f"{len(POINTS)} {len(FACES)} 0", *rows]) + "\n"
+
+
+def as_ply(name="") -> str:
+    header = [f"ply\nformat ascii 1.0\ncomment {name}\nelement vertex {len(POINTS)}"]
+    header += [f"property float {axis}" for axis in "xyz"]
+    header += [f"element face {len(FACES)}", "property list uchar int vertex_indices", "end_header"]
+    return "\n".join([*header, *map(numbers, POINTS), *(numbers([len(face), *face]) for face in FACES)]) + "\n"
+
+
+def as_stl(name="", end="endsolid", normal="facet normal 0 0 0") -> str:
+    loops = ["\n".join(f"vertex {numbers(POINTS[i])}" for i in triangle) for triangle in triangles()]
+    facets = [f"{normal}\nouter loop\n{loop}\nendloop\nendfacet" for loop in loops]
+    return "\n".join([f"solid {name}", *facets, f"{end} {name}"]) + "\n"
+
+
+TEXTS = {"obj": as_obj, "off": as_off, "ply": as_ply, "stl": as_stl}
+ENCODINGS = {
+    "UTF-8": (b"", "utf-8"),
+    "UTF-8 with a mark": (codecs.BOM_UTF8, "utf-8"),
+    "UTF-16 LE": (codecs.BOM_UTF16_LE, "utf-16-le"),
+    "UTF-16 BE": (codecs.BOM_UTF16_BE, "utf-16-be"),
+    "UTF-16 LE without a mark": (b"", "utf-16-le"),
+    "UTF-16 BE without a mark": (b"", "utf-16-be"),
+    "UTF-32 LE": (codecs.BOM_UTF32_LE, "utf-32-le"),
+    "UTF-32 BE": (codecs.BOM_UTF32_BE, "utf-32-be"),
+    "Latin-1": (b"", "latin-1"),
+}
+
+
+@pytest.mark.parametrize("ends", ["\n", "\r\n", "\r"], ids=["LF", "CRLF", "CR"])
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("kind", TEXTS)
+def test_a_text_in_any_encoding_is_the_same_mesh(tmp_path, kind, encoding, ends):
+    mark, codec = ENCODINGS[encoding]
+    path = tmp_path / f"house.{kind}"
+    path.write_bytes(mark + TEXTS[kind]("B\xfcro \xb5").replace("\n", ends).encode(codec))
+    same_house(load_mesh(path))
+
+
+@pytest.mark.parametrize("kind", TEXTS)
+def test_a_text_that_is_not_in_the_encoding_that_it_announces_is_refused(tmp_path, kind):
+    path = tmp_path / f"house.{kind}"
+    path.write_bytes(codecs.BOM_UTF16_LE + TEXTS[kind]().encode("utf-16-le") + b"\x00\xd8\x20")
+    with pytest.raises(MeshError, match="begins as UTF-16-LE text, but is none"):
+        load_mesh(path)
+
+
+# PLY
+
+
+def binary_ply(order="<", count="u1", index="i4", extra=(), lists=(), faces=FACES, points=POINTS) -> bytes:
+    """The house in binary, with columns beside those that are needed, and lists of three floats before the corners."""
+    names = {"u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short", "u4": "uint", "i4": "int", "f4": "float"}
+    names |= {"u8": "uint64", "f8": "double"}
+    header = [f"ply\nformat binary_{'little' if order == '<' else 'big'}_endian 1.0\nobj_info made by a test"]
+    header += [f"element camera 2\nproperty list {names[count]} short pixels\nproperty double focal"]
+    header += [f"element vertex {len(points)}", *(f"property float {axis}" for axis in "xyz")]
+    header += [f"property uchar {name}" for name in extra] + [f"element face {len(faces)}"]
+    header += [f"property list {names[count]} float {name}" for name in lists]
+    header += [f"property list {names[count]} {names[index]} vertex_index"]
+    header += [f"property uchar {name}" for name in extra] + ["end_header\n"]
+
+    def column(values, kind):
+        return np.array(values, order + kind).tobytes()
+
+    body = b"".join(column([n], count) + column(range(n), "i2") + column([1.5], "f8") for n in (2, 3))
+    body += b"".join(column(point, "f4") + bytes(len(extra)) for point in points)
+    for face in faces:
+        body += len(lists) * (column([3], count) + column([7, 8, 9], "f4"))
+        body += column([len(face)], count) + column(face, index) + bytes(len(extra))
+    return "\n".join(header).encode() + body
+
+
+@pytest.mark.parametrize("order", ["<", ">"], ids=["little endian", "big endian"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        {},
+        {"count": "i4", "index": "u4"},
+        {"count": "u2", "index": "i2"},
+        {"count": "i1", "index": "u1"},
+        {"count": "u4", "index": "u8"},
+        {"extra": ("red", "green", "blue")},
+        {"lists": ("texcoord",)},
+        {"count": "u4", "extra": ("quality",), "lists": ("texcoord", "weights")},
+        {"faces": triangles()},
+        {"faces": triangles(), "extra": ("red",), "lists": ("texcoord",)},
+    ],
+    ids=str,
+)
+def test_every_kind_of_binary_ply(tmp_path, order, how):
+    path = tmp_path / "house.ply"
+    path.write_bytes(binary_ply(order, **how))
+    same_house(load_mesh(path))
+    path.write_bytes(binary_ply(order, **how) + b"\0 what a program puts at the end")
+    same_house(load_mesh(path))
+
+
+def test_a_binary_ply_cut_anywhere_in_its_rows_is_refused(tmp_path):
+    path = tmp_path / "house.ply"
+    whole = binary_ply(extra=("red",))
+    for length in range(whole.index(b"end_header") + 11, len(whole) - 1, 3):
+        path.write_bytes(whole[:length])
+        with pytest.raises(MeshError, match="cut short"):
+            load_mesh(path)
+
+
+STRIPS = [[0, 1, 2, 3, -1, 3, 2, 4], [4, 5, 4, 6, 7]]  # the second one turns: it names a vertex twice
+STRIP_TRIANGLES = [(0, 1, 2), (2, 1, 3), (3, 2, 4), (4, 5, 6), (4, 6, 7)]
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_triangle_strips(tmp_path, text):
+    points = np.array([(k, k % 2, k * k / 9) for k in range(8)], float)
+    header = f"ply\nformat {'ascii' if text else 'binary_little_endian'} 1.0\nelement vertex 8\n"
+    header += "property double x\nproperty double y\nproperty double z\nelement tristrips 2\n"
+    header += "property list int int vertex_indices\nend_header\n"
+    body = "\n".join([*map(numbers, points), *(numbers([len(s), *s]) for s in STRIPS)]).encode()
+    if not text:
+        body = points.tobytes() + b"".join(np.array([len(s), *s], "<i4").tobytes() for s in STRIPS)
+    path = tmp_path / "strips.ply"
+    path.write_bytes(header.encode() + body)
+    mesh = load_mesh(path)
+    found = (mesh.vertices * mesh.radius + mesh.centre)[mesh.faces]
+    for triangle, corners in zip(STRIP_TRIANGLES, found, strict=True):
+        np.testing.assert_allclose(corners, [(k, k % 2, round(k * k / 9, 5)) for k in triangle], atol=1e-4)
+
+
+def header_of(*lines: str) -> str:
+    return (
+        "\n".join(["ply", "format ascii 1.0", "element vertex 3", *lines, "end_header", "0 0 0\n1 0 0\n0 1 0"]) + "\n"
+    )
+
+
+XYZ = ("property float x", "property float y", "property float z")
+CORNERS = "property list uchar int vertex_indices"
+REFUSED = {
+    "points": (header_of(*XYZ), "holds 3 points and no faces; .*Compute Normals"),
+    "points and an empty table of faces": (header_of(*XYZ, "element face 0", CORNERS), "holds 3 points and no faces"),
+    "points with normals": (
+        re.sub(r"(?m)^(\d \d \d)$", r"\1 0 0 1", header_of(*XYZ, *(f"property float n{axis}" for axis in "xyz"))),
+        "holds 3 points with normals and no faces; .*Screened Poisson",
+    ),
+    "splats": (re.sub(r"(?m)^(\d \d \d)$", r"\1 9", header_of(*XYZ, "property float f_dc_0")), "Gaussian splats"),
+    "a range grid": (header_of(*XYZ, "element range_grid 2", CORNERS) + "1 0\n0\n", "range grid.* one depth image"),
+    "no positions": (header_of("property float u", "property float v", "property float w"), "have no x, y, z"),
+    "an unknown type": (header_of("property quad x"), "property quad x"),
+    "an index that is none": (header_of(*XYZ, "element face 1", CORNERS) + "3 0 1 1.5\n", "no whole number"),
+    "a row too long": (header_of(*XYZ, "element face 1", CORNERS) + "3 0 1 2 7\n", "row 0 of element face has 5"),
+    "a list of less than nothing": (header_of(*XYZ, "element face 1", CORNERS) + "-3 0 1 2\n", "a list of -3"),
+    "a word": (header_of(*XYZ, "element face 1", CORNERS) + "3 0 one 2\n", "something else than numbers"),
+    "less than no rows": (header_of(*XYZ, "element face -1", CORNERS), "announces -1 rows"),
+    "no format": ("ply\nelement vertex 1\nend_header\n0\n", "binary_big_endian, not missing"),
+    "a binary file saved as text": (
+        codecs.BOM_UTF16_LE + binary_ply().decode("latin-1").encode("utf-16-le"),
+        "binary file that was saved as UTF-16-LE text",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_ply_that_is_no_mesh_is_called_what_it_is(tmp_path, case, capfd):
+    content, sentence = REFUSED[case]
+    path = tmp_path / "a.ply"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(MeshError, match=f"a.ply: .*{sentence}"):
+        load_mesh(path)
+    assert capfd.readouterr() == ("", "")
+
+
+# STL
+
+
+@pytest.mark.parametrize("end", ["endsolid", "end solid", "  ENDSOLID", "EndSolid"])
+@pytest.mark.parametrize("name", ["", "vertex", "a vertex 1 2 3", "endsolid", "my endsolid endloop", "solid solid"])
+@pytest.mark.parametrize("normal", ["facet normal 0 0 1", "facet normal nan nan nan", "facet", ""])
+def test_stl_texts_with_any_name_and_without_normals(tmp_path, name, end, normal, capfd):
+    path = tmp_path / "house.stl"
+    path.write_text(as_stl(name, end, normal))
+    same_house(load_mesh(path))
+    path.write_text(as_stl(name, end, normal).upper().replace("NAN", "nan"))
+    same_house(load_mesh(path))
+    assert capfd.readouterr() == ("", "")
+
+
+def binary_stl(header=b"", after=b"", announced=None) -> bytes:
+    facets = b"".join(np.array([(0, 0, 0), *POINTS[triangle]], "<f4").tobytes() + b"\0\0" for triangle in triangles())
+    count = len(triangles()) if announced is None else announced
+    return header.ljust(80, b"\0") + np.uint32(count).tobytes() + facets + after
+
+
+@pytest.mark.parametrize("header", [b"", b"solid", b"solid with a vertex", b"\xfe\xff", b"s\0o\0l\0i\0d\0"])
+@pytest.mark.parametrize("after", [b"", b"\n", b"end of the file"])
+def test_binary_stl_with_any_header_and_bytes_after_its_end(tmp_path, header, after):
+    path = tmp_path / "house.stl"
+    path.write_bytes(binary_stl(header, after))
+    same_house(load_mesh(path))
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (binary_stl(announced=3), "announces 3 faces, but holds 16"),
+        (binary_stl(announced=0), "announces 0 faces, but holds 16"),
+        (binary_stl(announced=17), "cut short"),
+        (binary_stl()[:60], "cut short"),
+        (as_stl().replace("endsolid", "").encode(), "endsolid is missing"),
+        (as_stl().replace("endloop", "").encode(), "endloop is missing"),
+        (as_stl().replace("vertex 0 0 0", "vertex 0 0", 1).encode(), "numbers"),
+        (as_stl().replace("vertex 0 0 0", "vertex 0 0 0x", 1).encode(), "numbers"),
+    ],
+)
+def test_a_damaged_stl_is_refused(tmp_path, content, sentence):
+    path = tmp_path / "a.stl"
+    path.write_bytes(content)
+    with pytest.raises(MeshError, match=f"a.stl: .*{sentence}"):
+        load_mesh(path)
