@@ -1,9 +1,15 @@
-"""What whole episodes say of objects: of known classes, or of none; "most like" counts what is unknown too.
+"""Whole episodes with all defaults: how often objects are named, named right, and called unknown.
 
-    python benchmarks/strangers.py data/ModelNet10 --split test --objects 250 [--sensor wrist] [--around heavy]
-    python benchmarks/strangers.py data/PSB --objects 300 --every-second; YCB --unit m [--models mine]
+    python benchmarks/strangers.py data/ModelNet10 --split test --draws 3 [--sensor wrist] [--aligned]
+    python benchmarks/strangers.py data/PSB --objects 300 --every-second
+    python benchmarks/strangers.py YCB --unit m [--models mine]
+    python benchmarks/strangers.py data/ModelNet10 --split test --objects 60 --around heavy
 
-With all defaults, from a random first view; ``--around``: each among others of the folder, in drawn scenes of a level.
+Each object is turned about the vertical by a random angle, as real objects are, unless ``--aligned``
+leaves it as its file has it. An episode begins at a random view. With ``--around`` the object stands
+among others of the folder, in drawn scenes of a level of clutter. "Most like" also counts objects
+that were called unknown. ``--draws`` episodes are run with each object; each has its own angle, first
+view and sensor noise.
 """
 
 from pathlib import Path
@@ -13,13 +19,21 @@ import numpy as np
 import tyro
 
 import nextview
+from nextview.benchmark.statistics import interval, resample
 from nextview.cli.progress import track
-from nextview.data.folders import list_dataset
+from nextview.data.folders import Entry, list_dataset
 from nextview.data.scene_drawing import Meshes, draw_scene
 from nextview.errors import DatasetError
+from nextview.geometry.observation import Camera
+from nextview.geometry.resting import rotated
+from nextview.geometry.viewsphere import rotation_z
+from nextview.session.session import FrameCamera
 from nextview.simulation.robot_camera import Named, RobotCamera
 from nextview.simulation.scene import build_scene
 from nextview.simulation.sensed_camera import SensedCamera
+
+BOOTSTRAP_SAMPLES = 1000
+REPORTED = ("unknown", "named right", "most like their class", "named and confident")
 
 
 def main(
@@ -32,40 +46,77 @@ def main(
     around: Literal["light", "medium", "heavy"] | None = None,
     named: Named = "mask",
     unit: str | None = None,
+    aligned: bool = False,
+    draws: int = 1,
+    unknown: float | None = None,
     seed: int = 0,
 ) -> None:
-    system, rng = nextview.load(models=models), np.random.default_rng(seed)
-    entries = [e for e in list_dataset(meshes) if split in (None, e.split)]
-    if every_second:  # of the classes, by the alphabet: the others chose the score
-        judged = sorted({e.label for e in entries})[1::2]
-        entries = [e for e in entries if e.label in judged]
-    place = {e.name: e.path.relative_to(meshes).as_posix() for e in entries}
-    others = Meshes(meshes, tuple(sorted(place.values())))
-    entries = [entries[i] for i in np.sort(rng.permutation(len(entries))[:objects])]
-    found = []
+    """Run episodes with the objects of a folder and print what they ended with."""
+    system = nextview.load(models=models, unknown=unknown)
+    entries = [entry for entry in list_dataset(meshes) if split in (None, entry.split)]
+    if every_second:
+        # Every second class by the alphabet: the other classes chose the novelty score.
+        judged = sorted({entry.label for entry in entries})[1::2]
+        entries = [entry for entry in entries if entry.label in judged]
+
+    places = {entry.name: entry.path.relative_to(meshes).as_posix() for entry in entries}
+    others = Meshes(meshes, tuple(sorted(places.values())))
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(entries))[:objects])
+    entries = [entries[i] for i in chosen]
+
+    def camera_before(entry: Entry, draw: int, rng: np.random.Generator) -> Camera | FrameCamera | None:
+        if around is not None:
+            scene = f"{entry.name}@{around}-{draw}"
+            try:
+                layout = draw_scene(places[entry.name], others, around, seed, scene)
+            except DatasetError:  # no scene of this level was found around the object
+                return None
+            return RobotCamera(build_scene(layout, meshes), sensor or "none", named)
+
+        mesh = nextview.load_mesh(entry.path, unit=unit)
+        if not aligned:
+            mesh = rotated(mesh, rotation_z(rng.uniform(0, 2 * np.pi)))
+        if sensor is None:
+            return nextview.SimulatedCamera(mesh)
+        return SensedCamera(mesh, sensor, rng)
+
+    # One row of outcomes for each object; each holds the means over its episodes.
+    rows, labels = [], []
 
     def work():
         for done, entry in enumerate(entries, 1):
-            own = np.random.default_rng([seed, done])
-            if around is None:
-                mesh = nextview.load_mesh(entry.path, unit=unit)
-                camera = nextview.SimulatedCamera(mesh) if sensor is None else SensedCamera(mesh, sensor, own)
-            else:
-                try:
-                    layout = draw_scene(place[entry.name], others, around, seed, f"{entry.name}@{around}-0")
-                except DatasetError:  # no scene of this level is found around it
+            outcomes = []
+            for draw in range(draws):
+                rng = np.random.default_rng([seed, done, draw])
+                camera = camera_before(entry, draw, rng)
+                if camera is None:
                     continue
-                camera = RobotCamera(build_scene(layout, meshes), sensor or "none", named)
-            session = system.session_with(camera, None, int(own.integers(2**32)))
-            session.reachable = getattr(camera, "reachable", None)
-            result = session.run(camera)
-            right = entry.label == result.most_like
-            found.append((not result.unknown, result.confident, right and not result.unknown, right, len(result.views)))
+                session = system.session_with(camera, None, int(rng.integers(2**32)))
+                session.reachable = getattr(camera, "reachable", None)
+                result = session.run(camera)
+                most_like = entry.label == result.most_like
+                named_right = most_like and not result.unknown
+                sure = result.confident and not result.unknown
+                outcomes.append((result.unknown, named_right, most_like, sure, len(result.views)))
+            if outcomes:
+                rows.append(np.mean(outcomes, axis=0))
+                labels.append(entry.label)
             yield done
 
     track(work(), len(entries), f"episodes of {meshes.name}")
-    shown = "{:.3f} named, {:.3f} named and confident, {:.3f} right, {:.3f} most like their class; {:.2f} views"
-    print(f"{len(found)} objects: " + shown.format(*np.mean(found, 0)))
+    table = np.array(rows)
+    weights = resample(len(table), BOOTSTRAP_SAMPLES, np.random.default_rng(seed))
+    low, high = interval(weights @ table / weights.sum(1, keepdims=True))
+
+    print(f"{len(table)} objects, {draws} episodes each")
+    for column, name in enumerate(REPORTED):
+        mean = table[:, column].mean()
+        print(f"{name:22} {mean:.3f} ({low[column]:.3f}-{high[column]:.3f})")
+    print(f"{'views':22} {table[:, -1].mean():.2f}")
+
+    of_class = np.array(labels)
+    shares = [f"{label} {table[of_class == label, 0].mean():.3f}" for label in sorted(set(labels))]
+    print("unknown by class: " + ", ".join(shares))
 
 
 if __name__ == "__main__":

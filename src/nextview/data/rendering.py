@@ -21,7 +21,7 @@ from nextview.files import command, sha256_of
 from nextview.geometry.depth import POINTS
 from nextview.geometry.mesh import FORMATS, MAX_FACES, UNITS, Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Camera
-from nextview.geometry.viewsphere import DISTANCE, ViewSphere
+from nextview.geometry.viewsphere import DISTANCE, ViewSphere, rotation_z
 from nextview.sensing.observed_object import SIZE
 from nextview.simulation.robot_camera import sensed_camera
 from nextview.simulation.scene import build_scene
@@ -52,9 +52,8 @@ class Deform:
     def __call__(self, mesh: Mesh, seed: int, name: str) -> Mesh:
         """The new object, normalised again."""
         factors, angle = self.draw(seed, name)
-        c, s = np.cos(angle), np.sin(angle)
-        rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        return make_mesh((mesh.vertices * mesh.radius * factors) @ rotation.T, mesh.faces, mesh.name)
+        stretched = mesh.vertices * mesh.radius * factors
+        return make_mesh(stretched @ rotation_z(angle).T, mesh.faces, mesh.name)
 
 
 def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np.ndarray]:

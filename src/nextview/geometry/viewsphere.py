@@ -24,6 +24,13 @@ MOST = 5_000  # viewpoints that there may be: distances between all of them are 
 SNAP = 1e-6  # radians within which a camera stands at a candidate. What is more is a place of its own
 
 
+def rotation_z(angle: float) -> Float:
+    """Returns the rotation about +z by an angle in radians, counter-clockwise, (3, 3) float64."""
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
 def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = DISTANCE) -> Float:
     """Camera-to-world poses, (..., 4, 4) float64, of cameras that look at the origin with the horizon level.
 

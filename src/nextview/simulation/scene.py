@@ -12,6 +12,7 @@ from nextview.checks import points
 from nextview.errors import DatasetError, MeshError
 from nextview.files import regular_file, sha256_of
 from nextview.geometry.mesh import MAX_FACES, Mesh, load_mesh
+from nextview.geometry.viewsphere import rotation_z
 from nextview.simulation.scene_layout import Block, Placement, SceneLayout
 
 Float = NDArray[np.float64]
@@ -103,8 +104,7 @@ def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FA
 
 def place(mesh: Mesh, at: Placement, floor: float) -> Item:
     """A mesh, in its own frame and radii, rotated, scaled and stood on the table."""
-    c, s = np.cos(at.azimuth), np.sin(at.azimuth)
-    vertices = at.radius * mesh.vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
+    vertices = at.radius * mesh.vertices @ rotation_z(at.azimuth).T
     vertices += (at.x, at.y, floor - vertices[:, 2].min())
     return Item(vertices, mesh.faces, footprint(vertices))
 
