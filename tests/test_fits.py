@@ -346,7 +346,7 @@ def test_what_is_fitted_finds_the_strange_and_keeps_the_rate_that_was_asked_for(
         return objects(n, centres[labels]), labels
 
     learned, _ = known(600)
-    score = fit_novelty(learned.transpose(1, 0, 2, 3).reshape(2, -1, 12), *known(400))
+    score = fit_novelty(learned, *known(400))
     fresh, _ = known(2000)
     strange = objects(500, np.tile(6 * np.eye(12)[7], (500, 1)))
     for n in (1, 3):

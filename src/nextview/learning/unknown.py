@@ -1,4 +1,4 @@
-"""Learn to notice objects of no known class: what objects of the known ones look like, and how novel others of them."""
+"""Learn to notice objects of no known class, from views of known objects and of other objects of the same classes."""
 
 import zlib
 from collections.abc import Iterator
@@ -7,29 +7,46 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from nextview.data.folders import Entry, list_dataset
 from nextview.data.pool import WorkerDied, each
 from nextview.data.progress import Track, silently
+from nextview.data.rendering import Deform
 from nextview.errors import DatasetError, MeshError
 from nextview.geometry.mesh import load_mesh
-from nextview.geometry.viewsphere import ViewSphere
+from nextview.geometry.observation import Camera
+from nextview.geometry.viewsphere import look_at_origin
 from nextview.learning.fitting_set import card_to_fit
 from nextview.learning.teaching import embeddings
-from nextview.recognition.novelty import Novelty, novelty_path
+from nextview.recognition.novelty import Novelty, as_stored, novelty_path
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 
 Float32 = NDArray[np.float32]
-LEARNED_VIEWS, HELD_OUT_VIEWS = 2, 5
-"""Views of each object without a sensor's errors, and as many through it."""
+REMEMBERED_VIEWS = 3
+"""Remembered views of each known object as its mesh has it, and as many of a stretched copy."""
+CALIBRATION_VIEWS = 5
+"""Views of each held-out object, for each of ``CONDITIONS``."""
+MAX_ELEVATION = np.radians(75.0)
+"""Views are drawn between the horizontal plane and this elevation."""
+DEFORMATIONS = (Deform(rotated=True), Deform(stretch=0.25, rotated=True))
+"""No real object stands along the axes of a data set, and few have the proportions of one of its meshes."""
+CONDITIONS = 2 * len(DEFORMATIONS)
+"""Through the sensor and without one, each deformation: of views of a held-out object, in this order."""
 LEVELS = 201  # of the quantiles
+NO_VIEWS = np.zeros((0, 0, 0), np.float32)
 
 
 @dataclass(frozen=True)
 class FittedUnknown:
-    """What ``fit_unknown`` fitted to."""
+    """What ``fit_unknown`` fitted to.
+
+    Attributes:
+        objects: how many objects are remembered.
+        held_out: how many other objects the score was calibrated on.
+    """
 
     objects: int
     held_out: int
@@ -38,16 +55,17 @@ class FittedUnknown:
 def fit_unknown(
     meshes: Path,  # folder of the meshes that the recogniser was trained on; those of the test split are left out
     card: Path,  # of the recogniser
-    sensor: str = "wrist",  # through which half of the views are taken, see simulation.sensor.sensor_named
+    sensor: str = "wrist",  # through which half of the calibration views are taken, see simulation.sensor.sensor_named
     seed: int = 0,  # of all that is drawn
     workers: int | None = None,  # processes; one for each core by default
     track: Track = silently,
 ) -> FittedUnknown:
     """Teach a recogniser to notice objects of no class that it knows, at a false-alarm rate that can be chosen.
 
-    It remembers views of its training objects, and how novel views of the objects are that its card calls held out. The
-    novelty score goes into NAME.novelty.safetensors beside the card, and its SHA-256 into the card. When stopped, it
-    begins anew.
+    It remembers views of its training objects. How novel other views of known classes are is measured on the objects
+    that its card calls held out. All objects are turned about the vertical at random; half of them are stretched. The
+    novelty score goes into NAME.novelty.safetensors beside the card, and its SHA-256 into the card. A run that was
+    stopped begins anew.
     """
     with card_to_fit(card) as (model, write):
         entries = [e for e in list_dataset(meshes) if e.split != "test" and e.label in model.classes]
@@ -65,10 +83,13 @@ def fit_unknown(
         held_out = [e for e in entries if e in seen and e.name in model.held_out]
         if not known or not held_out:
             raise DatasetError(f"{meshes}: holds no object that {card} was trained on, or none that it calls held out")
+
         labels = np.array([model.classes.index(e.label) for e in held_out])
-        novelty = fit_novelty(np.concatenate(known, 1), np.stack([seen[e] for e in held_out]), labels)
-        about = f"{len(known)} objects of the training split, calibrated on {len(held_out)} others, half of the views "
-        about += f"through the sensor {sensor}"
+        novelty = fit_novelty(np.concatenate(known), np.stack([seen[e] for e in held_out]), labels)
+        about = (
+            f"{len(known)} objects of the training split, calibrated on {len(held_out)} others, turned at random and "
+            f"half of them stretched, half of the views through the sensor {sensor}"
+        )
         # Killed between the two files, this leaves a card without a score, not one with the hash of another.
         write("novelty", "nothing, the fit was cut off", [], novelty_sha256="")
         write("novelty", about, [], novelty_sha256=novelty.save(novelty_path(model.path), overwrite=True))
@@ -76,35 +97,74 @@ def fit_unknown(
 
 
 def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -> Float32:
-    """Embeddings of views of a mesh through a sensor, and without one, (2, views, F); none if it cannot be seen."""
+    """Embeddings of views of a mesh; none if it cannot be seen.
+
+    Of a held-out object, (CONDITIONS, views, F). Of any other, clean views of each deformation, (deformations, views,
+    F).
+    """
     rng = np.random.default_rng([seed, zlib.crc32(entry.name.encode())])
-    wanted, poses = HELD_OUT_VIEWS if entry.name in held_out else LEARNED_VIEWS, ViewSphere.named("40").poses
     try:
         mesh = load_mesh(entry.path)
     except MeshError:
-        return np.zeros((0, 0, 0), np.float32)
+        return NO_VIEWS
+
+    objects = [deform(mesh, seed, entry.name) for deform in DEFORMATIONS]
+    cameras: list[Camera] = [SimulatedCamera(thing) for thing in objects]
+    wanted = REMEMBERED_VIEWS
+    if entry.name in held_out:
+        sensed = [SensedCamera(thing, sensor, rng) for thing in objects]
+        cameras = [*sensed, *cameras]
+        wanted = CALIBRATION_VIEWS
+
     found = []
-    for camera in (SensedCamera(mesh, sensor, rng), SimulatedCamera(mesh)):
-        views = (camera.observe(poses[view]) for view in rng.permutation(len(poses))[: 4 * wanted])
-        kept = [view for view, _ in zip((v for v in views if v.seen), range(wanted), strict=False)]
-        if len(kept) < wanted:
-            return np.zeros((0, 0, 0), np.float32)
-        found.append(embeddings(kept))
+    for camera in cameras:
+        views = _random_views(camera, wanted, rng)
+        if len(views) < wanted:
+            return NO_VIEWS
+        found.append(views)
     return np.stack(found)
 
 
-def fit_novelty(known: Float32, held_out: Float32, labels: NDArray[np.int64], n_views: int = 5) -> Novelty:
-    """A novelty score of views, calibrated on objects that are not among the known ones.
+def _random_views(camera: Camera, wanted: int, rng: Generator) -> Float32:
+    """Embeddings of so many views from random directions, (views, F); fewer where the object is often not seen."""
+    tries = 4 * wanted
+    elevations = rng.uniform(0, MAX_ELEVATION, tries)
+    azimuths = rng.uniform(0, 2 * np.pi, tries)
+    seen = []
+    for pose in look_at_origin(elevations, azimuths):
+        view = camera.observe(pose)
+        if view.seen:
+            seen.append(view)
+        if len(seen) == wanted:
+            break
+    return embeddings(seen) if seen else NO_VIEWS[0]
 
-    ``known`` are embeddings of views through a sensor and without one, (2, rows, F), ``held_out`` those of N objects,
-    (N, 2, views, F), ``labels`` the classes of these, (N,).
+
+def fit_novelty(
+    known: Float32, held_out: Float32, labels: NDArray[np.int64], n_views: int = CALIBRATION_VIEWS
+) -> Novelty:
+    """Returns a novelty score of views, calibrated on objects that are not among the known ones.
+
+    Args:
+        known: embeddings of views to remember, (..., F).
+        held_out: embeddings of views of N other objects, (N, conditions, views, F); the first half of the conditions
+            through a sensor, the others without one's errors.
+        labels: classes of these N objects, (N,).
+        n_views: up to so many views of an object the mean score is calibrated.
     """
-    rows = known.reshape(-1, known.shape[-1]).astype(np.float16).astype(np.float32)  # as they are stored
-    raw = Novelty(np.zeros((1, 2), np.float32), np.array([len(held_out)]), rows, np.array([[0, 1], [0, 1]], np.float32))
+    rows = as_stored(known.reshape(-1, known.shape[-1]))
+    plain = np.array([[0, 1], [0, 1]], np.float32)
+    raw = Novelty(np.zeros((1, 2), np.float32), np.array([len(held_out)]), rows, plain)
     scores = np.stack([raw.scores(views.reshape(-1, rows.shape[1])).reshape(views.shape[:-1]) for views in held_out])
-    standard = np.stack([scores.mean((0, 2)), scores.std((0, 2))], 1).astype(np.float32)
-    scores = (scores - standard[:, :1]) / standard[:, 1:]
-    table = quantiles(np.concatenate([scores[:, 0], scores[:, 1]]), np.tile(labels, 2), n_views)
+
+    objects, conditions, views = scores.shape
+    ways = scores.reshape(objects, 2, conditions // 2 * views)  # through a sensor, and without one
+    standard = np.stack([ways.mean((0, 2)), ways.std((0, 2))], 1).astype(np.float32)
+
+    of_condition = standard[np.repeat([0, 1], conditions // 2)]
+    scores = (scores - of_condition[:, :1]) / of_condition[:, 1:]
+    rows_of_scores = scores.transpose(1, 0, 2).reshape(-1, views)
+    table = quantiles(rows_of_scores, np.tile(labels, conditions), n_views)
     return replace(raw, standard=standard, quantiles=table)
 
 

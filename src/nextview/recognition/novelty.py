@@ -134,8 +134,8 @@ class Novelty(Quantiles):
         return (distance - middle) / deviation
 
     def save(self, path: Path, overwrite: bool = False) -> str:
-        """Write a .safetensors file, the known views in half precision; returns its SHA-256."""
-        arrays = {name: getattr(self, name) for name in ARRAYS} | {"neighbours": self.neighbours.astype(np.float16)}
+        """Write a .safetensors file, the known views in eight bits a number; returns its SHA-256."""
+        arrays = {name: getattr(self, name) for name in ARRAYS} | {"neighbours": _in_eight_bits(self.neighbours)}
         content = save({name: np.ascontiguousarray(values) for name, values in arrays.items()})
         with new_file(path, overwrite) as part:
             part.write_bytes(content)
@@ -177,6 +177,17 @@ def unit(rows: Float) -> Float:
     return rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)
 
 
+def _in_eight_bits(rows: Float) -> NDArray[np.int8]:
+    """Unit vectors as int8, same shape: the largest number of each row becomes 127. ``unit`` brings them back."""
+    largest = np.abs(rows).max(axis=-1, keepdims=True)
+    return np.rint(rows / largest * np.iinfo(np.int8).max).astype(np.int8)
+
+
+def as_stored(rows: Float) -> NDArray[np.float32]:
+    """Unit vectors, (R, F), as they are read after they were saved."""
+    return unit(_in_eight_bits(rows).astype(np.float32))
+
+
 def novelty_path(weights: Path) -> Path:
     """Where the novelty score of a recogniser lies: NAME.novelty.safetensors beside NAME.onnx."""
     return weights.with_suffix(".novelty.safetensors")
@@ -190,8 +201,11 @@ def read_novelty(path: Path, sha256: str) -> Novelty:
     """
     content = checked_bytes(path, sha256, "a novelty score")
     arrays: dict[str, Any] = arrays_in(content, ARRAYS, f"{path}: not a novelty score")
-    if np.issubdtype(arrays["neighbours"].dtype, np.floating):
-        arrays["neighbours"] = arrays["neighbours"].astype(np.float32)
+    stored = arrays["neighbours"]
+    if np.issubdtype(stored.dtype, np.floating):  # files of version 0.3 and before
+        arrays["neighbours"] = stored.astype(np.float32)
+    elif stored.dtype == np.int8 and stored.ndim == 2:
+        arrays["neighbours"] = unit(stored.astype(np.float32))
 
     try:
         return Novelty(**arrays)
