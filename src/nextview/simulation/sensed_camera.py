@@ -51,6 +51,7 @@ class SensedCamera:
         self.denoise, self._rng, self._reach, self._metres = denoise, rng, table, mesh.metres
         self._camera, self._floor = self._looking_at(mesh), float(mesh.vertices[:, 2].min())
         self._truth = ObjectFrame(np.zeros(3), self.sensor.radius, np.eye(3))
+        self.true_pose: Float | None = None  # of the camera in the last frame, (4, 4), in the true object frame, metres
         setup, draws = self.sensor, rng.spawn(1)[0]
         centre = draws.normal(0, setup.centre * setup.radius, 3)
         radius = setup.radius * np.exp(draws.normal(0, setup.size))
@@ -92,6 +93,7 @@ class SensedCamera:
             angles = rng.normal(0, self.sensor.turned, 3)
             true[:3, :3] = true[:3, :3] @ Rotation.from_rotvec(angles, degrees=True).as_matrix()
             true[:3, 3] += rng.normal(0, self.sensor.moved, 3)
+        self.true_pose = true
         depth, whose = self._scene(true)
         measured, source = self.sensor.measure(depth, rng)
         part = within(measured)  # nothing is measured beside it

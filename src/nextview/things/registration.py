@@ -1,0 +1,417 @@
+"""Align surfaces with all views of a thing at once, many hypotheses at a time.
+
+Every hypothesis is a surface in some pose. A Gauss-Newton step casts the rays of all views at it,
+and draws it towards what was measured: along the surface's normals where the ray meets it and a
+depth was measured (point to plane, Chen and Medioni, "Object modelling by registration of multiple
+range images", 1992, projected along the ray as in Blais and Levine 1995), and within the image
+where it sticks out of the thing's outline. Weights are robust (Cauchy), and come down from coarse
+to fine. A tilt from the pose that it rests in and an error of each camera's place are held near
+zero.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, DepthView
+from nextview.things.surface import SurfaceCaster
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+TURN = slice(0, 3)
+PLACE = slice(3, 6)
+POSE = 6
+"""Unknowns of a step: turn and place of a hypothesis; the errors of the cameras follow."""
+
+FIXED = 1e9  # weight of an unknown that does not change
+FREE = 1e-3  # weight of one that nothing is known of
+SHIFT_LIMIT = 0.02  # metres that a step moves a hypothesis at most
+TURN_LIMIT = 0.3  # radians that a step turns it at most
+
+
+@dataclass(frozen=True)
+class RegistrationPrior:
+    """How far off things may be before anything was aligned: standard deviations.
+
+    Attributes:
+        tilt: of the vertical, radians.
+        place: of the centre, object radii.
+        camera: of the place of each camera, metres.
+        pixels: how many pixels of a view are as good as so many that err independently.
+    """
+
+    tilt: float = 0.04
+    place: float = 0.5
+    camera: float = 0.004
+    pixels: float = 60.0
+
+
+@dataclass(frozen=True)
+class Level:
+    """Some steps of a registration.
+
+    Attributes:
+        steps: how many.
+        reach: deviation at which a pixel counts half, metres.
+        turned: whether the tilt is aligned too, and not only azimuth and place.
+    """
+
+    steps: int
+    reach: float
+    turned: bool
+
+
+COARSE = (Level(2, 0.02, False), Level(2, 0.008, False), Level(1, 0.004, True))
+FINE = (Level(2, 0.003, True), Level(1, 0.002, True))
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Poses of H hypotheses in the object frame, metres.
+
+    Attributes:
+        things: number of the surface of each hypothesis, (H,) int64.
+        ups: direction in the scan file's axes that points up where the thing rests, (H, 3) float64.
+        rotations: from the axes of the scan file to those of the object frame, (H, 3, 3) float64.
+        centres: where the centre of the surface lies, (H, 3) float64.
+        cameras: by how much each view sees the thing displaced, because of an error of the camera's
+            place, (H, V, 3) float64.
+    """
+
+    things: NDArray[np.int64]
+    ups: Float
+    rotations: Float
+    centres: Float
+    cameras: Float
+
+    def __len__(self) -> int:
+        """Number of hypotheses."""
+        return len(self.things)
+
+    def select(self, rows: NDArray) -> "Alignment":
+        """Some of the hypotheses, by index or mask."""
+        return Alignment(
+            things=self.things[rows],
+            ups=self.ups[rows],
+            rotations=self.rotations[rows],
+            centres=self.centres[rows],
+            cameras=self.cameras[rows],
+        )
+
+    @property
+    def tilts(self) -> Float:
+        """Turn about x and y out of the resting pose, (H, 2) float64, radians."""
+        ups = np.einsum("hij,hj->hi", self.rotations, self.ups)
+        return np.stack([-ups[:, 1], ups[:, 0]], 1)
+
+    def poses(self, caster: SurfaceCaster) -> Float:
+        """Poses of the scan files' frames in the object frame, (H, 4, 4) float64, metres."""
+        poses = np.tile(np.eye(4), (len(self), 1, 1))
+        poses[:, :3, :3] = self.rotations
+        own_centres = caster.centres[self.things].astype(np.float64)
+        poses[:, :3, 3] = self.centres - np.einsum("hij,hj->hi", self.rotations, own_centres)
+        return poses
+
+
+def start(things: NDArray[np.integer], rotations: Float, views: int) -> Alignment:
+    """Hypotheses before anything is aligned: each with its centre in that of the object frame.
+
+    Args:
+        things: number of the surface of each, (H,) int.
+        rotations: from the axes of the scan file to those of the object frame, (H, 3, 3).
+        views: how many views there are.
+    """
+    count = len(things)
+    rotations = np.asarray(rotations, np.float64)
+    return Alignment(
+        things=np.asarray(things, np.int64),
+        ups=rotations[:, 2],
+        rotations=rotations,
+        centres=np.zeros((count, 3)),
+        cameras=np.zeros((count, views, 3)),
+    )
+
+
+def centred(caster: SurfaceCaster, alignment: Alignment, views: Sequence[DepthView]) -> Alignment:
+    """Move each hypothesis so that what shows of it lies about where the thing was measured.
+
+    The centre of the object frame is that of what was seen, which need not be the centre of the
+    thing. A hypothesis that covers the outline of the thing better where it was stays there.
+    """
+    change = np.zeros((len(alignment), 3))
+    before = np.zeros(len(alignment))
+    for number, view in enumerate(views):
+        rendered = render(caster, alignment, view, number)
+        shows = np.isfinite(rendered.depth)
+        before += _overlap(view, shows)
+
+        seen = np.median(view.points[view.kind == THING], axis=0)
+        depth = np.where(shows, rendered.depth, np.nan)
+        some = shows.any(1)
+        points = view.origin + view.rays * depth[some, :, None]
+        change[some] += (seen - np.nanmedian(points, axis=1)) / len(views)
+
+    moved = replace(alignment, centres=alignment.centres + change)
+    after = np.zeros(len(alignment))
+    for number, view in enumerate(views):
+        after += _overlap(view, np.isfinite(render(caster, moved, view, number).depth))
+    better = after > before
+    return replace(alignment, centres=np.where(better[:, None], moved.centres, alignment.centres))
+
+
+def _overlap(view: DepthView, shows: NDArray[np.bool_]) -> Float:
+    """Intersection over union of where hypotheses show, (H, P), with the thing's pixels, (H,)."""
+    thing = view.kind == THING
+    hidden = view.kind == NOT_MEASURED
+    union = ((shows & ~hidden) | thing).sum(1)
+    return (shows & thing).sum(1) / np.maximum(union, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """What one view would see of H hypotheses, object frame, metres.
+
+    Attributes:
+        depth: (H, P) float32, infinity where a hypothesis does not show.
+        normals: towards the camera, (H, P, 3) float32.
+    """
+
+    depth: Float32
+    normals: Float32
+
+
+def render(caster: SurfaceCaster, alignment: Alignment, view: DepthView, number: int) -> Rendered:
+    """Cast the rays of a view at all hypotheses.
+
+    Args:
+        caster: of all surfaces.
+        alignment: the hypotheses.
+        view: the view, which is the one of this ``number``.
+        number: decides which of the cameras' errors is its own.
+    """
+    centres = alignment.centres + alignment.cameras[:, number]
+    from_centre = np.einsum("hji,hj->hi", alignment.rotations, view.origin - centres)
+    origins = from_centre + caster.centres[alignment.things]
+    turns = alignment.rotations.astype(np.float32)
+
+    depth, normals = caster.cast(alignment.things, origins.astype(np.float32), view.rays @ turns)
+    return Rendered(depth, normals @ turns.swapaxes(1, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Pulls:
+    """By how much, and in which direction, each pixel of one view draws each hypothesis.
+
+    Attributes:
+        arms: from the centre of the hypothesis to what is drawn, (H, P, 3).
+        directions: unit vectors, (H, P, 3).
+        distances: metres, (H, P).
+        weights: inverse variances, (H, P); zero where nothing is drawn.
+    """
+
+    arms: Float32
+    directions: Float32
+    distances: Float32
+    weights: Float32
+
+
+OUTLINE_PIXELS = 1.5  # deviation of an outline, pixels
+SURFACE_ERROR = 0.001  # deviation of a surface from its scan, metres
+HIDING = 0.005  # metres by which something stands before a surface that it hides
+
+
+def _pulls(view: DepthView, rendered: Rendered, centres: Float, reach: float) -> _Pulls:
+    """What draws the hypotheses whose centres are these, (H, 3), as this view sees them."""
+    shows = np.isfinite(rendered.depth)
+    depth = np.where(shows, rendered.depth, 0)
+    origin = view.origin.astype(np.float32)
+    points = origin + view.rays * depth[..., None]
+    arms = points - centres.astype(np.float32)[:, None]
+
+    # Where the thing was measured: along the normal.
+    thing = shows & (view.kind == THING)
+    gap = np.where(thing, view.depth - depth, 0)
+    along = np.einsum("hpi,pi->hp", rendered.normals, view.rays)
+    surface = gap * along
+    # Where the hypothesis shows, and the outline says that it does not: towards the outline.
+    beyond = shows & (view.kind == ELSEWHERE) & (view.depth > depth - HIDING)
+    aside = view.towards @ view.camera_axes[:, :2].T.astype(np.float32)
+    off = np.where(beyond, view.edge * view.pitch * depth, 0)
+
+    directions = np.where(thing[..., None], rendered.normals, aside)
+    distances = np.where(thing, surface, off)
+
+    # Where the thing was measured and the hypothesis does not show: the nearest of its pixels is
+    # drawn there.
+    missing = ~shows & (view.kind == THING)
+    nearest, gap, aside = _nearest_shown(view, shows)
+    missing &= nearest >= 0
+    row, pixel = np.nonzero(missing)
+    from_pixel = nearest[row, pixel]
+    arms[row, pixel] = arms[row, from_pixel]
+    directions[row, pixel] = aside[row, pixel]
+    distances[row, pixel] = gap[row, pixel] * view.pitch * depth[row, from_pixel]
+
+    outline = OUTLINE_PIXELS * view.pitch * np.where(shows, depth, view.depth)
+    variance = np.where(thing, SURFACE_ERROR**2 + view.noise**2, SURFACE_ERROR**2 + outline**2)
+    weights = (thing | beyond | missing) / variance / (1 + (distances / reach) ** 2)
+    return _Pulls(arms, directions, distances, weights.astype(np.float32))
+
+
+def _nearest_shown(
+    view: DepthView, shows: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], Float32, Float32]:
+    """For each pixel the nearest one where a hypothesis shows, (H, P), -1 where none does.
+
+    And the distance from there to the pixel, (H, P), pixels of the image, and its direction, (H, P,
+    3), object frame.
+    """
+    count = len(shows)
+    images = shows.reshape(count, *view.shape)
+    # One transform for all hypotheses: other images are too far away to be nearest.
+    apart = 2.0 * float((view.step * view.shape).sum()) + 1
+    index = distance_transform_edt(
+        ~images, sampling=(apart, *view.step), return_distances=False, return_indices=True
+    )
+    same = index[0] == np.arange(count)[:, None, None]
+    rows, columns = np.indices(view.shape)
+    down = (rows - index[1]) * view.step[0]
+    right = (columns - index[2]) * view.step[1]
+    distance = np.hypot(down, right)
+
+    scale = 1 / np.maximum(distance, 1e-9)
+    in_image = np.stack([right * scale, down * scale], -1).reshape(count, -1, 2)
+    nearest = np.where(same, index[1] * view.shape[1] + index[2], -1)
+    aside = in_image @ view.camera_axes[:, :2].T
+    return (
+        nearest.reshape(count, -1),
+        distance.reshape(count, -1).astype(np.float32),
+        aside.astype(np.float32),
+    )
+
+
+def align(
+    caster: SurfaceCaster,
+    alignment: Alignment,
+    views: Sequence[DepthView],
+    levels: Sequence[Level],
+    prior: RegistrationPrior = RegistrationPrior(),
+) -> Alignment:
+    """Align hypotheses with all views at once.
+
+    Args:
+        caster: of all surfaces.
+        alignment: the hypotheses as they are so far.
+        views: the views, in the order of ``alignment.cameras``.
+        levels: steps from coarse to fine.
+        prior: what is held near zero.
+
+    Returns:
+        The same hypotheses in better poses.
+    """
+    for level in levels:
+        for _ in range(level.steps):
+            alignment = _step(caster, alignment, views, level, prior)
+    return alignment
+
+
+def _step(
+    caster: SurfaceCaster,
+    alignment: Alignment,
+    views: Sequence[DepthView],
+    level: Level,
+    prior: RegistrationPrior,
+) -> Alignment:
+    """One Gauss-Newton step: turn, place and, with several views, the cameras' errors."""
+    errors_too = len(views) > 1  # one camera's error is the same as one of the place
+    unknowns = POSE + 3 * len(views) * errors_too
+    left = np.zeros((len(alignment), unknowns, unknowns))
+    right = np.zeros((len(alignment), unknowns))
+
+    for number, view in enumerate(views):
+        rendered = render(caster, alignment, view, number)
+        centres = alignment.centres + alignment.cameras[:, number]
+        square, towards = _normal_equations(_pulls(view, rendered, centres, level.reach), prior)
+        left[:, :POSE, :POSE] += square
+        right[:, :POSE] += towards
+        if errors_too:
+            # A view that sees the thing displaced is the same, to itself, as a thing in another
+            # place.
+            own = slice(POSE + 3 * number, POSE + 3 * number + 3)
+            left[:, own, own] += square[:, PLACE, PLACE]
+            left[:, :POSE, own] += square[:, :, PLACE]
+            left[:, own, :POSE] += square[:, PLACE, :]
+            right[:, own] += towards[:, PLACE]
+
+    weights, so_far = _priors(caster, alignment, unknowns, level, prior)
+    left += weights[:, :, None] * np.eye(unknowns)
+    right -= weights * so_far
+    change = np.linalg.solve(left, right[..., None])[..., 0]
+
+    turn = np.clip(change[:, TURN], -TURN_LIMIT, TURN_LIMIT)
+    moved = np.clip(change[:, 3:], -SHIFT_LIMIT, SHIFT_LIMIT)
+    cameras = alignment.cameras
+    if errors_too:
+        cameras = cameras + moved[:, 3:].reshape(cameras.shape)
+    return replace(
+        alignment,
+        rotations=rotations_of(turn) @ alignment.rotations,
+        centres=alignment.centres + moved[:, :3],
+        cameras=cameras,
+    )
+
+
+def _normal_equations(pulls: _Pulls, prior: RegistrationPrior) -> tuple[Float, Float]:
+    """What one view says of turn and place: matrices, (H, 6, 6), and right-hand sides, (H, 6)."""
+    jacobian = np.concatenate([np.cross(pulls.arms, pulls.directions), pulls.directions], -1)
+    # Neighbouring pixels err together.
+    used = np.count_nonzero(pulls.weights, axis=1)
+    share = np.minimum(1, prior.pixels / np.maximum(used, 1)).astype(np.float32)
+    weighted = (jacobian * (pulls.weights * share[:, None])[..., None]).swapaxes(1, 2)
+    return weighted @ jacobian, (weighted @ pulls.distances[..., None])[..., 0]
+
+
+def _priors(
+    caster: SurfaceCaster,
+    alignment: Alignment,
+    unknowns: int,
+    level: Level,
+    prior: RegistrationPrior,
+) -> tuple[Float, Float]:
+    """Weights that hold unknowns near zero, and where these are by now, (H, unknowns) each."""
+    weights = np.zeros((len(alignment), unknowns))
+    so_far = np.zeros((len(alignment), unknowns))
+
+    weights[:, :2] = 1 / prior.tilt**2 if level.turned else FIXED
+    weights[:, 2] = FREE
+    if level.turned:
+        so_far[:, :2] = alignment.tilts
+
+    reach = prior.place * caster.radii[alignment.things].astype(np.float64)
+    weights[:, PLACE] = 1 / reach[:, None] ** 2
+    so_far[:, PLACE] = alignment.centres
+    if unknowns > POSE:
+        weights[:, POSE:] = 1 / prior.camera**2
+        so_far[:, POSE:] = alignment.cameras.reshape(len(alignment), -1)
+    return weights, so_far
+
+
+def rotations_of(vectors: Float) -> Float:
+    """Rotation matrices, (H, 3, 3), of rotation vectors, (H, 3), radians."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(vectors).as_matrix()
+
+
+def rotation_about_z(angles: Float) -> Float:
+    """Rotation matrices, (H, 3, 3), by some angles about the vertical, (H,), radians."""
+    return rotations_of(np.asarray(angles)[:, None] * (0.0, 0.0, 1.0))
+
+
+def camera_cost(alignment: Alignment, prior: RegistrationPrior = RegistrationPrior()) -> Float:
+    """Half the squared deviations of the cameras' places, (H, V) float64: a cost."""
+    return 0.5 * (alignment.cameras**2).sum(-1) / prior.camera**2

@@ -1,0 +1,229 @@
+"""Surfaces of taught things, in metres, at which many rays can be cast in one call."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import MeshError
+from nextview.geometry.mesh import UNITS, Mesh
+from nextview.geometry.ray_caster import embree_scene
+
+Float32 = NDArray[np.float32]
+
+FEWEST_FACES = 500  # a simplified surface has at least so many triangles, if it had as many
+FINEST_ERROR = (
+    0.0004  # metres by which a simplified surface may be off: less than depth cameras measure
+)
+SURFACE_SAMPLES = 2000  # points at which the error of a simplified surface is measured
+SPACING = 3.0  # distance between surfaces in a shared scene, in radii of the largest
+MISSED = np.float32(np.inf)  # depth along a ray that meets nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The surface of one thing in its own frame, which is that of the scan file.
+
+    Attributes:
+        name: what the thing is called.
+        vertices: (V, 3) float32, metres, with the origin and the axes of the scan file.
+        faces: (F, 3) int32, indices of the vertices.
+    """
+
+    name: str
+    vertices: Float32
+    faces: NDArray[np.int32]
+
+    @classmethod
+    def from_mesh(cls, mesh: Mesh, name: str) -> "Surface":
+        """Take over a mesh whose unit is known.
+
+        Args:
+            mesh: in the object frame; its ``centre`` and ``radius`` lead back to the frame of its
+                file.
+            name: what the thing is called.
+
+        Returns:
+            The surface in metres, in the frame of the mesh file.
+
+        Raises:
+            MeshError: the unit of the mesh is not known.
+        """
+        if mesh.unit is None:
+            raise MeshError(f"{mesh.name}: the unit of length is not known; say it with --unit")
+
+        in_file = mesh.vertices * mesh.radius + mesh.centre
+        vertices = (in_file * UNITS[mesh.unit]).astype(np.float32)
+        return cls(name, vertices, np.ascontiguousarray(mesh.faces, np.int32))
+
+    @cached_property
+    def centre(self) -> Float32:
+        """Centre of the bounding box, (3,) float32, metres, in the frame of the scan file."""
+        return (self.vertices.min(0) + self.vertices.max(0)) / 2
+
+    @cached_property
+    def radius(self) -> float:
+        """Distance of the farthest vertex from the centre, metres."""
+        return float(np.linalg.norm(self.vertices - self.centre, axis=1).max())
+
+    @cached_property
+    def diameter(self) -> float:
+        """Largest distance between two points of the surface, metres."""
+        from scipy.spatial import ConvexHull, QhullError
+        from scipy.spatial.distance import pdist
+
+        try:
+            corners = self.vertices[ConvexHull(self.vertices).vertices]
+        except QhullError:  # a flat surface has no hull
+            corners = self.vertices
+        if len(corners) > SURFACE_SAMPLES:
+            corners = corners[:: len(corners) // SURFACE_SAMPLES + 1]
+        return float(pdist(corners).max())
+
+    def simplified(self, error: float = FINEST_ERROR) -> "Surface":
+        """Reduce the number of triangles as far as the surface stays the same to a depth camera.
+
+        The triangles are halved (quadric error metric, ``fast_simplification``) until 95 % of
+        points on the original are no longer within ``error`` of the simplified surface; the last
+        one that was near enough is taken.
+
+        Args:
+            error: metres by which the surface may be off.
+
+        Returns:
+            A surface in the same frame, with fewer triangles or the same.
+        """
+        from fast_simplification import simplify
+
+        kept = self
+        count = len(self.faces) // 2
+        while count >= FEWEST_FACES:
+            vertices, faces = simplify(self.vertices, self.faces, target_count=count)
+            smaller = Surface(
+                self.name, vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32)
+            )
+            if not len(faces) or _deviation(self, smaller) > error:
+                break
+            kept = smaller
+            count //= 2
+        return kept
+
+    def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Draw points that are spread evenly over the surface.
+
+        Args:
+            count: number of points.
+            rng: decides where they lie.
+
+        Returns:
+            Points in the frame of the scan file, (count, 3) float64, metres.
+        """
+        corners = self.vertices[self.faces].astype(np.float64)
+        edges = corners[:, 1:] - corners[:, :1]
+        areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+        chosen = rng.choice(len(areas), count, p=areas / areas.sum())
+
+        shares = rng.random((count, 2))
+        outside = shares.sum(1) > 1  # of the triangle, in the other half of the parallelogram
+        shares[outside] = 1 - shares[outside]
+        return corners[chosen, 0] + (shares[:, :, None] * edges[chosen]).sum(1)
+
+
+def _deviation(surface: Surface, simplified: Surface) -> float:
+    """Distance to a simplified surface within which 95 % of points on the original lie, metres.
+
+    It is measured along the normals of the original by casting rays both ways.
+    """
+    rng = np.random.default_rng(0)
+    corners = surface.vertices[
+        surface.faces[rng.integers(len(surface.faces), size=SURFACE_SAMPLES)]
+    ]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    some = lengths[:, 0] > 0
+    normals = normals[some] / lengths[some]
+    points = corners.mean(1)[some]
+
+    scene = embree_scene([(simplified.vertices, simplified.faces)])
+    distances = []
+    for direction in (normals, -normals):
+        start = np.ascontiguousarray(points - 1e-6 * direction, np.float32)
+        hits = scene.run(start, np.ascontiguousarray(direction, np.float32), output=1)
+        distances.append(np.where(hits["primID"] >= 0, hits["tfar"], np.inf))
+    return float(np.quantile(np.minimum(*distances), 0.95))
+
+
+class SurfaceCaster:
+    """Casts rays at many surfaces in one call.
+
+    All surfaces stand in one Embree scene, far apart on a grid. A ray that is meant for one of them
+    starts near it, and what it meets of another one does not count.
+
+    Attributes:
+        surfaces: the surfaces, by their number.
+        centres: centre of each, in its own frame, (T, 3) float32, metres.
+        radii: radius of each, (T,) float32, metres.
+    """
+
+    def __init__(self, surfaces: Sequence[Surface]) -> None:
+        """Place the surfaces in a scene.
+
+        Args:
+            surfaces: at least one.
+        """
+        self.surfaces = tuple(surfaces)
+        self.centres = np.stack([surface.centre for surface in self.surfaces])
+        self.radii = np.array([surface.radius for surface in self.surfaces], np.float32)
+
+        side = int(np.ceil(np.sqrt(len(self.surfaces))))
+        row, column = np.divmod(np.arange(len(self.surfaces)), side)
+        pitch = SPACING * self.radii.max()
+        places = np.stack([column - side / 2, row - side / 2, np.zeros(len(row))], 1) * pitch
+        self._shifts = (
+            places.astype(np.float32) - self.centres
+        )  # from its own frame to its place in the scene
+
+        placed = zip(self.surfaces, self._shifts, strict=True)
+        self._scene = embree_scene(
+            [(surface.vertices + shift, surface.faces) for surface, shift in placed]
+        )
+
+    def cast(
+        self, things: NDArray[np.integer], origins: Float32, directions: Float32
+    ) -> tuple[Float32, Float32]:
+        """Cast the same number of rays at each of some surfaces.
+
+        Args:
+            things: which surface each row of rays is cast at, (H,) int.
+            origins: where the rays of a row start, in the frame of its surface, (H, 3) float32,
+                metres.
+            directions: of the rays, of any length, (H, P, 3) float32.
+
+        Returns:
+            How many times its length each ray goes, (H, P) float32, infinity where it meets
+            nothing; and the unit normal of the surface there, towards the origin, (H, P, 3)
+            float32, in the frame of the surface.
+        """
+        rows, rays = directions.shape[:2]
+        # A ray starts where it may enter the sphere around its surface, behind whatever stands
+        # before it on the grid.
+        length = np.sqrt(np.einsum("hpi,hpi->hp", directions, directions))
+        away = np.linalg.norm(origins - self.centres[things], axis=1) - 1.01 * self.radii[things]
+        skipped = np.maximum(away, 0).astype(np.float32)[:, None] / length
+
+        starts = (origins + self._shifts[things])[:, None] + skipped[..., None] * directions
+        flat = np.ascontiguousarray(directions.reshape(-1, 3), np.float32)
+        hits = self._scene.run(
+            np.ascontiguousarray(starts.reshape(-1, 3), np.float32), flat, output=1
+        )
+
+        own = hits["geomID"].reshape(rows, rays) == np.asarray(things)[:, None]
+        hit = own & (hits["primID"].reshape(rows, rays) >= 0)
+        depth = np.where(hit, hits["tfar"].reshape(rows, rays) + skipped, MISSED)
+
+        normals = hits["Ng"].reshape(rows, rays, 3)
+        towards = -np.sign(np.einsum("hpi,hpi->hp", normals, directions))
+        scale = towards / (np.sqrt(np.einsum("hpi,hpi->hp", normals, normals)) + 1e-30)
+        return depth, normals * scale[..., None]

@@ -1,0 +1,99 @@
+"""How likely a view is, pixel by pixel, if a surface stands where it was aligned."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, DepthView
+from nextview.things.registration import Rendered
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PixelModel:
+    """What the pixels of a view are like if a hypothesis is true.
+
+    Attributes:
+        outlier: log-likelihood of a pixel that the hypothesis does not explain, against one that it
+            explains exactly.
+        hole: that of a pixel where the surface was not measured, seen face on. A grazing one costs
+            less.
+        surface: deviation of a surface from its scan and of its alignment, metres.
+        steep: how many pixels a steep surface may be off sideways.
+        edge: pixels of the outline within which a deviation is usual.
+        hiding: metres by which something stands before a surface that it hides.
+    """
+
+    outlier: float = -4.0
+    hole: float = -0.5
+    surface: float = 0.0008
+    steep: float = 1.0
+    edge: float = 3.0
+    hiding: float = 0.006
+
+
+@dataclass(frozen=True, eq=False)
+class ViewLikelihood:
+    """How well H hypotheses explain one view.
+
+    Attributes:
+        total: sum of the log-likelihoods of all pixels against an exact match, (H,) float64, 0 at
+            most.
+        pixels: pixels that it is a sum over: those of the thing and those where the hypothesis
+            shows, (H,) float64.
+        explained: share of the thing's pixels that the hypothesis explains, (H,) float64.
+    """
+
+    total: Float
+    pixels: Float
+    explained: Float
+
+    @property
+    def mean(self) -> Float:
+        """Mean log-likelihood of a pixel, (H,) float64."""
+        return self.total / np.maximum(self.pixels, 1)
+
+
+def likelihood(
+    view: DepthView, rendered: Rendered, model: PixelModel = PixelModel()
+) -> ViewLikelihood:
+    """Judge every pixel of a view, given what it would see of each hypothesis.
+
+    A depth on the thing is compared with the surface's under the noise of the sensor, which grows
+    where the surface is steep. The thing's pixels where no surface shows are outliers; so are
+    pixels where the surface should show, and what is behind it was measured. What stands before the
+    surface says nothing. Neither do pixels where neither shows.
+    """
+    shows = np.isfinite(rendered.depth)
+    depth = np.where(shows, rendered.depth, 1)
+    lengths = np.linalg.norm(view.rays, axis=1)
+    cosine = -np.einsum("hpi,pi->hp", rendered.normals, view.rays) / lengths
+    cosine = np.clip(cosine, 0.15, 1)
+    steepness = np.sqrt(1 - cosine**2) / cosine
+
+    measured = np.isfinite(view.depth)
+    observed = np.where(measured, view.depth, 0)
+    sideways = model.steep * view.pitch * depth * steepness
+    variance = view.noise**2 + model.surface**2 + sideways**2
+    squared = (observed - depth) ** 2 / variance
+    # A mixture of the sensor's noise and of outliers.
+    match = np.log(np.exp(-squared / 2) + np.exp(model.outlier)) - np.log1p(np.exp(model.outlier))
+
+    # Mismatches at an outline cost less, the nearer to it they are.
+    deep = np.clip(np.abs(view.edge) / model.edge, 0.1, 1)
+    thing = view.kind == THING
+    hidden = (view.kind == ELSEWHERE) & (view.depth < depth - model.hiding)
+    through = shows & (view.kind == ELSEWHERE) & ~hidden
+    hole = shows & (view.kind == NOT_MEASURED)
+
+    judged = np.zeros(shows.shape)
+    judged = np.where(shows & thing, match, judged)
+    judged = np.where(~shows & thing, model.outlier * deep, judged)
+    judged = np.where(through, model.outlier * deep, judged)
+    judged = np.where(hole, model.hole * cosine, judged)
+
+    counted = thing | through | hole
+    explained = (shows & thing & (squared < 9)).sum(1) / max(1, int(thing.sum()))
+    return ViewLikelihood(judged.sum(1), counted.sum(1).astype(np.float64), explained)

@@ -1,0 +1,219 @@
+"""Recognise taught things by their geometry: propose, align, judge every pixel, believe."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import ModelError, ObservationError
+from nextview.geometry.observation import Observation
+from nextview.things.depth_view import DepthView, depth_view
+from nextview.things.proposals import Proposals, propose
+from nextview.things.registration import (
+    COARSE,
+    FINE,
+    Alignment,
+    RegistrationPrior,
+    align,
+    camera_cost,
+    centred,
+    render,
+    rotation_about_z,
+    start,
+)
+from nextview.things.surface import Surface, SurfaceCaster
+from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
+from nextview.things.weighing import EvidenceWeights, JudgedEpisode
+
+Float = NDArray[np.float64]
+
+COARSE_SIDE = 24  # rows and columns of pixels that decide which hypotheses survive
+FINE_SIDE = 40  # rows and columns of pixels that survivors are judged by
+MOST_SURVIVORS = 12
+HOPELESS = (
+    25.0  # a hypothesis that is so much less likely than the best one, as a logarithm, is given up
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Verified:
+    """What the geometry of some views says.
+
+    Attributes:
+        belief: in each thing, (T,) float64, sums to 1.
+        things: thing of each hypothesis that was judged, the likeliest hypothesis first, (M,)
+            int64.
+        resting: which thing in which resting pose, index of the verifier's hypotheses, (M,) int64.
+        probabilities: of these hypotheses, (M,) float64, their sum is 1.
+        poses: of the scan files' frames in the object frame, (M, 4, 4) float64, metres.
+        cameras: by how much each view sees them displaced, (M, V, 3) float64, metres, object frame.
+        mean: mean log-likelihood of the pixels of each view, (M, V) float64.
+        camera_costs: half the squared deviations of each camera's place, (M, V) float64.
+        log_belief: log-belief in each hypothesis by features and size, (M,) float64.
+        by_features: belief in each thing by features and size alone, (T,) float64.
+        explained: share of the thing's pixels in each view that each hypothesis explains, (M, V)
+            float64.
+    """
+
+    belief: Float
+    things: NDArray[np.int64]
+    resting: NDArray[np.int64]
+    probabilities: Float
+    poses: Float
+    cameras: Float
+    mean: Float
+    camera_costs: Float
+    log_belief: Float
+    by_features: Float
+    explained: Float
+
+    def judged(self, truth: int) -> JudgedEpisode:
+        """The same as an example of the thing of this number, to fit weights to."""
+        return JudgedEpisode(
+            truth, self.things, self.mean, self.camera_costs, self.log_belief, self.by_features
+        )
+
+    @property
+    def residual(self) -> float:
+        """How badly the likeliest hypothesis explains the views, in the mean; 0 for exactly."""
+        return float(-self.mean[0].mean())
+
+
+class Verifier:
+    """Recognises things of known geometry, and tells their poses.
+
+    Attributes:
+        caster: the surfaces of the things.
+        owners: thing of each hypothesis, (H,) int64. A hypothesis is a thing in a resting pose.
+        rotations: from the axes of the scan file into the resting pose, (H, 3, 3) float64.
+        weights: how much each kind of evidence counts.
+    """
+
+    def __init__(
+        self,
+        surfaces: Sequence[Surface],
+        owners: NDArray[np.integer],
+        rotations: NDArray[np.floating],
+        weights: EvidenceWeights = EvidenceWeights(),
+        pixels: PixelModel = PixelModel(),
+        prior: RegistrationPrior = RegistrationPrior(),
+    ) -> None:
+        """Make the surfaces ready for casting.
+
+        Args:
+            surfaces: of the things.
+            owners: thing of each hypothesis, (H,).
+            rotations: into the resting pose of each hypothesis, (H, 3, 3).
+            weights: how much each kind of evidence counts.
+            pixels: what pixels are like if a hypothesis is true.
+            prior: how far off cameras and the vertical may be.
+
+        Raises:
+            ModelError: owners that are none of the things, or rotations of other hypotheses.
+        """
+        self.owners = np.asarray(owners, np.int64)
+        self.rotations = np.asarray(rotations, np.float64)
+        unknown = set(self.owners.tolist()) - set(range(len(surfaces)))
+        if unknown or self.rotations.shape != (len(self.owners), 3, 3):
+            raise ModelError(
+                f"{len(surfaces)} surfaces do not fit {len(self.owners)} resting poses of things"
+            )
+
+        self.caster = SurfaceCaster(surfaces)
+        self.weights = weights
+        self.pixels = pixels
+        self.prior = prior
+
+    def __call__(self, observations: Sequence[Observation], joint: Float) -> Verified:
+        """Align what is likely with all views, and judge it.
+
+        Args:
+            observations: views of one thing, all in one object frame.
+            joint: belief in each hypothesis and azimuth bin by features and size, (H, bins): see
+                ``propose``.
+
+        Returns:
+            The belief by features, size and geometry, and the poses.
+
+        Raises:
+            ObservationError: no view shows the thing, or its scale is not known.
+        """
+        if joint.shape[0] != len(self.owners):
+            raise ModelError(
+                f"a belief in {joint.shape[0]} hypotheses, and there are {len(self.owners)}"
+            )
+
+        coarse_views = _views(observations, COARSE_SIDE)
+        proposals = propose(joint)
+        alignment, proposals = self._survivors(proposals, coarse_views)
+
+        fine_views = _views(observations, FINE_SIDE)
+        alignment = align(self.caster, alignment, fine_views, FINE, self.prior)
+        return self._verified(proposals, alignment, self._judge(alignment, fine_views), joint)
+
+    def _survivors(
+        self, proposals: Proposals, views: Sequence[DepthView]
+    ) -> tuple[Alignment, Proposals]:
+        """The proposals that are likely after an alignment with coarse images, and that."""
+        turns = rotation_about_z(proposals.azimuths) @ self.rotations[proposals.hypotheses]
+        alignment = start(self.owners[proposals.hypotheses], turns, len(views))
+        alignment = centred(self.caster, alignment, views)
+        alignment = align(self.caster, alignment, views, COARSE, self.prior)
+
+        scores = self._scores(proposals.log_belief, alignment, self._judge(alignment, views))
+        order = np.argsort(-scores, kind="stable")[:MOST_SURVIVORS]
+        rows = order[scores[order] > scores[order[0]] - HOPELESS]
+        return alignment.select(rows), proposals.select(rows)
+
+    def _judge(self, alignment: Alignment, views: Sequence[DepthView]) -> list[ViewLikelihood]:
+        return [
+            likelihood(view, render(self.caster, alignment, view, number), self.pixels)
+            for number, view in enumerate(views)
+        ]
+
+    def _scores(
+        self, log_belief: Float, alignment: Alignment, judged: Sequence[ViewLikelihood]
+    ) -> Float:
+        """Log-likelihood of each hypothesis by all evidence, up to a constant, (M,)."""
+        mean = np.stack([view.mean for view in judged], 1)
+        return self.weights.scores(mean, camera_cost(alignment, self.prior), log_belief)
+
+    def _verified(
+        self,
+        proposals: Proposals,
+        alignment: Alignment,
+        judged: Sequence[ViewLikelihood],
+        joint: Float,
+    ) -> Verified:
+        """The answer of the proposals that were aligned, sorted by their scores."""
+        scores = self._scores(proposals.log_belief, alignment, judged)
+        by_features = np.bincount(self.owners, joint.sum(1), len(self.caster.surfaces))
+        by_features /= by_features.sum()
+        belief = self.weights.belief(scores, alignment.things, by_features)
+
+        order = np.argsort(-scores, kind="stable")
+        shares = np.exp(scores[order] - scores.max())
+        sorted_alignment = alignment.select(order)
+        return Verified(
+            belief=belief,
+            things=sorted_alignment.things,
+            resting=proposals.hypotheses[order],
+            probabilities=shares / shares.sum(),
+            poses=sorted_alignment.poses(self.caster),
+            cameras=sorted_alignment.cameras,
+            mean=np.stack([view.mean for view in judged], 1)[order],
+            camera_costs=camera_cost(sorted_alignment, self.prior),
+            log_belief=proposals.log_belief[order],
+            by_features=by_features,
+            explained=np.stack([view.explained for view in judged], 1)[order],
+        )
+
+
+def _views(observations: Sequence[Observation], side: int) -> list[DepthView]:
+    """The pixels of the observations that show the thing; ObservationError if none does."""
+    found = (depth_view(observation, side) for observation in observations)
+    views = [view for view in found if view is not None]
+    if not views:
+        raise ObservationError("no view shows the thing, so nothing can be aligned")
+    return views

@@ -1,0 +1,137 @@
+"""How much features, size and geometry count beside each other, and the belief that follows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import ModelError
+
+Float = NDArray[np.float64]
+
+NEVER = -1e9  # log-likelihood of a thing that was not aligned
+LEAST_BELIEF = 1e-9  # belief in the truth below which it is not told how wrong it was
+
+GEOMETRY_WEIGHTS = (5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0)
+FEATURE_WEIGHTS = (0.2, 0.4, 0.6, 0.8, 1.0)
+CAMERA_WEIGHTS = (0.1, 0.5)
+CORRELATIONS = (0.0, 0.2, 0.5, 1.0)
+DOUBTS = (0.001, 0.003, 0.01, 0.03)
+"""What ``fit_weights`` tries."""
+
+
+@dataclass(frozen=True)
+class EvidenceWeights:
+    """How much each kind of evidence counts.
+
+    The pixels of a view are correlated, and so are the views of a thing: they are not as many
+    independent pieces of evidence. What the sums are multiplied by is fitted to views of which the
+    truth is known.
+
+    Attributes:
+        geometry: of the mean log-likelihood of a view's pixels.
+        features: of the log-belief by features and size.
+        cameras: of the log-likelihood of the errors of the cameras' places.
+        correlation: of two views, 0 to 1: the sum over k views is divided by ``1 + correlation * (k
+            - 1)``.
+        doubt: share of the belief that is left to features and size alone.
+    """
+
+    geometry: float = 20.0
+    features: float = 0.6
+    cameras: float = 0.2
+    correlation: float = 0.2
+    doubt: float = 0.003
+
+    def scores(self, mean: Float, camera_costs: Float, log_belief: Float) -> Float:
+        """Log-likelihood of hypotheses by all evidence, up to a constant.
+
+        Args:
+            mean: mean log-likelihood of the pixels of each view, (M, V).
+            camera_costs: half the squared deviations of each camera's place, (M, V).
+            log_belief: log-belief in each hypothesis by features and size, (M,).
+
+        Returns:
+            (M,) float64.
+        """
+        of_views = self.geometry * mean - self.cameras * camera_costs
+        together = 1 + self.correlation * (mean.shape[1] - 1)
+        return of_views.sum(1) / together + self.features * log_belief
+
+    def belief(self, scores: Float, things: NDArray[np.int64], by_features: Float) -> Float:
+        """Belief in each thing, by its likeliest hypothesis.
+
+        Args:
+            scores: of M hypotheses, (M,).
+            things: thing of each, (M,) int.
+            by_features: belief in each thing by features and size alone, (T,), sums to 1.
+
+        Returns:
+            (T,) float64, sums to 1.
+        """
+        best = np.full(len(by_features), NEVER)
+        np.maximum.at(best, things, scores)
+        belief = np.exp(best - best.max())
+        belief /= belief.sum()
+        return (1 - self.doubt) * belief + self.doubt * by_features
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedEpisode:
+    """What was found of the hypotheses of one thing after some views, and which thing it was.
+
+    Attributes:
+        truth: number of the thing.
+        things: thing of each hypothesis, (M,) int64.
+        mean: mean log-likelihood of the pixels of each view, (M, V) float64.
+        camera_costs: half the squared deviations of each camera's place, (M, V) float64.
+        log_belief: log-belief in each hypothesis by features and size, (M,) float64.
+        by_features: belief in each thing by features and size alone, (T,) float64.
+    """
+
+    truth: int
+    things: NDArray[np.int64]
+    mean: Float
+    camera_costs: Float
+    log_belief: Float
+    by_features: Float
+
+    def belief(self, weights: EvidenceWeights) -> Float:
+        """Belief in each thing with some weights, (T,) float64."""
+        scores = weights.scores(self.mean, self.camera_costs, self.log_belief)
+        return weights.belief(scores, self.things, self.by_features)
+
+
+def fit_weights(episodes: Sequence[JudgedEpisode]) -> EvidenceWeights:
+    """Choose the weights with the least mean negative log-belief in the truth.
+
+    All combinations of some values are tried; the doubt is fitted after the others.
+
+    Args:
+        episodes: of things whose names are known, after one and more views.
+
+    Returns:
+        The best weights.
+
+    Raises:
+        ModelError: there is no episode.
+    """
+    if not episodes:
+        raise ModelError("weights are fitted to episodes, and there is none")
+
+    tried = []
+    for values in product(GEOMETRY_WEIGHTS, FEATURE_WEIGHTS, CAMERA_WEIGHTS, CORRELATIONS):
+        weights = EvidenceWeights(*values)
+        tried.append((_loss(weights, episodes), weights))
+    best = min(tried, key=lambda pair: pair[0])[1]
+
+    doubting = [replace(best, doubt=doubt) for doubt in DOUBTS]
+    return min(doubting, key=lambda weights: _loss(weights, episodes))
+
+
+def _loss(weights: EvidenceWeights, episodes: Sequence[JudgedEpisode]) -> float:
+    """Mean negative logarithm of the belief in the truth."""
+    believed = np.array([episode.belief(weights)[episode.truth] for episode in episodes])
+    return float(-np.log(np.maximum(believed, LEAST_BELIEF)).mean())

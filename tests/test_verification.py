@@ -1,0 +1,354 @@
+"""Things of known geometry: their alignment, and what each kind of pixel does to the likelihood."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from nextview.errors import MeshError, ModelError, ObservationError
+from nextview.geometry.mesh import Mesh, make_mesh
+from nextview.geometry.observation import Observation, SceneView
+from nextview.geometry.ray_caster import embree_scene
+from nextview.geometry.resting import rotated
+from nextview.geometry.viewsphere import look_at_origin
+from nextview.simulation.simulated import SimulatedCamera
+from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, depth_view
+from nextview.things.proposals import propose
+from nextview.things.registration import (
+    COARSE,
+    FINE,
+    align,
+    centred,
+    render,
+    rotation_about_z,
+    start,
+)
+from nextview.things.surface import Surface, SurfaceCaster
+from nextview.things.unknown import KnownResiduals
+from nextview.things.verification import likelihood
+from nextview.things.verifier import Verified, Verifier
+
+SIDE = 40
+VIEWS = ((25.0, 20.0), (50.0, 140.0), (35.0, 260.0))  # elevation and azimuth, degrees
+
+
+def mesh_of(*boxes, origin=(0.0, 0.0, 0.0)) -> Mesh:
+    """A mesh of boxes, each by its extents and its middle, metres, and where its origin lies."""
+    parts = [trimesh.creation.box(extents) for extents, _ in boxes]
+    for part, (_, middle) in zip(parts, boxes, strict=True):
+        part.apply_translation(np.add(middle, origin))
+    whole = trimesh.util.concatenate(parts)
+    return make_mesh(whole.vertices, whole.faces, unit="m")
+
+
+def l_block() -> Mesh:
+    """Two arms of different length, 4 cm high; the scan's origin is 30 cm off."""
+    long_arm = ((0.16, 0.04, 0.04), (0.0, 0.0, 0.0))
+    short_arm = ((0.04, 0.08, 0.04), (-0.06, 0.06, 0.0))
+    return mesh_of(long_arm, short_arm, origin=(0.3, -0.1, 0.2))
+
+
+def cup(handle: bool) -> Mesh:
+    body = ((0.08, 0.08, 0.1), (0.0, 0.0, 0.0))
+    grip = ((0.05, 0.015, 0.06), (0.06, 0.0, 0.0))
+    return mesh_of(body, grip) if handle else mesh_of(body)
+
+
+def views_of(mesh: Mesh, yaw: float = 0.0, directions=VIEWS) -> list[Observation]:
+    """Exact views of a mesh turned about the vertical."""
+    camera = SimulatedCamera(rotated(mesh, rotation_about_z(np.array([yaw]))[0]))
+    return [camera.observe(look_at_origin(np.radians(up), np.radians(around))) for up, around in directions]
+
+
+def true_pose(mesh: Mesh, yaw: float) -> np.ndarray:
+    """The scan file's frame in the object frame, metres, of what ``views_of`` shows."""
+    turn = rotation_about_z(np.array([yaw]))[0]
+    shown = rotated(mesh, turn)
+    pose = np.eye(4)
+    pose[:3, :3] = turn
+    pose[:3, 3] = -(turn @ mesh.centre + shown.centre)
+    return pose
+
+
+def displaced(observation: Observation, by) -> Observation:
+    """The same view, of which the camera is believed to stand elsewhere by some metres."""
+    pose = observation.pose.copy()
+    pose[:3, 3] += np.asarray(by) / observation.radius
+    return replace(observation, pose=pose)
+
+
+def with_scene(observation: Observation, depth, target) -> Observation:
+    """The same view with all that the camera saw, depth in object radii."""
+    scene = SceneView(depth.astype(np.float32), target, observation.pose, observation.intrinsics)
+    return replace(observation, scene=scene)
+
+
+def on_a_wall(observation: Observation) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of the view with a wall behind the thing, and the thing's pixels."""
+    target = observation.depth > 0
+    return np.where(target, observation.depth, 5.0), target
+
+
+def off_by(found: np.ndarray, true: np.ndarray, at: np.ndarray) -> tuple[float, float]:
+    """Degrees and millimetres between two poses, at a point of the scan."""
+    turn = Rotation.from_matrix(found[:3, :3] @ true[:3, :3].T).magnitude()
+    moved = (found - true) @ np.append(at, 1)
+    return float(np.degrees(turn)), float(1000 * np.linalg.norm(moved[:3]))
+
+
+def aligned(mesh: Mesh, observations, yaws) -> tuple[SurfaceCaster, np.ndarray, np.ndarray]:
+    """Poses found from some azimuths, and how likely the views are with each."""
+    caster = SurfaceCaster([Surface.from_mesh(mesh, "thing")])
+    coarse = [depth_view(each, 24) for each in observations]
+    fine = [depth_view(each, SIDE) for each in observations]
+    found = start(np.zeros(len(yaws), int), rotation_about_z(yaws), len(observations))
+    found = align(caster, centred(caster, found, coarse), coarse, COARSE)
+    found = align(caster, found, fine, FINE)
+    judged = [likelihood(view, render(caster, found, view, k)).mean for k, view in enumerate(fine)]
+    return found, found.poses(caster), np.sum(judged, 0)
+
+
+@pytest.mark.parametrize("views", [1, 3])
+@pytest.mark.parametrize("yaw", [0.3, 2.0, -1.2])
+def test_a_known_pose_is_found_to_a_millimetre_and_a_degree(yaw, views):
+    mesh = l_block()
+    observations = views_of(mesh, yaw)[:views]
+    yaws = np.arange(8) * np.pi / 4
+    _, poses, likely = aligned(mesh, observations, yaws)
+    turn, moved = off_by(poses[likely.argmax()], true_pose(mesh, yaw), mesh.centre)
+    assert turn < 1
+    assert moved < 1
+
+
+def test_a_tilt_of_the_vertical_is_found_too():
+    mesh = l_block()
+    lean = Rotation.from_rotvec([0.03, -0.02, 0.4]).as_matrix()
+    shown = rotated(mesh, lean)
+    camera = SimulatedCamera(shown)
+    observations = [camera.observe(look_at_origin(np.radians(up), np.radians(around))) for up, around in VIEWS]
+    _, poses, _ = aligned(mesh, observations, np.array([0.35]))
+    true = np.eye(4)
+    true[:3, :3] = lean
+    true[:3, 3] = -(lean @ mesh.centre + shown.centre)
+    turn, moved = off_by(poses[0], true, mesh.centre)
+    assert turn < 0.5
+    assert moved < 1
+
+
+def test_a_centre_that_is_a_quarter_radius_off_is_made_up_for():
+    mesh = l_block()
+    off = 0.25 * mesh.metres * np.array([0.6, -0.7, 0.3])
+    observations = [displaced(each, off) for each in views_of(mesh, 0.5)]
+    _, poses, likely = aligned(mesh, observations, np.arange(8) * np.pi / 4)
+    true = true_pose(mesh, 0.5)
+    true[:3, 3] += off
+    turn, moved = off_by(poses[likely.argmax()], true, mesh.centre)
+    assert turn < 1
+    assert moved < 1
+
+
+def test_errors_of_the_cameras_places_are_told_from_the_pose():
+    mesh = l_block()
+    errors = 0.001 * np.array([[4.0, -2.0, 1.0], [-3.0, 3.0, 2.0], [-1.0, -1.0, -3.0]])
+    exact = views_of(mesh, 0.5)
+    moved = [displaced(each, error) for each, error in zip(exact, errors, strict=True)]
+    found, poses, likely = aligned(mesh, moved, np.array([0.4]))
+    np.testing.assert_allclose(found.cameras[0], errors, atol=0.0015)
+    assert off_by(poses[0], true_pose(mesh, 0.5), mesh.centre)[1] < 1.5
+    _, _, best = aligned(mesh, exact, np.array([0.4]))
+    assert likely[0] > best[0] - 0.3
+
+
+def test_a_missing_handle_lowers_the_likelihood():
+    caster = SurfaceCaster([Surface.from_mesh(cup(handle), str(handle)) for handle in (True, False)])
+    for handle in (True, False):
+        observation = views_of(cup(handle), directions=((30.0, 60.0),))[0]
+        view = depth_view(observation, SIDE)
+        found = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
+        found = align(caster, centred(caster, found, [view]), [view], (*COARSE, *FINE))
+        with_it, without = likelihood(view, render(caster, found, view, 0)).mean
+        assert (with_it > without + 0.1) == handle
+
+
+@pytest.fixture
+def block_view():
+    """An exact view of the block, and its surface in the right pose."""
+    mesh = l_block()
+    observation = views_of(mesh, directions=VIEWS[:1])[0]
+    caster = SurfaceCaster([Surface.from_mesh(mesh, "block")])
+    return observation, caster, start(np.zeros(1, int), np.eye(3)[None], 1)
+
+
+def mean_likelihood(observation, caster, placed) -> float:
+    view = depth_view(observation, SIDE)
+    return float(likelihood(view, render(caster, placed, view, 0)).mean[0])
+
+
+@pytest.mark.parametrize(
+    ("distance", "lowers"),
+    [(1.0, False), (5.0, True), (0.0, False)],
+    ids=["something stands before it", "the wall shows through it", "nothing is measured there"],
+)
+def test_what_shows_in_the_place_of_a_part(block_view, distance, lowers):
+    observation, caster, placed = block_view
+    depth, target = on_a_wall(observation)
+    whole = mean_likelihood(with_scene(observation, depth, target), caster, placed)
+    columns = np.flatnonzero(target.any(0))
+    part = target & (np.arange(target.shape[1]) > np.quantile(columns, 0.6))
+    changed = with_scene(observation, np.where(part, distance, depth), target & ~part)
+    after = mean_likelihood(changed, caster, placed)
+    assert whole > -0.15
+    assert after < whole - 0.5 if lowers else after > whole - 0.35
+
+
+def test_surface_that_no_hypothesis_explains_lowers_the_likelihood(block_view):
+    observation, caster, placed = block_view
+    depth, target = on_a_wall(observation)
+    whole = mean_likelihood(with_scene(observation, depth, target), caster, placed)
+    rows, columns = np.nonzero(target)
+    more = target.copy()
+    more[rows.min() - 12 : rows.min() + 8, int(np.median(columns)) :] = True
+    grown = with_scene(observation, np.where(more & ~target, 2.9, depth), more)
+    assert mean_likelihood(grown, caster, placed) < whole - 0.3
+
+
+def test_a_few_pixels_at_the_outline_cost_little(block_view):
+    observation, caster, placed = block_view
+    depth, target = on_a_wall(observation)
+    whole = mean_likelihood(with_scene(observation, depth, target), caster, placed)
+    shifted = np.roll(depth, 1, axis=1), np.roll(target, 1, axis=1)
+    assert mean_likelihood(with_scene(observation, *shifted), caster, placed) > whole - 0.3
+
+
+def test_kinds_of_pixels():
+    observation = views_of(l_block(), directions=VIEWS[:1])[0]
+    depth, target = on_a_wall(observation)
+    depth[:, : depth.shape[1] // 2] = np.where(target, depth, 0)[:, : depth.shape[1] // 2]
+    view = depth_view(with_scene(observation, depth, target), SIDE)
+    assert set(view.kind.tolist()) == {NOT_MEASURED, ELSEWHERE, THING}
+    assert len(view.kind) == np.prod(view.shape)
+    assert (view.edge[view.kind == THING] < 0).all()
+    assert (view.edge[view.kind != THING] > 0).all()
+    points = view.points[view.kind == THING]
+    reach = np.linalg.norm(points, axis=1).max()
+    assert reach == pytest.approx(observation.radius, rel=0.1)  # metres, about the centre
+    nothing = replace(observation, depth=np.zeros_like(observation.depth))
+    assert depth_view(nothing, SIDE) is None
+    with pytest.raises(ObservationError, match="the object radius in metres is not known"):
+        depth_view(replace(observation, radius=None), SIDE)
+
+
+def test_rays_cast_at_many_surfaces_are_those_cast_at_each_alone():
+    rng = np.random.default_rng(0)
+    meshes = [l_block(), cup(True), mesh_of(((0.5, 0.3, 0.2), (1.0, 2.0, 3.0))), cup(False)]
+    surfaces = [Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)]
+    things = rng.integers(len(surfaces), size=12)
+    directions = rng.normal(size=(12, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    centres = np.stack([surfaces[k].centre for k in things])
+    origins = (centres + 0.8 * directions).astype(np.float32)
+    rays = (centres + rng.normal(0, 0.04, (200, 12, 3)) - origins).swapaxes(0, 1).astype(np.float32)
+
+    depth, normals = SurfaceCaster(surfaces).cast(things, origins, rays)
+    for row, thing in enumerate(things):
+        alone = embree_scene([(surfaces[thing].vertices, surfaces[thing].faces)])
+        hits = alone.run(np.tile(origins[row], (200, 1)), np.ascontiguousarray(rays[row]), output=1)
+        met = hits["primID"] >= 0
+        assert np.mean(met != np.isfinite(depth[row])) < 0.02  # rays along an edge may go either way
+        both = met & np.isfinite(depth[row])
+        assert both.sum() > 20
+        np.testing.assert_allclose(depth[row, both], hits["tfar"][both], atol=1e-4)
+        assert (np.einsum("pi,pi->p", normals[row, both], rays[row, both]) < 0).all()
+        np.testing.assert_allclose(np.linalg.norm(normals[row, both], axis=1), 1, atol=1e-4)
+
+
+def test_a_surface_keeps_the_frame_of_its_scan_and_loses_what_no_camera_sees():
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
+    ball.apply_translation((2.0, -1.0, 0.5))
+    in_millimetres = make_mesh(1000 * ball.vertices, ball.faces, unit="mm")
+    surface = Surface.from_mesh(in_millimetres, "ball")
+    np.testing.assert_allclose(surface.centre, (2.0, -1.0, 0.5), atol=1e-5)
+    assert surface.diameter == pytest.approx(0.1, rel=1e-3)
+    few = surface.simplified()
+    assert len(few.faces) < len(surface.faces) / 4
+    off = np.linalg.norm(few.sample(500, np.random.default_rng(0)) - (2.0, -1.0, 0.5), axis=1) - 0.05
+    assert np.abs(off).max() < 0.001
+    block = Surface.from_mesh(l_block(), "block")
+    assert block.simplified() is block  # it has no triangle too many
+    with pytest.raises(MeshError, match="unit of length is not known"):
+        Surface.from_mesh(make_mesh(ball.vertices, ball.faces), "ball")
+
+
+def test_few_are_proposed_where_it_is_clear_and_a_ball_does_not_crowd_out_the_rest():
+    clear = np.full((50, 16), 1e-12)
+    clear[7, 3] = 1
+    found = propose(clear / clear.sum())
+    assert len(found) == 24
+    assert found.hypotheses[0] == 7
+    assert -2 * np.pi * 3 / 16 in found.azimuths[found.hypotheses == 7].tolist()
+
+    rng = np.random.default_rng(0)
+    unclear = rng.uniform(0.9, 1, (50, 16))
+    unclear[4] = 20  # every azimuth suits it
+    found = propose(unclear / unclear.sum())
+    assert len(found) == 72
+    assert (found.hypotheses == 4).sum() == 8
+    assert len(set(found.hypotheses.tolist())) > 20
+
+
+def even_belief(hypotheses: int) -> np.ndarray:
+    return np.full((hypotheses, 16), 1 / 16 / hypotheses)
+
+
+def verifier_of(*meshes: Mesh) -> Verifier:
+    surfaces = [Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)]
+    return Verifier(surfaces, np.arange(len(meshes)), np.tile(np.eye(3), (len(meshes), 1, 1)))
+
+
+@pytest.mark.parametrize("shown", [0, 1, 2])
+def test_a_thing_is_named_by_its_geometry_alone(shown):
+    meshes = [l_block(), cup(True), cup(False)]
+    verifier = verifier_of(*meshes)
+    found = verifier(views_of(meshes[shown], 0.8)[:2], even_belief(3))
+    assert found.belief.argmax() == shown
+    assert found.belief[shown] > 0.9
+    np.testing.assert_allclose([found.belief.sum(), found.probabilities.sum()], 1)
+    assert found.things[0] == shown
+    assert found.residual < 0.2
+    assert found.explained[0].min() > 0.9
+    turn, moved = off_by(found.poses[0], true_pose(meshes[shown], 0.8), meshes[shown].centre)
+    assert moved < 1.5
+    assert turn < 1 or shown == 2  # the cup without a handle has four azimuths
+
+
+def test_two_things_of_the_same_geometry_share_the_belief():
+    verifier = verifier_of(cup(True), cup(True), l_block())
+    found = verifier(views_of(cup(True), 0.3), even_belief(3))
+    np.testing.assert_allclose(found.belief[:2], 0.5, atol=0.1)
+
+
+def test_what_does_not_fit_together_is_refused():
+    verifier = verifier_of(cup(True), l_block())
+    with pytest.raises(ModelError, match="a belief in 5 hypotheses, and there are 2"):
+        verifier(views_of(cup(True)), even_belief(5))
+    surfaces = [Surface.from_mesh(cup(True), "cup")]
+    with pytest.raises(ModelError, match="1 surfaces do not fit 2 resting poses"):
+        Verifier(surfaces, np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)))
+    nothing = [replace(each, depth=np.zeros_like(each.depth)) for each in views_of(cup(True))]
+    with pytest.raises(ObservationError, match="no view shows the thing"):
+        verifier(nothing, even_belief(2))
+
+
+def residual_of(verifier: Verifier, mesh: Mesh) -> Verified:
+    return verifier(views_of(mesh, 0.3)[:2], even_belief(len(verifier.owners)))
+
+
+def test_what_no_hypothesis_explains_has_a_small_p_value():
+    known = KnownResiduals.fit(np.array([0, 0, 1, 1]), np.array([0.1, 0.2, 0.15, 0.25]), np.array([2, 2, 2, 2]), 2)
+    verifier = verifier_of(cup(True), l_block())
+    stranger = mesh_of(((0.12, 0.12, 0.02), (0, 0, 0)), ((0.02, 0.02, 0.12), (0, 0, 0.05)))
+    taught, strange = residual_of(verifier, l_block()), residual_of(verifier, stranger)
+    assert known.p_value(strange.residual, int(strange.things[0]), 2) == pytest.approx(0.2)  # the least of 1 in 5
+    assert known.p_value(taught.residual, int(taught.things[0]), 2) > 0.5
