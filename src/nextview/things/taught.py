@@ -99,5 +99,5 @@ class TaughtThings:
         calibration = self.recogniser.calibration
         classes = len(self.recogniser.classes)
         total = log_evidence.sum(0)
-        joint = calibration.joint(total, len(observations), classes, np.float64(0))[self._rows]
+        joint = calibration.joint(total, len(observations), classes, np.zeros(()))[self._rows]
         return self.verifier(observations, joint / joint.sum())

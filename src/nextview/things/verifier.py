@@ -188,7 +188,8 @@ class Verifier:
     ) -> Verified:
         """The answer of the proposals that were aligned, sorted by their scores."""
         scores = self._scores(proposals.log_belief, alignment, judged)
-        by_features = np.bincount(self.owners, joint.sum(1), len(self.caster.surfaces))
+        by_features = np.zeros(len(self.caster.surfaces))
+        np.add.at(by_features, self.owners, joint.sum(1))
         by_features /= by_features.sum()
         belief = self.weights.belief(scores, alignment.things, by_features)
 
