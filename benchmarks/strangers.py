@@ -33,6 +33,7 @@ from nextview.simulation.scene import build_scene
 from nextview.simulation.sensed_camera import SensedCamera
 
 BOOTSTRAP_SAMPLES = 1000
+MOST_UNKNOWN_CLASSES = 5
 REPORTED = ("unknown", "named right", "most like their class", "named and confident")
 
 
@@ -115,8 +116,9 @@ def main(
     print(f"{'views':22} {table[:, -1].mean():.2f}")
 
     of_class = np.array(labels)
-    shares = [f"{label} {table[of_class == label, 0].mean():.3f}" for label in sorted(set(labels))]
-    print("unknown by class: " + ", ".join(shares))
+    shares = {label: table[of_class == label, 0].mean() for label in sorted(set(labels))}
+    most = sorted(shares, key=lambda label: -shares[label])[:MOST_UNKNOWN_CLASSES]
+    print("most often unknown: " + ", ".join(f"{label} {shares[label]:.3f}" for label in most))
 
 
 if __name__ == "__main__":
