@@ -29,8 +29,8 @@ from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import azimuth_of, look_at_origin
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate import Discriminate
-from nextview.recognition.memory import AZIMUTHS, RINGS, Memory, read_memory
-from nextview.recognition.model_card import find_models, read_card
+from nextview.recognition.memory import AZIMUTHS, RINGS, Memory, open_memory
+from nextview.recognition.model_card import find_models
 from nextview.simulation.sensed_camera import SensedCamera
 from research.film_stage import Array, Colour, Look, Shot, Stage, circle, font, rays_of, scene, shot, tag, toned
 
@@ -274,8 +274,8 @@ def main(folder: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path], se
     placed = laid_out(folder, np.random.default_rng(seed))
     ours, theirs = (nextview.load(models="ycb", policy=name, threads=1) for name in (None, "random-all"))
     runs = [{name: episode(s, ours.policy, placed, k, seed) for k, name in enumerate(THINGS)} for s in (ours, theirs)]
-    card = read_card(find_models("ycb").recogniser)
-    thumbs = Thumbs(folder, read_memory(card.path, card.sha256), ours.classes)
+    _, memory = open_memory(find_models("ycb").recogniser)
+    thumbs = Thumbs(folder, memory, ours.classes)
     sides = (
         Side("nextview", "looks where the things it believes in differ", OURS, runs[0]),
         Side("random views", "looks anywhere", THEIRS, runs[1]),

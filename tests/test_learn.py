@@ -23,7 +23,7 @@ from nextview.policies.discriminate import Discriminate
 from nextview.recognition.approximate import NearestViews
 from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, reorient
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.memory import AZIMUTHS, RINGS, by_ring, read_memory, similarities
+from nextview.recognition.memory import AZIMUTHS, RINGS, by_ring, open_memory, similarities
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
 from nextview.simulation.simulated import SimulatedCamera
@@ -87,15 +87,15 @@ def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(tmp_pa
     shutil.copytree(taught, models)
     slab = make_mesh(sample_mesh("table").vertices * (1, 0.2, 1), sample_mesh("table").faces)
     write_off(more / "bench.off", slab)
-    before = read_memory(taught / "memory.safetensors", read_card(taught / "memory.json").sha256)
+    before = open_memory(taught / "memory.json")[1]
     learn(more, models, upright=True, add=True, workers=0)
     card = read_card(models / "memory.json")
     assert card.classes == ("bench", *THINGS)
-    np.testing.assert_array_equal(read_memory(card.path, card.sha256).views[1:], before.views)
+    np.testing.assert_array_equal(open_memory(card.card_path)[1].views[1:], before.views)
     learn(models, models, remove=("bench",))
     card = read_card(models / "memory.json")
     assert card.classes == THINGS
-    np.testing.assert_array_equal(read_memory(card.path, card.sha256).held_out, before.held_out)
+    np.testing.assert_array_equal(open_memory(card.card_path)[1].held_out, before.held_out)
     assert "is all it knows" in learn(models, models, remove=THINGS[1:]).notes[0]
     with pytest.raises(UsageError, match="knows nothing called 'mug'"):
         learn(models, models, remove=("mug",))
@@ -119,7 +119,7 @@ def test_a_run_that_was_stopped_goes_on_and_gives_the_same(tmp_path, taught, sca
     counts = []
     learn(scans, tmp_path / "mine", upright=True, workers=0, track=lambda done, total, what: counts.extend(done))
     assert counts[0] == 2  # what was finished is not looked at again
-    assert (tmp_path / "mine/memory.safetensors").read_bytes() == (taught / "memory.safetensors").read_bytes()
+    assert read_card(tmp_path / "mine/memory.json").sha256 == read_card(taught / "memory.json").sha256
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
 
 

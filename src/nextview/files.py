@@ -2,9 +2,12 @@
 
 What exists is refused; with ``overwrite`` exactly the files that are written are replaced. A file is written under a
 temporary name beside its place and then renamed, so a run that is killed leaves what was there before.
+
+Temporary folders have random names and hold a marker, MARKER: only a folder with the marker is ever removed.
 """
 
 import errno
+import glob
 import hashlib
 import os
 import shlex
@@ -12,7 +15,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -24,6 +27,8 @@ from nextview.errors import DatasetError, ModelError, NextviewError, ResultsErro
 T = TypeVar("T")
 Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]  # a field of a record: a hash in hexadecimal digits
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a full disk
+MARKER = "nextview-unfinished.json"  # in each temporary folder: an ``Unfinished`` record
+LONGEST_NAME = 40  # letters of an output's name that the name of its temporary folder holds
 LARGEST_RECORD = 64 * 2**20  # bytes of a JSON record; a card takes some hundred thousand
 
 
@@ -60,11 +65,23 @@ def new_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
 
 
 @contextmanager
-def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
+def new_folder(path: Path, overwrite: bool = False, last: str = "", withdraw: bool = False) -> Iterator[Path]:
     """Write a folder of files: yields a temporary folder beside it.
 
-    An existing folder with files in it is refused. With ``overwrite`` each file that was written replaces the one of
-    its name, and all others stay. ResultsError: see ``check_new``; or the disk is full.
+    A folder that was not there appears whole. Of one that is there, with ``overwrite``, each file that was written
+    replaces the one of its name, and all others stay: the deepest first, ``last`` at the end. No file is replaced
+    before every place is known to be free.
+
+    Args:
+        path: The folder.
+        overwrite: Whether files in it may be replaced; without, it has to be empty.
+        last: The file, directly in the folder, that names or describes the others. Whoever is stopped before it is
+            replaced leaves the one that was there.
+        withdraw: Whether that file is removed before the first other is replaced: for files that keep their names, so
+            that whoever is stopped leaves no mixture of old and new ones, but a folder that says nothing.
+
+    Raises:
+        ResultsError: see ``check_new``; or the disk is full.
     """
     check_new(path, overwrite, folder=True)
     there = path.is_dir()
@@ -73,29 +90,144 @@ def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
         part = temporary / place.name
         part.mkdir()
         yield part
-        written = [file for file in part.rglob("*") if file.is_file()]
+
+        written = [file.relative_to(part) for file in part.rglob("*") if file.is_file()]
         for file in written:
-            _sync(file)
+            _sync(part / file)
+
         if not there:
             check_new(path, overwrite, folder=True)
             if not path.exists():
                 os.rename(part, path)
+                _sync_folder(path.parent)
                 return
+
         for file in written:
-            place = path / file.relative_to(part)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            check_new(place, overwrite)
-            os.replace(file, place)
+            _check_inside(path, file, overwrite)
+        if withdraw:
+            (path / last).unlink(missing_ok=True)
+            _sync_folder(path)
+        _replace(part, path, written, last)
+
+
+def _replace(part: Path, folder: Path, files: Sequence[Path], last: str) -> None:
+    """Move files, by their relative paths, from one folder into another: the deepest first, ``last`` at the end."""
+    for file in sorted(files, key=lambda file: (file.as_posix() == last, -len(file.parts), file)):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        if file.as_posix() == last:
+            _sync_folder(folder)  # what it names is on the disk before it is
+        os.replace(part / file, folder / file)
+    _sync_folder(folder)
+
+
+def _check_inside(folder: Path, file: Path, overwrite: bool) -> None:
+    """``check_new`` of a file in a folder, which no link on the way may lead out of."""
+    for above in file.parents:
+        if (folder / above).is_symlink() and above != Path():
+            raise ResultsError(f"{folder / above}: is a link; give what it points to")
+    check_new(folder / file, overwrite)
+
+
+class Unfinished(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What marks a folder as a temporary one of this package.
+
+    Attributes:
+        output: The name of the output that it is for.
+        key: What the parts in it are of, see ``unfinished``; TEMPORARY where they are of no further use.
+    """
+
+    output: str
+    key: str
+
+
+TEMPORARY = "temporary"
+
+
+@contextmanager
+def unfinished(output: Path, key: str) -> Iterator[Path]:
+    """A folder beside an output for the parts of it that are done, so that a stopped run can go on.
+
+    It is the folder that an earlier run with the same key left, or a new one. It is removed at the end, but stays after
+    an error if there is anything in it. Folders that earlier runs with other keys left are removed, and temporary ones
+    of runs that were killed. Use it inside ``only_one``.
+
+    Raises:
+        ResultsError: it cannot be written.
+    """
+    output = output.absolute()
+    found = None
+    for folder in _marked(output.parent, output.name):
+        if found is None and _marker(folder) == Unfinished(output.name, key):
+            found = folder
+        else:
+            _remove(folder)
+    for folder in _marked(output, "new") if output.is_dir() else ():
+        _remove(folder)
+
+    folder = _marked_folder(output, key) if found is None else found
+    try:
+        yield folder
+    except BaseException:  # also where the user stops it
+        if [path.name for path in folder.iterdir()] == [MARKER]:
+            _remove(folder)
+        raise
+    _remove(folder)
+
+
+def _marked_folder(path: Path, key: str) -> Path:
+    """Make a temporary folder of a random name beside a path, with its marker."""
+    folder = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=f".{path.name[:LONGEST_NAME]}-", dir=path.parent))
+        (folder / MARKER).write_bytes(msgspec.json.encode(Unfinished(path.name, key)))
+    except OSError as error:
+        if folder is not None:
+            _remove(folder)
+        raise ResultsError(f"{path}: cannot be written ({error.strerror})") from None
+    return folder
+
+
+def _marked(place: Path, name: str) -> list[Path]:
+    """The temporary folders for an output of that name in a folder, by their markers."""
+    found = []
+    for folder in sorted(place.glob(f".{glob.escape(name[:LONGEST_NAME])}-*")):
+        marker = _marker(folder)
+        if marker is not None and marker.output == name:
+            found.append(folder)
+    return found
+
+
+def _marker(folder: Path) -> Unfinished | None:
+    """What marks a folder as a temporary one of ours; None if nothing does."""
+    file = folder / MARKER
+    try:
+        if folder.is_symlink() or file.is_symlink() or not file.is_file():
+            return None
+        return msgspec.json.decode(file.read_bytes(), type=Unfinished)
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError):  # of another user, or another's file of that name
+        return None
+
+
+def _remove(folder: Path) -> None:
+    """Remove a temporary folder, as far as the system lets us.
+
+    Its marker goes after all else: what a kill leaves of it is still known as ours.
+    """
+    with suppress(OSError):
+        for path in folder.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.name != MARKER:
+                path.unlink(missing_ok=True)
+        (folder / MARKER).unlink(missing_ok=True)
+        folder.rmdir()
 
 
 @contextmanager
 def _beside(path: Path) -> Iterator[Path]:
     """A temporary folder on the same disk, removed at the end; what the disk refuses becomes one sentence."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name[:40]}-", dir=path.parent))
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be written ({error.strerror})") from None
+    temporary = _marked_folder(path, TEMPORARY)
     try:
         yield temporary
     except OSError as error:
@@ -103,12 +235,24 @@ def _beside(path: Path) -> Iterator[Path]:
             raise
         raise ResultsError(f"{path}: cannot be written ({error.strerror})") from None
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        _remove(temporary)
 
 
 def _sync(path: Path) -> None:
     with path.open("rb+") as file:
         os.fsync(file.fileno())
+
+
+def _sync_folder(path: Path) -> None:
+    """See that the renames in a folder are on the disk, as far as the system can tell."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    with suppress(OSError):  # no file is lost without it: some network file systems refuse it, as does a folder that
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)  # can be written but not read
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 @contextmanager
@@ -119,6 +263,9 @@ def only_one(path: Path) -> Iterator[None]:
     place = path.absolute()
     file = place.with_name(f".{place.name}.lock")
     lock = FileLock(file, timeout=0)
+    if file.is_symlink() or (file.exists() and (not file.is_file() or file.stat().st_size > 0)):
+        what = "another run's lock, or no file of this program"  # a lock is an empty file, where the system has locks
+        raise DatasetError(f"{path}: cannot be written while {file} is there: {what}")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         lock.acquire()

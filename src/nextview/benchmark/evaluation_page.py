@@ -58,11 +58,11 @@ def write_evaluation(
         card = find_card(name)
         what = f"{'shapes' if settings.deduplicate else 'objects'}{'' if p.of_size is None else ', of known size'}"
         scores = {f"{settings.split or p.splits[0] or 'all'} ({len(p)} {what})": scores_for_card(card, p)}
-        noted[card.path.with_suffix(".json")] = card.sha256, scores
+        noted[card.card_path] = card.sha256, scores
     made = asdict(settings) | {"predictions": predictions.name, "predictions_sha256": sha256_of(predictions)}
     made |= {"models": p.models, "objects": len(p)}
     found = evaluate(p, settings.samples, np.random.default_rng([settings.seed, 0]))
-    with new_folder(out, overwrite) as part:
+    with new_folder(out, overwrite, last="evaluate.json", withdraw=True) as part:
         for name, frame in found.tables().items():
             frame.to_csv(part / f"{name}.csv", index=False)
         (part / "evaluate.json").write_text(json.dumps({"settings": made, "left_out": found.left_out}, indent=1) + "\n")

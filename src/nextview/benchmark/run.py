@@ -99,7 +99,7 @@ def run_benchmark(
         "threshold_decay": grid.threshold_decay,
         "valley_classes": [table.classes[i] for i in grid.specs.valley_classes(LEM)],
     }
-    with new_folder(out, overwrite) as part:
+    with new_folder(out, overwrite, last="benchmark.json", withdraw=True) as part:
         _write_episodes(part / "episodes.parquet", grid)
         for name, frame in vars(tables).items():
             frame.to_csv(part / f"{name}.csv", index=False)

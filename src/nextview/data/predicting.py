@@ -1,7 +1,6 @@
 """Run the models over every view of a store, once; resumable by object."""
 
 import hashlib
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -16,7 +15,7 @@ from nextview.data.predictions import Predictions
 from nextview.data.splits import some_objects
 from nextview.data.store import ViewStore, writing
 from nextview.errors import PredictionsError
-from nextview.files import check_new, command
+from nextview.files import check_new, command, unfinished
 from nextview.geometry.observation import enough_shows
 from nextview.recognition.inference import MapNetwork, Recogniser
 from nextview.recognition.memory import open_recogniser
@@ -54,23 +53,19 @@ def predict(
     plan, radii, of_size = _plan(store, objects, recogniser, maps), store.radii[objects], None
     if size and recogniser.size is not None and not np.isnan(radii).all():
         of_size = recogniser.size.logits(radii).astype(np.float32)
-    with writing(out):
-        key = hashlib.sha256(repr((plan.names, plan.models)).encode() + plan.depth_entropy.tobytes()).hexdigest()
-        place = out.with_name(f".{out.name}.part").absolute()
-        if not (place / key).exists():  # an earlier run with other objects or models is of no use
-            shutil.rmtree(place, ignore_errors=True)
-            (place / key).mkdir(parents=True)
-        files = [place / key / f"{i}.npz" for i in objects]
+    key = hashlib.sha256(repr((plan.names, plan.models)).encode() + plan.depth_entropy.tobytes()).hexdigest()
+    with writing(out), unfinished(out, key) as place:
+        files = [place / f"{i}.npz" for i in objects]
         items = [item for item in zip(objects.tolist(), files, strict=True) if not item[1].exists()]
         networks = tuple((name, _card_file(card)) for name, card in maps.items())
         work = partial(_predict_object, (store.path.absolute(), _card_file(recogniser), networks))
         yield from counted(work, items, len(objects), lambda it: f"{path}: {store.names[it[0]]}", workers, scheduler)
+
         arrays = _together(files)
         maps_found = {name.removeprefix("map/"): found for name, found in arrays.items() if name.startswith("map/")}
         logits = arrays["logits"] if of_size is None else arrays["logits"] + of_size[:, None]
         bins = arrays.get("azimuth_bins")
         replace(plan, logits=logits, of_size=of_size, azimuth_bins=bins, maps=maps_found).save(out, overwrite)
-        shutil.rmtree(place)
 
 
 def _plan(store: ViewStore, objects: NDArray[np.int64], recogniser: ModelCard, maps: Cards) -> Predictions:
@@ -87,7 +82,7 @@ def _plan(store: ViewStore, objects: NDArray[np.int64], recogniser: ModelCard, m
 
 
 def _card_file(card: ModelCard) -> Path:
-    return card.path.with_suffix(".json").absolute()
+    return card.card_path.absolute()
 
 
 @lru_cache(maxsize=1)

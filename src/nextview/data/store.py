@@ -93,7 +93,7 @@ class ViewStore:
     @classmethod
     def create(cls, path: Path, attributes: Attributes, overwrite: bool = False) -> "ViewStore":
         """Make an empty store, whole or not at all; with ``overwrite`` it replaces the store at ``path``."""
-        with new_folder(path, overwrite) as part:
+        with new_folder(path, overwrite, last="zarr.json") as part:
             store = cls(part, zarr.open_group(part, mode="w"), attributes)
             store.note()
             for name in store.rendered:

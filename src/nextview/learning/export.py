@@ -263,7 +263,7 @@ def _export(candidate: _Candidate, out: Path, bits: int, overwrite: bool, track:
         raise UsageError(f"--name is the name of a model, not a path: {name}")
     for suffix in (".json", ".onnx"):
         check_new(out / f"{name}{suffix}", overwrite)
-    with new_folder(out, overwrite=True) as folder:
+    with new_folder(out, overwrite=True, last=f"{name}.json") as folder:
         part, weights = folder / f"{name}.json", folder / f"{name}.onnx"
         example = np.resize(sample, (2, *sample.shape[1:]))
         limit, end = (0.1, "input") if candidate.card.is_recogniser else (0.02, "seen")

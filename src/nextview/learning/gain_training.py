@@ -173,7 +173,7 @@ def write_gain(card: Path, policy: Gain, about: PolicyCard, features: NDArray[np
     assert isinstance(policy.score, Score)
     weights, networks = card.with_suffix(".onnx"), policy.score.networks
     expected = Score(deepcopy(networks).double())(features.astype(np.float64))
-    with new_folder(card.parent, overwrite=True) as part:
+    with new_folder(card.parent, overwrite=True, last=card.name) as part:
         made = part / weights.name
         export_onnx(RowByRow(networks), features[:2].astype(np.float32), FEATURES_INPUT, ["cells"], made, bits=32)
         sha256 = sha256_of(made)

@@ -1,6 +1,8 @@
 """Teach things: from a folder of meshes or captured frames to a memory that recognises them, without PyTorch."""
 
-import shutil
+import glob
+import hashlib
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -9,31 +11,38 @@ from typing import Any
 
 import numpy as np
 from msgspec.structs import replace as replace_record
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
 from nextview.data.pool import WorkerDied, each
 from nextview.data.pool import count as count_workers
 from nextview.data.progress import Track, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
-from nextview.files import check_new, command, new_file, new_folder, only_one
+from nextview.files import check_new, command, new_file, new_folder, only_one, sha256_of, unfinished
 from nextview.learning.learned_picture import draw_learned
-from nextview.learning.memory_fit import VIEWS, fit_memory, size_evidence
+from nextview.learning.memory_fit import VIEWS, Fit, fit_memory, size_evidence
 from nextview.learning.teaching import Arrays, How, teach
 from nextview.learning.things import Found, Source, find_things
 from nextview.recognition.belief import Calibration
-from nextview.recognition.memory import AZIMUTHS, Memory, read_memory
+from nextview.recognition.inference import Features
+from nextview.recognition.memory import AZIMUTHS, Memory, check_features, open_memory
 from nextview.recognition.model_card import (
     FEATURES,
+    MEMORY_SUFFIX,
+    SHORT_HASH,
     ModelCard,
     Taught,
     Thing,
     Training,
     find_card,
-    read_card,
+    memory_path,
     write_card,
 )
 
 NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
+CARD, WEIGHTS, PICTURE = f"{NAME}.json", f"{NAME}{MEMORY_SUFFIX}", "learned.png"
+PARTS = "things"  # the key of the things that a run that was stopped has taught, see ``files.unfinished``
 Pair = tuple[Source, Arrays]  # a thing, and what is remembered of it
 ODD_SIZE = 300  # a thing so many times larger or smaller than the median of the others is asked about
 
@@ -94,48 +103,81 @@ def learn_things(
         DatasetError: nothing can be taught; what is wrong, in one sentence.
         ResultsError: ``out`` is there, and neither ``add`` nor ``overwrite``.
     """
-    folder, out = Path(folder), Path(out)
-    card_path, old, taught = out / f"{NAME}.json", None, list[Pair]()
-    if add or remove:
-        old = read_card(card_path)
-        taught = _known(old, read_memory(old.path, old.sha256), remove)
-    elif card_path.exists() and not overwrite:
-        raise UsageError(f"{out}: knows things already; --add puts others beside them, --overwrite replaces them")
-    else:
-        check_new(out, overwrite, folder=True)
-    found = Found([], []) if remove and folder.resolve() == out.resolve() else find_things(folder)
-    names, left_out = {source.name for source, _ in taught}, list(found.left_out)
-    for thing in found.things:
-        if thing.name in names:
-            raise UsageError(f"{thing.path}: something called {thing.name} is known already; --remove it, or rename it")
-    part = out.with_name(f".{out.name}.part")
-    with only_one(out):
+    folder = Path(folder)
+    out = Path(out)
+    keeps = add or bool(remove)
+    _check_places(out, keeps, overwrite)
+    nothing_new = bool(remove) and folder.resolve() == out.resolve()
+    found = Found([], []) if nothing_new else find_things(folder)
+    left_out = list(found.left_out)
+
+    with only_one(out), unfinished(out, PARTS) as part:
+        # Read inside: another run may have changed it until now.
+        old = _before(out, keeps)
+        taught = [] if old is None else _known(*old, remove)
+        _check_names(found.things, taught)
+
         track(_teach(found.things, how, part, taught, left_out, workers, scheduler), len(found.things), "things")
+        if not taught and nothing_new:
+            raise UsageError(f"{out}: would know nothing any more; delete it instead")
         if not taught:
             raise DatasetError(f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})")
         taught.sort(key=lambda pair: (pair[0].label, pair[0].name))
         if not how.any_size:
             _check_sizes(taught)
-        learned = _write(out, taught, left_out, old)
-        shutil.rmtree(part, ignore_errors=True)
-    return learned
+        return _write(out, taught, left_out, () if old is None else old[0].training.commands)
+
+
+def _check_places(out: Path, keeps: bool, overwrite: bool) -> None:
+    """Refuse, before any work is done, a folder that cannot be written, or a memory that must not be replaced.
+
+    Raises:
+        UsageError: there is a memory, and it is neither to be kept nor to be replaced.
+        ResultsError: see ``files.check_new``.
+    """
+    card = out / CARD
+    if card.exists() and not keeps and not overwrite:
+        raise UsageError(f"{out}: knows things already; --add puts others beside them, --overwrite replaces them")
+    check_new(out, keeps or overwrite, folder=True)
+    for place in (card, out / PICTURE):
+        check_new(place, overwrite=True)
+
+
+def _before(out: Path, keeps: bool) -> tuple[ModelCard, Memory] | None:
+    """The memory whose things are kept; None if none is."""
+    if not keeps:
+        return None
+    card, memory = open_memory(out / CARD)
+    check_features(card, memory, Features(threads=1).size)
+    return card, memory
+
+
+def _check_names(things: Sequence[Source], taught: Sequence[Pair]) -> None:
+    """Refuse things that are called as one that is known already."""
+    names = {source.name for source, _ in taught}
+    for thing in things:
+        if thing.name in names:
+            raise UsageError(f"{thing.path}: something called {thing.name} is known already; --remove it, or rename it")
 
 
 def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]:
     """The things of a memory, without some."""
     assert card.memory is not None
-    names = [thing.name for thing in card.memory.things]
-    if missing := sorted(set(remove) - set(names)):
-        raise UsageError(f"{card.path}: knows nothing called {missing[0]!r}")
+    names = {thing.name for thing in card.memory.things}
+    missing = sorted(set(remove) - names)
+    if missing:
+        raise UsageError(f"{card.card_path}: knows nothing called {missing[0]!r}")
+
     kept = []
     for index, thing in enumerate(card.memory.things):
+        if thing.name in remove:
+            continue
         own = memory.thing == index
         label = card.classes[card.calibration.hypotheses[int(np.flatnonzero(own)[0])]]
         arrays = {name: getattr(memory, name)[own] for name in ("views", "rotations")}
         arrays |= {name: getattr(memory, name)[index] for name in PER_THING}
         arrays["radii"] = arrays["radii"].reshape(1)
-        if thing.name not in remove:
-            kept.append((Source(thing.name, label, Path(thing.source)), arrays))
+        kept.append((Source(thing.name, label, Path(thing.source)), arrays))
     return kept
 
 
@@ -152,13 +194,11 @@ def _teach(
     scheduler: str | None,
 ) -> Iterator[int]:
     """Teach things side by side, each into a file of its own; what is there from a run that was stopped is taken."""
-    part.mkdir(parents=True, exist_ok=True)
     waiting = []
     for source in sources:
-        file = part / f"{source.name}.safetensors"
-        # A file that was changed since, or other options, make it anew.
-        stamp = repr((str(source.path.resolve()), source.path.stat().st_mtime_ns, replace(how, any_size=False)))
-        if (arrays := _finished(file, stamp)) is not None:
+        stamp = _stamp(source, how)
+        arrays = _finished(_part_of(part, source), stamp)
+        if arrays is not None:
             taught.append((source, arrays))
         else:
             waiting.append((source, stamp))
@@ -169,19 +209,62 @@ def _teach(
     before, results = len(sources) - len(waiting), each(work, waiting, workers, scheduler)
     yield before
     for count, ((source, _), result) in enumerate(results, before + 1):
-        if isinstance(result, WorkerDied | str):
+        if isinstance(result, str | WorkerDied):
             left_out.append(f"{source.name}: {result}")
         else:
             taught.append((source, result))
         yield count
 
 
+def _stamp(source: Source, how: How) -> str:
+    """What the part of a thing was made from: it is made anew if any of this has changed.
+
+    That is its path, the name, size and time of its file or of each file in its folder, the options, and the features.
+    The time of the folder itself does not tell: copying over its files leaves it as it was.
+    """
+    content = hashlib.sha256()
+    for file in _files_of(source.path):
+        try:
+            status = file.stat()
+            seen = f"{file}\0{status.st_size}\0{status.st_mtime_ns}\0"
+        except OSError as error:  # a broken link: what reads the thing says so
+            seen = f"{file}\0{error.errno}\0"
+        content.update(seen.encode(errors="surrogateescape"))
+
+    features = find_card(FEATURES).sha256
+    return repr((str(source.path.resolve()), content.hexdigest(), replace(how, any_size=False), features))
+
+
+def _files_of(path: Path) -> Iterator[Path]:
+    """A file itself, or all files in a folder, also behind links to folders, in order."""
+    if not path.is_dir():
+        yield path
+        return
+
+    for place, folders, names in os.walk(path, followlinks=True):
+        real = Path(place).resolve()
+        above = {real, *real.parents}
+        # A link to a folder above would be walked for ever.
+        folders[:] = [name for name in sorted(folders) if Path(place, name).resolve() not in above]
+        yield from (Path(place, name) for name in sorted(names))
+
+
+def _part_of(part: Path, source: Source) -> Path:
+    """Where what is remembered of a thing is kept until all are taught; names may be too long for a file's."""
+    name = source.name.encode(errors="surrogateescape")
+    return part / f"{hashlib.sha256(name).hexdigest()[:32]}.safetensors"
+
+
 def _finished(file: Path, stamp: str) -> Arrays | None:
+    """What an earlier run that was stopped has left of a thing; None if nothing, or it was of something else."""
     try:
         arrays = load_file(file)
-    except Exception:  # missing, or cut off by a kill: it is made again
+    except (OSError, SafetensorError):  # missing, or damaged: it is made again
         return None
-    return arrays if bytes(arrays.pop("stamp").tobytes()).decode() == stamp else None
+    found = arrays.pop("stamp", None)
+    if found is None or found.tobytes() != stamp.encode(errors="surrogateescape"):
+        return None
+    return arrays
 
 
 def _teach_one(how: How, part: Path, threads: int, item: tuple[Source, str]) -> Arrays | str:
@@ -192,8 +275,9 @@ def _teach_one(how: How, part: Path, threads: int, item: tuple[Source, str]) -> 
     except NextviewError as error:
         return str(error)
     arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
-    with new_file(part / f"{source.name}.safetensors", overwrite=True) as file:
-        save_file(arrays | {"stamp": np.frombuffer(stamp.encode(), np.uint8)}, file)
+    noted = np.frombuffer(stamp.encode(errors="surrogateescape"), np.uint8)
+    with new_file(_part_of(part, source), overwrite=True) as file:
+        save_file(arrays | {"stamp": noted}, file)
     return arrays
 
 
@@ -210,22 +294,57 @@ def _check_sizes(taught: Sequence[Pair]) -> None:
             raise DatasetError(f"{source.path}: is {how} than most others; {hint}")
 
 
-def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: ModelCard | None) -> Learned:
-    """Fit what is fitted to all things together, and write memory and card."""
+def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], commands: tuple[str, ...]) -> Learned:
+    """Fit what is fitted to all things together, and write memory and card.
+
+    The new memory gets a name of its own, with its hash. The card's renaming is what makes it the one that counts: a
+    run that is killed leaves the old memory or the new one. The old file is removed at the very end.
+    """
     classes = tuple(dict.fromkeys(source.label for source, _ in taught))
     label = np.array([classes.index(source.label) for source, _ in taught])
+    memory, fit = _fitted(taught, label)
+    card = _card(taught, classes, label, memory, fit, commands)
+
+    with new_folder(out, overwrite=True, last=CARD) as part:
+        sha256 = memory.save(part / WEIGHTS)
+        weights = memory_path(part / CARD, sha256)
+        (part / WEIGHTS).rename(weights)
+        write_card(part / CARD, replace_record(card, sha256=sha256))
+        draw_learned(part / PICTURE, {source.name: arrays["pictures"] for source, arrays in taught}, fit)
+        if _is_intact(out / weights.name, sha256):  # the very same memory again
+            weights.unlink()
+    _remove_old(out, weights.name)
+
+    names = [source.name for source, _ in taught]
+    confused = tuple((names[a], names[b], share) for a, b, share in fit.confused)
+    return Learned(out, len(taught), len(classes), fit.accuracy, confused, _notes(taught), tuple(left_out))
+
+
+def _fitted(taught: Sequence[Pair], label: NDArray[np.int64]) -> tuple[Memory, Fit]:
+    """The memory of things, and what is fitted to all of them together; ``label`` is the class of each."""
     poses = [len(arrays["views"]) for _, arrays in taught]
     thing = np.repeat(np.arange(len(taught)), poses)
     stacked = {name: np.stack([arrays[name] for _, arrays in taught]) for name in PER_THING}
     stacked["radii"] = stacked["radii"][:, 0]
     joint = {name: np.concatenate([arrays[name] for _, arrays in taught]) for name in ("views", "rotations")}
     fit = fit_memory(joint["views"], thing, label, *(stacked[name] for name in PER_THING[:3]))
-    memory = Memory(thing=thing, head=fit.head, head_bias=fit.head_bias, **joint, **stacked)
-    things = tuple(Thing(source.name, str(source.path), n) for (source, _), n in zip(taught, poses, strict=True))
+    return Memory(thing=thing, head=fit.head, head_bias=fit.head_bias, **joint, **stacked), fit
+
+
+def _card(
+    taught: Sequence[Pair],
+    classes: tuple[str, ...],
+    label: NDArray[np.int64],
+    memory: Memory,
+    fit: Fit,
+    commands: tuple[str, ...],
+) -> ModelCard:
+    """The card of a memory, still without the hash of its file; ``commands`` made what it held before."""
+    poses = np.bincount(memory.thing)
+    things = tuple(Thing(s.name, str(s.path), int(n)) for (s, _), n in zip(taught, poses, strict=True))
     features = find_card(FEATURES)
-    calibration = Calibration(1.0, 1.0, None, fit.correlation, tuple(label[thing].tolist()))
     novelty, usual = (tuple(map(tuple, np.round(rows, 4).tolist())) for rows in (fit.quantiles, fit.usual))
-    card = ModelCard(
+    return ModelCard(
         NAME,
         "recogniser",
         features.input,
@@ -233,19 +352,41 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
         network="memory of views",
         classes=classes,
         azimuth_bins=AZIMUTHS,
-        calibration=calibration,
-        size=size_evidence(stacked["radii"], label),
-        training=Training(f"{len(taught)} things", commands=() if old is None else old.training.commands),
+        calibration=Calibration(1.0, 1.0, None, fit.correlation, tuple(label[memory.thing].tolist())),
+        size=size_evidence(memory.radii, label),
+        training=Training(f"{len(taught)} things", commands=commands),
         scores={"held-out views": {str(k): round(a, 4) for k, a in zip(VIEWS, fit.accuracy, strict=True)}},
         memory=Taught(things, features.sha256, fit.weight, novelty=novelty, usual=usual),
     ).made_by(command())
-    with new_folder(out, overwrite=True) as part:
-        sha256 = memory.save(part / f"{NAME}.safetensors")
-        write_card(part / f"{NAME}.json", replace_record(card, sha256=sha256))
-        draw_learned(part / "learned.png", {source.name: arrays["pictures"] for source, arrays in taught}, fit)
-    names = [source.name for source, _ in taught]
-    confused = tuple((names[a], names[b], share) for a, b, share in fit.confused)
-    return Learned(out, len(taught), len(classes), fit.accuracy, confused, _notes(taught), tuple(left_out))
+
+
+def _is_intact(weights: Path, sha256: str) -> bool:
+    return weights.is_file() and sha256_of(weights) == sha256
+
+
+def _remove_old(out: Path, kept: str) -> None:
+    """Remove the files of memories that the card does not name any more.
+
+    Ours are those whose name holds their hash, and that of earlier versions, which has none, if it is a memory. A link
+    is removed, never what it points to.
+    """
+    for file in out.glob(f"{glob.escape(NAME)}-*{MEMORY_SUFFIX}"):
+        digits = file.stem.removeprefix(f"{NAME}-")
+        if file.name != kept and len(digits) == SHORT_HASH and file.is_file() and sha256_of(file).startswith(digits):
+            file.unlink()
+
+    earlier = out / WEIGHTS
+    if earlier.is_file() and _holds_views(earlier):
+        earlier.unlink()
+
+
+def _holds_views(file: Path) -> bool:
+    """Whether a file is that of a memory, by the names of its arrays."""
+    try:
+        with safe_open(file, "numpy") as arrays:
+            return {"views", "thing", "held_out", "pictures"} <= set(arrays.keys())
+    except SafetensorError:
+        return False
 
 
 def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from nextview.errors import OtherUseError, PolicyError
 from nextview.geometry.viewsphere import Viewpoints, azimuth_of
 from nextview.policies.base import EpisodeState, best_view, check_weight, travel_from
-from nextview.recognition.memory import AZIMUTHS, RINGS, read_memory
-from nextview.recognition.model_card import read_card
+from nextview.recognition.memory import AZIMUTHS, RINGS, open_memory
 
 Float = NDArray[np.float64]
 WEIGHT = 40.0  # of a cosine, as a log-likelihood: for one view whose noise is not known yet
@@ -51,12 +50,10 @@ class Discriminate:
     @classmethod
     def from_card(cls, path: Path, viewpoints: Viewpoints, classes: tuple[str, ...] | None = None) -> "Discriminate":
         """For the things of a memory, by its card; OtherUseError if ``classes`` are not those of its things."""
-        card = read_card(path)
-        if card.memory is None:
-            raise PolicyError(f"{path}: is no memory of things")
+        card, memory = open_memory(path)
         if classes is not None and card.classes != tuple(classes):
             raise OtherUseError(f"{path}: discriminates other things ({', '.join(card.classes[:10])})")
-        return cls(viewpoints, read_memory(card.path, card.sha256).views, np.array(card.calibration.hypotheses))
+        return cls(viewpoints, memory.views, np.array(card.calibration.hypotheses))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         values = self.view_values(state)

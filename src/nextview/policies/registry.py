@@ -15,7 +15,7 @@ from nextview.policies.gain import Gain, VisibleGain
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card
 from nextview.recognition.map_names import SPHERE, in_order
-from nextview.recognition.model_card import DISCRIMINATE, MAPS, MEMORY_SUFFIX
+from nextview.recognition.model_card import DISCRIMINATE, MAPS, is_memory
 
 POLICIES: dict[str, Callable[[Any], Policy]] = {  # those of no map; each map has its own, see ``map_policy``
     "random": Random,
@@ -60,7 +60,7 @@ def make_policy(
     if by_map is not None:
         return by_map
     card = _card(name)
-    if card is not None and card.with_suffix(MEMORY_SUFFIX).exists():
+    if card is not None and is_memory(card):
         return Discriminate.from_card(card, sphere, None if classes is None else tuple(classes))
     if card is not None:
         policy = read_policy(card, sphere, classes)
@@ -89,7 +89,7 @@ def make_policy_anywhere(
 ) -> Policy:
     """A policy by name for live use, whatever the viewpoints: see ``policies.off_grid``."""
     card = _card(name.partition("@")[0])
-    if card is not None and not card.with_suffix(MEMORY_SUFFIX).exists():
+    if card is not None and not is_memory(card):
         about = read_policy_card(card)
         viewpoints = ViewSphere(about.elevations, about.azimuths)
     elif _on_grid(name, maps) and not isinstance(viewpoints, ViewSphere):

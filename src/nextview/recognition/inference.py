@@ -149,6 +149,11 @@ class Recogniser:
             raise ModelError(f"{self.card.path}: has no novelty score of views")
         if self._known is None:
             self._known = Features(self._threads)
+            known = self.novelty.neighbours.shape[1]
+            if known != self._known.size:
+                file = novelty_path(self.card.path)
+                hint = "run nextview fit unknown again"
+                raise ModelError(f"{file}: was fitted to {known} features, not {self._known.size}; {hint}")
         inputs = np.concatenate([from_observations(self._known.card.input, [o]) for o in observations])
         return self.novelty.scores(self._known(inputs), np.array([o.exact for o in observations]))
 
@@ -159,6 +164,12 @@ class Features:
     def __init__(self, threads: int = 0) -> None:
         self.card = find_card(FEATURES)
         self._session = open_onnx(self.card.path, self.card.sha256, threads)
+
+    @property
+    def size(self) -> int:
+        """How many numbers an embedding has, F."""
+        ends = {end.name: end for end in self._session.get_outputs()}
+        return int(ends[EMBEDDING_OUTPUT].shape[1])
 
     def __call__(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
         """Embeddings, (B, F) float32, from what the network takes, see ``network_input``."""

@@ -8,50 +8,98 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
+from safetensors.numpy import save
 
+from nextview.checks import check_array
 from nextview.errors import ModelError
-from nextview.files import checked_bytes, new_file
+from nextview.files import arrays_in, checked_bytes, new_file
 from nextview.recognition.approximate import NearestViews, is_large
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Features, Recogniser
-from nextview.recognition.model_card import MEMORY_SUFFIX, find_card
-from nextview.recognition.novelty import Quantiles, unit
+from nextview.recognition.model_card import FEATURES, ModelCard, find_card
+from nextview.recognition.novelty import ROUNDED, Quantiles, unit
 
 RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the remembered views, degrees
 AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
+PICTURE = 64  # side of the picture of a thing, pixels
 Float = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What T things look like, each in one or more resting poses: H of these in all, sorted by class."""
+    """What T things look like, each in one or more resting poses: H of these in all, sorted by class.
 
-    # embedding of each remembered view, unit vectors, (H, rings, azimuths, F); zero where nothing is remembered
+    Attributes:
+        views: Embedding of each remembered view, unit vectors, (H, rings, azimuths, F); zero where nothing is
+            remembered.
+        thing: Which thing each resting pose is of, ascending, (H,) int64.
+        rotations: Of each resting pose, from the file's axes, (H, 3, 3) float32.
+        held_out: Embeddings of views through a sensor that are not remembered, K of each thing in its first resting
+            pose, (T, K, F): what calibration and reports are made of. Zero where nothing was seen.
+        held_out_views: Elevation and azimuth of each of these, radians, (T, K, 2) float32.
+        radii: Object radius of each thing, metres, (T,) float32; NaN where it is not known.
+        pictures: A picture of each thing, (T, 64, 64) uint8.
+        head: Weights of a linear classifier of embeddings for classes of several things, (F, C).
+        head_bias: What it adds for each class, (C,).
+    """
+
     views: Float
-    thing: NDArray[np.int64]  # which thing each resting pose is of, (H,) int64
-    rotations: Float  # of each resting pose, from the file's axes, (H, 3, 3) float32
-    # embeddings of views through a sensor that are not remembered, K of each thing in its first resting pose, (T, K,
-    # F): what calibration and reports are made of
+    thing: NDArray[np.int64]
+    rotations: Float
     held_out: Float
-    held_out_views: Float  # elevation and azimuth of each, radians, (T, K, 2) float32
-    radii: Float  # object radius of each thing, metres, (T,) float32; NaN where it is not known
-    pictures: NDArray[np.uint8]  # a picture of each thing, (T, 64, 64) uint8
-    head: Float  # a linear classifier of embeddings for classes of several things, (F, C) and (C,)
+    held_out_views: Float
+    radii: Float
+    pictures: NDArray[np.uint8]
+    head: Float
     head_bias: Float
 
     def __post_init__(self) -> None:
-        h, t, f = len(self.thing), len(self.radii), self.views.shape[-1]
-        k, c = self.held_out.shape[1], len(self.head_bias)
-        shapes = {"views": (h, len(RINGS), AZIMUTHS, f), "thing": (h,), "rotations": (h, 3, 3), "radii": (t,)}
-        shapes |= {"held_out": (t, k, f), "held_out_views": (t, k, 2), "pictures": (t, 64, 64), "head": (f, c)}
-        for name, shape in shapes.items():
-            values = getattr(self, name)
-            if values.shape != shape or 0 in shape or (name != "radii" and not np.isfinite(values).all()):
-                raise ModelError(f"no memory: {name} has the shape {values.shape}, or is not finite")
-        if sorted(set(self.thing.tolist())) != list(range(t)):
-            raise ModelError("no memory: resting poses of things that are not there")
+        self._check_shapes()
+        self._check_values()
+
+    def _check_shapes(self) -> None:
+        """See that all arrays are of the right kinds of numbers, finite, and of shapes that fit together."""
+        check_array("its thing", self.thing, np.integer, (None,))
+        check_array("its radii", self.radii, np.floating, (None,), finite=False)
+        poses = len(self.thing)
+        things = len(self.radii)
+
+        check_array("its views", self.views, np.floating, (poses, len(RINGS), AZIMUTHS, None))
+        size = self.views.shape[-1]
+        check_array("its rotations", self.rotations, np.floating, (poses, 3, 3))
+
+        check_array("its held_out", self.held_out, np.floating, (things, None, size))
+        held_out = self.held_out.shape[1]
+        check_array("its held_out_views", self.held_out_views, np.floating, (things, held_out, 2))
+        check_array("its pictures", self.pictures, np.uint8, (things, PICTURE, PICTURE))
+
+        check_array("its head_bias", self.head_bias, np.floating, (None,))
+        check_array("its head", self.head, np.floating, (size, len(self.head_bias)))
+
+    def _check_values(self) -> None:
+        """See that the numbers can be what they stand for."""
+        if np.unique(self.thing).tolist() != list(range(len(self.radii))):
+            raise ModelError("its thing names things that are not there, or not all that are")
+        if (np.diff(self.thing) < 0).any():
+            raise ModelError("its thing does not ascend")
+
+        known = self.radii[~np.isnan(self.radii)]
+        if not ((known > 0) & np.isfinite(known)).all():
+            raise ModelError("its radii are not above zero and finite")
+
+        for name in ("views", "held_out"):
+            lengths = np.linalg.norm(getattr(self, name).astype(np.float32), axis=-1)
+            if (np.minimum(lengths, np.abs(lengths - 1)) > ROUNDED).any():
+                raise ModelError(f"its {name} are no unit vectors")
+
+        rotations = self.rotations.astype(np.float64)
+        products = rotations @ rotations.swapaxes(1, 2)
+        turned = np.abs(products - np.eye(3)).max() < ROUNDED and (np.linalg.det(rotations) > 0).all()
+        if not turned:
+            raise ModelError("its rotations are no rotations")
+
+        if np.abs(self.held_out_views[..., 0]).max() > np.pi / 2 + ROUNDED:
+            raise ModelError("its held_out_views have elevations beyond 90 degrees")
 
     def save(self, path: Path, overwrite: bool = False) -> str:
         """Write a .safetensors file, embeddings in half precision; returns its SHA-256."""
@@ -65,12 +113,53 @@ class Memory:
 
 @lru_cache(maxsize=2)
 def read_memory(path: Path, sha256: str) -> Memory:
-    """Read what ``Memory.save`` wrote; ModelError if it is not that."""
+    """Read what ``Memory.save`` wrote.
+
+    Raises:
+        ModelError: the file is missing, is not that of this hash, or one of its values makes no sense.
+    """
+    names = [f.name for f in fields(Memory)]
+    arrays = arrays_in(checked_bytes(path, sha256, "a memory"), names, f"{path}: not a memory")
     try:
-        arrays = load(checked_bytes(path, sha256, "a memory"))
-        return Memory(**{f.name: arrays[f.name] for f in fields(Memory)})
-    except (SafetensorError, KeyError) as error:
+        return Memory(**arrays)
+    except ModelError as error:
         raise ModelError(f"{path}: not a memory ({error})") from None
+
+
+def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
+    """The card of a memory of taught things and the memory itself, which fit together.
+
+    Args:
+        model: The name of a bundled memory, or the path of a card.
+
+    Raises:
+        ModelError: one of them is missing, damaged, of other features than those that the package has now, or they do
+            not fit together.
+    """
+    card = find_card(model)
+    if card.memory is None:
+        raise ModelError(f"{card.card_path}: is no memory of things")
+
+    features = find_card(FEATURES)
+    if card.memory.features_sha256 != features.sha256:
+        raise ModelError(f"{card.card_path}: was taught with other features; teach it again with nextview learn")
+    if card.input != features.input:
+        raise ModelError(f"{card.card_path}: takes other inputs than the features that it was taught with")
+    if card.azimuth_bins != AZIMUTHS:
+        raise ModelError(f"{card.card_path}: has {card.azimuth_bins} azimuth bins, not {AZIMUTHS}")
+
+    memory = read_memory(card.path, card.sha256)
+    if memory.thing.tolist() != list(card.memory.poses):
+        raise ModelError(f"{card.path}: its resting poses are not those of the things on its card, {card.card_path}")
+    if len(memory.head_bias) != len(card.classes):
+        raise ModelError(f"{card.path}: is of {len(memory.head_bias)} classes, and its card of {len(card.classes)}")
+    return card, memory
+
+
+def check_features(card: ModelCard, memory: Memory, size: int) -> None:
+    """See that a memory holds embeddings of as many numbers as the features have; ModelError if not."""
+    if memory.views.shape[-1] != size:
+        raise ModelError(f"{card.path}: its views have {memory.views.shape[-1]} features, not {size}")
 
 
 def similarities(views: Float, embeddings: Float, elevations: Float) -> NDArray[np.float32]:
@@ -99,20 +188,16 @@ class TaughtRecogniser(Recogniser):
     """Recognises taught things in each view by what is remembered of them; ``model`` is the path of its card."""
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:
-        self.card = find_card(model)
-        if (about := self.card.memory) is None:
-            raise ModelError(f"model {self.card.name} is no memory of things")
+        self.card, self.memory = open_memory(model)
         self.classes, self.azimuth_bins = self.card.classes, self.card.azimuth_bins
         self.calibration = self.card.calibration
-        self.memory = read_memory(self.card.path, self.card.sha256)
         self._features = Features(threads)
-        if self._features.card.sha256 != about.features_sha256:
-            raise ModelError(f"{self.card.path}: was taught with other features; teach it again with nextview learn")
-        h, things = len(self.memory.thing), len(about.things)
-        if (h, things) != (len(self.calibration.hypotheses), len(self.memory.radii)):
-            raise ModelError(f"{self.card.path}: holds {h} resting poses, and its card is of others")
+        check_features(self.card, self.memory, self._features.size)
         self._views = by_ring(self.memory.views)
         self._nearest = NearestViews(self._views) if is_large(self._views) else None
+
+        about = self.card.memory
+        assert about is not None
         judged = np.array([self.memory.held_out[..., 0].size])
         usual = np.array(about.usual) if about.usual else None
         self.novelty = Quantiles(np.array(about.novelty), judged, joint=True, usual=usual) if about.novelty else None
@@ -153,4 +238,4 @@ def joined(clean: Float, sensed: Float) -> NDArray[np.float32]:
 def open_recogniser(model: str | Path, threads: int = 0) -> Recogniser:
     """A recogniser, or a memory of taught things, by the name of a bundled model or the path of a card."""
     card = find_card(model)
-    return (TaughtRecogniser if card.path.suffix == MEMORY_SUFFIX else Recogniser)(model, threads)
+    return (Recogniser if card.memory is None else TaughtRecogniser)(model, threads)

@@ -1,5 +1,6 @@
 """The card of a model: what it is, how it was made, how good it is, and which file holds its weights."""
 
+import glob
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ import msgspec
 from msgspec.structs import replace
 
 from nextview.errors import ModelError
-from nextview.files import Sha256, read_record, regular_file, write_record
+from nextview.files import LARGEST_RECORD, Sha256, read_record, regular_file, write_record
 from nextview.recognition.belief import PLAIN_SUM, Calibration, SizeEvidence
 from nextview.recognition.map_names import LCM, LEM, SPHERE, Good
 from nextview.recognition.network_input import InputSpec
@@ -22,6 +23,10 @@ DISCRIMINATE = "discriminate"  # the policy of a memory of things; its card is t
 COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}  # bundled recognisers, by the name of their models
 MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}  # the map networks that are bundled, by the name of the map
 NOWHERE = Path()
+SCHEMA = 2  # of the cards of models; those of policies have 1
+LARGEST_WEIGHT = 1e6  # of a cosine; what is fitted is below a hundred
+MOST_POSES = 1000  # of a thing; what is taught has a handful
+SHORT_HASH = 16  # hexadecimal digits of the SHA-256 of a memory that its file's name holds
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -33,31 +38,66 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One taught thing: its name, the file or folder that it was taught from, and in how many resting poses."""
+    """One taught thing.
 
-    name: str
+    Attributes:
+        name: Its name, unique among the things of a memory.
+        source: The file or folder that it was taught from.
+        poses: In how many resting poses it was taught.
+    """
+
+    name: Annotated[str, msgspec.Meta(min_length=1)]
     source: str
-    poses: int
+    poses: Annotated[int, msgspec.Meta(ge=1, le=MOST_POSES)]
 
 
 class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a memory of things is of."""
+    """What a memory of things is of.
 
-    things: tuple[Thing, ...]  # in order
-    features_sha256: Sha256  # of the features that it is made of
-    weight: float  # of a cosine
+    Attributes:
+        things: The things, in order.
+        features_sha256: The SHA-256 of the network whose features are remembered.
+        weight: Of a cosine, as a log-likelihood.
+        attribution: Whose work the things are, in words.
+        novelty: Quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative log-likelihood of known
+            things, given the class that explains them best; () if that was not fitted.
+        usual: See ``novelty.Quantiles``; () if that was not fitted.
+    """
+
+    things: Annotated[tuple[Thing, ...], msgspec.Meta(min_length=1)]
+    features_sha256: Sha256
+    weight: Annotated[float, msgspec.Meta(gt=0, le=LARGEST_WEIGHT)]
     attribution: str = ""
-    # quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative log-likelihood of known things, given
-    # the class that explains them best
     novelty: tuple[tuple[float, ...], ...] = ()
-    usual: tuple[tuple[float, ...], ...] = ()  # see ``novelty.Quantiles``
+    usual: tuple[tuple[float, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        names = {thing.name for thing in self.things}
+        if len(names) < len(self.things):
+            raise ModelError("two things have the same name")
+
+        levels = {len(row) for row in self.novelty}
+        if self.novelty and (len(levels) > 1 or min(levels) < 2):
+            raise ModelError("the quantiles of the novelty are not of the same length, two at least")
+
+        for row in self.novelty:
+            if list(row) != sorted(row):
+                raise ModelError("the quantiles of the novelty do not ascend")
+
+    @property
+    def poses(self) -> tuple[int, ...]:
+        """The index of the thing that each resting pose is of, in order: what ``Memory.thing`` holds."""
+        return tuple(index for index, thing in enumerate(self.things) for _ in range(thing.poses))
 
 
-class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="schema", tag=2):
+class ModelCard(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="schema", tag=SCHEMA
+):
     """One model; as a file, a JSON object of these fields beside the file of the same name with its weights.
 
     That is an ONNX file; of a memory of taught things, which is a recogniser too, a safetensors file. ModelError: a
-    recogniser without classes, sizes of other classes than these, or a network of no input.
+    recogniser without classes, sizes of other classes than these, a network of no input, or a memory of other classes
+    or resting poses than those of its things.
     """
 
     name: str  # what users call it
@@ -96,6 +136,37 @@ class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
             raise ModelError("two classes have the same name")
         if self.size is not None and len(self.size.log_density) != len(self.classes):
             raise ModelError(f"sizes of {len(self.size.log_density)} classes, not {len(self.classes)}")
+        if self.memory is not None:
+            self._check_memory(self.memory)
+
+    def _check_memory(self, memory: Taught) -> None:
+        """See that things, resting poses and classes fit together."""
+        if not self.is_recogniser:
+            raise ModelError(f"a memory of things is a recogniser, not a {self.kind}")
+
+        # The calibration checks that the hypotheses ascend by steps of one: the last tells the number of classes.
+        hypotheses = self.calibration.hypotheses
+        if not hypotheses or hypotheses[-1] + 1 != len(self.classes):
+            raise ModelError(f"its hypotheses are not of its {len(self.classes)} classes")
+        if self.calibration.bin_correlation is None:
+            raise ModelError("a memory of things has a calibration of its azimuth bins")
+
+        poses = memory.poses
+        if len(poses) != len(hypotheses):
+            raise ModelError(f"its things have {len(poses)} resting poses, and its hypotheses are {len(hypotheses)}")
+        if len(set(zip(poses, hypotheses, strict=True))) > len(memory.things):
+            raise ModelError("a thing is of two classes")
+
+        if any(len(row) != len(self.classes) for row in memory.usual):
+            raise ModelError(f"its usual novelty is not of its {len(self.classes)} classes")
+
+    @property
+    def card_path(self) -> Path:
+        """Where the card itself is: in the folder of the file that ``path`` names."""
+        stem = self.path.stem
+        if self.memory is not None:
+            stem = stem.removesuffix(f"-{self.sha256[:SHORT_HASH]}")
+        return self.path.with_name(f"{stem}.json")
 
     @property
     def is_recogniser(self) -> bool:
@@ -118,13 +189,69 @@ class ModelCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
 
 
 def read_card(path: Path) -> ModelCard:
-    """Read a card; the weights are the file beside it with the same name. ModelError if one is missing."""
+    """Read a card; its weights are the file beside it that ``ModelCard.path`` then names.
+
+    Raises:
+        ModelError: card or weights are missing, or the card is damaged.
+    """
     path = Path(path)
     card = read_record(path, ModelCard, "a model card")
-    card = replace(card, path=path.with_suffix(MEMORY_SUFFIX if card.memory else ".onnx"))
-    if not card.path.exists():
-        raise ModelError(f"{card.path}: the weights of model {card.name} are missing")
-    return card
+    weights = path.with_suffix(".onnx") if card.memory is None else _memory_there(path, card.sha256)
+    if not weights.exists():
+        raise ModelError(f"{weights}: the weights of model {card.name} are missing")
+    return replace(card, path=weights)
+
+
+def memory_path(card: Path, sha256: str) -> Path:
+    """Where the file of a memory of things is written, by the path of its card and the SHA-256 of the file.
+
+    It is NAME-HASH.safetensors beside NAME.json, HASH the first digits of the SHA-256: a new memory lies beside the old
+    one until the card names it.
+    """
+    return card.with_name(f"{card.stem}-{sha256[:SHORT_HASH]}{MEMORY_SUFFIX}")
+
+
+def _memory_there(card: Path, sha256: str) -> Path:
+    """Where the file of a memory is: earlier versions called it NAME.safetensors."""
+    named = memory_path(card, sha256)
+    earlier = card.with_suffix(MEMORY_SUFFIX)
+    return earlier if earlier.exists() and not named.exists() else named
+
+
+class _Peek(msgspec.Struct):
+    """The fields that tell what a card is of.
+
+    Attributes:
+        schema: 1 of the card of a policy, 2 of that of a model.
+        memory: What only the card of a memory of things holds.
+        elevations: The rings of viewpoints that a policy was learned for.
+    """
+
+    schema: int = 0
+    memory: Any = None
+    elevations: Any = None
+
+
+def _peek(path: Path) -> _Peek:
+    """What a JSON file says that it is; an empty answer if it is damaged, as reading it as a card will say why."""
+    regular_file(path, "a card", ModelError, LARGEST_RECORD)
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=_Peek)
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return _Peek()
+
+
+def is_memory(card: Path) -> bool:
+    """Whether a card is that of a memory of things: by what it says, or, where it is damaged, by the file beside it."""
+    if not card.is_file():
+        return False
+    peek = _peek(card)
+    if peek.schema == SCHEMA and peek.memory is not None:
+        return True
+    if card.with_suffix(MEMORY_SUFFIX).exists():
+        return True
+    digits = "[0-9a-f]" * SHORT_HASH
+    return any(card.parent.glob(f"{glob.escape(card.stem)}-{digits}{MEMORY_SUFFIX}"))
 
 
 def write_card(path: Path, card: ModelCard) -> None:
@@ -170,10 +297,8 @@ def find_models(models: str | Path) -> Collection:
         raise ModelError(f"{folder}: is neither a folder with models nor the name of bundled ones ({known})")
     networks, policies = dict[str, list[Path]](), dict[str, Path]()
     for path in sorted(folder.glob("*.json")):
-        regular_file(path, "a card", ModelError)
-        # A policy's card names the viewpoints that it was learned for.
-        weights = path.with_suffix(".onnx").exists() or path.with_suffix(MEMORY_SUFFIX).exists()
-        if weights and b'"elevations"' not in path.read_bytes():
+        has_network = path.with_suffix(".onnx").exists() and _peek(path).elevations is None
+        if has_network or is_memory(path):
             networks.setdefault(read_card(path).kind, []).append(path)
         else:
             policies[path.stem] = path
@@ -188,6 +313,6 @@ def find_models(models: str | Path) -> Collection:
 
 def _with_memory(found: Collection) -> Collection:
     """With the policy that needs no more than a memory of things, where the recogniser is one."""
-    if not found.recogniser.with_suffix(MEMORY_SUFFIX).exists():
+    if not is_memory(found.recogniser):
         return found
     return Collection(found.recogniser, found.maps, {DISCRIMINATE: found.recogniser} | found.policies)

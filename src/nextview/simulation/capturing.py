@@ -52,7 +52,8 @@ def write_capture(
     poses = look_at_origin(elevation, np.arctan2(y, x), DISTANCE * radius)
     poses[:, 2, 3] += height
     cameras, objects = {}, {}
-    with new_folder(folder, overwrite) as new:
+    # Without this record the folder is no capture: a run that is stopped leaves no mixture of two objects' views.
+    with new_folder(folder, overwrite, last="scene_camera.json", withdraw=True) as new:
         (new / "box.json").write_text(json.dumps({"low": low.tolist(), "high": high.tolist()}) + "\n")
         for name in ("depth", "mask_visib")[: 1 + masks]:
             (new / name).mkdir()

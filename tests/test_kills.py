@@ -1,0 +1,220 @@
+"""Runs that are killed before any step on the disk: what is read then is the old output or the new one, never neither.
+
+An audit hook ends the process at the n-th time that something is about to be opened for writing, made, renamed or
+removed in the folder: as ``kill -9`` does, without clearing up.
+"""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+INJECTION = """
+import json, os, sys
+from pathlib import Path
+
+CHANGES = {"os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.link", "os.symlink", "os.truncate"}
+
+
+def changes(event, arguments):
+    if event == "open":
+        mode, flags = arguments[1:]
+        return bool(flags & (os.O_WRONLY | os.O_RDWR)) if isinstance(flags, int) else "r" not in str(mode)
+    return event in CHANGES
+
+
+def steps(work, place, ready, after, kinds=CHANGES | {"open"}):
+    '''Work in a child that dies at its n-th change in a folder, for n = 1, 2, ..., until it lives.
+
+    Prints, for each, at which change it died, and what ``after`` says.
+    '''
+    said = []
+    while True:
+        ready()
+        reading, writing = os.pipe()
+        child = os.fork()
+        if child == 0:
+            count = 0
+
+            def hook(event, arguments):
+                nonlocal count
+                inside = changes(event, arguments) and os.fsdecode(arguments[0]).startswith(str(place))
+                if event in kinds and inside:
+                    count += 1
+                    if count > len(said):
+                        os.write(writing, event.encode())
+                        os._exit(9)
+
+            sys.addaudithook(hook)
+            try:
+                work()
+            except BaseException:
+                import traceback
+                traceback.print_exc()
+                os._exit(1)
+            os._exit(0)
+        os.close(writing)
+        event = os.read(reading, 100).decode()
+        os.close(reading)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        said.append((event, code, after()))
+        if code != 9:
+            break
+    print(json.dumps(said))
+"""
+
+LEARN = """
+import shutil
+import numpy as np
+from types import SimpleNamespace
+from nextview.learning import learn as module
+from nextview.learning.learn import learn
+from nextview.recognition.memory import AZIMUTHS, RINGS, open_memory
+from nextview.recognition.novelty import unit
+
+
+def teach(path, name, how, threads):  # as a network would, but at once
+    rng = np.random.default_rng([*path.read_bytes(), *name.encode()])
+    return {
+        "views": unit(rng.normal(size=(2, len(RINGS), AZIMUTHS, 256))).astype(np.float16),
+        "rotations": np.tile(np.eye(3, dtype=np.float32), (2, 1, 1)),
+        "held_out": unit(rng.normal(size=(4, 256))).astype(np.float16),
+        "held_out_views": np.zeros((4, 2), np.float32),
+        "radii": np.array([0.1], np.float32),
+        "pictures": np.zeros((64, 64), np.uint8),
+    }
+
+
+module.teach = teach
+module.draw_learned = lambda path, pictures, fit: path.write_text(" ".join(pictures))
+module.Features = lambda threads: SimpleNamespace(size=256)
+case, earlier, folder = sys.argv[1], sys.argv[2] == "earlier", Path(sys.argv[3])
+old, out = folder / "old", folder / "place" / "mine"
+for name, things in {"first": "box ball", "more": "cup", "other": "ball box"}.items():
+    (folder / name).mkdir()
+    for thing in things.split():
+        (folder / name / f"{thing}.off").write_text(name)
+learn(folder / "first", old, workers=0)
+if earlier:
+    next(old.glob("memory-*.safetensors")).rename(old / "memory.safetensors")
+
+
+def known(out):
+    card, memory = open_memory(out / "memory.json")
+    return [[thing.name for thing in card.memory.things], float(memory.views.astype(float).sum())]
+
+
+def ready():
+    shutil.rmtree(out.parent, ignore_errors=True)
+    shutil.copytree(old, out)
+
+
+def work():
+    if case == "add":
+        learn(folder / "more", out, add=True, workers=0)
+    elif case == "remove":
+        learn(out, out, remove=("box",), workers=0)
+    else:
+        learn(folder / "other", out, overwrite=True, workers=0)
+
+
+ready()
+work()
+new = known(out)
+
+
+def after():
+    found = known(out)
+    which = "old" if found == known(old) else "new" if found == new else str(found)
+    # A further run works, and removes what the killed one has left.
+    if which == "new":
+        learn(folder / "other", out, overwrite=True, workers=0)
+    else:
+        work()
+        assert known(out) == new
+    left = [path for place in (out, out.parent) for path in sorted(place.iterdir())]
+    return which, [path.name for path in left if not is_empty(path)]
+
+
+def is_empty(path):  # a folder that was made, and not yet marked
+    return path.is_dir() and not any(path.iterdir())
+
+
+steps(work, out.parent, ready, after)
+"""
+
+CAPTURE = """
+import shutil
+from nextview.data.samples import sample_mesh
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.simulation.captured import is_capture
+from nextview.simulation.capturing import write_capture
+
+folder = Path(sys.argv[1])
+old, new, out = folder / "old", folder / "new", folder / "place/out"
+sphere = ViewSphere((30.0,), 3)
+
+
+def contents(folder):
+    return {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def ready():
+    shutil.rmtree(out.parent, ignore_errors=True)
+    shutil.copytree(old, out)
+    (out / "mine.txt").write_text("mine")
+
+
+def work():
+    list(write_capture(sample_mesh("table"), out, sphere, 0.4, overwrite=True))
+
+
+def after():
+    found = contents(out)
+    assert found[Path("mine.txt")] == b"mine"
+    if not is_capture(out):
+        return "none"
+    for name, files in frames.items():
+        if all(found.get(file) == content for file, content in files.items()):
+            return name
+    return "mixed"
+
+
+for name, place in (("chair", old), ("table", new)):
+    list(write_capture(sample_mesh(name), place, sphere, 0.4))
+frames = {place.name: contents(place) for place in (old, new)}
+steps(work, out, ready, after, {"os.rename", "os.remove"})
+"""
+
+
+def died(program, *arguments):
+    command = [sys.executable, "-c", INJECTION + program, *map(str, arguments)]
+    ran = subprocess.run(command, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    return json.loads(ran.stdout.splitlines()[-1])
+
+
+COMMANDS = [("add", "now"), ("remove", "now"), ("overwrite", "now"), ("add", "earlier")]
+"""Commands, and the layout of the memory that they find: the file of earlier versions had no hash in its name."""
+
+
+@pytest.mark.parametrize(("case", "layout"), COMMANDS)
+def test_learn_killed_before_any_step_leaves_the_old_memory_or_the_new_one(tmp_path, case, layout):
+    said = died(LEARN, case, layout, tmp_path)
+    events = [event for event, *_ in said]
+    assert events.count("os.rename") >= 5  # weights, card and picture aside, and to their places
+    assert [code for _, code, _ in said] == [9] * (len(said) - 1) + [0]
+    found = [which for *_, (which, _) in said]
+    assert set(found) == {"old", "new"}
+    assert found == sorted(found, reverse=True)  # from some step on it is the new one
+    for *_, (_, left) in said:
+        assert len(left) == 4
+        assert [name for name in left if not name.startswith("memory-")] == ["learned.png", "memory.json", "mine"]
+
+
+def test_capture_killed_between_any_two_steps_never_mixes_the_views_of_two_objects(tmp_path):
+    said = died(CAPTURE, tmp_path)
+    found = [which for *_, which in said]
+    assert found == sorted(found, key=["old", "none", "new"].index)
+    assert found.count("none") == 9  # three depth images, three masks, box.json, scene_gt.json and scene_camera.json

@@ -1,0 +1,310 @@
+"""A memory of taught things whose hash is right, but whose values do not fit: each is refused in one sentence."""
+
+import json
+import re
+import shutil
+from copy import deepcopy
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+import nextview
+from nextview.errors import ModelError
+from nextview.files import sha256_of
+from nextview.recognition.inference import Features
+from nextview.recognition.memory import open_memory, open_recogniser
+from nextview.recognition.model_card import find_models, read_card
+
+FLOATS = ("views", "rotations", "held_out", "held_out_views", "radii", "head", "head_bias")
+ARRAYS = (*FLOATS, "thing", "pictures")
+
+
+@pytest.fixture(scope="session")
+def sized(shared, scans):
+    """A memory of three things whose sizes are known."""
+
+    def make(folder):
+        nextview.learn(scans, folder / "mine", unit="cm", upright=True, workers=0)
+
+    return shared("sized", make) / "mine"
+
+
+@pytest.fixture
+def models(sized, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(sized, tmp_path / "mine")
+
+
+@pytest.fixture(scope="module")
+def features():
+    return Features(threads=1)
+
+
+def rewrite(models, change):
+    """Change the arrays of a memory; the card has the new hash, and the file's name of earlier versions."""
+    card = models / "memory.json"
+    weights = read_card(card).path
+    arrays = load_file(weights)
+    change(arrays)
+    weights.unlink()
+    weights = models / "memory.safetensors"
+    save_file({name: np.array(values, order="C") for name, values in arrays.items()}, weights)
+    about = json.loads(card.read_text())
+    card.write_text(json.dumps(about | {"sha256": sha256_of(weights)}))
+
+
+def with_value(values, value):
+    changed = values.copy()
+    changed.flat[-1] = value
+    return changed
+
+
+def lengthened(values, axis):
+    return np.concatenate([values, values.take([-1], axis)], axis)
+
+
+OF_EACH = {
+    "0-d": lambda values: values.ravel()[0],
+    "one dimension less": lambda values: values[0],
+    "one dimension more": lambda values: values[None],
+    "empty": lambda values: values[:0],
+    "complex": lambda values: values.astype(np.complex64),
+    "truth values": lambda values: values.astype(bool),
+    "16-bit integers": lambda values: values.astype(np.uint16) if values.dtype.kind == "f" else values / 1,
+}
+OF_FLOATS = {
+    "NaN": lambda values: with_value(values, np.nan),
+    "infinite": lambda values: with_value(values, np.inf),
+    "minus infinite": lambda values: with_value(values, -np.inf),
+}
+OF_ONE = {
+    ("views", "twice as long"): lambda values: values * 2,
+    ("views", "half as long"): lambda values: values / 2,
+    ("held_out", "half as long"): lambda values: values / 2,
+    ("rotations", "mirrored"): lambda values: -values,
+    ("rotations", "sheared"): lambda values: values + np.eye(3, k=1, dtype=np.float32) / 10,
+    ("rotations", "zero"): lambda values: values * 0,
+    ("held_out_views", "in degrees"): np.degrees,
+    ("radii", "negative"): lambda values: values * 0 - 0.1,
+    ("radii", "zero"): lambda values: np.zeros_like(values),
+    ("thing", "negative"): lambda values: values - 1,
+    ("thing", "beyond the last"): lambda values: values + 1,
+    ("thing", "all one"): lambda values: values * 0,
+    ("thing", "descending"): lambda values: values[::-1],
+}
+
+
+AXES = {"views": 4, "held_out": 3, "held_out_views": 3, "rotations": 3, "pictures": 3, "head": 2}
+
+
+def array_mutations():
+    for name in ARRAYS:
+        for how, change in OF_EACH.items():
+            yield name, how, change
+        for axis in range(AXES.get(name, 1)):
+            yield name, f"one less along axis {axis}", lambda values, axis=axis: np.delete(values, -1, axis)
+            yield name, f"one more along axis {axis}", lambda values, axis=axis: lengthened(values, axis)
+    for name in FLOATS:
+        for how, change in OF_FLOATS.items():
+            if (name, how) != ("radii", "NaN"):  # a size that is not known
+                yield name, how, change
+    for (name, how), change in OF_ONE.items():
+        yield name, how, change
+
+
+@pytest.mark.parametrize(("name", "how", "change"), [pytest.param(*m, id="-".join(m[:2])) for m in array_mutations()])
+def test_every_array_is_checked(models, name, how, change):
+    rewrite(models, lambda arrays: arrays.update({name: change(arrays[name])}))
+    with pytest.raises(ModelError, match=r"^\S+/mine/memory\.safetensors: (not a memory \()?its .+"):
+        open_memory(models / "memory.json")
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_every_array_has_to_be_there(models, name):
+    rewrite(models, lambda arrays: arrays.pop(name))
+    with pytest.raises(ModelError, match=rf"memory\.safetensors: not a memory \(it holds no {name}\)"):
+        open_memory(models / "memory.json")
+
+
+def fewer_features(arrays):
+    for name in ("views", "held_out"):
+        kept = arrays[name].astype(np.float32)[..., :-1]
+        arrays[name] = kept / np.maximum(np.linalg.norm(kept, axis=-1, keepdims=True), 1e-9)
+    arrays["head"] = arrays["head"][:-1]
+
+
+def fewer_classes(arrays):
+    arrays["head"] = arrays["head"][:, :-1]
+    arrays["head_bias"] = arrays["head_bias"][:-1]
+
+
+def more_classes(arrays):
+    arrays["head"] = lengthened(arrays["head"], 1)
+    arrays["head_bias"] = lengthened(arrays["head_bias"], 0)
+
+
+def fewer_things(arrays):
+    for name in ("held_out", "held_out_views", "radii", "pictures"):
+        arrays[name] = arrays[name][:-1]
+    kept = arrays["thing"] < len(arrays["radii"])
+    for name in ("views", "rotations", "thing"):
+        arrays[name] = arrays[name][kept]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (fewer_features, "its views have 255 features, not 256"),
+        (fewer_classes, "is of 2 classes, and its card of 3"),
+        (more_classes, "is of 4 classes, and its card of 3"),
+        (fewer_things, "its resting poses are not those of the things on its card"),
+    ],
+)
+def test_arrays_that_fit_together_have_to_fit_card_and_features(models, change, sentence):
+    rewrite(models, change)
+    with pytest.raises(ModelError, match=rf"^\S+/mine/memory\.safetensors: {re.escape(sentence)}"):
+        open_recogniser(models / "memory.json")
+    with pytest.raises(ModelError, match=r"memory\.safetensors"):
+        nextview.learn(models, models, remove=("table",))
+
+
+def changed_card(models, change):
+    card = models / "memory.json"
+    about = json.loads(card.read_text())
+    change(about)
+    card.write_text(json.dumps(about))
+    return card
+
+
+def set_at(path, value):
+    """A change that sets a field of a card; "novelty/0/3" is the fourth value of a list in a list."""
+
+    def change(about):
+        *above, last = [int(key) if key.isdigit() else key for key in path.split("/")]
+        for key in above:
+            about = about[key]
+        about[last] = value(about[last]) if callable(value) else value
+
+    return change
+
+
+REFUSED = {
+    "one class more": set_at("classes", lambda names: [*names, "mug"]),
+    "one class less": set_at("classes", lambda names: names[:-1]),
+    "a class twice": set_at("classes", lambda names: [*names[:-1], names[0]]),
+    "no azimuth bins": set_at("azimuth_bins", 0),
+    "other azimuth bins": set_at("azimuth_bins", 8),
+    "other input": set_at("input", {"kind": "geometry", "size": 64}),
+    "a map network": set_at("kind", "lem"),
+    "one hypothesis more": set_at("calibration/hypotheses", lambda h: [*h, h[-1]]),
+    "one hypothesis less": set_at("calibration/hypotheses", lambda h: h[:-1]),
+    "no hypotheses": set_at("calibration/hypotheses", []),
+    "a negative hypothesis": set_at("calibration/hypotheses", lambda h: [-1, *h[1:]]),
+    "no calibration": lambda about: about.pop("calibration"),
+    "no calibration of the bins": lambda about: about["calibration"].pop("bin_correlation"),
+    "negative correlation": set_at("calibration/bin_correlation", -0.1),
+    "sizes of one class less": set_at("size/log_density", lambda rows: rows[:-1]),
+    "ragged sizes": set_at("size/log_density/0", lambda row: row[:-1]),
+    "descending sizes": set_at("size/radii_m", lambda radii: radii[::-1]),
+    "negative weight of sizes": set_at("size/weight", -1.0),
+    "one thing more": set_at("memory/things", lambda t: [*t, t[-1] | {"name": "mug"}]),
+    "one thing less": set_at("memory/things", lambda t: t[:-1]),
+    "a thing twice": set_at("memory/things", lambda t: [*t[:-1], t[0]]),
+    "no things": set_at("memory/things", []),
+    "a thing without a name": set_at("memory/things/0/name", ""),
+    "no poses": set_at("memory/things/0/poses", 0),
+    "negative poses": set_at("memory/things/0/poses", -1),
+    "one pose more": set_at("memory/things/0/poses", 2),
+    "other features": set_at("memory/features_sha256", "0" * 64),
+    "no hash": set_at("memory/features_sha256", ""),
+    "no weight": set_at("memory/weight", 0.0),
+    "negative weight": set_at("memory/weight", -30.0),
+    "endless weight": set_at("memory/weight", 1e300),
+    "an empty row of novelty": set_at("memory/novelty", [[]]),
+    "one level of novelty": set_at("memory/novelty", lambda rows: [row[:1] for row in rows]),
+    "ragged novelty": set_at("memory/novelty/0", lambda row: row[:-1]),
+    "descending novelty": set_at("memory/novelty/0", lambda row: row[::-1]),
+    "novelty of text": set_at("memory/novelty/0/0", "NaN"),
+    "novelty of nothing": set_at("memory/novelty/0/0", None),
+    "an empty row of usual": set_at("memory/usual", [[]]),
+    "ragged usual": set_at("memory/usual/0", lambda row: row[:-1]),
+    "usual of one class more": set_at("memory/usual", lambda rows: [[*row, 0.0] for row in rows]),
+    "an unknown field": set_at("memory/things/0/colour", "red"),
+}
+
+
+@pytest.mark.parametrize("how", REFUSED)
+def test_a_card_that_does_not_fit_is_refused_by_its_name(models, how):
+    change = REFUSED[how]
+    card = changed_card(models, lambda about: change(Missing(about) if how == "an unknown field" else about))
+    with pytest.raises(ModelError, match=r"^\S+/mine/memory\.(json|safetensors): .+"):
+        open_recogniser(card)
+
+
+class Missing(dict):
+    def __getitem__(self, key):
+        return self.get(key)
+
+
+def fields_of(value, path=()):
+    """The paths of all fields of a card, of long lists the first and the last."""
+    if path:
+        yield path
+    if isinstance(value, dict):
+        for key, inside in value.items():
+            yield from fields_of(inside, (*path, key))
+    elif isinstance(value, list):
+        for index in {0, len(value) - 1} if value else ():
+            yield from fields_of(value[index], (*path, index))
+
+
+def holder(about, path):
+    for key in path[:-1]:
+        about = about[key]
+    return about
+
+
+VALUES = {
+    "null": lambda value: None,
+    "text": lambda value: "\x00",
+    "number": lambda value: -1,
+    "large": lambda value: 10**30,
+    "list": lambda value: [],
+    "object": lambda value: {},
+    "shorter": lambda value: value[:-1] if isinstance(value, list | str) and value else {},
+    "longer": lambda value: [*value, value[-1]] if isinstance(value, list) and value else [[]],
+}
+
+
+@pytest.mark.parametrize("how", ["dropped", *VALUES])
+def test_any_other_field_is_refused_by_name_or_the_memory_works(models, features, monkeypatch, how):
+    monkeypatch.setattr("nextview.recognition.memory.Features", lambda threads: features)
+    card = models / "memory.json"
+    original = json.loads(card.read_text())
+    refused = 0
+    for path in fields_of(original):
+        about = deepcopy(original)
+        where = holder(about, path)
+        if how == "dropped":
+            del where[path[-1]]
+        else:
+            where[path[-1]] = VALUES[how](where[path[-1]])
+        card.write_text(json.dumps(about))
+        sentence = None
+        try:
+            recogniser = open_recogniser(find_models(models).recogniser)
+        except ModelError as error:
+            sentence = str(error)
+        if sentence is not None:
+            assert re.match(r"\S+/mine\S*: .+", sentence), (path, sentence)
+            refused += 1
+            continue
+        seen = recogniser.memory.held_out[:, 0].astype(np.float32)
+        evidence = recogniser.evidence(seen, recogniser.memory.held_out_views[:, 0, 0])
+        assert np.isfinite(evidence.logits).all(), path
+        assert np.isfinite(evidence.azimuth_bins).all(), path
+        if recogniser.novelty is not None:
+            score = recogniser.novelty.of_belief(np.zeros(3), 1)
+            assert 0 <= recogniser.novelty.of_views([score]) <= 1, path
+    assert refused > 20
