@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from nextview.checks import number
-from nextview.errors import UsageError
+from nextview.errors import ResultsError, UsageError
 from nextview.files import new_folder
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
@@ -37,6 +37,7 @@ def write_capture(
     object's centre, at its lowest point. The object may stand on a ``table`` that is seen too, and have ``masks``.
     """
     number(radius, "the object radius, in metres,", above=0)
+    _check_others(folder, len(sphere), masks)
     if (farthest := radius * (DISTANCE + max(1.0, 1.5 * TABLE * table))) > STEP * NOTHING:
         raise UsageError(f"the camera sees {farthest:.3g} m far, the depth images end at {STEP * NOTHING:.3g} m")
     height = -radius * float(mesh.vertices[:, 2].min())
@@ -73,3 +74,18 @@ def write_capture(
             yield i + 1
         for name, values in (("scene_camera", cameras), ("scene_gt", objects)):
             (new / f"{name}.json").write_text(json.dumps(values, indent=1) + "\n")
+
+
+def _check_others(folder: Path, views: int, masks: bool) -> None:
+    """Refuse a folder with images that reading the new views would take for theirs, but that are not replaced.
+
+    Raises:
+        ResultsError: it holds colour or grey images of views of these numbers, or masks where none are written.
+    """
+    others = {"rgb": "", "gray": ""} | ({} if masks else {"mask_visib": "_*"})
+    for name, end in others.items():
+        for i in range(views):
+            found = next(folder.glob(f"{name}/{i:06d}{end}.*"), None)
+            if found is not None:
+                what = "an image that would be taken for one of the new views"
+                raise ResultsError(f"{found}: is {what}; remove the folder {name}, or give another one")

@@ -1,0 +1,269 @@
+"""Where a memory is written: links, folders of others, two runs at once, other features, parts of a stopped run."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+from pipeline import SAMPLE_FILES
+
+from nextview.data.predicting import predict
+from nextview.data.samples import sample_mesh
+from nextview.errors import DatasetError, ModelError, ResultsError, UsageError
+from nextview.files import MARKER, new_folder, only_one
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.learning import learn as module
+from nextview.learning.learn import learn
+from nextview.recognition.memory import AZIMUTHS, RINGS, open_memory
+from nextview.recognition.model_card import read_card
+from nextview.recognition.novelty import unit
+from nextview.simulation.capturing import write_capture
+
+
+@pytest.fixture
+def looked_at(monkeypatch):
+    """The names of things that were looked at: by random numbers, as a network takes longer."""
+    names = []
+
+    def teach(path, name, how, threads):
+        names.append(name)
+        rng = np.random.default_rng([*name.encode()])
+        return {
+            "views": unit(rng.normal(size=(1, len(RINGS), AZIMUTHS, 256))).astype(np.float16),
+            "rotations": np.eye(3, dtype=np.float32)[None],
+            "held_out": unit(rng.normal(size=(4, 256))).astype(np.float16),
+            "held_out_views": np.zeros((4, 2), np.float32),
+            "radii": np.array([0.1], np.float32),
+            "pictures": np.zeros((64, 64), np.uint8),
+        }
+
+    monkeypatch.setattr(module, "teach", teach)
+    monkeypatch.setattr(module, "draw_learned", lambda path, pictures, fit: path.write_text(" ".join(pictures)))
+    return names
+
+
+@pytest.fixture
+def place(tmp_path, looked_at):
+    """Folders of meshes, first (box, ball) and more (cup), and a memory of the first, mine."""
+    for folder, names in {"first": ("box", "ball"), "more": ("cup",)}.items():
+        (tmp_path / folder).mkdir()
+        for name in names:
+            shutil.copy(SAMPLE_FILES / "chair.off", tmp_path / folder / f"{name}.off")
+    learn(tmp_path / "first", tmp_path / "mine", workers=0)
+    looked_at.clear()
+    return tmp_path
+
+
+def known(out):
+    return [thing.name for thing in open_memory(out / "memory.json")[0].memory.things]
+
+
+def contents(folder):
+    """All there is in a folder, by name: bytes of files, targets of links."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink():
+            found[name] = os.readlink(path)
+        elif path.is_file():
+            found[name] = path.read_bytes()
+    return found
+
+
+RUNS = {
+    "add": lambda place: learn(place / "more", place / "mine", add=True, workers=0),
+    "remove": lambda place: learn(place / "mine", place / "mine", remove=("box",), workers=0),
+    "overwrite": lambda place: learn(place / "more", place / "mine", overwrite=True, workers=0),
+}
+AFTER = {"add": ["ball", "box", "cup"], "remove": ["ball"], "overwrite": ["cup"]}
+
+
+def link_away(path, place):
+    target = place / "disk"
+    shutil.move(path, target)
+    path.symlink_to(target, target_is_directory=target.is_dir())
+    return target
+
+
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize("linked", ["memory.json", "learned.png", "."])
+def test_a_link_where_a_file_is_to_be_replaced_is_refused_before_anything_is_done(place, looked_at, run, linked):
+    link_away(place / "mine" / linked if linked != "." else place / "mine", place)
+    before = contents(place)
+    with pytest.raises(ResultsError, match="is a link; give what it points to"):
+        RUNS[run](place)
+    assert contents(place) == before
+    assert not looked_at
+    assert known(place / "mine") == ["ball", "box"]
+
+
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize("layout", ["now", "earlier"])
+def test_weights_that_are_a_link_are_replaced_and_what_it_points_to_stays(place, run, layout):
+    weights = read_card(place / "mine/memory.json").path
+    if layout == "earlier":
+        weights = weights.rename(place / "mine/memory.safetensors")
+    target = link_away(weights, place)
+    content = target.read_bytes()
+    assert known(place / "mine") == ["ball", "box"]
+    RUNS[run](place)
+    assert known(place / "mine") == AFTER[run]
+    assert not weights.is_symlink()
+    assert target.read_bytes() == content
+
+
+def test_the_very_same_memory_again_keeps_its_file_though_that_is_a_link(place):
+    weights = read_card(place / "mine/memory.json").path
+    target = link_away(weights, place)
+    learn(place / "first", place / "mine", overwrite=True, workers=0)
+    assert weights.readlink() == target
+    assert known(place / "mine") == ["ball", "box"]
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_what_is_not_ours_beside_the_output_stays(place, run):
+    marked = json.dumps({"output": "other", "key": "things"})
+    foreign = {
+        ".mine.part/thesis.txt": "mine",
+        ".mine-abcdefgh/thesis.txt": "mine",
+        f".mine-bcdefghi/{MARKER}": "not a record",
+        f".mine-cdefghij/{MARKER}": marked,
+        "mine/.new-abcdefgh/thesis.txt": "mine",
+        "mine/memory-0123456789abcdef.safetensors": "its name is no hash of it",
+        "mine/memory-notes.safetensors": "mine",
+        "mine/notes.txt": "mine",
+    }
+    for name, text in foreign.items():
+        (place / name).parent.mkdir(exist_ok=True)
+        (place / name).write_text(text)
+    RUNS[run](place)
+    assert known(place / "mine") == AFTER[run]
+    now = contents(place)
+    assert {name: now.get(name) for name in foreign} == {name: text.encode() for name, text in foreign.items()}
+
+
+def test_predict_leaves_a_folder_of_others_alone(tmp_path, views, models):
+    (tmp_path / ".p.npz.part").mkdir()
+    (tmp_path / ".p.npz.part/thesis.txt").write_text("mine")
+    list(predict(views, tmp_path / "p.npz", read_card(models / "tiny.json"), {}, "test", workers=0))
+    assert {path.name for path in tmp_path.iterdir()} == {".p.npz.part", "p.npz"}
+    assert (tmp_path / ".p.npz.part/thesis.txt").read_text() == "mine"
+
+
+def test_a_lock_of_others_is_not_taken_for_ours(tmp_path):
+    (tmp_path / ".mine.lock").write_text("poetry")
+    with (
+        pytest.raises(DatasetError, match=r"cannot be written while \S+/\.mine\.lock is there"),
+        only_one(tmp_path / "mine"),
+    ):
+        pass
+    assert (tmp_path / ".mine.lock").read_text() == "poetry"
+
+
+def test_of_two_runs_at_once_one_is_refused_and_none_loses_what_the_other_wrote(place, monkeypatch):
+    shutil.copytree(place / "more", place / "third")
+    (place / "third/cup.off").rename(place / "third/jug.off")
+    with only_one(place / "mine"), pytest.raises(DatasetError, match="another run is writing it"):
+        learn(place / "more", place / "mine", add=True, workers=0)
+
+    find = module.find_things
+    waiting = [place / "third"]
+
+    def find_things(folder):  # while this run looks for its things, another one begins and ends
+        if waiting:
+            learn(waiting.pop(), place / "mine", add=True, workers=0)
+        return find(folder)
+
+    monkeypatch.setattr(module, "find_things", find_things)
+    learn(place / "more", place / "mine", add=True, workers=0)
+    assert known(place / "mine") == ["ball", "box", "cup", "jug"]
+
+
+@pytest.mark.parametrize("run", ["add", "remove"])
+def test_numbers_of_other_features_are_not_mixed_with_these(place, looked_at, run):
+    card = place / "mine/memory.json"
+    about = json.loads(card.read_text())
+    about["memory"]["features_sha256"] = "0" * 64
+    card.write_text(json.dumps(about))
+    before = contents(place / "mine")
+    with pytest.raises(ModelError, match=r"^\S+/memory\.json: was taught with other features"):
+        RUNS[run](place)
+    assert contents(place / "mine") == before
+    assert not looked_at
+    assert {path.name for path in place.iterdir()} == {"first", "more", "mine"}
+
+
+def test_a_memory_of_nothing_is_not_written(place):
+    with pytest.raises(UsageError, match="would know nothing any more; delete it instead"):
+        learn(place / "mine", place / "mine", remove=("box", "ball"), workers=0)
+    assert known(place / "mine") == ["ball", "box"]
+
+
+CHANGES = {
+    "nothing": (lambda folder: None, False),
+    "the size of a file": (lambda folder: (folder / "depth/0.png").write_bytes(b"longer than it was"), True),
+    "the time of a file": (lambda folder: os.utime(folder / "depth/0.png", (1, 1)), True),
+    "one file more": (lambda folder: (folder / "depth/1.png").write_bytes(b"0"), True),
+    "one file less": (lambda folder: (folder / "scene_gt.json").unlink(), True),
+    "the name of a file": (lambda folder: (folder / "depth/0.png").rename(folder / "depth/2.png"), True),
+    "a file behind a link": (lambda folder: os.utime(folder / "rgb/0.png", (1, 1)), True),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_frames_that_were_changed_in_place_are_looked_at_again(tmp_path, looked_at, what):
+    folder = tmp_path / "scans/thing"
+    (folder / "depth").mkdir(parents=True)
+    for name in ("scene_camera.json", "scene_gt.json", "depth/0.png"):
+        (folder / name).write_bytes(b"{}")
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk/0.png").write_bytes(b"0")
+    (folder / "rgb").symlink_to(tmp_path / "disk")
+    (folder / "loop").symlink_to(tmp_path)
+    shutil.copy(SAMPLE_FILES / "chair.off", tmp_path / "scans/box.off")
+
+    def stop(done, total, what):
+        for count in done:
+            if count == 2:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        learn(tmp_path / "scans", tmp_path / "mine", workers=0, track=stop)
+    assert sorted(looked_at) == ["box", "thing"]
+    looked_at.clear()
+    change, again = CHANGES[what]
+    times = {path: path.stat().st_mtime_ns for path in (folder, folder / "depth", tmp_path / "disk")}
+    change(folder)
+    for path, time in times.items():  # as cp over what is there leaves it
+        os.utime(path, ns=(time, time))
+    learn(tmp_path / "scans", tmp_path / "mine", workers=0)
+    assert looked_at == ["thing"] * again
+    assert {path.name for path in tmp_path.iterdir()} == {"scans", "disk", "mine"}
+
+
+def test_no_file_of_a_folder_is_replaced_before_all_can_be(tmp_path):
+    out = tmp_path / "out"
+    (out / "b").mkdir(parents=True)
+    for name in ("a.txt", "c.txt"):
+        (out / name).write_text("old")
+    (tmp_path / "away").mkdir()
+    (out / "linked").symlink_to(tmp_path / "away")
+    before = contents(out)
+    for taken in ("b", "linked/x.txt"):
+        with pytest.raises(ResultsError, match=r"is a (folder|link)"), new_folder(out, overwrite=True) as part:
+            for name in ("a.txt", "c.txt", taken):
+                (part / name).parent.mkdir(exist_ok=True)
+                (part / name).write_text("new")
+        assert contents(out) == before
+    assert not any((tmp_path / "away").iterdir())
+
+
+@pytest.mark.parametrize("image", ["rgb/000001.jpg", "gray/000000.png", "mask_visib/000002_000000.png"])
+def test_capture_writes_no_views_beside_images_that_would_be_taken_for_theirs(tmp_path, image):
+    sphere = ViewSphere((30.0,), 3)
+    (tmp_path / image).parent.mkdir()
+    (tmp_path / image).write_bytes(b"mine")
+    with pytest.raises(ResultsError, match="would be taken for one of the new views"):
+        list(write_capture(sample_mesh("chair"), tmp_path, sphere, 0.4, masks=False, overwrite=True))
+    assert contents(tmp_path) == {image: b"mine"}
