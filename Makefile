@@ -4,7 +4,7 @@ PYTHON ?= python3
 .PHONY: demo test lint docs reproduce reproduce-small clean
 
 demo: .venv/installed  ## look at a sample object, with the base installation (no torch)
-	.venv/bin/nextview demo --figure nextview_demo.png
+	.venv/bin/nextview demo
 
 test: .venv-test/installed  ## run the tests; NEXTVIEW_TESTS=all: also those that take minutes each
 	OMP_NUM_THREADS=1 .venv-test/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # one file is run by one process, of one thread

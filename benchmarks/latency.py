@@ -18,7 +18,6 @@ require("train")
 
 import numpy as np
 import onnx
-import onnxruntime as ort
 import tyro
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, shape_inference
@@ -26,6 +25,7 @@ from onnx import TensorProto, helper, shape_inference
 from nextview.cli.ending import orderly_end
 from nextview.recognition.inference import open_weights
 from nextview.recognition.model_card import ModelCard, bundled_cards, find_card
+from nextview.recognition.runtime import ort
 
 SIDE = 2048
 """Of the matrices of the baselines."""

@@ -16,10 +16,42 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.errors import ModelError, NextviewError, UsageError
+from nextview.errors import MissingExtraError, ModelError, NextviewError, UsageError
 
+EXTRAS = {  # packages by the optional part of the installation that brings them
+    "benchmark": ("jinja2", "pandas", "pyarrow"),
+    "cluster": ("dask", "distributed"),
+    "explore": ("viser", "websockets"),
+    "large": ("faiss",),
+    "record": ("rerun",),
+    "envs": ("gymnasium",),
+    "train": ("lightning", "numcodecs", "onnx", "onnxscript", "torch", "torchmetrics"),
+}
 TRACEBACK = "NEXTVIEW_TRACEBACK"  # an environment variable: set, the whole traceback of a plugin's error is printed too
 _NOT_PLUGINS = (f"{Path(__file__).parent}{os.sep}", "<frozen ", *map(sysconfig.get_path, ("stdlib", "purelib")))
+
+
+def missing_extra(error: ModuleNotFoundError) -> str | None:
+    """What to install; None where the module belongs to no optional part."""
+    package = (error.name or "").partition(".")[0]
+    extra = next((extra for extra, packages in EXTRAS.items() if package in packages), None)
+    return None if extra is None else f"this needs the package {package}: pip install 'nextview[{extra}]'"
+
+
+@contextmanager
+def extras() -> Iterator[None]:
+    """Stands around imports from optional parts of the installation.
+
+    Raises:
+        MissingExtraError: such a part is not installed; the sentence says how to install it.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        sentence = missing_extra(error)
+        if sentence is None:
+            raise
+        raise MissingExtraError(sentence) from error
 
 
 def one_line(text: str, most: int = 80) -> str:

@@ -13,7 +13,7 @@ class UsageError(NextviewError):
     """An argument or an option that makes no sense."""
 
 
-class MissingExtraError(NextviewError):
+class MissingExtraError(NextviewError, ModuleNotFoundError):
     """A package that an optional part of nextview needs is not installed."""
 
 

@@ -227,15 +227,29 @@ def _remove(folder: Path) -> None:
 @contextmanager
 def _beside(path: Path) -> Iterator[Path]:
     """A temporary folder on the same disk, removed at the end; what the disk refuses becomes one sentence."""
-    temporary = _marked_folder(path, TEMPORARY)
+    with _folders_above(path):
+        temporary = _marked_folder(path, TEMPORARY)
+        try:
+            yield temporary
+        except OSError as error:
+            if error.errno not in FULL:
+                raise
+            raise ResultsError(f"{path}: cannot be written ({error.strerror})") from None
+        finally:
+            _remove(temporary)
+
+
+@contextmanager
+def _folders_above(path: Path) -> Iterator[None]:
+    """Where the block fails, remove those folders above a path that were not there before and hold nothing."""
+    missing = [folder for folder in path.absolute().parents if not folder.exists()]
     try:
-        yield temporary
-    except OSError as error:
-        if error.errno not in FULL:
-            raise
-        raise ResultsError(f"{path}: cannot be written ({error.strerror})") from None
-    finally:
-        _remove(temporary)
+        yield
+    except BaseException:
+        for folder in missing:  # the innermost comes first
+            with suppress(OSError):  # it was never made, or something else is in it
+                folder.rmdir()
+        raise
 
 
 def _sync(path: Path) -> None:
@@ -266,18 +280,19 @@ def only_one(path: Path) -> Iterator[None]:
     if file.is_symlink() or (file.exists() and (not file.is_file() or file.stat().st_size > 0)):
         what = "another run's lock, or no file of this program"  # a lock is an empty file, where the system has locks
         raise DatasetError(f"{path}: cannot be written while {file} is there: {what}")
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        lock.acquire()
-    except Timeout:
-        raise DatasetError(f"{path}: another run is writing it; wait for that one or stop it") from None
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be written ({error.strerror})") from None
-    try:
-        yield
-    finally:
-        file.unlink(missing_ok=True)  # while it is held: whoever opened it before sees that it is gone, and tries anew
-        lock.release()
+    with _folders_above(place):
+        try:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            lock.acquire()
+        except Timeout:
+            raise DatasetError(f"{path}: another run is writing it; wait for that one or stop it") from None
+        except OSError as error:
+            raise DatasetError(f"{path}: cannot be written ({error.strerror})") from None
+        try:
+            yield
+        finally:
+            file.unlink(missing_ok=True)  # while it is held: who opened it before sees that it is gone, and tries anew
+            lock.release()
 
 
 def regular_file(path: Path, what: str, error: type[NextviewError], largest: int | None = None) -> None:

@@ -10,13 +10,10 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from nextview.checks import number, one_line, whole
+from nextview.checks import extras, number, one_line, whole
 from nextview.data.folders import list_dataset
 from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLES, sample_mesh
@@ -34,6 +31,11 @@ from nextview.recognition.map_names import in_order
 from nextview.recognition.model_card import find_models
 from nextview.session.episode import Episodes
 from nextview.simulation.simulated import SimulatedCamera
+
+with extras():
+    import gymnasium
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
 
 Rows = NDArray[np.int64]
 Source = str | Path | Predictions

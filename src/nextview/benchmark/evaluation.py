@@ -5,18 +5,21 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from nextview.benchmark import statistics as st
 from nextview.benchmark.published import comparable_classes, published_map, published_recognisers
 from nextview.benchmark.true_maps import known_maps, true_map
+from nextview.checks import extras
 from nextview.data import metrics
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError
 from nextview.recognition.belief import Calibration
 from nextview.recognition.map_names import CONFIDENCE, measure_of
 from nextview.recognition.model_card import ModelCard
+
+with extras():
+    import pandas as pd
 
 Index = NDArray[np.int64]
 Float = NDArray[np.float64]

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -13,8 +12,12 @@ from nextview.benchmark.evaluation import Evaluation
 from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold
 from nextview.benchmark.page import words
 from nextview.benchmark.run import Results
+from nextview.checks import extras
 from nextview.recognition.map_names import LCM, LEM
 from nextview.session.style import ACCENT, BLUE, GREY, INK, LIGHT_BLUE, legend, new_figure, percent_axis
+
+with extras():
+    import pandas as pd
 
 COLOURS = {
     "random": GREY, "gain": "#b5179e", "random-all": "#4a5560", "furthest": "#d99000", "unidirectional": LIGHT_BLUE,

@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-import pandas as pd
-
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.summary import Tables
+from nextview.checks import extras
+
+with extras():
+    import pandas as pd
 
 SIGNIFICANT = 0.05  # a difference is called one when its p-value after Holm's correction is below this
 FEW_OBJECTS, WIDE = 200, 0.03  # with fewer objects, or wider intervals of differences in accuracy, little can be told

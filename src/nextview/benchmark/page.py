@@ -6,15 +6,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from nextview.benchmark.entries import knows_truth
+from nextview.checks import extras
 from nextview.data.predictions import Predictions
 from nextview.files import new_folder
 from nextview.recognition.map_names import measure_of
 from nextview.session.style import to_svg
+
+with extras():
+    import pandas as pd
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
 NONE = "\N{EN DASH}"
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
@@ -20,6 +19,7 @@ from nextview.benchmark.published import COLUMNS, published_threshold
 from nextview.benchmark.run import Results, load
 from nextview.benchmark.true_maps import stored_rows
 from nextview.benchmark.views import as_rows
+from nextview.checks import extras
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import scene_views
 from nextview.data.store import ViewStore
@@ -28,6 +28,9 @@ from nextview.files import check_new, new_file
 from nextview.geometry.depth import headlight
 from nextview.policies.registry import DEFAULT
 from nextview.recognition.map_names import LEM
+
+with extras():
+    import pandas as pd
 
 PICTURE = 112  # side of a view's picture, pixels
 OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])  # nothing, target, others, table

@@ -6,14 +6,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.replay import THRESHOLDS, Grid, make_specs, run_grid
 from nextview.benchmark.summary import Tables, summarise
 from nextview.benchmark.views import as_rows, markdown
+from nextview.checks import extras
 from nextview.data.predictions import Predictions
 from nextview.data.progress import Track, silently
 from nextview.errors import EntryError, ResultsError, UsageError
@@ -23,6 +21,11 @@ from nextview.recognition.belief import PLAIN_SUM, Stopping
 from nextview.recognition.map_names import LEM
 from nextview.recognition.model_card import find_models
 from nextview.recognition.own_stopping import own_stopping
+
+with extras():
+    import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from nextview.benchmark import statistics as st
@@ -13,9 +12,13 @@ from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.published import comparable_classes, published
 from nextview.benchmark.replay import Grid
 from nextview.benchmark.views import COLUMNS, measured
+from nextview.checks import extras
 from nextview.data import metrics
 from nextview.session.episode import Outcome
 from nextview.simulation.scene_layout import LEVELS, clutter_level
+
+with extras():
+    import pandas as pd
 
 Float = NDArray[np.float64]
 Drawn = dict[tuple, NDArray[np.float64]]  # what resampling gives, by policy, threshold and measure

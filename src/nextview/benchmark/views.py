@@ -8,13 +8,16 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-import pandas as pd
 
 from nextview.benchmark.entries import knows_truth
 from nextview.benchmark.replay import Grid, Trajectories, truncate
 from nextview.benchmark.statistics import holm, interval, mcnemar, resample
+from nextview.checks import extras
 from nextview.data.metrics import ratio
 from nextview.session.episode import Outcome
+
+with extras():
+    import pandas as pd
 
 CEILING = "oracle-gain"
 COLUMNS = ["policy", "n_views", "measure", "value", "low", "high", "p", "p_holm"]

@@ -27,17 +27,29 @@ def find(path: str) -> Any:
 
 
 def call(name: str, command: Command, arguments: Sequence[str], track: Callable[..., None]) -> tuple[Any, dict]:
-    """What the function of a command returns, and its arguments. A parameter ``track`` is given, all others are asked.
+    """What the function of a command returns, and its arguments by their names."""
+    run, called = entry(command, arguments, track)
+    returned = tyro.cli(run, prog=f"nextview {name}", args=arguments, config=CONFIG)
+    return returned, called
 
-    Parameters without a default, and those that are positional only, are arguments; all others are options.
+
+def entry(
+    command: Command, arguments: Sequence[str] = (), track: Callable[..., None] | None = None
+) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """A function that tyro can ask for on a command line, and a dictionary of the arguments that it is called with.
+
+    Parameters without a default, and those that are positional only, are arguments; all others are options. A parameter
+    ``track`` is given, and is not asked for. ``arguments`` tell whether the defaults are those of another preset.
     """
     function = find(command.function)
-    signature, hints = inspect.signature(function), get_type_hints(function, include_extras=True)
+    signature = inspect.signature(function)
+    hints = get_type_hints(function, include_extras=True)
+    comments = _comments(function)
     parameters = []
     for parameter in signature.parameters.values():
         kind = hints[parameter.name]
-        if text := _comments(function).get(parameter.name):
-            kind = Annotated[kind, tyro.conf.arg(help=text)]
+        if parameter.name in comments:
+            kind = Annotated[kind, tyro.conf.arg(help=comments[parameter.name])]
         if parameter.name != "track":
             parameters.append(parameter.replace(annotation=kind))
     if command.thesis:
@@ -46,17 +58,18 @@ def call(name: str, command: Command, arguments: Sequence[str], track: Callable[
         kind = Annotated[Literal["default", "thesis"], tyro.conf.arg(help=PRESET)]
         keyword = inspect.Parameter.KEYWORD_ONLY
         parameters.append(inspect.Parameter("preset", keyword, default="default", annotation=kind))
+    given = {"track": track} if "track" in hints else {}
     called: dict[str, Any] = {}
 
     def run(*positional: Any, preset: str = "default", **options: Any) -> Any:
         called.update(signature.bind_partial(*positional, **options).arguments)
-        return function(*positional, **options, **({"track": track} if "track" in hints else {}))
+        return function(*positional, **options, **given)
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     text = inspect.cleandoc(function.__doc__ or "").replace("``", "")
     run.__doc__ = re.sub(r"(?<=\S)\n(?: {8,})?(?=\S)", " ", text)  # a paragraph a line: tyro would keep where lines end
-    return tyro.cli(run, prog=f"nextview {name}", args=arguments, config=CONFIG), called
+    return run, called
 
 
 def _comments(function: Callable[..., Any]) -> dict[str, str]:

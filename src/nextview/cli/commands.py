@@ -27,6 +27,7 @@ COMMANDS = {  # by name, in the order in which they are listed
     ),
     "explore": Command(f"{CLI}.explore:explore", "choose views in the browser, and see what is believed"),
     "capture": Command(f"{CLI}.scenes:capture", "write depth images of a mesh, as a camera would take them"),
+    "completion": Command(f"{CLI}.completion:completion", "print what a shell completes: bash, zsh or fish"),
     "list": Command(f"{CLI}.listing:show", "list the bundled models, or the view measures"),
     "download": Command(f"{CLI}.listing:download", "download ModelNet10 or ModelNet40"),
     "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes, a target half hidden in each"),

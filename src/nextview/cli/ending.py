@@ -8,16 +8,8 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Any
 
+from nextview.checks import EXTRAS, missing_extra
 from nextview.errors import NextviewError
-
-EXTRAS = {  # packages by the optional part of the installation that brings them
-    "benchmark": ("jinja2", "pandas", "pyarrow"),
-    "cluster": ("dask", "distributed"),
-    "explore": ("viser",),
-    "record": ("rerun",),
-    "envs": ("gymnasium",),
-    "train": ("lightning", "numcodecs", "onnx", "onnxscript", "torch", "torchmetrics"),
-}
 
 
 def printable(text: str) -> str:
@@ -36,7 +28,7 @@ def orderly_end(after_ctrl_c: str) -> Iterator[None]:
         yield
         sys.stdout.flush()
     except (NextviewError, ModuleNotFoundError) as error:
-        sentence = missing_extra(error) if isinstance(error, ModuleNotFoundError) else str(error)
+        sentence = str(error) if isinstance(error, NextviewError) else missing_extra(error)
         if sentence is None:
             raise
         _end(sentence, 2)
@@ -58,13 +50,6 @@ def orderly_end(after_ctrl_c: str) -> Iterator[None]:
 def _end(sentence: str, status: int) -> Any:
     print(f"nextview: {printable(sentence)}", file=sys.stderr)
     sys.exit(status)
-
-
-def missing_extra(error: ModuleNotFoundError) -> str | None:
-    """What to install; None where the module belongs to no optional part."""
-    package = (error.name or "").partition(".")[0]
-    extra = next((extra for extra, packages in EXTRAS.items() if package in packages), None)
-    return None if extra is None else f"this needs the package {package}: pip install 'nextview[{extra}]'"
 
 
 def require(extra: str) -> None:

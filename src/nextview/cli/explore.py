@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
+from nextview.checks import extras
 from nextview.cli.progress import console
 from nextview.cli.sources import Looking, Unit
 
@@ -31,7 +32,8 @@ def explore(
     Candidate views are coloured by what the policy values them at. Images, local maps and belief follow at once. Two
     policies walk side by side, with clean renders or through a sensor with its errors.
     """
-    import viser  # noqa: F401  # a missing extra is named before models are opened
+    with extras():
+        import viser  # noqa: F401  # a missing extra is named before models are opened
 
     from nextview.viewers.exploration import Exploration, shown_objects
     from nextview.viewers.page import Page

@@ -9,7 +9,7 @@ from nextview import __version__
 from nextview.checks import did_you_mean
 from nextview.cli.commands import COMMANDS, RESUMES
 from nextview.cli.ending import orderly_end
-from nextview.errors import UsageError
+from nextview.errors import MissingExtraError, UsageError
 
 ABOUT = "Active 3D object recognition: what an object is, and where to look next."
 
@@ -48,7 +48,16 @@ def _call(name: str, arguments: list[str]) -> None:
     from nextview.cli.progress import console, track
 
     command = COMMANDS[name]
-    result, given = call(name, command, arguments, track)
+    try:
+        result, given = call(name, command, arguments, track)
+    except MissingExtraError as missing:
+        if not {"-h", "--help"} & set(arguments):
+            raise
+        from nextview.cli.stand_ins import stand_ins
+
+        console.print(f"nextview {name}: {missing}", soft_wrap=True)
+        with stand_ins():
+            result, given = call(name, command, arguments, track)
     if command.show:
         find(command.show)(result)
     if command.then:

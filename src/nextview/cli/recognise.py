@@ -12,6 +12,8 @@ from nextview.errors import NextviewError, ObservationError, UsageError
 from nextview.files import new_file
 from nextview.session.system import System, load, simulated
 
+DEMO_PICTURE = Path("nextview_demo.png")
+
 
 @dataclass(frozen=True)
 class Output:
@@ -61,14 +63,18 @@ def recognise(
 def demo(
     shape: Literal["table", "chair", "monitor"] = "table",  # which one
     start: int = 33,  # first view, 0 to 39
-    figure: Path = Path("nextview_demo.png"),  # where to write the picture
-    overwrite: bool = False,  # replace the picture if it exists
+    figure: Path | None = None,  # where to write the picture; nextview_demo.png, that of the last demo, if not given
+    overwrite: bool = False,  # replace a picture of another name if it exists
 ) -> None:
     """Recognise a sample object that ships with nextview, and draw the episode."""
     from nextview.data.samples import sample_mesh
 
-    check_file(figure, overwrite)
-    show(simulated(sample_mesh(shape)), f"the sample {shape}", load(), Output(figure, overwrite=overwrite), start)
+    output = Output(figure, overwrite=overwrite)
+    if figure is None:  # the name is the demo's own: a second demo draws over the first
+        output = Output(DEMO_PICTURE, overwrite=True)
+    check_file(output.figure, output.overwrite)
+    show(simulated(sample_mesh(shape)), f"the sample {shape}", load(), output, start)
+    console.print(f"the episode is drawn in {output.figure}")
 
 
 def show(

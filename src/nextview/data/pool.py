@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from nextview.checks import whole
+from nextview.checks import extras, whole
 from nextview.errors import DatasetError
 
 MOST = 1024  # processes on one machine
@@ -118,10 +118,8 @@ def _begin_worker() -> None:
 
 
 def _on_cluster(function: Callable, items: Sequence[Item], scheduler: str) -> Iterator[tuple[Item, Any]]:
-    try:
+    with extras():
         from distributed import Client, KilledWorker, as_completed
-    except ImportError as error:
-        raise DatasetError(f"a scheduler needs {error.name}: pip install 'nextview[cluster]'") from None
     try:
         client = Client(scheduler, timeout=PATIENCE)
     except (OSError, ValueError) as error:

@@ -1,12 +1,14 @@
 """The networks: ResNet with torchvision's parameter names, PointNet with its two transforms, and a ResNet of maps."""
 
-import torch
-from torch import Tensor, nn
-from torch.nn import functional as F
-
+from nextview.checks import extras
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.recipes import MapRecipe, RecogniserRecipe
 from nextview.recognition.network_input import CHANNELS_OF
+
+with extras():
+    import torch
+    from torch import Tensor, nn
+    from torch.nn import functional as F
 
 STAGES = (  # expansion, width, kernel, stride and blocks (Tan and Le, EfficientNet, ICML 2019, table 1)
     (1, 16, 3, 1, 1),

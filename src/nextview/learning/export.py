@@ -9,13 +9,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import onnx
-import torch
 from msgspec.structs import replace
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
-from torch import Tensor, nn
 
+from nextview.checks import extras
 from nextview.data.measures import find_measure
 from nextview.data.metrics import map_scores, recogniser_scores
 from nextview.data.predictions import Predictions
@@ -33,6 +30,12 @@ from nextview.recognition.inference import BINS_OUTPUT, FEATURES_OUTPUT, MapNetw
 from nextview.recognition.map_names import CONFIDENCE, Good, map_name
 from nextview.recognition.model_card import ModelCard, Training, write_card
 from nextview.recognition.network_input import InputSpec, from_store
+
+with extras():
+    import onnx
+    import torch
+    from onnx import TensorProto, helper, numpy_helper
+    from torch import Tensor, nn
 
 OPSET = 18
 SMALL = 2**17

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
+from nextview.checks import extras
 from nextview.data.predictions import Predictions
 from nextview.data.progress import Track, silently
 from nextview.data.scene_views import scenes_of
@@ -39,6 +38,10 @@ from nextview.policies.learned_tables import cells_from
 from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
 from nextview.recognition.inference import open_onnx
 from nextview.recognition.map_names import in_order
+
+with extras():
+    import torch
+    from torch import Tensor, nn
 
 Best = tuple[tuple[Gain, ...], Value]  # policies, one for each fold, and their mean value
 BOUND = 1e-5

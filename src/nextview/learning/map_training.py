@@ -4,13 +4,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import lightning as L
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn import functional as F
 
+from nextview.checks import extras
 from nextview.data.measures import confidence_maps, normalise_per_object
 from nextview.data.predictions import Predictions
 from nextview.data.progress import Track, silently
@@ -24,6 +21,12 @@ from nextview.learning.recipes import Hardware, MapRecipe
 from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, read_run, start_from, train_once
 from nextview.recognition.map_names import CONFIDENCE
 from nextview.recognition.network_input import cloud_input
+
+with extras():
+    import lightning as L
+    import torch
+    from torch import Tensor, nn
+    from torch.nn import functional as F
 
 Seen = NDArray[Any] | PackedViews  # of N objects from V views, what the network sees
 

@@ -6,13 +6,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import lightning as L
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn import functional as F
 
+from nextview.checks import extras
 from nextview.data.progress import Track, silently
 from nextview.data.rendering import rotations
 from nextview.data.splits import check_any, deduplicate, split_training
@@ -22,6 +19,12 @@ from nextview.learning.architectures import recogniser_network
 from nextview.learning.inputs import PackedViews, ready_inputs
 from nextview.learning.recipes import Hardware, RecogniserRecipe
 from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, start_from, train_once
+
+with extras():
+    import lightning as L
+    import torch
+    from torch import Tensor, nn
+    from torch.nn import functional as F
 
 Float = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -12,22 +12,25 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-import lightning as L
 import msgspec
 import numpy as np
-import torch
-from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
-from lightning.fabric.utilities.rank_zero import rank_zero_only
-from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
-from torch import Tensor, nn
-from torch.utils.data import DataLoader, IterableDataset
 
+from nextview.checks import extras
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError
 from nextview.files import command, decode_record, new_file, only_one, read_record, sha256_of, write_record
 from nextview.learning.architectures import LiteNet, ResNet
 from nextview.learning.recipes import Hardware
+
+with extras():
+    import lightning as L
+    import torch
+    from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
+    from lightning.fabric.utilities.rank_zero import rank_zero_only
+    from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+    from torch import Tensor, nn
+    from torch.utils.data import DataLoader, IterableDataset
 
 Recipe = TypeVar("Recipe")
 N = TypeVar("N", bound=nn.Module)

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.checks import extras
+
 LARGE = 20_000  # remembered views of a ring, from which looking at all of them takes more than 10 ms
 INDEX, PROBED = "PCA64,IVF256,SQ8", 16  # 64 numbers of a byte for each view; so many of 256 cells are searched
 SAMPLE = 10_240  # views from which an index learns its cells
@@ -41,7 +43,8 @@ class NearestViews:
 
 
 def _index(views: NDArray[np.float32], sample: NDArray[np.int64]) -> Any:
-    import faiss
+    with extras():
+        import faiss
 
     index = faiss.index_factory(views.shape[-1], INDEX, faiss.METRIC_INNER_PRODUCT)
     index.train(views[sample])

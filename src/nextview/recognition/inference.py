@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
 from nextview.checks import one_line
@@ -19,6 +18,7 @@ from nextview.recognition.map_names import SPHERE, maps_among
 from nextview.recognition.model_card import FEATURES, RECOGNISER, ModelCard, find_card
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, novelty_path, read_novelty
+from nextview.recognition.runtime import ort
 
 INPUT = "input"
 BINS_OUTPUT = "sides"

@@ -12,11 +12,9 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
-import viser
 from numpy.typing import NDArray
-from websockets.asyncio import server as websocket
 
-from nextview.checks import whole
+from nextview.checks import extras, whole
 from nextview.errors import NextviewError, UsageError
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import map_policy_names, policy_names
@@ -26,6 +24,10 @@ from nextview.simulation.sensor import SENSORS
 from nextview.viewers.card import class_card, preview_card, walk_card
 from nextview.viewers.exploration import Exploration
 from nextview.viewers.walk_scene import WalkScene
+
+with extras():
+    import viser
+    from websockets.asyncio import server as websocket
 
 SAND = "#e9dfd0"  # at the foot of the background
 NOTHING, CLEAN = "nothing", "clean renders"

@@ -5,11 +5,14 @@ from typing import TYPE_CHECKING
 from uuid import uuid4
 
 import numpy as np
-import rerun as rr
-import rerun.blueprint as rrb
 
+from nextview.checks import extras
 from nextview.errors import UsageError
 from nextview.session.style import ACCENT, INK, heat, rgb
+
+with extras():
+    import rerun as rr
+    import rerun.blueprint as rrb
 
 if TYPE_CHECKING:
     from nextview.session.session import Session

@@ -4,15 +4,18 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import viser
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from nextview.checks import extras
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.viewsphere import great_circle
 from nextview.session.style import ACCENT, FAINT, INK, WOOD, heat, rgb
 from nextview.viewers.card import warm
 from nextview.viewers.exploration import Walk
+
+with extras():
+    import viser
 
 Float = NDArray[np.float64]
 BALL = 0.09  # radius of a candidate view, object radii

@@ -1,0 +1,30 @@
+"""``nextview completion``: what a shell completes of the whole command."""
+
+from typing import Literal
+
+from tyro.extras import SubcommandApp
+
+from nextview.cli.call import CONFIG, entry
+from nextview.cli.stand_ins import stand_ins
+
+
+def completion(
+    shell: Literal["bash", "zsh", "fish"],  # which shell
+    /,
+) -> None:
+    """Print the script by which a shell completes commands, options and their values.
+
+    For bash: nextview completion bash > ~/.local/share/bash-completion/completions/nextview
+    """
+    from nextview.cli.commands import COMMANDS
+
+    groups: dict[str, SubcommandApp] = {"": SubcommandApp()}
+    with stand_ins():
+        for name, command in COMMANDS.items():
+            group, _, word = name.rpartition(" ")
+            if group not in groups:
+                groups[group] = SubcommandApp()
+                groups[""].command(groups[group], name=group, help=f"the commands of {group}")
+            function, _ = entry(command)
+            groups[group].command(function, name=word, help=command.line)
+        groups[""].cli(prog="nextview", args=["--tyro-print-completion", shell], config=CONFIG)
