@@ -3,7 +3,7 @@
     nextview render THINGS shown.zarr --sensor wrist --rotated --seed 7
     nextview render THINGS again.zarr --sensor wrist --rotated --seed 7 --noise-seed 1     # the same, with other errors
     nextview predict shown.zarr shown.npz --models MINE; nextview predict again.zarr again.npz --models MINE
-    python benchmarks/things.py MINE/memory.json things shown.npz again.npz [--by-shape] [--runs 10]
+    python benchmarks/things.py MINE/memory.json things shown.npz again.npz [--by-shape] [--policies MODULE:CLASS]
 
 Each predictions file is a draw of the sensor's noise: all are judged. Writes things.md (the table) and things.csv
 (every number) into the folder. The bootstrap is over things, whose runs and draws belong together; p is McNemar's test
@@ -16,14 +16,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 import tyro
 from numpy.typing import NDArray
 
 from nextview.benchmark.replay import Trajectories, make_specs, replay, replay_policy
 from nextview.benchmark.statistics import holm, interval, mcnemar, resample
+from nextview.checks import extras
+from nextview.cli.ending import orderly_end
 from nextview.data.metrics import ratio
 from nextview.data.predictions import Predictions
 from nextview.errors import UsageError
@@ -31,6 +33,9 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, best_view
 from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, of_true_class
 from nextview.recognition.memory import TaughtRecogniser
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 RIVALS = ("random-all", "spread", "furthest", "orbit-10")
 OWN, FORESIGHT, CEILING = "discriminate", "foresight", "fair ceiling"
@@ -98,11 +103,13 @@ def margins(recogniser: TaughtRecogniser, by_shape: bool) -> NDArray[np.float64]
     return np.bincount(label, own - logs.max(1)) / np.bincount(label)
 
 
-def run(draws: Sequence[Predictions], card: Path, runs: int, seed: int, most: int) -> dict[str, Trajectories]:
-    """Where each policy goes, by its name in the table."""
+def run(
+    draws: Sequence[Predictions], card: Path, others: Sequence[str], runs: int, seed: int, most: int
+) -> dict[str, Trajectories]:
+    """Where each policy goes, by its name in the table; ``others`` are compared too."""
     specs = make_specs(together(draws), runs, seed)
     p, n = specs.predictions, len(draws[0])
-    found = {name: replay(name, specs, MOST, seed) for name in RIVALS}
+    found = {name: replay(name, specs, MOST, seed) for name in dict.fromkeys((*RIVALS, *others))}
     found[OWN] = replay(str(card), specs, MOST, seed)
     found[FORESIGHT] = replay("oracle-gain-all", specs, most, seed)
     if len(draws) > 1:
@@ -161,6 +168,7 @@ def main(
     card: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     predictions: tyro.conf.Positional[tuple[Path, ...]],
+    policies: tuple[str, ...] = (),
     by_shape: bool = False,
     runs: int = 10,
     views: tuple[int, ...] = (1, 2, 3, 5),
@@ -171,18 +179,24 @@ def main(
     Args:
         card: of the memory; ``out`` is the folder to write.
         predictions: made by it, of one draw of the noise each.
+        policies: compared too: MODULE:CLASS of your own, or any name that nextview benchmark takes.
         by_shape: as if sizes were not known.
         runs: random first views of each thing in each draw.
         views: after how many the policies are compared.
         seed: decides first views and random policies.
     """
+    with extras():
+        import pandas as pd
+
+    if not predictions:
+        raise UsageError("name at least one file of predictions, made by nextview predict with these models")
     draws = [draw.by_shape() if by_shape else draw for draw in map(Predictions.load, predictions)]
     recogniser = TaughtRecogniser(card)
     if recogniser.classes != draws[0].classes:
         raise UsageError(f"{card}: knows other things than the predictions")
     margin = margins(recogniser, by_shape)[draws[0].labels]
     half = np.sort(np.argsort(margin, kind="stable")[: len(margin) // 2])
-    paths = run(draws, card, runs, seed, max(views))
+    paths = run(draws, card, policies, runs, seed, max(views))
     rows: list[dict] = []
     for name, things in (("all", np.arange(len(margin))), ("the confusable half", half)):
         rows += [{"things": name} | row for row in measured(paths, draws[0].labels, things, views)]
@@ -195,4 +209,5 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("nothing was written"):
+        tyro.cli(main)

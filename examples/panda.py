@@ -4,15 +4,25 @@ pip install './research[arm]'
 python examples/panda.py samples/chair.off [--seed 0] [--film episode.gif]
 """
 
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import tyro
-from panda_film import Film
 
 import nextview
+from nextview.cli.ending import orderly_end
+from nextview.errors import MissingExtraError
 from nextview.sensing import ObservedObject
-from research.arm import Arm, first_joints
+
+if TYPE_CHECKING:
+    from research.arm import Arm
+
+NEEDED = ("research", "mujoco", "mink", "gymnasium_robotics")
 
 
 def recognise(arm: Arm, looked=lambda session: None, threshold: float = 0.97) -> nextview.Recognition:
@@ -28,6 +38,13 @@ def main(
     azimuth: float = 215.0,
     film: Path | None = None,
 ) -> None:
+    for package in NEEDED:
+        if find_spec(package) is None:
+            raise MissingExtraError(f"{sys.argv[0]} needs the package {package}: pip install './research[arm]'")
+    from panda_film import Film
+
+    from research.arm import Arm, first_joints
+
     arm = Arm(nextview.load_mesh(mesh), np.random.default_rng(seed))
     start = first_joints(arm, np.radians(35), np.radians(azimuth), 0.4)
     if start is None:
@@ -40,4 +57,5 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("nothing was written"):
+        tyro.cli(main)

@@ -5,7 +5,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from nextview.geometry.depth import headlight
-from nextview.geometry.ray_caster import RayCaster
+from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.viewsphere import look_at_origin
 from research.arm import along, seconds_of
 
@@ -78,19 +78,25 @@ def scene(things, pose):
     x, y = np.meshgrid((np.arange(width) + 0.5) / width - 0.5, (np.arange(height) + 0.5 - height / 2) / width)
     rays = np.stack([x, y, np.full(x.shape, 1.0)], -1).reshape(-1, 3) @ pose[:3, :3].T
     triangles, colours = [each for each, _ in things], np.array([colour for _, colour in things])
-    caster = RayCaster(triangles)
-    hits = caster.hits(pose[:3, 3], rays)
+    cast = embree_scene(triangles)
+    hits = first_hits(cast, pose[:3, 3], rays)
     hit = hits["primID"] >= 0
     normals = hits["Ng"][hit] / np.linalg.norm(hits["Ng"][hit], axis=1, keepdims=True)
     normals *= -np.sign((normals * rays[hit]).sum(1))[:, None]
     points = pose[:3, 3] + rays[hit] * hits["tfar"][hit, None] + 1e-3 * normals
-    shadow = caster.hits(points, np.broadcast_to(LIGHT, points.shape))["primID"] >= 0
+    shadow = first_hits(cast, points, np.broadcast_to(LIGHT, points.shape))["primID"] >= 0
     lit = np.maximum(normals @ LIGHT, 0) * ~shadow
     facing = np.abs((normals * rays[hit]).sum(1)) / np.linalg.norm(rays[hit], axis=1)
     picture = np.tile(np.array(BACKGROUND, float) / 255, (len(rays), 1))
     picture[hit] = colours[hits["geomID"][hit]] * (0.22 + 0.2 * facing + 0.55 * lit)[:, None]
     image = Image.fromarray((255 * picture.clip(0, 1) + 0.5).astype(np.uint8).reshape(height, width, 3))
     return image.resize(SIZE, Image.Resampling.BOX)
+
+
+def first_hits(cast, origins, rays):
+    """What Embree says of where rays, (N, 3), end first: primID (-1 for nothing), geomID, tfar, and normals Ng."""
+    origins = np.ascontiguousarray(np.broadcast_to(origins, rays.shape), np.float32)
+    return cast.run(origins, np.ascontiguousarray(rays, np.float32), output=1)
 
 
 def beside(session):

@@ -15,7 +15,7 @@ import tyro
 from numpy.typing import NDArray
 
 from nextview.cli.ending import orderly_end
-from nextview.cli.progress import follow
+from nextview.cli.progress import follow, say_done
 from nextview.data import measures
 from nextview.data.folders import list_dataset
 from nextview.data.rendering import deformed
@@ -92,7 +92,8 @@ def main(
     """
     select = some_objects(ViewStore.open(store), split, held_out, objects)
     steps = measure(store, meshes, measures, workers, scheduler, select, overwrite, max_faces)
-    follow(steps, f"measuring {store.name}")
+    before, total = follow(steps, f"measuring {store.name}")
+    say_done(store, "measured", before, total)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import tyro
 from numpy.typing import NDArray
 
 from nextview.cli.ending import orderly_end
-from nextview.cli.progress import track
+from nextview.cli.progress import follow, say_done
 from nextview.data.measures import Made, keep
 from nextview.data.scene_views import SceneSight, scene_views, sight_of
 from nextview.data.splits import some_objects
@@ -113,8 +113,8 @@ def main(
         scheduler: address of a dask.distributed scheduler to use instead.
     """
     steps = plan(store, names, workers, scheduler, some_objects(ViewStore.open(store), split, held_out, objects))
-    _, total = next(steps)
-    track((done for done, _ in steps), total, f"planning {store.name}")
+    before, total = follow(steps, f"planning {store.name}")
+    say_done(store, "planned", before, total)
 
 
 if __name__ == "__main__":

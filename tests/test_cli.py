@@ -3,6 +3,7 @@
 import inspect
 import io
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,12 +18,14 @@ import pytest
 from pipeline import run_python, some_predictions
 from rich.console import Console
 
+from nextview.checks import EXTRAS, extras
 from nextview.cli import progress
 from nextview.cli.call import find
 from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
 from nextview.cli.predict import summed_up
 from nextview.data.store import ViewStore
+from nextview.errors import MissingExtraError
 
 COMMAND = [sys.executable, "-m", "nextview"]
 
@@ -169,6 +172,96 @@ def test_a_missing_extra_is_named_with_what_brings_it(package, arguments, extra)
     assert done.returncode == 2
     assert f"pip install 'nextview[{extra}]'" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+WITHOUT = "import sys; sys.modules.update(dict.fromkeys({packages!r}, None))\n"
+"""Code that hides packages from imports, as if they were not installed."""
+MISSING = [package for packages in EXTRAS.values() for package in packages]
+
+
+@pytest.mark.parametrize(
+    ("code", "extra"),
+    [
+        ("from nextview.viewers.recording import Recorder", "record"),
+        ("import nextview.benchmark.environments", "envs"),
+        ("from nextview.benchmark.run import run_benchmark", "benchmark"),
+        ("from nextview.benchmark.report import report", "benchmark"),
+        ("from nextview.benchmark.evaluation_page import write_evaluation", "benchmark"),
+        ("from nextview.viewers.page import Page", "explore"),
+        ("from nextview.learning.recogniser_training import train_recogniser", "train"),
+        ("from nextview.learning.export import export_map", "train"),
+        ("from nextview.learning.gain_training import train_gain", "train"),
+        ("from nextview.data.pool import each; list(each(print, [1], None, 'tcp://localhost:1'))", "cluster"),
+    ],
+)
+def test_python_without_an_extra_names_it_too(code, extra):
+    caught = "    print(error)\nelse:\n    raise SystemExit('nothing was raised')"
+    body = f"import nextview\ntry:\n    {code}\nexcept nextview.MissingExtraError as error:\n{caught}"
+    done = run_python(WITHOUT.format(packages=MISSING) + body)
+    assert done.returncode == 0, done.stderr
+    assert f"pip install 'nextview[{extra}]'" in done.stdout
+    assert done.stdout.count("\n") == 1
+
+
+def test_a_module_that_is_no_extra_is_no_missing_extra():
+    with pytest.raises(ModuleNotFoundError) as raised, extras():
+        import no_such_package_at_all  # noqa: F401
+    assert not isinstance(raised.value, MissingExtraError)
+
+
+@pytest.mark.parametrize("name", ["train recogniser", "train gain", "export map", "evaluate", "benchmark", "report"])
+def test_help_needs_no_extra(name):
+    """The packages are hidden from the search of installed ones."""
+    hidden = (
+        "from importlib.machinery import PathFinder\n"
+        "plain = PathFinder.find_spec\n"
+        f"missing = {MISSING!r}\n"
+        "find = lambda name, *more: None if name.partition('.')[0] in missing else plain(name, *more)\n"
+        "PathFinder.find_spec = staticmethod(find)\n"
+    )
+    done = run_python(hidden + f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"usage: nextview {name} ")
+    assert "pip install 'nextview[" in done.stderr
+    assert done.stdout == run_python(f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})").stdout
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_completes_the_whole_command(shell, capsys):
+    pytest.importorskip("torch")
+    with pytest.raises(SystemExit) as end:
+        main(["completion", shell])
+    assert end.value.code in (0, None)
+    script = capsys.readouterr().out
+    assert all(word in script for name in COMMANDS for word in name.split())
+    assert "--held-out" in script
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [("re", {"recognise", "render", "report"}), ("fit s", {"size"}), ("train recogniser --lay", {"--layers"})],
+)
+def test_bash_completes_commands_and_options(words, offered, tmp_path):
+    pytest.importorskip("torch")
+    script = run_python("from nextview.cli.main import main; main(['completion', 'bash'])").stdout
+    (tmp_path / "nextview.sh").write_text(script)
+    ask = (
+        f"source {tmp_path}/nextview.sh; f=$(complete -p nextview | sed 's/.*-F \\([^ ]*\\).*/\\1/'); "
+        f"COMP_WORDS=(nextview {words}); COMP_CWORD=$((${{#COMP_WORDS[@]}}-1)); $f; echo ${{COMPREPLY[@]}}"
+    )
+    done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) == offered
+
+
+def test_a_stage_that_resumes_says_what_it_did(views, tmp_path, capsys, monkeypatch):
+    store = tmp_path / "views.zarr"
+    shutil.copytree(views, store)
+    (tmp_path / "ones.py").write_text("def one(view):\n    return 1.0\n")
+    monkeypatch.chdir(tmp_path)
+    for said in ("18 of 18 objects measured now", "nothing was left to do; all 18 objects were measured before"):
+        main(["measure", str(store), "--measures", "ones:one", "--workers", "0"])
+        assert said in " ".join(capsys.readouterr().err.split())
 
 
 def test_where_there_is_no_terminal_a_line_tells_how_far_it_is(monkeypatch):

@@ -88,3 +88,12 @@ def test_what_is_not_the_published_file_leaves_nothing(tmp_path, options, publis
         download(server.archive(published), tmp_path)
     assert "\n" not in str(refusal.value)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("there", [(), ("mine",)])
+def test_a_download_that_fails_leaves_no_folder_of_its_own(tmp_path, there):
+    for name in there:
+        (tmp_path / name).mkdir()
+    with Server(GOOD, status=500) as server, pytest.raises(DatasetError, match="500"):
+        download(Archive(server.url, "0" * 64, "Shapes"), tmp_path / "mine" / "data", timeout=5)
+    assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")) == list(there)

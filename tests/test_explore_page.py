@@ -88,6 +88,9 @@ def sockets(page, **headers):
         ("{address}", "null", False),
         ("evil.example:{port}", "http://evil.example:{port}", False),  # a name that points here (DNS rebinding)
         ("", None, False),
+        ("[::bad", None, False),  # no address at all
+        ("[::bad]:{port}", None, False),
+        ("{address}", "http://[::bad", False),
     ],
 )
 def test_only_pages_of_its_own_may_drive_it(page, host, origin, allowed):

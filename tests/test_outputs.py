@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from pipeline import refused
 
 from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
@@ -53,8 +54,20 @@ def contents(folder):
 
 
 def test_no_command_is_forgotten():
-    others = {"measure", "check", "explore", "list", "download", "export recogniser", "export map"}
+    others = {"measure", "check", "completion", "explore", "list", "download", "export recogniser", "export map"}
     assert {name.partition(" --")[0] for name in WRITES} == COMMANDS.keys() - FITS - others
+
+
+def test_the_demo_draws_over_its_own_picture_and_no_other(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        main(["demo"])
+    assert "the episode is drawn in nextview_demo.png" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["nextview_demo.png"]
+    mine = tmp_path / "mine.png"
+    mine.write_bytes(b"mine")
+    assert "mine.png: exists" in refused(capsys, "demo", "--figure", mine)
+    assert mine.read_bytes() == b"mine"
 
 
 @pytest.mark.parametrize("name", WRITES)

@@ -156,7 +156,7 @@ class RecogniseNode(Node):
 
     def failed(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """The camera cannot be brought to the pose that was asked for."""
-        return self.answer(response, lambda session: session.failed())
+        return self.answer(response, give_up)
 
     def answer(self, response: Trigger.Response, act) -> Trigger.Response:
         """Do something with the session, and tell what follows."""
@@ -166,10 +166,9 @@ class RecogniseNode(Node):
                 return response
             try:
                 act(self.session)
+                response.success, response.message = True, self.tell()
             except (nextview.NextviewError, TransformException) as error:
                 response.success, response.message = False, str(error)
-                return response
-            response.success, response.message = True, self.tell()
         return response
 
     def tell(self) -> str:
@@ -190,6 +189,15 @@ class RecogniseNode(Node):
             self.ended.set()
             return str(session.result)
         return f"view {len(session.views)} is taken in"
+
+
+def give_up(session: nextview.Session) -> None:
+    """Tell a session that the pose that it asked for cannot be reached; before the first look it has asked for none."""
+    if not session.views:
+        raise nextview.SessionError(
+            "no pose was asked for yet: bring the camera anywhere before the object, and call look"
+        )
+    session.failed()
 
 
 def main() -> None:

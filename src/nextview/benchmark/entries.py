@@ -19,6 +19,7 @@ from nextview.policies.oracle import OracleGain, OracleMeasure, OracleValley
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import DEFAULT, VISIBLE, make_policy, map_policy, map_policy_names, policy_names
 from nextview.recognition.map_names import LCM, LEM, SPHERE, in_order, map_name
+from nextview.recognition.model_card import DISCRIMINATE
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,11 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
     card = plain.removeprefix(VISIBLE)
     if known or card in bundled_policies() or card.endswith(".json") or ":" in name:
         return make_policy(name, p.sphere, specs.valley_classes(plain), p.classes, p.maps)
+    if plain == DISCRIMINATE:
+        raise EntryError(
+            "the policy discriminate needs the memory of taught things that made these predictions: name its models, "
+            "--models FOLDER (or ycb), or its card, --policies FOLDER/memory.json"
+        )
     names = [*policy_names(), *map_policy_names(p.maps), *bundled_policies(), *ORACLES]
     names += ["true-MEASURE-all", *(f"{kind}-K" for kind in FIXED)]
     raise EntryError(f"no policy is called {name!r}{did_you_mean(name, names) or '; there are ' + ', '.join(names)}")

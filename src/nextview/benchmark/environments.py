@@ -4,6 +4,7 @@
 - ``nextview/RecogniseMesh-v0``: over meshes, rendered and shown to the networks as the agent goes.
 """
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -37,6 +38,7 @@ with extras():
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 
+log = logging.getLogger(__name__)
 Rows = NDArray[np.int64]
 Source = str | Path | Predictions
 CAMERAS = 16  # meshes that are kept ready to be looked at
@@ -144,10 +146,14 @@ def replayed(predictions: Source, split: Split = "train", balanced: bool = False
     """The task of recognising the objects of one split, each shape once for "train"; None takes all objects.
 
     ``predictions`` to learn from are of objects that the recogniser was not trained on (``nextview predict
-    --held-out``); ``balanced`` draws every class equally often. PredictionsError: no objects of that split, no such map
+    --held-out``). Of predictions that name no splits, as those of taught things, "train" takes all. ``balanced`` draws
+    every class equally often. PredictionsError: no objects of that split, no such map
     or azimuth bins.
     """
     p = predictions if isinstance(predictions, Predictions) else Predictions.load(Path(predictions))
+    if split == "train" and not p.splits.any():
+        log.warning("the predictions name no splits, as those of taught things: all %d objects are taken", len(p))
+        split = None
     p = p if split is None else p.of_split(split)
     p = p.deduplicate() if split == "train" else p
     for name in rules.maps:

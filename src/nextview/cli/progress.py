@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -32,10 +33,20 @@ def track(done: Iterable[int], total: int, what: str, /) -> None:
     (_show_bar if console.is_terminal else _print_lines)(done, total, what)
 
 
-def follow(steps: Iterator[tuple[int, int]], what: str) -> None:
-    """Track a stage that yields how many are done, of how many."""
-    _, total = next(steps)
+def follow(steps: Iterator[tuple[int, int]], what: str) -> tuple[int, int]:
+    """Track a stage that yields how many are done, of how many; return how many were done before, of how many."""
+    before, total = next(steps)
     track((done for done, _ in steps), total, what)
+    return before, total
+
+
+def say_done(where: Path, done: str, before: int, total: int) -> None:
+    """Say at the end of a stage that resumes what this run did: ``done`` is a participle ("measured", "planned")."""
+    if before == total:
+        console.print(f"{where}: nothing was left to do; all {total} objects were {done} before", soft_wrap=True)
+        return
+    earlier = f", {before} were before" if before else ""
+    console.print(f"{where}: {total - before} of {total} objects {done} now{earlier}", soft_wrap=True)
 
 
 def _show_bar(done: Iterable[int], total: int, what: str) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from nextview.cli.progress import console, follow, track
+from nextview.cli.progress import console, follow, say_done, track
 from nextview.data import measures as view_measures
 from nextview.data import rendering
 from nextview.data import store as view_store
@@ -98,7 +98,8 @@ def measure(
     """Compute view measures of every rendered object and keep them in the store. Resumes where it was."""
     select = some_objects(ViewStore.open(store), split, held_out, objects)
     steps = view_measures.measure(store, measures, **vars(workers), objects=select, overwrite=overwrite)
-    follow(steps, f"measuring {store.name}")
+    before, total = follow(steps, f"measuring {store.name}")
+    say_done(store, "measured", before, total)
 
 
 def track_all(done: Iterable[tuple[str, str | None]], total: int, what: str, before: int = 0) -> list[str]:

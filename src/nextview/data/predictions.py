@@ -115,6 +115,8 @@ class Predictions:
         """The objects of one split."""
         kept = self.splits == split
         if not kept.any():
+            if not self.splits.any():
+                raise PredictionsError(f"these predictions name no splits, so no objects of {split!r}: take them all")
             there = ", ".join(repr(str(name)) for name in np.unique(self.splits))
             raise PredictionsError(f"these predictions hold no objects of the split {split!r}, only of {there}")
         return self.of_objects(np.flatnonzero(kept))

@@ -248,15 +248,32 @@ def refused(hosts: Sequence[str], origins: Sequence[str], served: str) -> str | 
     A page of another site can reach this machine in two ways. By this machine's address: then Origin names the site.
     By a name of its own that points to this address: then Host has that name.
     """
-    if len(hosts) != 1 or not (name := urlsplit(f"//{hosts[0]}").hostname):
+    name = _host_name(hosts[0]) if len(hosts) == 1 else None
+    if name is None:
         return "the header Host has to name one host"
     own = socket.gethostname().lower()
     is_number = ":" in name or re.fullmatch(r"[\d.]+", name)
     if not is_number and name not in ("localhost", served.lower(), own, f"{own}.local"):
         return f"no page is served under the name {name}"
-    if any(urlsplit(origin).netloc.lower() != hosts[0].lower() for origin in origins):
+    if any(_place(origin) != hosts[0].lower() for origin in origins):
         return "a page of another site may not drive this one"
     return None
+
+
+def _host_name(host: str) -> str | None:
+    """The name in a header Host, without its port; None if there is none, or it cannot be read."""
+    try:
+        return urlsplit(f"//{host}").hostname
+    except ValueError:  # a bracket that is not closed, and no address within brackets
+        return None
+
+
+def _place(origin: str) -> str | None:
+    """Host and port of a header Origin; None if they cannot be read."""
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return None
 
 
 def _check_address(host: str, port: int) -> None:
