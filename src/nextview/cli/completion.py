@@ -26,5 +26,5 @@ def completion(
                 groups[group] = SubcommandApp()
                 groups[""].command(groups[group], name=group, help=f"the commands of {group}")
             function, _ = entry(command)
-            groups[group].command(function, name=word, help=command.line)
+            groups[group].command(name=word, help=command.line)(function)
         groups[""].cli(prog="nextview", args=["--tyro-print-completion", shell], config=CONFIG)
