@@ -1,0 +1,138 @@
+"""The main jobs in a base installation, on small inputs made here; each has to give the right result.
+
+Run by ``.ci/base_installation`` in an empty working folder that holds copies of ``samples`` and ``examples``.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+NEXTVIEW = str(Path(sys.executable).with_name("nextview"))
+EXTRAS = ("torch", "pandas", "gymnasium", "viser", "rerun", "distributed", "pytest", "skimage")
+OVER = {"rod": 90, "plate": 180, "angle": 90}  # degrees by which a thing is turned over: to a side on which it rests
+MATPLOTLIB = {".cache", ".cache/matplotlib", ".config", ".config/matplotlib"}
+
+
+def run(*arguments: object, status: int = 0) -> str:
+    """What a command prints; it has to end with this status and without a traceback."""
+    command = [NEXTVIEW, *map(str, arguments)]
+    begun = time.monotonic()
+    done = subprocess.run(command, capture_output=True, text=True)
+    said = done.stdout + done.stderr
+    print(f"{time.monotonic() - begun:5.1f} s  nextview {' '.join(command[1:])}", flush=True)
+    assert done.returncode == status, said
+    assert "Traceback" not in said, said
+    return said
+
+
+def recognised(*arguments: object) -> dict:
+    """The answer of ``nextview recognise``."""
+    said = run("recognise", *arguments, "--json")
+    return json.loads(said[said.index("{") : said.rindex("}") + 1])
+
+
+def things() -> dict[str, trimesh.Trimesh]:
+    """Things of some ten centimetres, metres, which are told apart from any side, by name."""
+    rod = trimesh.creation.cylinder(0.02, 0.2, sections=48)
+    plate = trimesh.creation.box((0.2, 0.16, 0.012))
+    foot = trimesh.creation.box((0.14, 0.03, 0.03)).apply_translation((0.05, 0, 0))
+    post = trimesh.creation.box((0.03, 0.03, 0.16)).apply_translation((0, 0, 0.08))
+    return {"rod": rod, "plate": plate, "angle": trimesh.util.concatenate([foot, post])}
+
+
+def no_extra_is_there() -> None:
+    there = [name for name in EXTRAS if find_spec(name) is not None]
+    assert not there, f"this is no base installation: {there}"
+
+
+def learn_and_recognise() -> None:
+    """Things are taught in each of their resting poses, and known lying on another side."""
+    scans = Path("scans")
+    scans.mkdir()
+    for (name, mesh), ending in zip(things().items(), ("ply", "stl", "obj"), strict=True):
+        mesh.export(scans / f"{name}.{ending}")
+    run("learn", scans, "mine", "--unit", "m", "--workers", 0)
+
+    card = json.loads(Path("mine/memory.json").read_text())
+    poses = np.bincount(card["calibration"]["hypotheses"], minlength=len(card["classes"]))
+    poses = dict(zip(card["classes"], poses.tolist(), strict=True))
+    assert set(poses) == set(things()), poses
+    assert poses["rod"] > 1, f"a rod stands and lies: {poses}"
+    assert poses["angle"] > 1, f"an angle rests on several sides: {poses}"
+
+    for name, mesh in things().items():
+        turned = trimesh.transformations.rotation_matrix(np.radians(OVER[name]), (0, 1, 0))
+        lying = mesh.copy().apply_transform(turned)
+        for how, shown in (("as taught", mesh), ("on its side", lying)):
+            shown.export("shown.ply")
+            found = recognised("shown.ply", "--models", "mine", "--unit", "m", "--start", 3)
+            assert found["most_like"] == name, f"{name} {how} is {found['most_like']}"
+
+
+def look_at_samples() -> None:
+    """Known classes, clean and through a sensor; a figure is a picture of some size."""
+    for name in ("chair", "table", "monitor"):
+        found = recognised(f"samples/{name}.off", "--start", 3)
+        assert found["answer"] == name, found["answer"]
+    said = run("recognise", "samples/chair.off", "--sensor", "wrist", "--figure", "episode.png")
+    assert "chair" in said
+    assert Path("episode.png").stat().st_size > 50_000
+    for _ in range(2):  # the second draws over the first
+        run("demo")
+    assert Path("nextview_demo.png").stat().st_size > 50_000
+
+
+def sessions_with_frames() -> None:
+    """Depth frames of a camera on an arm and before a turntable, and a captured folder."""
+    for example, name in (("arm_over_table", "chair"), ("turntable", "monitor")):
+        command = [sys.executable, f"examples/{example}.py", f"samples/{name}.off"]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert name in done.stdout.splitlines()[-1], done.stdout
+    run("capture", "samples/chair.off", "captured", "--unit", "cm", "--table", "--viewpoints", 12)
+    assert recognised("captured")["answer"] == "chair"
+
+
+def stores_and_predictions() -> None:
+    """A store of the samples, checked, and what the models say of every view of it."""
+    for name in ("chair", "table", "monitor"):
+        place = Path("shop") / name
+        place.mkdir(parents=True)
+        Path(f"samples/{name}.off").rename(place / f"{name}.off")
+    run("render", "shop", "views.zarr", "--size", 112, "--workers", 0)
+    assert "3 objects are sound, 0 damaged" in run("check", "views.zarr", "--workers", 0)
+    assert "3 objects" in run("predict", "views.zarr", "views.npz", "--workers", 0)
+    assert "all 40 1.000" in run("predict", "views.zarr", "views.npz", "--workers", 0, "--overwrite")
+    assert "DAMAGED" not in run("list", "models")
+    said = run("benchmark", "views.npz", "results", status=2)
+    assert "pip install 'nextview[benchmark]'" in said
+    assert said.count("\n") == 1
+    assert run("train", "recogniser", "--help").startswith("usage: nextview train recogniser")
+    assert "recognise" in run("completion", "bash")
+
+
+def nothing_unasked_is_written() -> None:
+    """The home folder holds what matplotlib keeps of fonts, and nothing else."""
+    home = Path(os.environ["HOME"])
+    found = {path.relative_to(home).as_posix() for path in home.rglob("*")}
+    strange = {path for path in found - MATPLOTLIB if not path.startswith(".cache/matplotlib/")}
+    assert not strange, f"in the home folder: {sorted(strange)}"
+
+
+for job in (
+    no_extra_is_there,
+    learn_and_recognise,
+    look_at_samples,
+    sessions_with_frames,
+    stores_and_predictions,
+    nothing_unasked_is_written,
+):
+    print(job.__name__.replace("_", " "), flush=True)
+    job()
