@@ -48,6 +48,7 @@ def things() -> dict[str, trimesh.Trimesh]:
 
 
 def no_extra_is_there() -> None:
+    """What an extra or the tests bring cannot be imported."""
     there = [name for name in EXTRAS if find_spec(name) is not None]
     assert not there, f"this is no base installation: {there}"
 

@@ -318,7 +318,7 @@ def main(
     with new_file(out / "measures.csv", True) as part:
         table.to_csv(part, index=False)
     with new_file(out / "measures.md", True) as part:
-        part.write_text(text)
+        part.write_text(text, encoding="utf-8")
     to_png(drawn, out / "measures.png")
     print(text, end="")
 

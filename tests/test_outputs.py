@@ -3,17 +3,20 @@
 Commands that write into what they are given (measure, fit into a card) and download are not here.
 """
 
+import os
+import re
 import shutil
 from pathlib import Path
 
 import pytest
-from pipeline import refused
+from pipeline import refused, run_python
 
 from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
 from nextview.data.predictions import Predictions
 
-SAMPLE = str(Path(__file__).parent.parent / "samples/chair.off")
+ROOT = Path(__file__).parent.parent
+SAMPLE = str(ROOT / "samples/chair.off")
 FITS = {name for name in COMMANDS if name.startswith("fit ")}
 GAIN = "--episodes 1 --networks-per-fold 1 --inputs belief view"
 SMALL = "--size 32 --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.3"
@@ -106,3 +109,36 @@ def test_what_exists_is_refused_and_overwritten_on_demand_only(name, made, tmp_p
         assert now
     else:
         assert not [path for path, content in now.items() if content == b"mine"]
+
+
+# The home folder
+
+HOMELY = {
+    "recognise": "from nextview.cli.main import main; main(['recognise', SAMPLE, '--max-views', '1'])",
+    "from Python": "import nextview; nextview.recognise(SAMPLE, max_views=1)",
+    "learn": "from nextview.cli.main import main; main(['learn', FOLDER, 'mine', '--upright', '--workers', '0'])",
+    "a figure": "import nextview; nextview.recognise(SAMPLE, max_views=1).plot('e.png')",
+}
+
+
+@pytest.mark.parametrize("job", HOMELY)
+def test_a_run_writes_nothing_in_the_home_folder(job, tmp_path):
+    home = tmp_path / "home"
+    home.mkdir()
+    code = f"SAMPLE, FOLDER = {SAMPLE!r}, {str(Path(SAMPLE).parent)!r}\n{HOMELY[job]}"
+    hidden = ("ORT_DISABLE_TELEMETRY", "MPLCONFIGDIR", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")
+    environment = {name: value for name, value in os.environ.items() if name not in hidden} | {"HOME": str(home)}
+    done = run_python(code, env=environment, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    written = {path.relative_to(home).parts[:2] for path in home.rglob("*") if path.is_file()}
+    assert written <= ({(".cache", "matplotlib")} if job == "a figure" else set())
+
+
+def test_who_wants_telemetry_keeps_it():
+    code = "import os, nextview; print(os.environ['ORT_DISABLE_TELEMETRY'])"
+    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    assert run_python(code, env=environment).stdout.strip() == "1"
+    tops = ("src", "benchmarks", "research", "examples", "docs", "workflow")
+    sources = [path for top in tops for path in (ROOT / top).rglob("*.py")]
+    with_it = {path.name for path in sources if re.search(r"^\s*(import|from) onnxruntime", path.read_text(), re.M)}
+    assert with_it == {"runtime.py"}  # all others take it from there

@@ -185,7 +185,7 @@ def samples(views: tuple[int, ...]) -> Figure:
     for row, name in zip(axes, ("chair", "monitor", "table"), strict=True):
         for each, view in zip(row, views, strict=True):
             elevation, azimuth = SPHERE.angles(view)
-            picture(each, view, sample_mesh(name), f"{name}, {elevation:.0f}° up, {azimuth:.0f}° round")
+            picture(each, view, sample_mesh(name), f"{name}, {elevation:.0f}° up, {azimuth:.0f}° around")
     return figure
 
 

@@ -85,7 +85,9 @@ def write_figures(
             figure.savefig(part / f"{name}.pdf", bbox_inches="tight", metadata={"CreationDate": None})
         for name, table in tables.items():
             table.to_csv(part / f"{name}.csv", index=False)
-            (part / f"{name}.tex").write_text(table.to_latex(index=False, escape=True, float_format="%.4g", na_rep=""))
+            (part / f"{name}.tex").write_text(
+                table.to_latex(index=False, escape=True, float_format="%.4g", na_rep=""), encoding="utf-8"
+            )
 
 
 def origin(p: Predictions, settings: Mapping[str, Any]) -> dict[str, str]:

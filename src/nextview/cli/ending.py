@@ -1,5 +1,6 @@
 """How a command ends, whatever happens: a mistake of the user's in one sentence, a bug with its traceback."""
 
+import io
 import os
 import sys
 import warnings
@@ -24,6 +25,7 @@ def printable(text: str) -> str:
 @contextmanager
 def orderly_end(after_ctrl_c: str) -> Iterator[None]:
     """End with status 2 after an error of the user's or a missing extra, with 130 after Ctrl-C."""
+    _print_anything()
     try:
         yield
         sys.stdout.flush()
@@ -45,6 +47,13 @@ def orderly_end(after_ctrl_c: str) -> Iterator[None]:
         warnings.simplefilter("ignore")
         sys.unraisablehook = lambda unraisable: None  # reads that zarr has begun complain of being left
         _end(f"stopped; {after_ctrl_c}", 130)
+
+
+def _print_anything() -> None:
+    """Print what an output of another encoding than UTF-8 lacks as codes: ASCII has no degrees, cp1252 no Chinese."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _end(sentence: str, status: int) -> Any:

@@ -117,7 +117,7 @@ class Log(L.Callback):
         row["seconds"] = round(time.perf_counter() - self.began, 3)
         self.rows.append(row)
         if trainer.is_global_zero:
-            with new_file(self.path, overwrite=True) as part, part.open("w", newline="") as file:
+            with new_file(self.path, overwrite=True) as part, part.open("w", newline="", encoding="utf-8") as file:
                 table = csv.DictWriter(file, list(self.rows[0]))
                 table.writeheader()
                 table.writerows(self.rows)

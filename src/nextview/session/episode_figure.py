@@ -46,7 +46,7 @@ def draw_episode(
     valued = any(view.values is not None for view in views)
     light, path = SoftLight([view.observation for view in views]), np.array([view.direction for view in views])
     seen_from = _best_side(path)
-    rows = [("", WIDE), ("what it believes", 1.5), ("values of views (dark: high)", WIDE)]
+    rows = [("", WIDE), ("what it believes", 1.5), ("values of views", WIDE)]
     rows = rows if valued else rows[:2]
     large = LARGE if valued else LARGE - 1
     width = GAP + len(views) * (WIDE + GAP) + large + GAP
@@ -68,6 +68,8 @@ def draw_episode(
     for title, high in rows:
         y -= 0.42 + high
         figure.text(GAP / width, (y + high + 0.1) / height, title, fontsize=10, color=GREY)
+        if title == rows[-1][0] and valued:
+            _draw_scale(axes(GAP + 1.1, y + high + 0.08, 1.3, 0.15))
         for k, view in enumerate(views):
             axis = axes(GAP + k * (WIDE + GAP), y, WIDE, high)
             if title == rows[0][0]:
@@ -106,7 +108,7 @@ def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
     axis.imshow(pixels, interpolation="antialiased")
     inside: dict[str, Any] = {"transform": axis.transAxes, "fontsize": 9}
     axis.text(0.05, 1.08, str(step), **inside, **NUMBER, bbox={"boxstyle": "circle,pad=0.25", "color": BLUE})
-    where = f"view {view.index}: {elevation:.0f}° up, {round(azimuth) % 360}° round"
+    where = f"view {view.index}: {elevation:.0f}° up, {round(azimuth) % 360}° around"
     axis.text(0.13, 1.08, where, va="center_baseline", color=INK, **inside)
     said = [] if seen.seen else ["nothing is seen"]
     said += [warning.name for warning in view.warnings]
@@ -166,6 +168,14 @@ def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_fro
     for name, at, colour, off in (("here", here, BLUE, -17 * side), ("next", there, ACCENT, 17 * side)):
         axis.text(at[0], at[1] + off, name, fontsize=9, weight="bold", color=colour, ha="center", va="center",
                   path_effects=[withStroke(linewidth=3, foreground=PAPER)])  # fmt: skip
+
+
+def _draw_scale(axis: Axes) -> None:
+    """What the colours of values mean: from low to high."""
+    axis.imshow(VALUES(np.linspace(0, 1, 64))[None], aspect="auto", extent=(0.25, 0.72, 0, 1))
+    axis.set(xlim=(0, 1), ylim=(0, 1))
+    axis.text(0.22, 0.5, "low", fontsize=9, color=GREY, ha="right", va="center_baseline")
+    axis.text(0.75, 0.5, "high", fontsize=9, color=GREY, ha="left", va="center_baseline")
 
 
 def _draw_path(axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light: SoftLight, seen_from: float) -> None:

@@ -14,6 +14,8 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
+from nextview.session.fonts import fit_fonts
+
 INK, GREY, FAINT = "#1f2933", "#8a949e", "#d5dbe1"
 BLUE, LIGHT_BLUE, ACCENT = "#0b5fa5", "#38a0d9", "#d1495b"  # of all figures; policies: ``figures.COLOURS``
 PAPER, GROUND, WOOD = "#fafaf8", "#f5efe4", "#e0ab6c"  # of pictures: the page, what things stand on, the things
@@ -42,12 +44,14 @@ STYLE = {
 
 
 class PlainFigure(Figure):
-    """A figure that shows names as they are: a dollar begins no formula."""
+    """A figure that shows names as they are: a dollar begins no formula, and every script has its font."""
 
     def draw(self, renderer: Any) -> None:
         """Draw, after all texts are known."""
-        for text in self.findobj(Text):
+        texts = self.findobj(Text)
+        for text in texts:
             text.set_parse_math(False)
+        fit_fonts(texts)
         super().draw(renderer)
 
 

@@ -74,7 +74,7 @@ def _image(pixels: NDArray[np.uint8], width: int) -> str:
 def _figures(walk: Walk, view: View) -> str:
     """The image, and the value of each view where they lie on rings; the highest ring on top."""
     elevation, azimuth = view.angles
-    where = f"from view {view.index}, {elevation:.0f}° up, {round(azimuth) % 360}° round"
+    where = f"from view {view.index}, {elevation:.0f}° up, {round(azimuth) % 360}° around"
     found = [(where, _image(view.observation.picture, 160))]
     if view.values is not None and isinstance(walk.sphere, ViewSphere):
         grid = view.values.reshape(walk.sphere.rings, walk.sphere.azimuths)

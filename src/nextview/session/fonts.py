@@ -1,0 +1,80 @@
+"""Fonts for names in any script: a figure takes those of this machine that have the characters of its texts."""
+
+import logging
+from collections.abc import Iterable
+from functools import cache
+
+from matplotlib.font_manager import FontEntry, findfont, fontManager
+from matplotlib.ft2font import FT2Font
+from matplotlib.text import Text
+
+log = logging.getLogger(__name__)
+NO_SCRIPT = ("Last Resort", "STIX", "cm")  # fonts of boxes, and of formulas
+INSTALL = "fonts-noto on Debian and Ubuntu, fonts-noto-cjk for Chinese, Japanese and Korean, has them"
+
+
+def fit_fonts(texts: Iterable[Text]) -> None:
+    """Give each text the fonts that its characters need beside its own.
+
+    A character that no installed font has is written as its code, as in a terminal, and one line of the log says which
+    font to install.
+    """
+    lacking: set[str] = set()
+    for text in texts:
+        missing = _missing(text.get_text(), findfont(text.get_fontproperties()))
+        if not missing:
+            continue
+        families, without = _fonts_for(frozenset(missing))
+        text.set_fontfamily([*text.get_fontfamily(), *families])
+        text.set_text("".join(_code(c) if c in without else c for c in text.get_text()))
+        lacking |= without
+    if lacking:
+        log.warning("no font of this machine has %s, drawn as codes: %s", "".join(sorted(lacking)), INSTALL)
+
+
+def _missing(written: str, path: str) -> set[str]:
+    """The characters that a font lacks, but for ends of lines."""
+    has = _characters(path)
+    return {c for c in written if ord(c) not in has and c != "\n"}
+
+
+@cache
+def _characters(path: str) -> frozenset[int]:
+    """The codes of all characters in a font file; none if it cannot be read."""
+    try:
+        return frozenset(FT2Font(path).get_charmap())
+    except (OSError, RuntimeError) as error:  # what FreeType says of a damaged file
+        log.debug("%s: not a usable font (%s)", path, error)
+        return frozenset()
+
+
+@cache
+def _fonts_for(missing: frozenset[str]) -> tuple[tuple[str, ...], frozenset[str]]:
+    """Families that have these characters, as few as possible, and the characters that none has."""
+    families: list[str] = []
+    without = set(missing)
+    fonts = [font for font in fontManager.ttflist if not font.name.startswith(NO_SCRIPT)]
+    fonts.sort(key=_plainness)
+    while without:
+        best = max(fonts, key=lambda font: len(_held(font, without)), default=None)  # the plainest of equal ones
+        held = set() if best is None else _held(best, without)
+        if best is None or not held:
+            break
+        families.append(best.name)
+        without -= held
+    return tuple(families), frozenset(without)
+
+
+def _held(font: FontEntry, characters: Iterable[str]) -> set[str]:
+    has = _characters(font.fname)
+    return {c for c in characters if ord(c) in has}
+
+
+def _plainness(font: FontEntry) -> tuple[bool, bool, str]:
+    """Upright fonts of normal weight come first; then by name, so that every run takes the same."""
+    weighs = font.weight not in (400, "normal", "regular", "book")
+    return font.style != "normal", weighs, font.name
+
+
+def _code(character: str) -> str:
+    return character.encode("unicode_escape").decode()
