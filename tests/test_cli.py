@@ -174,9 +174,14 @@ def test_a_missing_extra_is_named_with_what_brings_it(package, arguments, extra)
     assert done.stderr.count("\n") == 1
 
 
-WITHOUT = "import sys; sys.modules.update(dict.fromkeys({packages!r}, None))\n"
-"""Code that hides packages from imports, as if they were not installed."""
 MISSING = [package for packages in EXTRAS.values() for package in packages]
+HIDDEN = f"""
+from importlib.machinery import PathFinder
+missing, plain = {MISSING!r}, PathFinder.find_spec
+find = lambda name, *more: None if name.partition('.')[0] in missing else plain(name, *more)
+PathFinder.find_spec = staticmethod(find)
+"""
+"""Code that hides packages from the search of installed ones."""
 
 
 @pytest.mark.parametrize(
@@ -197,7 +202,7 @@ MISSING = [package for packages in EXTRAS.values() for package in packages]
 def test_python_without_an_extra_names_it_too(code, extra):
     caught = "    print(error)\nelse:\n    raise SystemExit('nothing was raised')"
     body = f"import nextview\ntry:\n    {code}\nexcept nextview.MissingExtraError as error:\n{caught}"
-    done = run_python(WITHOUT.format(packages=MISSING) + body)
+    done = run_python(HIDDEN + body)
     assert done.returncode == 0, done.stderr
     assert f"pip install 'nextview[{extra}]'" in done.stdout
     assert done.stdout.count("\n") == 1
@@ -212,14 +217,7 @@ def test_a_module_that_is_no_extra_is_no_missing_extra():
 @pytest.mark.parametrize("name", ["train recogniser", "train gain", "export map", "evaluate", "benchmark", "report"])
 def test_help_needs_no_extra(name):
     """The packages are hidden from the search of installed ones."""
-    hidden = (
-        "from importlib.machinery import PathFinder\n"
-        "plain = PathFinder.find_spec\n"
-        f"missing = {MISSING!r}\n"
-        "find = lambda name, *more: None if name.partition('.')[0] in missing else plain(name, *more)\n"
-        "PathFinder.find_spec = staticmethod(find)\n"
-    )
-    done = run_python(hidden + f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})")
+    done = run_python(HIDDEN + f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})")
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"usage: nextview {name} ")
     assert "pip install 'nextview[" in done.stderr

@@ -89,7 +89,7 @@ def sockets(page, **headers):
         ("evil.example:{port}", "http://evil.example:{port}", False),  # a name that points here (DNS rebinding)
         ("", None, False),
         ("[::bad", None, False),  # no address at all
-        ("[::bad]:{port}", None, False),
+        ("[zz]:{port}", None, False),
         ("{address}", "http://[::bad", False),
     ],
 )
