@@ -1,10 +1,14 @@
 """The ROS 2 package: what it makes of messages that a bag has recorded. ROS itself is not here; ``rosbags`` is."""
 
 import ast
+import importlib
 import sys
+import threading
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -26,6 +30,12 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 K = np.array([[260.0, 0, 79.5], [0, 265.0, 59.5], [0, 0, 1]])
 """First pixel's centre at 0, as in ROS."""
 SHAPE = 120, 160
+ROS_MODULES = (
+    "geometry_msgs", "geometry_msgs.msg", "message_filters", "nextview_msgs", "nextview_msgs.action", "rclpy",
+    "rclpy.action", "rclpy.callback_groups", "rclpy.duration", "rclpy.executors", "rclpy.node", "rclpy.qos",
+    "rclpy.time", "sensor_msgs", "sensor_msgs.msg", "std_srvs", "std_srvs.srv", "tf2_ros",
+)  # fmt: skip
+"""What the node imports from ROS."""
 
 
 def message(kind, **fields):
@@ -157,6 +167,40 @@ def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
         ends.append(session)
     assert ends[1].result.answer == "chair"
     np.testing.assert_allclose(ends[1].views[-1].belief, ends[0].views[-1].belief, atol=1e-5)
+
+
+# The node, with stand-ins for ROS
+
+
+@pytest.fixture
+def node(monkeypatch):
+    """A node that was never started, with a session before its first look; what it publishes is kept."""
+    for name in ROS_MODULES:
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    monkeypatch.setattr(sys.modules["rclpy.node"], "Node", object)
+    monkeypatch.setattr(sys.modules["tf2_ros"], "TransformException", type("TransformException", (Exception,), {}))
+    monkeypatch.delitem(sys.modules, "nextview_ros.node", raising=False)
+    made = object.__new__(importlib.import_module("nextview_ros.node").RecogniseNode)
+    made.session = nextview.load().session(object=ObservedObject(life_size=False), distance=0.5)
+    made.busy, made.ended, made.goal = threading.Lock(), threading.Event(), MagicMock()
+    made.next_pose, made.value, made.get_clock = MagicMock(), {"axes": "opencv", "world_frame": "base"}.get, MagicMock()
+    return made
+
+
+def test_a_pose_that_fails_before_the_first_look_is_an_answer(node):
+    answer = node.failed(None, SimpleNamespace(success=None, message=None))
+    assert answer.success is False
+    assert "call look" in answer.message
+    assert not node.busy.locked()
+    node.session = None
+    assert node.failed(None, SimpleNamespace(success=None, message=None)).message == "no goal is active"
+
+
+def test_whatever_fails_while_the_node_answers_is_an_answer(node, monkeypatch):
+    monkeypatch.setattr(type(node), "tell", lambda self: self.session.target)  # before the first look there is none
+    answer = node.answer(SimpleNamespace(success=None, message=None), lambda session: None)
+    assert answer.success is False
+    assert answer.message
 
 
 # What cannot be run here is at least well formed
