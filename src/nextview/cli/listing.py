@@ -30,7 +30,7 @@ def show(
             table.add_row(key, measure.needs, "high" if measure.good == "peak" else "low", measure.source)
         return Terminal().print(table)
     if name:
-        return print(find_card(name).card_path.read_text())
+        return print(find_card(name).card_path.read_text(encoding="utf-8"))
     table = Table("model", "kind", "MB", "scores on test", "file")
     table.columns[0].no_wrap = True
     for card in bundled_cards().values():
