@@ -57,7 +57,9 @@ def _mesh_views(files: dict[str, Path], max_faces: int, store: ViewStore, i: int
     depths, name, hashes = store.read("depth", i), store.names[i], store.attributes.sha256
     if hashes and sha256_of(files[name]) != hashes[i]:
         raise DatasetError(f"{files[name]}: is not the mesh that {store.path} was rendered from")
-    mesh = deformed(store, load_mesh(files[name], max_faces=max_faces), name)
+    mesh = deformed(
+        store, load_mesh(files[name], max_faces=max_faces, largest_part=store.attributes.largest_part), name
+    )
     camera = FaceCamera(mesh, depths.shape[-1], store.sphere.distance)
     for depth, pose in zip(depths, store.sphere.poses, strict=True):
         yield camera.view(pose, depth * DEPTH_UNIT)  # float64, as when it was rendered

@@ -52,13 +52,14 @@ def capture(
     up: Literal["y", "z"] | None = None,  # the file's up axis; z if not given, but y for GLB
     unit: Unit | None = None,  # the file's unit of length
     max_faces: int = MAX_FACES,  # refuse a mesh of more triangles, or a file of more than 60 bytes for each of these
+    largest_part: bool = False,  # leave out all that is not connected to the largest part of the mesh
     overwrite: bool = False,  # replace the files of an earlier capture
 ) -> None:
     """Write captured views of a mesh: depth images, poses, intrinsics, as ``nextview recognise FOLDER`` reads them."""
     from nextview.simulation.capturing import write_capture
 
     check_new(out, overwrite, folder=True)
-    loaded = load_mesh(mesh, up, unit, max_faces)
+    loaded = load_mesh(mesh, up, unit, max_faces, largest_part)
     metres = loaded.metres if radius is None else radius
     if metres is None:
         raise UsageError(f"{mesh}: how large is it? Give the file's --unit or the object's --radius in metres")

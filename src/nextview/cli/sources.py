@@ -9,7 +9,7 @@ import numpy as np
 from nextview.cli.progress import console
 from nextview.errors import UsageError
 from nextview.files import check_new
-from nextview.geometry.mesh import MAX_FACES, load_mesh
+from nextview.geometry.mesh import MAX_FACES, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera
 from nextview.session.session import FrameCamera
 from nextview.session.system import simulated
@@ -53,6 +53,8 @@ class Source:
     # NAME:STRENGTH (docs/your_camera.md); clean renders if not given
     sensor: str | None = None
     max_faces: int = MAX_FACES  # refuse a mesh of more triangles, or a file of more than 60 bytes for each of these
+    # of a mesh file, leave out all that is not connected to its largest part, such as a plate or loose pieces of a scan
+    largest_part: bool = False
     point: Three | None = None  # of a folder: near the object that is meant, metres, in the capture's world
     # of a folder: the upright box into which the object just fits, its low and its high corner, metres (heights
     # along --up), or a JSON file with low, high and axes
@@ -65,7 +67,7 @@ class Source:
 
     def camera(self, path: Path, seed: int) -> Camera | FrameCamera:
         """A camera before the object of a mesh file or of a folder."""
-        folder, of_meshes = path.is_dir(), ("unit", "sensor", "max_faces")
+        folder, of_meshes = path.is_dir(), ("unit", "sensor", "max_faces", "largest_part")
         for field in fields(self)[1:]:
             if (field.name in of_meshes) == folder and getattr(self, field.name) != field.default:
                 option, kind = field.name.replace("_", "-"), "mesh files" if folder else "folders of captured views"
@@ -74,7 +76,10 @@ class Source:
             return self._captured(path)
         if isinstance(self.up, tuple):
             raise UsageError(f"{path}: the up axis of a mesh file is y or z, not {self.up}")
-        return simulated(load_mesh(path, self.up, self.unit, self.max_faces), self.sensor, seed)
+        mesh = load_mesh(path, self.up, self.unit, self.max_faces, self.largest_part)
+        for sentence in mesh_warnings(mesh):
+            console.print(f"{path}: {sentence}", style="yellow", soft_wrap=True)
+        return simulated(mesh, self.sensor, seed)
 
     def _captured(self, folder: Path) -> FrameCamera:
         from nextview.sensing.object_frame import Box, upright_axes

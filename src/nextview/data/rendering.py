@@ -88,6 +88,7 @@ class RenderOptions:
     held_out: str | None = None  # only the objects that this model (its name or card) held out of its training
     meshes: Path | None = None  # of scenes: the folder of the meshes that they are made of
     max_faces: int = MAX_FACES  # leave out a mesh of more triangles, or a file of more than 60 bytes for each of these
+    largest_part: bool = False  # leave out all that is not connected to the largest part of each mesh
 
 
 def render(
@@ -114,7 +115,9 @@ def render(
     with writing(path):
         with ThreadPoolExecutor() as pool:
             hashes = list(pool.map(_hash, [e.path for e in entries]))
-        recipe = {name: getattr(options, name) for name in ("seed", "noise_seed", "unit")} | vars(options.deform)
+        recipe = {name: getattr(options, name) for name in ("seed", "noise_seed", "unit", "largest_part")} | vars(
+            options.deform
+        )
         recipe |= {"sha256": hashes, "sensor": None if sensor is None else sensor.to_dict()}
         recipe |= {"scene": None if options.meshes is None else SIDE, "dataset": dataset.name}
         store = _begin(path, describe(entries, sphere, size, recipe), overwrite)
@@ -145,6 +148,8 @@ def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) ->
         raise UsageError(f"the unit is one of {', '.join(UNITS)}, not {options.unit}")
     if options.meshes is not None and options.deform != Deform():
         raise UsageError("scenes are rendered as they are: objects in them are neither stretched nor rotated")
+    if options.meshes is not None and options.largest_part:
+        raise UsageError("scenes are rendered as they are: the largest part is of a folder of meshes")
     if sphere.distance + 1 > FARTHEST:
         most = f"{FARTHEST:.2f} object radii, so the distance can be {FARTHEST - 1:.2f} at most"
         raise DatasetError(f"{path}: depth is stored up to {most}, not {sphere.distance:g}")
@@ -229,7 +234,8 @@ def _rendered(store: ViewStore, options: RenderOptions, sensor: AnySensor, entry
     rng = np.random.default_rng([seed, SENSING, *entry.name.encode()])
     camera: Camera
     if options.meshes is None:
-        mesh = deformed(store, load_mesh(entry.path, max_faces=options.max_faces), entry.name)
+        read = load_mesh(entry.path, max_faces=options.max_faces, largest_part=options.largest_part)
+        mesh = deformed(store, read, entry.name)
         camera = SimulatedCamera(mesh, size, sphere.distance) if sensor is None else SensedCamera(mesh, sensor, rng)
         return render_object(camera, sphere, size) | {"radius": np.array(mesh.radius)}
     scene = build_scene(SceneLayout.load(entry.path), Path(options.meshes).absolute(), options.max_faces)

@@ -51,6 +51,7 @@ class Attributes(msgspec.Struct, omit_defaults=True):
     noise_seed: Annotated[int, Meta(ge=0)] | None = None
     stretch: Annotated[float, Meta(ge=0, lt=1e300)] = 0.0
     rotated: bool = False
+    largest_part: bool = False
     sensor: dict[str, Any] | None = None
     scene: Pixels | None = None
     sha256: list[str] | None = None

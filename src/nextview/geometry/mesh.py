@@ -1,6 +1,6 @@
 """Read a mesh file and bring it into the object frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +10,13 @@ from nextview.checks import one_line, whole
 from nextview.errors import MeshError
 from nextview.files import regular_file
 from nextview.geometry.mesh_file import READERS
+from nextview.geometry.mesh_parts import keep_largest_part, mesh_doubts, refuse_lost_shape
 from nextview.geometry.triangles import MAX_FACES, check_faces, no_faces
 
 BYTES_PER_FACE = 60  # how many bytes a mesh file may have for each triangle that it may have
 FORMATS = tuple(READERS)
 UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}  # of length, metres
+ODD_RADII = (0.001, 20.0)  # metres: a radius outside is likelier one in another unit
 FLAT = 1e-12  # twice the area, square object radii, below which a face counts as a line: rounding makes up to 1e-15
 
 
@@ -29,6 +31,7 @@ class Mesh:
         radius: object radius in the file's units; ``vertices * radius + centre`` are the file's positions.
         name: what to call it in messages.
         unit: the file's unit, one of UNITS; None if it is not known.
+        notes: what was left out of the file's mesh, a sentence each; usually nothing.
     """
 
     vertices: NDArray[np.float64]
@@ -37,6 +40,7 @@ class Mesh:
     radius: float
     name: str = "mesh"
     unit: str | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def metres(self) -> float | None:
@@ -99,12 +103,40 @@ def _first_of_equals(rows: NDArray) -> NDArray[np.int64]:
     return found
 
 
-def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None, max_faces: int = MAX_FACES) -> Mesh:
+def mesh_warnings(mesh: Mesh) -> tuple[str, ...]:
+    """What is likely to be wrong with the mesh of one object, a sentence each; usually nothing.
+
+    That something was left out of it, that it has parts far from its main part, that it stands on a large plane, and
+    that it is of an odd size. It takes about as long as reading the file.
+
+    Args:
+        mesh: as ``load_mesh`` returns it.
+    """
+    doubts = [*mesh.notes, *mesh_doubts(mesh.vertices, mesh.faces)]
+    if mesh.metres is not None and not ODD_RADII[0] <= mesh.metres <= ODD_RADII[1]:
+        doubts.append(f"it has a radius of {mesh.metres:.3g} m: is its unit {mesh.unit}?")
+    return tuple(doubts)
+
+
+def load_mesh(
+    path: str | Path,
+    up: str | None = None,
+    unit: str | None = None,
+    max_faces: int = MAX_FACES,
+    largest_part: bool = False,
+) -> Mesh:
     """Read an OFF, OBJ, PLY, STL or GLB file, by its suffix, into the object frame; the parts of a scene are joined.
 
-    The ``up`` axis is "y" or "z"; by default z, but y for GLB, whose standard says so. The ``unit`` of length is one of
-    UNITS; None if it is not known. A mesh of more triangles than ``max_faces``, or in a file of more than
-    BYTES_PER_FACE bytes for each, is refused. MeshError: what is wrong with the file, in one sentence.
+    Args:
+        path: the file.
+        up: its up axis, "y" or "z"; by default z, but y for GLB, whose standard says so.
+        unit: its unit of length, one of UNITS; None if it is not known.
+        max_faces: how many triangles the mesh may have. The file may have BYTES_PER_FACE bytes for each.
+        largest_part: leave out all that is not connected to the part with the largest surface, as loose pieces of a
+            scan. A plate, such as a turntable's, is not taken for that part.
+
+    Raises:
+        MeshError: what is wrong with the file, in one sentence.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -135,4 +167,9 @@ def load_mesh(path: str | Path, up: str | None = None, unit: str | None = None, 
         raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({one_line(reason, 240)})") from None
     if (up or ("y" if suffix == ".glb" else "z")) == "y":
         vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)
-    return make_mesh(vertices, faces, str(path), unit)
+    notes: tuple[str, ...] = ()
+    if largest_part:
+        faces, notes = keep_largest_part(vertices, faces)
+    mesh = replace(make_mesh(vertices, faces, str(path), unit), notes=notes)
+    refuse_lost_shape(vertices, mesh.radius, str(path))
+    return mesh

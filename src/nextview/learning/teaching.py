@@ -13,7 +13,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from nextview.errors import DatasetError, NoViewLeftError, ObservationError
-from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.geometry.mesh import Mesh, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import resting_poses, rotated
 from nextview.geometry.viewsphere import ViewSphere, angle_between, direction_of, look_at_origin
@@ -45,6 +45,7 @@ class How:
     up: Literal["y", "z"] | None = None  # the up axis of the mesh files; z by default, but y for GLB
     upright: bool = False  # the things only ever stand as their files have them; by default they may also lie
     sensor: str = "wrist"  # the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help
+    largest_part: bool = False  # leave out all that is not connected to the largest part of each mesh
     any_size: bool = False  # take things of very different sizes as they are
     # depth frames without poses, beside camera-intrinsics.txt: the camera stood still, and the thing turned once around
     # by equal steps, counter-clockwise (ccw) or clockwise (cw) as seen from above
@@ -63,7 +64,7 @@ def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
         if not is_capture(path) and how.turntable is None:
             raise DatasetError(f"{path}: its frames have no poses; --turntable ccw or cw says how the thing turned")
         return _of_capture(read_capture(path) if is_capture(path) else read_turntable(path, str(how.turntable)))
-    mesh = load_mesh(path, how.up, how.unit)
+    mesh = load_mesh(path, how.up, how.unit, largest_part=how.largest_part)
     rotations = np.eye(3)[None] if how.upright else resting_poses(mesh)
     lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
     directions = np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), HELD_OUT)), rng.uniform(0, 2 * np.pi, HELD_OUT)
@@ -79,6 +80,7 @@ def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
         "held_out": shown.astype(np.float16),
         "held_out_views": np.stack(directions, 1).astype(np.float32),
         "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
+        "doubts": np.frombuffer("\n".join(mesh_warnings(mesh)).encode(), np.uint8),
         "pictures": _picture(SimulatedCamera(mesh, 64).observe(look_at_origin(np.radians(25), np.radians(35)))),
     }
 

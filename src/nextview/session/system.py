@@ -1,5 +1,6 @@
 """The front door: a recogniser, maps, a policy, candidate viewpoints and a stopping rule that belong together."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from nextview.checks import number, one_line, whole
 from nextview.errors import MeshError, ModelError, OtherUseError, PolicyError, UsageError
-from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.geometry.mesh import Mesh, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera
 from nextview.geometry.viewsphere import LAYOUTS, Viewpoints, ViewSphere, viewpoints_of
 from nextview.policies.base import Policy
@@ -84,6 +85,7 @@ class System:
         up: str | tuple[float, float, float] | None = None,
         unit: str | None = None,
         sensor: "str | Sensor | None" = None,
+        largest_part: bool = False,
     ) -> Recognition:
         """Look at an object until it is clear what it is, or the views run out.
 
@@ -97,6 +99,8 @@ class System:
             unit: the unit of length of a file, one of ``mesh.UNITS``, if it is known: size says something of the class.
             sensor: look at a mesh through this one, or through NAME or NAME:STRENGTH of ``known_sensors.SENSORS``; its
                 errors are drawn by the seed. None for clean renders.
+            largest_part: of a mesh file, leave out all that is not connected to its largest part, see ``load_mesh``.
+                What is likely to be wrong with a file's mesh is a Python warning.
 
         Raises:
             MeshError, DatasetError: the file or the folder cannot be used.
@@ -107,7 +111,9 @@ class System:
             if Path(what).is_dir():
                 what = _camera_of(Path(what), up)
             elif up is None or isinstance(up, str):
-                what = load_mesh(what, up, unit)
+                what = load_mesh(what, up, unit, largest_part=largest_part)
+                for sentence in mesh_warnings(what):
+                    warnings.warn(f"{what.name}: {sentence}", stacklevel=2)
             else:
                 raise MeshError(f"{what}: the up axis of a mesh file is y or z, not {up}")
         if isinstance(what, Mesh):

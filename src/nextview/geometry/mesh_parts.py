@@ -1,0 +1,218 @@
+"""The parts of a mesh, and what is likely to be wrong with a scan: a table in it, pieces that float, a lost shape."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import MeshError
+
+HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)  # odd, of many bits
+FLAT_PART = 0.05  # thickness of a part, over its width, below which it is a plate
+SMALL_PART = 0.01  # of the surface of the largest part: smaller ones are crumbs
+FAR_PARTS = 3.0  # how many times as large as its main part a mesh has to be to be asked about
+WIDE_PLANE = 2.0  # how many times as large as what stands on it
+MOST_WIDE_PLANE = 25.0  # more, and what is beside it is no object but a bump
+ONE_SIDED = 0.8  # how much more of what is not in the plane is on one side of it: 0 as much on both, 1 all
+PLANE_THICKNESS = 0.05  # of the mesh's size: what lies no farther from a plane belongs to it
+PLANE_FACES = 100_000  # that are looked at in search of a plane
+PLANE_ANGLE = np.cos(np.radians(15))  # between its normal and those of its faces
+LOST_STEP = 0.05  # object radii between two numbers of single precision, from where on a shape is lost
+USED_STEPS = 0.2  # share of coordinates that are odd multiples of such a step, half of them by chance
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The connected parts of a mesh: pieces of surface that share no position.
+
+    Attributes:
+        vertices: (V, 3) float64.
+        faces: (F, 3), indices into the vertices.
+        part: which part each face belongs to, (F,) int.
+        areas: the surface of each part, (P,) float64.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.integer]
+    part: NDArray[np.integer]
+    areas: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> "Parts":
+        """Find the parts of a mesh. Vertices in the same place count as one, as in an STL file they have to."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        places = _places(vertices)[faces]
+        count = int(places.max()) + 1 if len(places) else 0
+        ends = np.concatenate([places[:, :2], places[:, 1:]]).astype(np.int32)
+        graph = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
+        _, component = connected_components(graph, directed=False)
+        _, part = np.unique(component[places[:, 0]], return_inverse=True)
+        areas = np.bincount(part, _areas(vertices, faces)).astype(np.float64)
+        return cls(vertices, faces, part, areas)
+
+    @cached_property
+    def main(self) -> int:
+        """The part with the largest surface; a plate only if there is nothing else but crumbs."""
+        order = np.argsort(-self.areas, kind="stable")
+        for part in order:
+            if self.areas[part] < SMALL_PART * self.areas[order[0]]:
+                break
+            if not _is_flat(self.points_of(part)):
+                return int(part)
+        return int(order[0])
+
+    def points_of(self, part: int) -> NDArray[np.float64]:
+        """The positions of a part, (n, 3)."""
+        return self.vertices[np.unique(self.faces[self.part == part])]
+
+
+def _places(vertices: NDArray[np.float64]) -> NDArray[np.intp]:
+    """A number for each vertex, (V,), the same for those in the same place."""
+    bits = np.ascontiguousarray(vertices + 0.0).view(np.uint64)  # of zeros there are two
+    mixed = bits ^ (bits >> np.uint64(32))
+    _, places = np.unique((mixed * HASH_FACTORS).sum(1, dtype=np.uint64), return_inverse=True)
+    return places
+
+
+def _areas(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[np.float64]:
+    a, b, c = (vertices[corner] for corner in faces.T)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def _size(points: NDArray[np.float64]) -> float:
+    """Half the diagonal of the bounding box."""
+    return float(np.linalg.norm(np.ptp(points, axis=0))) / 2 if len(points) else 0.0
+
+
+def _is_flat(points: NDArray[np.float64]) -> bool:
+    """Whether points lie in a plate that is much wider than thick both ways."""
+    centred = points - points.mean(0)
+    axes = np.linalg.eigh(centred.T @ centred)[1]
+    _, width, thickness = np.sort(np.ptp(centred @ axes, axis=0))[::-1]
+    return bool(thickness < FLAT_PART * width)
+
+
+def keep_largest_part(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    """Leave out what is not connected to the largest part of a mesh.
+
+    The largest part has the largest surface. A plate, thinner than a twentieth of its width, is taken for what the
+    object stood on, and only counts if the other parts are crumbs.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3), indices into the vertices.
+
+    Returns:
+        The faces of the part, and a sentence about what was left out; none if there is one part alone.
+    """
+    if len(faces) == 0:
+        return faces, ()
+    parts = Parts.of(vertices, faces)
+    if len(parts.areas) == 1:
+        return faces, ()
+    share = parts.areas[parts.main] / max(parts.areas.sum(), np.finfo(float).tiny)
+    said = f"the largest of its {len(parts.areas):,} parts was taken, {share:.0%} of the surface"
+    return faces[parts.part == parts.main], (said,)
+
+
+def refuse_lost_shape(vertices: NDArray[np.float64], radius: float, name: str) -> None:
+    """Refuse an object that single precision, far from the origin, has rounded until its shape was lost.
+
+    Args:
+        vertices: (V, 3), as they stand in the file.
+        radius: of the object, the same unit.
+        name: of the file.
+
+    Raises:
+        MeshError: neighbouring numbers of single precision are more than a twentieth of the radius apart there, and the
+            positions are such numbers.
+    """
+    farthest = np.abs(vertices).max()
+    step = float(np.spacing(np.float32(min(farthest, np.finfo(np.float32).max))))
+    if step < LOST_STEP * radius:
+        return
+    column = vertices[:, np.abs(vertices).max(0).argmax()]
+    steps = column / np.spacing(np.abs(column).astype(np.float32)).astype(np.float64)
+    rounded = bool((steps == np.round(steps)).all())
+    # A building whose corners stand at whole metres is not rounded: half of rounded numbers are odd multiples.
+    if rounded and (step > radius or (steps % 2 == 1).mean() > USED_STEPS):
+        where = f"it lies {farthest:,.0f} from its origin, where single precision has steps of {step:.2g}"
+        raise MeshError(f"{name}: {where}, and has lost its shape; move it to the origin before it is saved")
+
+
+def mesh_doubts(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> tuple[str, ...]:
+    """What is likely to be wrong with the mesh of one object, a sentence each; usually nothing.
+
+    Args:
+        vertices: (V, 3), any unit.
+        faces: (F, 3), indices into the vertices.
+    """
+    doubts = []
+    parts = Parts.of(vertices, faces)
+    size = _size(vertices)
+    times = size / _size(parts.points_of(parts.main))
+    if times >= FAR_PARTS:
+        largest = f"it has {len(parts.areas):,} parts, and is {times:.1f} times as large as its main part"
+        doubts.append(f"{largest}: does a table or a loose piece belong to it? --largest-part leaves them out")
+    elif (times := _plane_times(vertices, faces)) >= WIDE_PLANE:
+        plane = f"a plane in it is {times:.1f} times as large as all that stands on it"
+        doubts.append(f"{plane}: is it a table? Cut it off, or use --largest-part if it is a part of its own")
+    return tuple(doubts)
+
+
+def _plane_times(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> float:
+    """How many times as large as the rest a mesh is because of one plane that reaches beyond it on all sides.
+
+    1 if there is no such plane, or nothing beside it.
+    """
+    some = faces[:: len(faces) // PLANE_FACES + 1]
+    a, b, c = (vertices[corner] for corner in some.T)
+    crosses = np.cross(b - a, c - a)
+    areas = np.linalg.norm(crosses, axis=1)
+    normals = crosses / np.maximum(areas, np.finfo(float).tiny)[:, None]
+    size = _size(vertices)
+
+    normal = _main_direction(normals, areas)
+    facing = np.abs(normals @ normal) > PLANE_ANGLE
+    heights = ((a + b + c) / 3)[facing] @ normal
+    bins = np.floor((heights - heights.min()) / (PLANE_THICKNESS * size)).astype(int)
+    weights = np.bincount(bins, areas[facing])
+    fullest = bins == weights.argmax()
+    height = np.average(heights[fullest], weights=areas[facing][fullest])
+
+    used = vertices[np.unique(faces)]
+    offsets = used @ normal - height
+    above = np.abs(offsets) > PLANE_THICKNESS * size
+    rest = _size(used[above])
+    one_sided = 2 * abs((offsets[above] > 0).mean() - 0.5) if above.any() else 0
+    if rest * MOST_WIDE_PLANE < size or one_sided < ONE_SIDED:
+        return 1.0
+    plane = used[~above]
+    centred = plane - plane.mean(0)
+    width = np.sort(np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1], axis=0))[1] / 2
+    return size / rest if width > rest else 1.0
+
+
+def _main_direction(normals: NDArray[np.float64], areas: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The direction, of either sign, that most of a surface faces, (3,)."""
+    upper = np.where(normals[:, 2:] < 0, -normals, normals)
+    cells = np.round(upper * 4).astype(int) + 4  # directions some 15 degrees apart
+    which = np.ravel_multi_index(tuple(cells.T), (9, 9, 9))
+    fullest = which == np.bincount(which, areas).argmax()
+    direction = _mean_direction(upper[fullest], areas[fullest])
+    for _ in range(2):  # the cell's edges cut off some of the faces around it
+        near = np.abs(normals @ direction) > PLANE_ANGLE
+        towards = normals[near] * np.sign(normals[near] @ direction)[:, None]
+        direction = _mean_direction(towards, areas[near])
+    return direction
+
+
+def _mean_direction(normals: NDArray[np.float64], areas: NDArray[np.float64]) -> NDArray[np.float64]:
+    mean = (normals * areas[:, None]).sum(0)
+    length = float(np.linalg.norm(mean))
+    return mean / length if length > 0 else normals[0]
