@@ -184,3 +184,16 @@ def test_recognise_warns_and_takes_the_largest_part(tmp_path):
     alone = nextview.recognise(saved(tmp_path / "egg.ply", thing()), start=9)
     first = [result.views[0].observation.depth for result in (part, alone, whole)]
     assert ((first[0] > 0) != (first[1] > 0)).mean() < 0.01 < ((first[0] > 0) != (first[2] > 0)).mean()
+
+
+def test_the_largest_part_of_what_is_no_mesh_file_is_refused(tmp_path):
+    mesh = make_mesh(thing().vertices, thing().faces)
+    for what in (mesh, tmp_path):
+        with pytest.raises(UsageError, match="taken of a mesh file"):
+            nextview.recognise(what, largest_part=True)
+
+
+def test_a_plane_is_looked_for_among_faces_without_area():
+    points = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1.0)])
+    faces = np.array([[0, 1, 1]] * 200_001 + [[0, 1, 2], [1, 2, 3]])
+    assert mesh_doubts(points, faces) == ()

@@ -176,9 +176,13 @@ def _plane_times(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> f
     areas = np.linalg.norm(crosses, axis=1)
     normals = crosses / np.maximum(areas, np.finfo(float).tiny)[:, None]
     size = _size(vertices)
+    if not areas.any():  # of those that were drawn
+        return 1.0
 
     normal = _main_direction(normals, areas)
-    facing = np.abs(normals @ normal) > PLANE_ANGLE
+    facing = (np.abs(normals @ normal) > PLANE_ANGLE) & (areas > 0)
+    if not facing.any():
+        return 1.0
     heights = ((a + b + c) / 3)[facing] @ normal
     bins = np.floor((heights - heights.min()) / (PLANE_THICKNESS * size)).astype(int)
     weights = np.bincount(bins, areas[facing])

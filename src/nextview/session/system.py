@@ -107,6 +107,8 @@ class System:
             UsageError: there is no such sensor, or ``what`` is nothing to look at.
             ObservationError: the object is found in none of the captured views.
         """
+        if largest_part and not (isinstance(what, str | Path) and not Path(what).is_dir()):
+            raise UsageError("the largest part is taken of a mesh file while it is read")
         if isinstance(what, str | Path):
             if Path(what).is_dir():
                 what = _camera_of(Path(what), up)
