@@ -40,7 +40,7 @@ def recognise(
 
     The object is in a mesh file, or in a folder of captured depth images with poses in the layout of BOP, TUM RGB-D or
     7-Scenes. Of these the view nearest to the one asked for answers. The object is what the masks show; else what lies
-    in the box; else the thing on the support plane that is nearest to the point, or the largest.
+    in the box; else the thing on the support plane that is nearest to the point, or at which the first camera is aimed.
     """
     if more and (output.figure or output.record):
         raise UsageError("--figure and --record are of one object; give them with one file or folder")

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.linalg import block_diag
 from scipy.spatial import ConvexHull, QhullError
 
@@ -30,9 +31,13 @@ FEWEST = 0.15  # share of the pixels of a level cell that a piece shows over it,
 LIES_OVER = 0.5  # share of the cells of a piece that lie over, or beside, one of another frame, from which they are one
 BESIDE = 2  # cells up to which two pieces stand side by side
 TWO = 0.25  # share of the cells of an object that a part of it has which may be another thing
+OVER_PLANE = 0.1  # share of a thing's pixels over what is seen of the plane, at least: it may hide most of it
+BOTTOM_ROWS = 2  # rows of that picture that are its lower edge
+AIM_WIDTH = 160  # columns of the picture in which is seen how far from the optical axis things lie
+AIM_SPREAD = 0.08  # picture widths from the optical axis at which a thing counts for 1 / e of its pixels
 REACH, FAR = 250, 1000
-"""Cells to each side of the middle of what is seen above the plane: farther things are left out. And cells from those
-of the first frame beyond which nothing can be a part of the same object."""
+"""Cells to each side of where the object is looked for: farther things are left out. And cells from those of the first
+frame beyond which nothing can be a part of the same object."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +59,17 @@ class Footprint:
         return np.isin(np.arange(len(self.pieces.stands)), self.piece[chosen])[self.pieces.grown]
 
 
-def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float) -> Footprint:
-    """The footprint of the pieces of a frame along upright axes, (3, 3), in cells of a side in metres."""
+def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Float) -> Footprint:
+    """The footprint of the pieces of a frame, seen from above, near a place.
+
+    Args:
+        frame: what the pieces are cut from.
+        pieces: of what stands on the plane.
+        axes: upright, rows x, y and z in the world, (3, 3).
+        cell: side of a cell, metres.
+        middle: where the object is, or is looked for, along x and y, (2,), cells: what is more than REACH cells
+            from there is left out.
+    """
     rows, columns = np.divmod(np.flatnonzero(pieces.label), pieces.label.shape[1])
     z = frame.depth[rows, columns]
     pose, (x, y) = frame.camera_to_world, frame.rays
@@ -64,7 +78,7 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float) -> Footpri
         a, b, c = (pose[:3, :3].T @ axis / cell).astype(np.float32)
         position = z * (a * x[columns] + b * y[rows] + c) + np.float32(axis @ pose[:3, 3] / cell)
         ij.append(np.floor(position).astype(np.int64))
-    low = np.array([np.median(v[::50]) if len(v) else 0 for v in ij]).astype(np.int64) - REACH
+    low = np.floor(middle).astype(np.int64) - REACH
     side = 2 * REACH + 1
     i, j = ij[0] - low[0], ij[1] - low[1]
     within = (i >= 0) & (i < side) & (j >= 0) & (j < side)
@@ -178,14 +192,37 @@ def on_ground(points: Float, plane: Float) -> Mask:
     return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(1))
 
 
-def largest(foot: Footprint, labels: NDArray[np.int64], plane: Float) -> int:
-    """The cluster with most surface in view on the plane, whose points are given in cells, (M, 2); or 0."""
+def central(foot: Footprint, labels: NDArray[np.int64], plane: Float, optical_axis: Float) -> int:
+    """The cluster on the plane at which the camera is aimed; 0 if there is none.
+
+    It is the one with most pixels, each of which counts the less the farther the cluster lies from the optical axis.
+
+    Args:
+        foot: the footprint of a frame.
+        labels: the cluster of each of its pairs, (K,).
+        plane: points of the support plane that are seen, in cells, (M, 2).
+        optical_axis: the pixel, column and row, through which it passes, (2,).
+    """
     if not labels.any():
         return 0
-    area = np.bincount(labels, foot.area)
-    middles = np.stack([np.bincount(labels, foot.area * x) for x in foot.cells.T], 1) / np.maximum(area, 1e-30)[:, None]
-    area[~on_ground(middles, plane)] = area[0] = 0
-    return int(area.argmax()) if area.max() > 0 else 0
+    pixels = np.bincount(labels, foot.pixels)
+    over_plane = np.bincount(labels, foot.pixels * on_ground(foot.cells.astype(np.float64) + 0.5, plane))
+
+    cluster_of = np.zeros(len(foot.pieces.stands), np.int64)
+    cluster_of[foot.piece] = labels
+    label = foot.pieces.label
+    step = max(1, label.shape[1] // AIM_WIDTH)
+    cluster = cluster_of[label[::step, ::step]]
+    stands = over_plane >= OVER_PLANE * pixels
+    stands[cluster[-BOTTOM_ROWS:]] = True  # cut off by the picture: nothing tells where it ends below
+    stands[0] = False
+
+    rows, columns = (step * np.arange(n) for n in cluster.shape)
+    away = np.hypot(columns[None] - optical_axis[0], rows[:, None] - optical_axis[1]) / label.shape[1]
+    nearest_pixel = np.asarray(ndimage.minimum(away, cluster, np.arange(len(pixels))))
+
+    weight = stands * pixels * np.exp(-((nearest_pixel / AIM_SPREAD) ** 2))
+    return int(weight.argmax()) if weight.max() > 0 else 0
 
 
 def nearest(footprints: Sequence[Footprint], labels: Sequence[NDArray[np.int64]], point: Float) -> int:

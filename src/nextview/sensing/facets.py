@@ -87,7 +87,7 @@ class Facets:
         """Where the rays meet the planes, camera frame, (N, 3) float64, metres."""
         return self.rays / np.einsum("ni,ni->n", self.planes, self.rays)[:, None]
 
-    def some(self, which: slice) -> "Facets":
+    def some(self, which: slice | Mask) -> "Facets":
         """Those of some of the pixels."""
         return Facets(self.planes[which], self.rays[which], self.rows[which], self.columns[which], self.pitch)
 

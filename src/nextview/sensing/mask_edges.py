@@ -2,17 +2,20 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion, binary_fill_holes, label, minimum_filter
+from scipy.ndimage import binary_erosion, binary_fill_holes, label, minimum_filter, uniform_filter
 
+from nextview.sensing.facets import Noise
 from nextview.sensing.frame import within
 
 EDGE = 6  # a segmenter's edge may be off by so many pixels
 STEP = 0.01  # neighbouring pixels of one surface differ by at most this part of their depth, and THICK
 THICK = 0.004  # metres
+NOISE_STEP = 2.5  # standard deviations by which a pixel may differ from the mean of its neighbours
+AROUND = 5  # pixels across the square of these
 Mask = NDArray[np.bool_]
 
 
-def trimmed(depth: NDArray[np.float32], mask: Mask, high: Mask | None = None) -> Mask:
+def trimmed(depth: NDArray[np.float32], mask: Mask, noise: Noise, high: Mask | None = None) -> Mask:
     """The pixels of a mask that hang together with its inside without a step in depth, (H, W) bool.
 
     Up to EDGE pixels at the edge of a mask may show the background, or hang in the air before it. The inside is what is
@@ -23,6 +26,7 @@ def trimmed(depth: NDArray[np.float32], mask: Mask, high: Mask | None = None) ->
     Args:
         depth: metres, (H, W), 0 where nothing was measured.
         mask: (H, W) bool.
+        noise: of the depth: pixels of one surface differ by it, too.
         high: pixels that show no edge of what lies on the plane, (H, W) bool.
     """
     measured = mask & (depth > 0)
@@ -30,6 +34,7 @@ def trimmed(depth: NDArray[np.float32], mask: Mask, high: Mask | None = None) ->
     if not measured[part].size:
         return mask
     own, z = measured[part], depth[part].astype(np.float64)
+    step = np.maximum(STEP * z + THICK, NOISE_STEP * noise.at(z) * z**2)
     whole = np.pad(mask[part] | binary_fill_holes(own) & (z == 0), 1)
     for width in range(EDGE, 0, -1):
         inside = binary_erosion(whole, np.ones((3, 3), bool), width)[1:-1, 1:-1] & own
@@ -39,14 +44,15 @@ def trimmed(depth: NDArray[np.float32], mask: Mask, high: Mask | None = None) ->
         return mask
     found = inside
     if high is not None:
-        far = z - minimum_filter(np.where(own, z, np.inf), 3, mode="constant", cval=np.inf) > STEP * z + THICK
+        far = z - minimum_filter(np.where(own, z, np.inf), 3, mode="constant", cval=np.inf) > step
         part_of, count = label(own & high[part] & ~far | inside)
         reached = np.zeros(count + 1, bool)
         reached[part_of[inside]] = True
         found = reached[part_of]
     for _ in range(EDGE):
-        nearest = minimum_filter(np.where(found, z, np.inf), 3, mode="constant", cval=np.inf)
-        found |= own & (np.abs(z - nearest) < STEP * z + THICK)
+        share = uniform_filter(found.astype(np.float64), AROUND, mode="constant")
+        usual = uniform_filter(np.where(found, z, 0), AROUND, mode="constant") / np.maximum(share, 1e-6)
+        found |= own & (share > 1e-3) & (np.abs(z - usual) < step)
     trimmed_mask = np.zeros_like(mask)
     trimmed_mask[part] = found
     return trimmed_mask

@@ -16,15 +16,17 @@ from nextview.checks import one_line
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.observation import Observation, SceneView, pinhole
 from nextview.geometry.viewsphere import DISTANCE
-from nextview.sensing import clusters, plausibility, segmentation
+from nextview.sensing import clusters, plausibility, segmentation, support
 from nextview.sensing.clusters import Footprint
 from nextview.sensing.facets import ROWS, Facets, Index, Noise, estimate_noise, fit_facets, look_again, virtual_pose
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
+from nextview.sensing.outliers import without_outliers
 from nextview.sensing.pieces import STANDS, cut
 from nextview.sensing.plausibility import ViewWarning, check_frame, check_observation, check_views
 from nextview.sensing.segmentation import Plane, Samples, find_plane, refine_plane, sample
+from nextview.sensing.walls import before_walls, find_walls
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -36,9 +38,12 @@ NEAREST = 0.01  # metres between the camera and the point that names an object: 
 MENDED = 0.03  # share of an object's pixels in an earlier frame that has to change before they are looked at again
 PART = 0.1  # of the most pixels that a frame shows of an object: others say too little of its size
 LESS_NOVEL = 1.0  # the novelty score has to be so much lower for an object to be joined or taken apart otherwise
+SIZE_CHANGE = 2.0  # factor by which the radius may change where an object is looked at anew
 FINEST = 1 / 32  # object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``
 SAME = 0.01  # change of the centre or the radius, in object radii, below which the object frame is left as it is
 BELOW = 0.02  # metres below the support plane at which the point of an object may lie: on it, but for a pose's error
+AHEAD = 16  # half the width of the middle of the picture, as a part of the picture
+MASK_POINTS = 2000  # pixels of a mask that tell where its bottom is
 TOO_LITTLE = "too little is seen of the object"
 NO_PLANE = ViewWarning(
     "support", "no support plane is seen, so where the object ends below is guessed: support=False if it stands on none"
@@ -85,10 +90,10 @@ class ObservedObject:
     """One object, seen in more and more frames. ``add`` takes a frame and gives an observation.
 
     The object is found in each frame: by the frame's mask; else as what lies in a ``box``; else as the cluster on the
-    support plane that is nearest to a ``point``, or the largest in the first frame. Its centre and radius are those of
-    the box, or estimated from all frames that show enough of it. When they get better the earlier frames are expressed
-    anew: ``observations`` are always all in the same, latest object frame, and ``revision`` counts how often it
-    changed. Its x axis points towards the first camera, unless a box or a known frame says otherwise.
+    support plane that is nearest to a ``point``, or at which the first camera is aimed. Its centre and radius are those
+    of the box, or estimated from all frames that show enough of it. When they get better the earlier frames are
+    expressed anew: ``observations`` are always all in the same, latest object frame, and ``revision`` counts how often
+    it changed. Its x axis points towards the first camera, unless a box or a known frame says otherwise.
 
     >>> thing = ObservedObject()                                                # doctest: +SKIP
     >>> observation = thing.add(Frame(depth, intrinsics, pose))                 # doctest: +SKIP
@@ -160,15 +165,20 @@ class ObservedObject:
         return self.state.observations[-1]
 
     def reconsider(self, novelty: Callable[[Sequence[Observation]], float]) -> None:
-        """Count what touches the object as a part of it, or do not, where its observations are less novel then."""
+        """Count what touches the object as a part of it, or do not, where its observations are less novel then.
+
+        An object of another order of size is another thing, such as the wall behind it, and is not considered.
+        """
         found = [(novelty(self.observations), self.state)]
+        radius = self.object_frame.radius
         for joins in self.other_joins():
             other = copy(self)
             other.state = ObjectState(self.state.rng, self.known, revision=self.revision + 1, joins=joins)
             with suppress(ObservationError):
                 for sighting in self.sightings:
                     other.add(sighting.frame)
-                found.append((novelty(other.observations) + LESS_NOVEL, other.state))
+                if 1 / SIZE_CHANGE < other.object_frame.radius / radius < SIZE_CHANGE:
+                    found.append((novelty(other.observations) + LESS_NOVEL, other.state))
         self.state = min(found, key=lambda pair: pair[0])[1]
 
     def other_joins(self) -> list[clusters.Joins]:
@@ -234,6 +244,9 @@ class ObservedObject:
 
     def _plane(self, frame: Frame, samples: Samples, up: Float | None, rng: np.random.Generator) -> Plane | None:
         """The support plane of the first frame."""
+        every = samples
+        if up is not None:  # the foot of a wall is no part of the floor
+            samples = samples.some(~segmentation.steep(samples, up))
         plane = find_plane(samples, rng, up, self._above())
         share = 0.0 if plane is None else float(plane.holds(samples).mean())
         if self.point is not None and up is not None and share < 1 / 3:
@@ -243,13 +256,32 @@ class ObservedObject:
             if under is not None and (more := float(under.holds(samples).mean())) > 2 * share:
                 plane, share = under, more
         if up is not None and frame.mask is None and share < 1 / 3:  # else no other is twice as large
-            largest = find_plane(samples, rng)
+            largest = find_plane(every, rng)
             mistake = None if largest is None else segmentation.mistake_in_pose(largest, frame.camera_to_world, up)
-            if largest is not None and mistake and largest.holds(samples).mean() > 2 * share:
+            if largest is not None and mistake and largest.holds(every).mean() > 2 * share:
                 raise ObservationError(f"the largest plane in view is not level: {mistake} Or up is another direction")
         if segmentation.lies_better_as_range(frame, plane, samples, rng, up, self._above()):
             raise ObservationError("the depth is measured along the rays, a range: give it along the optical axis")
-        return plane
+        return plane if plane is None or up is None else self._under_the_object(frame, every, plane)
+
+    def _under_the_object(self, frame: Frame, samples: Samples, plane: Plane) -> Plane:
+        """That of the level planes in the first frame on which the object stands; one of them is given."""
+        planes = support.level_planes(samples, plane)
+        if len(planes) == 1 or self.known is not None:
+            return plane
+        if frame.mask is not None:
+            rows, columns = np.nonzero(frame.mask & (frame.depth > 0))
+            few = slice(None, None, max(1, len(rows) // MASK_POINTS))
+            return support.under_points(samples, planes, frame.positions(rows[few], columns[few])) or plane
+
+        walls = find_walls(samples, planes[-1], np.random.default_rng(0), self.point)
+        of_walls = np.zeros(len(samples.points), bool)
+        for wall in walls:
+            of_walls |= wall.height(samples.points) < samples.tolerance
+        side = frame.shape[1] / (samples.columns.max() + 1)
+        axis = frame.intrinsics[[1, 0], [2, 2]] / side
+        target = support.Target(axis, frame.shape[1] / side, self.point)
+        return support.aimed_at(samples, planes, of_walls, target)
 
     def _above(self) -> Float | None:
         """A point that is known to be above the support plane."""
@@ -264,7 +296,7 @@ class ObservedObject:
             mask = frame.mask
             if self.known is None:  # else its size does not hang on pixels at the edge
                 high = None if plane is None else frame.along(plane.normal, plane.offset) > STANDS * frame.depth
-                mask = trimmed(frame.depth, mask, high)
+                mask = trimmed(frame.depth, mask, noise, high)
                 above = mask if plane is None else mask & segmentation.above_plane(frame, plane, noise)
                 mask = above if 2 * above.sum() > mask.sum() else mask  # a plane may lie above what is hidden or flat
         elif self.known is not None:
@@ -286,6 +318,10 @@ class ObservedObject:
     def _on_the_plane(self, frame: Frame, axes: Float, plane: Plane, samples: Samples, noise: Noise) -> Found:
         earlier, cell = self.state.sightings, self.state.cell
         above = segmentation.above_plane(frame, plane, noise)
+        place = self._place()
+        walls = find_walls(samples, plane, np.random.default_rng(0), place)
+        free = before_walls(frame, walls, noise)
+        above &= free
         ground = plane.extent(samples) @ axes[:2].T
         if not cell:  # by the distance from the camera to the object
             camera, distance = frame.camera_to_world[:3, 3], 1.0
@@ -296,14 +332,18 @@ class ObservedObject:
             else:
                 points = sample(frame, above, noise).points
                 points = points[clusters.on_ground(points @ axes[:2].T, ground)]
-                distance = float(np.median(np.linalg.norm(points - camera, axis=1))) if len(points) else 1.0
+                points = points if len(points) else _ahead(frame)[None]
+                distance = float(np.median(np.linalg.norm(points - camera, axis=1)))
             cell = clusters.CELL * distance
         height = frame.along(plane.normal, plane.offset)
-        pieces = cut(frame.depth, above, height, noise)
-        foot = clusters.footprint(frame, pieces, axes, cell)
+        pieces = cut(frame.depth, above, height, noise, free if walls else None)
+        middle = axes[:2] @ (_ahead(frame) if place is None else place)
+        if place is None:  # what is far ahead, such as a wall, is no place on the plane
+            middle = np.clip(middle, ground.min(0), ground.max(0))
+        foot = clusters.footprint(frame, pieces, axes, cell, middle / cell)
         footprints = [*(s.footprint for s in earlier if s.footprint is not None), foot]
         labels, two = clusters.clusters(footprints, self.state.joins)
-        target = self._target(labels, footprints, ground / cell, axes[:2] / cell)
+        target = self._target(labels, footprints, ground / cell, axes[:2] / cell, frame.intrinsics[:2, 2])
         for now, s in zip(labels, (s for s in earlier if s.footprint is not None), strict=False):
             was = int(np.bincount(now[s.chosen], minlength=1).argmax())
             if was and not any(was in label and target in label for label in labels):  # another side of the object
@@ -312,7 +352,7 @@ class ObservedObject:
         chosen = labels[-1] == target
         mask = foot.pixels_of(chosen)
         if (labels[-1][~chosen] > 0).any():  # cells at the border may hold pixels of a neighbour
-            mask = trimmed(frame.depth, mask, height > STANDS * frame.depth)
+            mask = trimmed(frame.depth, mask, noise, height > STANDS * frame.depth)
         if target == 0 or mask.sum() < FEWEST:
             where = "of the object known so far" if earlier else "on the support plane"
             raise ObservationError(f"this frame shows nothing {where}: check its pose, or aim the camera at the object")
@@ -329,8 +369,16 @@ class ObservedObject:
         latest = replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)
         return [*sightings, latest], cell, bool(two[target])
 
-    def _target(self, labels: list[Index], footprints: list[Footprint], ground: Float, to_cells: Float) -> int:
-        """The object's label: by the point; else that of most cells that were the object's before; else the largest."""
+    def _place(self) -> Float | None:
+        """Where the object is known to be, (3,), world, metres: by the point that asks for it, or earlier frames."""
+        if self.point is not None:
+            return self.point
+        return None if self.state.frame is None else self.state.frame.centre
+
+    def _target(
+        self, labels: list[Index], footprints: list[Footprint], ground: Float, to_cells: Float, optical_axis: Float
+    ) -> int:
+        """The object's label: by the point; else that of most cells that were the object's before; else as aimed at."""
         if self.point is not None:
             asked, here = to_cells @ self.point, labels[-1]
             target = clusters.nearest(footprints, labels, asked)
@@ -348,7 +396,7 @@ class ObservedObject:
             return target
         if self.sightings:
             return clusters.nearest(footprints[-1:], labels[-1:], to_cells @ self.object_frame.centre)
-        return clusters.largest(footprints[-1], labels[-1], ground)
+        return clusters.central(footprints[-1], labels[-1], ground, optical_axis)
 
     def _sighting(self, frame: Frame, mask: Mask, plane: Plane | None, noise: Noise) -> Sighting:
         if mask.sum() < FEWEST:
@@ -356,6 +404,8 @@ class ObservedObject:
         part = within(mask, 2)
         corner, coarse = (part[0].start, part[1].start), max(1, max(mask[part].shape) // SIZE)
         facets = fit_facets(frame.depth[part], mask[part], frame.intrinsics, corner, self.denoise, coarse, noise)
+        if self.denoise and len(facets.planes):
+            facets = without_outliers(facets, noise, coarse)
         if len(facets.planes) * coarse**2 < FEWEST:
             raise ObservationError(TOO_LITTLE)
         pose = frame.camera_to_world
@@ -396,6 +446,17 @@ def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
     k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
     few = (slice(step // 2, None, step),) * 2
     return SceneView(sighting.frame.depth[few] / np.float32(radius), sighting.mask[few], pose, k)
+
+
+def _ahead(frame: Frame) -> Float:
+    """What the middle of the picture, or all of it, shows in the median, straight ahead, (3,), world, metres."""
+    height, width = frame.shape
+    down, across = height // AHEAD + 1, width // AHEAD + 1
+    depth = frame.depth[height // 2 - down : height // 2 + down, width // 2 - across : width // 2 + across]
+    if not depth.any():
+        depth = frame.depth
+    pose = frame.camera_to_world
+    return pose[:3, 3] + float(np.median(depth[depth > 0])) * pose[:3, 2]
 
 
 def _changed(foot: Footprint, old: Mask, new: Mask) -> bool:

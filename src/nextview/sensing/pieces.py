@@ -55,8 +55,23 @@ class Pieces:
     inside: Mask
 
 
-def cut(depth: NDArray[np.float32], above: Mask, height: NDArray[np.float32], noise: Noise) -> Pieces:
-    """Cut the pixels ``above`` a plane, (H, W) bool, of a depth image, metres, with their heights over it, metres."""
+def cut(
+    depth: NDArray[np.float32],
+    above: Mask,
+    height: NDArray[np.float32],
+    noise: Noise,
+    before_walls: Mask | None = None,
+) -> Pieces:
+    """Cut what is seen above a plane into pieces.
+
+    Args:
+        depth: metres, (H, W), 0 where nothing was measured.
+        above: the pixels that are above the plane, (H, W) bool.
+        height: of each pixel over the plane, metres, (H, W).
+        noise: of the depth.
+        before_walls: pixels that show no wall, (H, W) bool: others are seen through a hole, and are no bottom of one.
+            All by default.
+    """
     label, grown = np.zeros((2, *depth.shape), np.int32)
     part = within(above)
     if not above[part].size:
@@ -65,6 +80,8 @@ def cut(depth: NDArray[np.float32], above: Mask, height: NDArray[np.float32], no
     few = (slice(None, None, step),) * 2
     z, mask, high = depth[part][few], above[part][few], height[part][few]
     bottom = _bottoms(z, mask, high)
+    if before_walls is not None:
+        bottom &= before_walls[part][few]
     mask = mask | bottom
     inverse, usual = _smooth(z, mask), np.where(mask, z, 1).astype(np.float32)
     error = (2 * noise.at(usual) * usual).astype(np.float32)  # as a part of the distance

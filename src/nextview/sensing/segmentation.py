@@ -19,7 +19,10 @@ TILT = np.cos(np.radians(12.0))  # cosine of the lean of a support plane, at mos
 LEAST = 0.04  # share of what is seen that lies on a support plane, at least; more if gravity is not known
 LEAST_ALONE = 0.15
 RANGE = 1.05  # times as much of a frame lies on a plane as range, if it is range: narrow lenses hardly bend one
-SAMPLES = 1500  # pixels in which planes are searched
+SAMPLES = 1500  # blocks of pixels in which planes are searched
+STEEP_LAG = 2  # samples between two that tell how steep a surface is
+STEEP_RISE = 0.7  # rise of a steep surface, as a part of the way
+MOST_ALONE = 4.0  # times by which the mean over a block is more exact than a pixel, at most: the lens errs, too
 
 
 @dataclass(frozen=True)
@@ -32,15 +35,39 @@ class Samples:
     columns: NDArray[np.int64]
     camera: Float
 
+    def some(self, which: NDArray[np.bool_]) -> "Samples":
+        """Those of a choice, (N,) bool."""
+        return Samples(self.points[which], self.tolerance[which], self.rows[which], self.columns[which], self.camera)
+
 
 def sample(frame: Frame, pixels: NDArray[np.bool_], noise: Noise) -> Samples:
-    """Some of the given pixels, (H, W) bool, which all have a depth."""
-    step = max(1, int(np.sqrt(pixels.sum() / SAMPLES)))
-    first = step // 2
-    rows, columns = np.nonzero(pixels[first::step, first::step])
-    points = frame.positions(first + step * rows, first + step * columns)
-    z = frame.depth[first::step, first::step][rows, columns].astype(np.float64)
-    return Samples(points, 3 * noise.at(z) * z**2 + 0.003 * z, rows, columns, frame.camera_to_world[:3, 3])
+    """What blocks of the given pixels, (H, W) bool, which all have a depth, show in the mean.
+
+    The mean inverse depth of some pixels of a plane is that at the mean of their places in the picture, with less noise
+    than that of one. A block is left out where fewer than half of its pixels are given.
+    """
+    side = max(1, int(np.sqrt(pixels.sum() / SAMPLES)))
+    count = _block_sums(pixels.astype(np.float64), side)
+    rows, columns = np.nonzero(2 * count >= side**2)
+    count = count[rows, columns]
+
+    inverse = np.where(pixels, 1 / np.where(pixels, frame.depth, 1), 0)
+    ray_x, ray_y = frame.rays
+    z = count / _block_sums(inverse, side)[rows, columns]
+    x = _block_sums(pixels * ray_x[None, :], side)[rows, columns] / count
+    y = _block_sums(pixels * ray_y[:, None], side)[rows, columns] / count
+
+    pose = frame.camera_to_world
+    points = (np.stack([x, y, np.ones(len(z))], 1) * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
+    alone = np.clip(np.sqrt(count) / (2 * noise.grain + 1), 1, MOST_ALONE)  # root of how many err for themselves
+    return Samples(points, 3 * noise.at(z) * z**2 / alone + 0.003 * z, rows, columns, pose[:3, 3])
+
+
+def _block_sums(values: NDArray[np.floating], side: int) -> Float:
+    """Sums over squares of so many pixels; what is left over at the right and at the bottom is left out."""
+    height, width = (n // side for n in values.shape)
+    blocks = values[: height * side, : width * side].reshape(height, side, width, side)
+    return np.asarray(blocks.sum((1, 3), dtype=np.float64))
 
 
 @dataclass(frozen=True)
@@ -67,6 +94,22 @@ class Plane:
         grid[samples.rows, samples.columns] = on
         part = ndimage.label(grid)[0][samples.rows, samples.columns]
         return samples.points[on & (part == np.bincount(part[on]).argmax())]
+
+
+def steep(samples: Samples, up: Float) -> Mask:
+    """Which samples lie on a surface that rises steeply, by what is seen above or below them in the picture."""
+    upright = np.zeros(len(samples.points), bool)
+    if not len(upright):
+        return upright
+    grid = np.full((samples.rows.max() + 1 + STEEP_LAG, samples.columns.max() + 1), -1)
+    grid[samples.rows, samples.columns] = np.arange(len(samples.points))
+    lower = grid[samples.rows + STEEP_LAG, samples.columns]
+    pairs = np.stack([np.arange(len(lower)), lower], 1)[lower >= 0]
+    step = samples.points[pairs[:, 0]] - samples.points[pairs[:, 1]]
+    rising = np.abs(step @ up) > STEEP_RISE * np.linalg.norm(step, axis=1)
+
+    upright[pairs[rising].ravel()] = True
+    return upright
 
 
 def find_plane(samples: Samples, rng: Generator, up: Float | None = None, above: Float | None = None) -> Plane | None:
@@ -126,8 +169,25 @@ def lies_better_as_range(
     depth = along @ frame.camera_to_world[:3, 2]
     nearer = replace(samples, points=samples.camera + along * (depth / np.linalg.norm(along, axis=1))[:, None])
     other = find_plane(nearer, deepcopy(rng), up, above)
-    share = 0.0 if plane is None else plane.holds(samples).mean()
-    return other is not None and bool(other.holds(nearer).mean() > RANGE * share)
+    if other is None:
+        return False
+
+    # Two planes of one room may be found: each is refined for both readings of the depth, so that like is compared.
+    share = held = 0.0
+    for found, its_samples in ((plane, samples), (other, nearer)):
+        if found is None:
+            continue
+        on = found.holds(its_samples)
+        share = max(share, _share_held(samples, on, found.normal))
+        held = max(held, _share_held(nearer, on, found.normal))
+    return held > RANGE * share
+
+
+def _share_held(samples: Samples, on: NDArray[np.bool_], normal: Float) -> float:
+    """Share of the samples on the plane that fits some of them, (N,) bool, best."""
+    middle = np.median(samples.points[on] @ normal)
+    plane = refine_plane(Plane(normal, -float(middle)), samples, loose=2)
+    return float(refine_plane(plane, samples).holds(samples).mean())
 
 
 def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:

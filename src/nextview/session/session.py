@@ -94,7 +94,7 @@ class Session:
         start: where to look first; a camera that stands elsewhere is as welcome.
         stopping: when to stop; by default the rule that goes with the recogniser, see ``Stopping.of``.
         rng: for policies that draw; seed 0 by default.
-        object: which object to find in frames; the largest on the support plane by default.
+        object: which object to find in frames; by default the one at which the first camera is aimed.
         distance: of the camera from the object's centre, metres; ``sphere.distance`` object radii by default.
         unknown: share of objects of known classes that may be called unknown; 0: none.
 

@@ -65,7 +65,7 @@ class System:
         Args:
             start: where to look first, an index of ``sphere``; drawn by the seed if not given.
             seed: decides the first view and whatever the policy draws.
-            object: which object to find in the frames of a depth camera; the largest on the support plane by default.
+            object: which object to find in the frames of a depth camera; by default the one at which the first camera is aimed.
             distance: how far from the object the camera shall stand, metres; 3 object radii by default. With an object
                 or a distance the session takes frames, else what it is given first.
         """

@@ -1,0 +1,239 @@
+"""Which of the level planes in a frame the object stands on: the floor, the table, or a shelf.
+
+The largest level plane is not always the support. A monitor stands on a desk that shows less of itself than the floor;
+the mattress of a bed, or the seat of a sofa, is a level plane too, and a part of the object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError
+
+from nextview.sensing.segmentation import Plane, Samples, refine_plane, steep
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+LEAST_SHARE = 0.03  # share of all samples on a further level plane, at least
+MOST_PLANES = 5
+HEIGHTS_TRIED = 300
+PARALLEL = np.cos(np.radians(3.0))  # cosine of the angle up to which two planes are parallel, but for noise
+GROUND_WIDTH = 1.5  # distances of the camera from what it is aimed at: no object is so wide, so the plane is no part
+AIM = 0.12  # picture widths between the optical axis and what stands on a plane, at most, if the camera is aimed at it
+POINT_ASIDE = 0.08  # distances of the camera between the object's point and what stands on a plane, at most
+LARGEST_SHARE = 0.25  # area, seen from above, of what stands on a plane, as a part of the plane's
+WELL_INSIDE = 0.85  # what stands on a plane has its middle in the plane's outline, drawn together to so much of it
+LARGE_PART = 0.2  # samples of a part of a level surface, of those of its largest part: smaller ones are scraps
+LOWEST_THING = 0.015  # height of what stands on a plane, as a part of its distance, at least
+GROUND_STEP = 0.25  # the same of a level surface: at a grazing angle its samples lie far apart
+TOLD_APART = 0.5  # tolerance of samples that tell a plane from the next one, as a part of the height between them
+SURFACE_STEP = 0.04  # neighbouring samples of one surface differ by at most this part of their depth, and noise
+BOTTOM_SHARE = 0.04  # share of a mask's points that may lie lower than its bottom: noise
+BOTTOM_MARGIN = 0.02  # height over a plane of the bottom of what stands on it, as a part of the distance
+BOTTOM_ASIDE = 0.08  # from there, to the side, to where the plane is seen, at most, as a part of the distance
+
+
+def level_planes(samples: Samples, first: Plane) -> list[Plane]:
+    """All level planes of a frame that have some samples, with the first, the highest at the head.
+
+    Floors, tables and shelves are parallel, so the others are found by their height alone.
+
+    Args:
+        samples: of the frame.
+        first: the level plane with most samples.
+    """
+    height = first.height(samples.points)
+    left = ~steep(samples, first.normal) & (np.abs(height) > samples.tolerance)
+    wanted = max(LEAST_SHARE * len(height), 2)
+
+    planes = [first]
+    while len(planes) < MOST_PLANES and left.sum() >= wanted:
+        candidates = height[left][:: max(1, int(left.sum()) // HEIGHTS_TRIED)]
+        near = np.abs(height[left, None] - candidates) < samples.tolerance[left, None]
+        best = int(near.sum(0).argmax())
+        if near[:, best].sum() < wanted:
+            break
+        on = np.flatnonzero(left)[near[:, best]]
+        weight = 1 / samples.tolerance[on] ** 2
+        parallel = Plane(first.normal, first.offset - float(weight @ height[on] / weight.sum()))
+        better = refine_plane(parallel, samples.some(_only(on, len(height))), loose=2)
+        planes.append(better if better.normal @ first.normal > PARALLEL else parallel)
+        left &= np.abs(planes[-1].height(samples.points)) > 2 * samples.tolerance
+    return sorted(planes, key=lambda plane: plane.offset)
+
+
+def _only(chosen: Index, count: int) -> Mask:
+    """True at some of ``count`` places, (count,) bool."""
+    mask = np.zeros(count, bool)
+    mask[chosen] = True
+    return mask
+
+
+def under_points(samples: Samples, planes: list[Plane], points: Float) -> Plane | None:
+    """The highest of some planes that is seen beside the bottom of an object, whose surface shows some points, (N, 3).
+
+    None where no plane is seen there: the bottom is hidden, or the object hangs in the air.
+    """
+    away = float(np.median(np.linalg.norm(points - samples.camera, axis=1)))
+    for plane in planes:
+        height = plane.height(points)
+        bottom = float(np.quantile(height, BOTTOM_SHARE))
+        margin = BOTTOM_MARGIN * away + float(np.median(samples.tolerance))
+        if abs(bottom) > margin:
+            continue
+        low = points[height < bottom + margin]
+        on = samples.points[plane.holds(samples)]
+        if not len(on):
+            continue
+        aside = _in_plane(on, plane)[:, None] - _in_plane(low[:: max(1, len(low) // 100)], plane)
+        if np.linalg.norm(aside, axis=2).min() < BOTTOM_ASIDE * away:
+            return plane
+    return None
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where the object is looked for, in the grid of samples and in space.
+
+    Attributes:
+        axis: row and column of the optical axis in the grid of samples, (2,).
+        width: of the picture, in columns of that grid.
+        place: where the object is, (3,), world, metres; None for what the camera is aimed at.
+    """
+
+    axis: Float
+    width: float
+    place: Float | None
+
+    def off(self, samples: Samples, plane: Plane) -> Float:
+        """How far each sample lies from there, (N,): 1 is as far as the object may be off."""
+        if self.place is None:
+            pixels = np.hypot(samples.rows - self.axis[0], samples.columns - self.axis[1])
+            return np.asarray(pixels / (AIM * self.width))
+        aside = _in_plane(samples.points, plane) - _in_plane(self.place[None], plane)
+        return np.asarray(np.linalg.norm(aside, axis=1) / (POINT_ASIDE * np.linalg.norm(self.place - samples.camera)))
+
+
+def aimed_at(samples: Samples, planes: list[Plane], in_the_way: Mask, target: Target) -> Plane:
+    """The support plane of what the camera is aimed at, or of what stands at a place.
+
+    From the highest plane down, the first is taken that carries something there; the lowest where none does.
+
+    Args:
+        samples: of the frame.
+        planes: level planes, the highest first.
+        in_the_way: which samples are of no object, such as walls, (N,) bool.
+        target: where the object is looked for.
+    """
+    level = ~in_the_way & ~steep(samples, planes[0].normal)
+    for plane, lower in pairwise(planes):
+        exact = samples.tolerance < TOLD_APART * np.abs(lower.height(samples.points) - plane.height(samples.points))
+        if _carries(samples, plane, level & exact, ~in_the_way, target):
+            return plane
+    return planes[-1]
+
+
+def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Target) -> bool:
+    """Whether a plane carries what the camera is aimed at, or what stands at a place; it is no part of it."""
+    on = plane.holds(samples) & level
+    if on.sum() < 3:
+        return False
+    off = target.off(samples, plane)
+    surface = _surfaces(samples, on, GROUND_STEP)
+    size = np.bincount(surface, on)
+    large = on & (size[surface] > LARGE_PART * size.max())
+    ground = _in_plane(samples.points[surface == surface[np.where(large, off, np.inf).argmin()]], plane)
+    try:
+        outline = ConvexHull(ground)
+    except (QhullError, ValueError):  # too few points, or all in a line
+        return False
+
+    nearest = samples.points[off.argmin()] if target.place is None else target.place
+    away = float(np.linalg.norm(nearest - samples.camera))
+    wide = bool(np.linalg.norm(np.ptp(ground[outline.vertices], 0)) > GROUND_WIDTH * away)
+    if target.place is not None and plane.height(target.place) < (-1 if wide else 1) * np.median(samples.tolerance):
+        return False
+
+    above = (plane.height(samples.points) > samples.tolerance) & free
+    thing = _thing_there(samples, above, off)
+    if thing is None or plane.height(samples.points[thing]).max() < LOWEST_THING * away:
+        return wide
+    return _stands_within(samples, plane, thing, outline) and not _goes_on_below(samples, plane, thing)
+
+
+def _thing_there(samples: Samples, above: Mask, off: Float) -> Index | None:
+    """The samples of the surface above a plane that is nearest to where the object is looked for; None if none is."""
+    if not above.any():
+        return None
+    group = _surfaces(samples, above)
+    off = np.where(above, off, np.inf)
+    nearest = int(off.argmin())
+    return np.flatnonzero(group == group[nearest]) if off[nearest] < 1 else None
+
+
+def _surfaces(samples: Samples, chosen: Mask, step: float = SURFACE_STEP) -> Index:
+    """The number of the surface of each chosen sample, (N,), 0 for others: of one are neighbours in the grid.
+
+    Their depths differ by at most so large a part, and noise.
+    """
+    depth = np.linalg.norm(samples.points - samples.camera, axis=1)
+    grid = np.full((samples.rows.max() + 2, samples.columns.max() + 2), -1)
+    at = np.flatnonzero(chosen)
+    grid[samples.rows[at], samples.columns[at]] = at
+    links = []
+    for down, right in ((0, 1), (1, 0)):
+        other = grid[samples.rows[at] + down, samples.columns[at] + right]
+        one, other = at[other >= 0], other[other >= 0]
+        limit = step * depth[one] + samples.tolerance[one]
+        joined = np.abs(depth[one] - depth[other]) < limit
+        links.append(np.stack([one[joined], other[joined]]))
+    return _components(len(depth), np.concatenate(links, 1), at)
+
+
+def _components(count: int, links: Index, nodes: Index) -> Index:
+    """The connected component of some of ``count`` nodes, (count,), 1 and more; 0 for the others."""
+    graph = coo_array((np.ones(links.shape[1], bool), (links[0], links[1])), shape=(count, count))
+    group = np.zeros(count, np.int64)
+    group[nodes] = connected_components(graph, directed=False)[1][nodes] + 1
+    return group
+
+
+def _stands_within(samples: Samples, plane: Plane, thing: Index, outline: ConvexHull) -> bool:
+    """Whether a thing covers a smaller part of the plane, away from its outline: no back of a sofa on its seat."""
+    shown = _in_plane(samples.points[thing], plane)
+    middle = outline.points[outline.vertices].mean(0)
+    centre = middle + (np.median(shown, 0) - middle) / WELL_INSIDE
+    inside = bool((outline.equations[:, :2] @ centre + outline.equations[:, 2] <= 0).all())
+    try:
+        area = float(ConvexHull(shown).volume) if len(shown) > 2 else 0.0
+    except QhullError:
+        area = 0.0
+    return inside and area < LARGEST_SHARE * float(outline.volume)
+
+
+def _goes_on_below(samples: Samples, plane: Plane, thing: Index) -> bool:
+    """Whether the surface of a thing goes on below the plane more often than it ends on it."""
+    height = plane.height(samples.points)
+    depth = np.linalg.norm(samples.points - samples.camera, axis=1)
+    grid = np.full((samples.rows.max() + 2, samples.columns.max() + 1), -1)
+    grid[samples.rows, samples.columns] = np.arange(len(height))
+    beneath = grid[samples.rows[thing] + 1, samples.columns[thing]]
+    one, other = thing[beneath >= 0], beneath[beneath >= 0]
+    same = np.abs(depth[one] - depth[other]) < SURFACE_STEP * depth[one] + samples.tolerance[one]
+    on = np.abs(height[other]) < samples.tolerance[other]
+    below = (height[other] < -samples.tolerance[other]) & same
+    return bool(below.sum() > on.sum())
+
+
+def _in_plane(points: Float, plane: Plane) -> Float:
+    """Coordinates of points, (N, 3), along a level plane, (N, 2), metres."""
+    first = np.cross(plane.normal, np.eye(3)[np.abs(plane.normal).argmin()])
+    first /= np.linalg.norm(first)
+    return points @ np.stack([first, np.cross(plane.normal, first)], 1)

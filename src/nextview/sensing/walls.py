@@ -1,0 +1,175 @@
+"""Walls of a room: upright planes that end the scene and are no part of any object.
+
+A wall is found among what rises above the support plane. Seen from above an upright plane is a line, so the search is
+a RANSAC for lines (Fischler and Bolles 1981). An object has upright sides, too: a wall is wider than an object,
+goes on to the edge of the picture, and has next to nothing behind it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from nextview.sensing.facets import Noise
+from nextview.sensing.frame import Frame
+from nextview.sensing.segmentation import Plane, Samples, steep
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LINE_TRIALS = 150  # lines that are tried for each wall
+MOST_LINES = 6  # upright planes that are looked at, the largest first
+FEWEST_SAMPLES = 0.02  # share of all samples that lie on a wall, at least
+WIDE = 1.5  # metres: an upright plane that reaches a side of the picture and is as wide is a wall
+WIDEST = 3.0  # metres: no object is so wide
+WIDE_SHARE = 0.8  # share of the columns of the picture over which a narrower wall extends, from side to side
+SIDE_CELLS = 1  # columns of the grid of samples that count as the side of the picture
+MOST_BEHIND = 0.1  # samples behind a wall, as a part of those on it, at most: flying pixels and doors ajar
+PARALLEL = np.cos(np.radians(25.0))  # cosine of the angle up to which two walls are parallel
+COARSE_WIDTH = 320  # columns of the picture in which pixels are compared with walls
+MEAN_SIDE = 3  # pixels of that picture across the square over which the distance from a wall is averaged
+WALL_NOISE = 2.0  # standard deviations of one pixel up to which a mean is on the wall
+WALL_ERROR = 0.006  # distance from a wall up to which a pixel is on it without noise, as a part of its depth
+CAMERA_BEHIND = 0.1  # how far behind a wall noise may put the camera, as a part of the distance of what it sees
+CORNER_GAP = 0.05  # from the next wall to a sample of a wall that meets it, as a part of its distance, at most
+NEAREST_TO_PLACE = 0.02  # metres that the place of an object lies before a wall, at least
+
+
+def find_walls(samples: Samples, plane: Plane, rng: Generator, place: Float | None = None) -> list[Plane]:
+    """Find the walls in a frame, as planes whose normals point into the room.
+
+    Args:
+        samples: of the whole frame.
+        plane: the support plane.
+        rng: draws the lines that are tried.
+        place: where the object is known to be, (3,), world, metres: it lies before every wall.
+
+    Returns:
+        The walls, the one with most samples first. Empty where there are none.
+    """
+    up = plane.normal
+    above = plane.height(samples.points) > samples.tolerance
+    left = np.flatnonzero(above & steep(samples, up))
+    wanted = max(FEWEST_SAMPLES * len(samples.points), 2)
+
+    walls: list[Plane] = []
+    for _ in range(MOST_LINES):
+        if len(left) < wanted:
+            break
+        upright = _largest_upright_plane(samples, left, up, rng)
+        if upright is None:
+            break
+
+        on = np.abs(upright.height(samples.points[left])) < samples.tolerance[left]
+        if on.sum() < wanted:
+            break
+        if _is_wall(samples, upright, left[on], up, walls, place) and not _hides_much(
+            samples, upright, walls, on.sum()
+        ):
+            walls.append(upright)
+        left = left[~on]
+    return walls
+
+
+def before_walls(frame: Frame, walls: Sequence[Plane], noise: Noise) -> Mask:
+    """Pixels that are farther before every wall than the noise of the frame explains, (H, W) bool.
+
+    At some metres the noise of a pixel is as deep as a thing that stands against the wall. So what counts is the mean
+    over the pixels around each, in a coarser picture; beside a thing that is off the wall, and the pixel is not.
+    """
+    if not walls:
+        return np.ones(frame.shape, bool)
+    step = max(1, round(frame.shape[1] / COARSE_WIDTH))
+    few = (slice(None, None, step), slice(None, None, step))
+    depth = frame.depth[few]
+    known = (depth > 0).astype(np.float32)
+    share = np.maximum(ndimage.uniform_filter(known, MEAN_SIDE, mode="constant"), np.float32(1e-6))
+    deviation = (noise.at(depth) * depth**2).astype(np.float32)
+
+    before = known > 0
+    for wall in walls:
+        # Noise moves a point along its ray: it comes nearer to the wall by so much as the ray does.
+        distance = frame.along(wall.normal, wall.offset)[few]
+        camera = float(wall.normal @ frame.camera_to_world[:3, 3] + wall.offset)
+        slope = np.abs(distance - np.float32(camera)) / np.maximum(depth, np.float32(1e-6))
+        mean = ndimage.uniform_filter(distance * known, MEAN_SIDE, mode="constant") / share
+        noise_there = deviation * slope
+        error = np.float32(WALL_ERROR) * depth
+        before &= (mean > WALL_NOISE * noise_there + error) & (distance > noise_there + error)
+    return np.repeat(np.repeat(before, step, 0), step, 1)[: frame.shape[0], : frame.shape[1]]
+
+
+def _largest_upright_plane(samples: Samples, chosen: NDArray[np.int64], up: Float, rng: Generator) -> Plane | None:
+    """The upright plane with most of the chosen samples on it, its normal to the side where most is seen."""
+    points, tolerance = samples.points[chosen], samples.tolerance[chosen]
+    one, other = points[rng.integers(len(points), size=(2, LINE_TRIALS))]
+    normals = np.cross(other - one, up)
+    length = np.linalg.norm(normals, axis=1)
+    possible = length > 1e-9
+    if not possible.any():
+        return None
+    normals = normals[possible] / length[possible, None]
+    offsets = -(normals * one[possible]).sum(1)
+
+    on = np.abs(points @ normals.T + offsets) < tolerance[:, None]
+    best = int(on.sum(0).argmax())
+    plane = _refined(points, tolerance, normals[best], on[:, best], up)
+    distance = plane.height(samples.points)  # a camera that looks along a wall may stand on either side by noise
+    off = np.abs(distance) > samples.tolerance
+    facing = 1.0 if np.sign(distance[off]).sum() >= 0 else -1.0
+    return Plane(facing * plane.normal, facing * plane.offset)
+
+
+def _refined(points: Float, tolerance: Float, normal: Float, on: Mask, up: Float) -> Plane:
+    """The upright plane of least squares through some points, weighted by how exact each is."""
+    weight = 1 / tolerance[on] ** 2
+    centre = weight @ points[on] / weight.sum()
+    spread = points[on] - centre
+    along = np.cross(up, normal)
+    across = np.stack([spread @ along, spread @ normal], 1)
+    vectors = np.linalg.eigh((weight[:, None] * across).T @ across)[1]
+    better = vectors[0, 0] * along + vectors[1, 0] * normal
+    better /= np.linalg.norm(better)
+    return Plane(better, float(-better @ centre))
+
+
+def _is_wall(
+    samples: Samples,
+    upright: Plane,
+    on: NDArray[np.int64],
+    up: Float,
+    walls: Sequence[Plane],
+    place: Float | None,
+) -> bool:
+    """Whether an upright plane with some samples on it is as wide as a wall and goes on to the picture's edge."""
+    if place is not None and upright.height(place) < NEAREST_TO_PLACE:
+        return False
+    away = float(np.median(np.linalg.norm(samples.points[on] - samples.camera, axis=1)))
+    if upright.height(samples.camera) < -CAMERA_BEHIND * away:
+        return False
+
+    first, last = samples.columns.min() + SIDE_CELLS, samples.columns.max() - SIDE_CELLS
+    columns = samples.columns[on]
+    at_left, at_right = columns.min() <= first, columns.max() >= last
+    along = samples.points[on] @ np.cross(up, upright.normal)
+    width = float(np.ptp(along))
+
+    from_side_to_side = at_left and at_right and len(np.unique(columns)) >= WIDE_SHARE * (last - first)
+    to_the_top = samples.rows[on].min() <= samples.rows.min() + SIDE_CELLS
+    gap = CORNER_GAP * away + float(np.median(samples.tolerance[on]))
+    in_corner = to_the_top and any((np.abs(wall.height(samples.points[on])) < gap).any() for wall in walls)
+    wide = width > WIDE or in_corner
+    return bool(width > WIDEST or (wide and (at_left or at_right)) or from_side_to_side)
+
+
+def _hides_much(samples: Samples, upright: Plane, walls: Sequence[Plane], many: int) -> bool:
+    """Whether much more is seen behind an upright plane than flying pixels, walls across it left out."""
+    behind = upright.height(samples.points) < -2 * samples.tolerance
+    for wall in walls:
+        if abs(wall.normal @ upright.normal) < PARALLEL:
+            behind &= np.abs(wall.height(samples.points)) > samples.tolerance
+    return bool(behind.sum() > MOST_BEHIND * many)

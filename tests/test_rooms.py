@@ -1,0 +1,235 @@
+"""Finding an object in a room: walls, support planes, what stands aside or far behind, and flying pixels."""
+
+import numpy as np
+import pytest
+import trimesh
+from pipeline import INTRINSICS, SHAPE, TABLE, box, cast, meshed, pose_at
+
+from nextview.data.samples import sample_mesh
+from nextview.errors import ObservationError
+from nextview.geometry.viewsphere import look_at_origin
+from nextview.sensing import Frame, ObservedObject, clusters
+from nextview.sensing.facets import Noise, fit_facets
+from nextview.sensing.object_frame import enclose
+from nextview.sensing.outliers import without_outliers
+from nextview.sensing.segmentation import Plane, sample
+from nextview.sensing.walls import before_walls, find_walls
+
+UP = np.array([0, 0, 1.0])
+EXACT = Noise(np.ones(1), np.zeros(1))
+FLOOR = box((12, 12, 0.02), (0, 0, -0.01))
+FAR_WALL = box((0.02, 12, 3), (-3.0, 0, 1.4))
+NEAR_WALL = box((0.02, 12, 3), (-0.5, 0, 1.4))
+SIDE_WALL = box((12, 0.02, 3), (0, 1.2, 1.4))
+SLANTED_WALL = box((0.02, 14, 3)).apply_transform(trimesh.transformations.rotation_matrix(0.6, UP, (0, 0, 0)))
+SLANTED_WALL.apply_translation((-2.5, 0, 1.4))
+CRATE = box((0.4, 0.4, 0.4), (0.2, 0.9, 0.2))
+
+
+def sample_of_size(name: str, height: float, at=(0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    mesh = sample_mesh(name)
+    vertices = mesh.vertices * height / np.ptp(mesh.vertices[:, 2])
+    vertices = vertices - [0, 0, vertices[:, 2].min()] + at
+    return trimesh.Trimesh(vertices, mesh.faces, process=False)
+
+
+CHAIR = sample_of_size("chair", 0.9)
+CUPBOARD = box((0.4, 1.2, 0.9), (0, 0, 0.45))
+DESK = trimesh.util.concatenate(
+    [box((0.8, 1.5, 0.04), (0, 0, 0.7))]
+    + [box((0.05, 0.05, 0.68), (x, y, 0.34)) for x in (-0.35, 0.35) for y in (-0.7, 0.7)]
+)
+MONITOR = sample_of_size("monitor", 0.45, (0, 0.1, 0.72))
+BED = trimesh.util.concatenate([box((2.0, 1.5, 0.45), (0, 0, 0.225)), box((0.06, 1.5, 0.5), (-1.0, 0, 0.7))])
+SOFA = trimesh.util.concatenate(
+    [box((0.9, 1.8, 0.4), (0, 0, 0.2)), box((0.2, 1.8, 0.45), (-0.35, 0, 0.62))]
+    + [box((0.9, 0.2, 0.25), (0, y, 0.52)) for y in (-0.8, 0.8)]
+)
+
+
+def frame(meshes, pose, seed=0, sigma=0.003, mask_of=None, wide=0) -> Frame:
+    """A frame whose noise grows with the square of the distance: ``sigma`` metres at one metre."""
+    depth, which = cast(meshes, pose)
+    rng = np.random.default_rng(seed)
+    noisy = depth + sigma * depth**2 * rng.normal(size=SHAPE)
+    noisy[rng.random(SHAPE) < 0.02] = 0
+    mask = None
+    if mask_of is not None:
+        mask = which == mask_of
+        for _ in range(wide):
+            mask = mask | np.roll(mask, 1, 0) | np.roll(mask, -1, 0) | np.roll(mask, 1, 1) | np.roll(mask, -1, 1)
+    return Frame(np.where(depth > 0, noisy, 0), INTRINSICS, pose, mask=mask, pixel_centre=0.5)
+
+
+def assert_is(thing: ObservedObject, mesh: trimesh.Trimesh, radius=0.15) -> None:
+    true = meshed(mesh)
+    assert thing.object_frame.radius == pytest.approx(true.radius, rel=radius)
+    assert np.linalg.norm(thing.object_frame.centre - true.centre) < 0.35 * true.radius
+
+
+def middle_of(mesh: trimesh.Trimesh) -> np.ndarray:
+    return mesh.bounds.mean(0)
+
+
+# Walls
+
+
+ROOMS = {
+    "far": [FAR_WALL],
+    "near": [NEAR_WALL],
+    "corner": [NEAR_WALL, SIDE_WALL],
+    "slanted": [SLANTED_WALL],
+    "none": [],
+}
+
+
+@pytest.mark.parametrize("asked", ["aim", "point"])
+@pytest.mark.parametrize("walls", ROOMS)
+@pytest.mark.parametrize("mesh", [CHAIR, CUPBOARD], ids=["chair", "cupboard"])
+def test_what_stands_in_a_room_is_found_without_its_walls(mesh, walls, asked):
+    pose = pose_at(15, -30, 2.6, middle_of(mesh))
+    scene = [mesh, FLOOR, *ROOMS[walls], CRATE]
+    thing = ObservedObject(point=middle_of(mesh) if asked == "point" else None)
+    thing.add(frame(scene, pose))
+    assert_is(thing, mesh)
+    _, which = cast(scene, pose)
+    assert (which == 0)[thing.sightings[0].mask].mean() > 0.95
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.003, 0.008])
+@pytest.mark.parametrize("walls", ROOMS)
+def test_walls_are_found_and_no_side_of_a_cupboard_is_one(walls, sigma):
+    pose = pose_at(12, 20, 2.4, middle_of(CUPBOARD))
+    seen = frame([CUPBOARD, FLOOR, *ROOMS[walls]], pose, sigma=sigma)
+    _, which = cast([CUPBOARD, FLOOR, *ROOMS[walls]], pose)
+    noise = Noise(np.array([1.0]), np.array([sigma]))
+    samples = sample(seen, seen.depth > 0, noise)
+    found = find_walls(samples, Plane(UP, 0.0), np.random.default_rng(0))
+    before = before_walls(seen, found, noise) & (seen.depth > 0)
+    assert before[which >= 2].sum() <= 0.03 * (which >= 2).sum()
+    assert before[(which == 0) & (seen.depth > 0)].mean() > 0.8
+    assert len(found) == sum((which == 2 + k).mean() > 0.03 for k in range(len(ROOMS[walls])))
+
+
+def test_a_front_that_fills_the_picture_is_no_wall_where_the_object_is_behind_it():
+    front = box((0.5, 3.2, 2.2), (-0.25, 0, 1.1))
+    pose = pose_at(0, 0, 1.2, (0, 0, 0.6))
+    seen = frame([front, FLOOR], pose)
+    samples = sample(seen, seen.depth > 0, EXACT)
+    assert len(find_walls(samples, Plane(UP, 0.0), np.random.default_rng(0))) == 1
+    assert not find_walls(samples, Plane(UP, 0.0), np.random.default_rng(0), place=middle_of(front))
+
+
+@pytest.mark.parametrize("asked", ["aim", "point"])
+@pytest.mark.parametrize("behind", [1.5, 3.0, 6.0])
+@pytest.mark.parametrize("elevation", [10, 25])
+def test_what_is_far_behind_a_table_does_not_draw_the_eye(elevation, behind, asked):
+    mug = box((0.08, 0.08, 0.1), (0.1, 0, 0.05))
+    clutter = [box((0.02, 3, 2), (-behind, 0, 0.2)), box((0.3, 0.5, 0.8), (-behind + 0.4, 0.3, -0.1))]
+    thing = ObservedObject(point=middle_of(mug) if asked == "point" else None)
+    pose = pose_at(elevation, 35, 0.5, middle_of(mug))
+    thing.add(frame([mug, box((0.9, 1.2, 0.04), (0, 0, -0.02)), *clutter], pose))
+    assert_is(thing, mug)
+    turned = pose_at(elevation, 80, 0.5, middle_of(mug))
+    thing.add(frame([mug, box((0.9, 1.2, 0.04), (0, 0, -0.02)), *clutter], turned))
+    assert_is(thing, mug)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_what_the_camera_is_aimed_at_comes_before_what_is_larger(side):
+    mug = box((0.08, 0.08, 0.1), (0, 0, 0.05))
+    carton = box((0.2, 0.2, 0.25), (0, 0.28 * side, 0.125))
+    thing = ObservedObject()
+    thing.add(frame([mug, carton, TABLE], pose_at(30, 0, 0.6, (0, 0.01, 0.06))))
+    assert_is(thing, mug)
+
+
+# The support plane
+
+
+@pytest.mark.parametrize("asked", ["mask", "wide mask", "point", "aim"])
+@pytest.mark.parametrize("elevation", [8, 20])
+def test_a_monitor_stands_on_its_desk(asked, elevation):
+    target = middle_of(MONITOR)
+    thing = ObservedObject(point=target if asked == "point" else None)
+    by_mask = 0 if "mask" in asked else None
+    seen = frame([MONITOR, DESK, FLOOR, FAR_WALL], pose_at(elevation, 15, 2.0, target), mask_of=by_mask, wide=2)
+    thing.add(seen)
+    assert_is(thing, MONITOR, radius=0.2)
+
+
+@pytest.mark.parametrize("asked", ["mask", "point", "aim"])
+@pytest.mark.parametrize("mesh", [BED, SOFA, DESK], ids=["bed", "sofa", "desk"])
+@pytest.mark.parametrize("azimuth", [10, 50])
+def test_a_level_part_of_the_object_is_not_its_support(mesh, asked, azimuth):
+    target = middle_of(mesh)
+    thing = ObservedObject(point=target if asked == "point" else None)
+    scene = [mesh, FLOOR, box((0.02, 12, 3), (-1.6, 0, 1.4))]
+    thing.add(frame(scene, pose_at(18, azimuth, 3.2, target), mask_of=0 if asked == "mask" else None))
+    assert_is(thing, mesh)
+
+
+# Extent
+
+
+@pytest.mark.parametrize("flying", [0, 1, 4, 40])
+def test_flying_pixels_say_nothing_of_the_size(flying):
+    ball = trimesh.creation.icosphere(3, 0.04).apply_translation((0, 0, 0.04))
+    pose = pose_at(35, 0, 0.6, (0, 0, 0.04))
+    depth, which = cast([ball, TABLE], pose)
+    mask = which == 0
+    clean = radius_of(fit_facets(depth, mask, INTRINSICS, denoise=False), pose)
+    rows, columns = np.nonzero(mask)
+    rng = np.random.default_rng(2)
+    chosen = rng.choice(len(rows), flying, replace=False)
+    depth[rows[chosen], columns[chosen]] += rng.uniform(0.03, 0.4, flying).astype(np.float32)
+    facets = fit_facets(depth, mask, INTRINSICS, denoise=False)
+    assert radius_of(without_outliers(facets, EXACT, 1), pose) == pytest.approx(clean, rel=0.03)
+
+
+def radius_of(facets, pose) -> float:
+    return enclose(facets.points @ pose[:3, :3].T + pose[:3, 3], np.eye(3), 0.0).radius
+
+
+@pytest.mark.parametrize("thick", [2, 3, 8])
+def test_thin_things_keep_their_length(thick):
+    depth = np.full((200, 300), 0.6, np.float32)
+    mask = np.zeros(depth.shape, bool)
+    mask[100 : 100 + thick, 40:260] = True
+    depth[mask] = np.broadcast_to(np.linspace(0.45, 0.55, 300, dtype=np.float32), depth.shape)[mask]
+    facets = fit_facets(depth, mask, INTRINSICS, denoise=False)
+    kept = without_outliers(facets, EXACT, 1)
+    assert np.ptp(kept.columns) == np.ptp(facets.columns)
+
+
+def test_a_second_look_does_not_make_an_object_of_another_order_of_size(monkeypatch):
+    """All on the table would count as one where what touches is joined, and the score would prefer it."""
+    parted = clusters.clusters
+
+    def all_as_one(footprints, joins="by their border"):
+        labels, two = parted(footprints, joins)
+        return ([np.minimum(label, 1) for label in labels] if joins == "always" else labels), two
+
+    monkeypatch.setattr(clusters, "clusters", all_as_one)
+    thing = ObservedObject()
+    blocks = [box((0.1, 0.1, 0.1), (0, y, 0.05)) for y in (0, -0.3, 0.3)]
+    thing.add(frame([*blocks, TABLE], pose_at(35, 20, 1.0, (0, 0, 0.05)), sigma=0.001))
+    before = thing.object_frame.radius
+    assert "always" in thing.other_joins()
+    thing.reconsider(lambda seen: -100 * seen[0].radius)
+    assert thing.object_frame.radius == before < 0.1
+
+
+@pytest.mark.parametrize("mesh", [BED, SOFA, DESK, CUPBOARD], ids=["bed", "sofa", "desk", "cupboard"])
+@pytest.mark.parametrize("sigma", [0.001, 0.008])
+def test_depth_is_told_from_range_in_a_room(mesh, sigma):
+    target = middle_of(mesh)
+    pose = pose_at(20, 25, 2.6, target)
+    right = frame([mesh, FLOOR, FAR_WALL], pose, sigma=sigma)
+    ObservedObject().add(right)
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]] + 0.5
+    rays = np.stack([column, row, np.ones(SHAPE)], -1) @ np.linalg.inv(INTRINSICS).T
+    floor = frame([FLOOR], look_at_origin(np.radians(60), 0, 1.5), sigma=0.001)
+    range_image = floor.depth * np.linalg.norm(rays, axis=-1)
+    with pytest.raises(ObservationError, match="a range"):
+        ObservedObject().add(Frame(range_image.astype(np.float32), INTRINSICS, floor.pose, pixel_centre=0.5))
