@@ -1,0 +1,280 @@
+"""Run every command that the pages show, on small inputs made here: a command that no machine runs is wrong some day.
+
+    python workflow/documented_commands.py [PAGE ...] [--only-list]
+
+Takes README.md, docs/*.md and research/README.md apart into commands and Python blocks, and runs them page by page, in
+the order of the page, each page in a folder of its own with what its commands need: a few box meshes under the names of
+ModelNet10, a store of their views and predictions. ``SMALL`` makes a command quick; ``NOT_RUN`` says what is not run,
+and why. What fails is printed with the end of its output, and the exit status is 1.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+import tyro
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
+
+PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")), "research/README.md")
+PROGRAMS = ("nextview", "python", "make", "pip", "rerun", "dask", "ros2", "rosdep", "colcon", "for", "pytest")
+LIMIT = 900  # seconds for one command
+
+NOT_RUN = {  # commands by how they begin, or what is in them; the reason
+    r"^make (test|lint|docs)": "a job of its own in CI",
+    r"^make ": "the workflow is run by tests/test_workflow.py",
+    r"^(pip|python3 -m pip) ": "installs; tests/test_wheel.py installs the wheel with each extra",
+    r"^nextview download": "473 MB from a server of others; tests/test_download.py has a server of its own",
+    r"^nextview explore": "serves until it is stopped; tests/test_explore_page.py clicks through the page",
+    r"^rerun ": "opens a window",
+    r"^dask ": "serves until it is stopped; tests/test_render.py has a cluster of its own",
+    r"--scheduler": "needs the scheduler of the line before",
+    r"^(ros2|rosdep|colcon|cp -r ros2|cd |source )": "needs ROS 2; tests/test_ros2.py tries the node with stand-ins",
+    r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
+    r"research\.(film|real_things|touching_things|growth)": "needs the YCB scans, and minutes",
+    r"research\.(train_grid|thing_features)": "trains for hours",
+    r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
+    r"benchmarks/(render|replay|latency|session_latency)\.py": "measures time, on a quiet machine",
+    r"benchmarks/reproduction\.py|workflow/": "part of make reproduce",
+    r"docs/site/explorer_pictures\.py": "needs a Chromium",
+    r"research/tests": "they are in make test",
+    r"agents/(ppo|mvselect)\.json .*agents/": "needs two agents of a million steps each",
+}
+SMALL = {  # options that make a command quick
+    "nextview render": "--size 112 --workers 1",
+    "nextview predict": "--workers 1",
+    "nextview measure": "--workers 1",
+    "nextview learn": "--workers 1",
+    "nextview scenes": "--scenes 1 --levels light --workers 1",
+    "nextview train recogniser": "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
+    "nextview train map": "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
+    "nextview train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
+    "nextview fit calibration": "--delta 0.2",
+    "nextview benchmark": "--runs 2 --samples 100",
+    "python -m research.train_agent": "--steps 2000",
+    "python -m research.measure": "--workers 1",
+    "python -m research.plan": "--workers 1",
+    "python benchmarks/views.py": "--runs 2",
+    "python benchmarks/things.py": "--runs 1",
+}
+FEWER = {  # what a page says of the published runs, and how many it is here
+    r"--scenes \d+": "--scenes 1",
+    r"--objects \d+": "--objects 2",
+    r"--runs \d+": "--runs 2",
+    r"--epochs \d+": "--epochs 1",
+    r"--views-per-object \d+": "--views-per-object 2",
+    r"--batch \d+": "--batch 8",
+}
+BEFORE = {  # what Python blocks of a page take for granted
+    "docs/your_camera.md": "from stand_ins import arm, intrinsics, np",
+    "docs/see_it.md": "import nextview",
+}
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command or a Python block of a page.
+
+    Attributes:
+        page: its path in the repository.
+        line: where it begins, counted from 1.
+        text: as it stands there, without comments of a shell.
+        python: whether it is a block of Python.
+    """
+
+    page: str
+    line: int
+    text: str
+    python: bool = False
+
+    @property
+    def why_not(self) -> str | None:
+        """Why it is not run; None if it is."""
+        if self.python:
+            return None
+        return next((why for pattern, why in NOT_RUN.items() if re.search(pattern, self.text)), None)
+
+    @property
+    def command(self) -> str:
+        """What is run: with the options that make it quick, unless the page gives them itself."""
+        text = self.text
+        for pattern, fewer in FEWER.items():
+            text = re.sub(pattern, fewer, text)
+        if "--help" in text:
+            return text
+        for begin, options in SMALL.items():
+            if text.startswith(f"{begin} "):
+                words = options.split()
+                pairs = zip(words[::2], words[1::2], strict=True)
+                text = " ".join([text, *(f"{name} {value}" for name, value in pairs if name not in text)])
+        return text
+
+
+def steps_of(page: str) -> Iterator[Step]:
+    """The commands and Python blocks of a page, in order; blocks of doctest are run by the tests."""
+    lines = (ROOT / page).read_text(encoding="utf-8").splitlines()
+    block: list[str] = []
+    begun, kind = 0, None
+    for number, line in enumerate(lines, 1):
+        if line.startswith("```"):
+            if kind == "python" and not block[0].startswith(">>>"):
+                yield Step(page, begun + 1, "\n".join(block), python=True)
+            kind = None if kind is not None else line.removeprefix("```").strip() or "sh"
+            begun, block = number, []
+        elif kind == "python":
+            block.append(line)
+        elif kind is not None or line.startswith("    "):
+            yield from _commands(page, number, lines)
+        else:
+            yield from _in_table(page, number, line)
+
+
+def _commands(page: str, number: int, lines: list[str]) -> Iterator[Step]:
+    """The command on a line, with the lines that go on after a backslash."""
+    text = lines[number - 1].strip()
+    if not text.startswith(PROGRAMS) or lines[number - 2].endswith("\\"):
+        return
+    while text.endswith("\\"):
+        text = f"{text[:-1].strip()} {lines[number].strip()}"
+        number += 1
+    text = re.sub(r"\s+#.*", "", text)
+    if " " in text:
+        yield Step(page, number, text)
+
+
+def _in_table(page: str, number: int, line: str) -> Iterator[Step]:
+    """The last cell of a row of research/README.md: how a file is run."""
+    cells = re.findall(r"`((?:nextview|python) [^`]+)`", line) if line.startswith("|") else []
+    for text in cells[-1:] if page == "research/README.md" else ():
+        yield Step(page, number, text)
+
+
+def make_inputs(folder: Path) -> None:
+    """What the commands of the pages find in their working folder."""
+    from pipeline import FURNITURE, boxes_mesh, write_off
+
+    from nextview.data.samples import SAMPLES
+    from nextview.recognition.model_card import find_card
+
+    for name in ("samples", "benchmarks", "research", "examples", "docs", "workflow"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "tests"))
+    held_out = find_card("recogniser-modelnet10").held_out
+    rng = np.random.default_rng(0)
+    test = {"chair": ("chair_0890", "chair_0917"), "table": ("table_0399", "table_0400")}
+    for label in FURNITURE:
+        learned = [name for name in held_out if name.rpartition("_")[0] == label][:3]
+        names = [(name, "train") for name in (*learned, f"{label}_0001", f"{label}_0002")]
+        names += [(name, "test") for name in test.get(label, (f"{label}_0470", f"{label}_0471"))]
+        for name, split in names:
+            scale = rng.uniform(0.8, 1.25, 3)
+            boxes = [tuple(tuple(np.multiply(corner, scale)) for corner in box) for box in SAMPLES[label]()]
+            write_off(folder / "data/ModelNet10" / label / split / f"{name}.off", boxes_mesh(boxes, label))
+    for copy in ("ModelNet10", "DATASET/ModelNet10"):
+        shutil.copytree(folder / "data/ModelNet10", folder / copy)
+    for label in FURNITURE:  # of classes that no recogniser knows
+        shutil.copytree(folder / "data/ModelNet10" / label / "test", folder / "PSB" / f"strange_{label}")
+    shutil.copytree(folder / "data/ModelNet10/chair/test", folder / "chairs")
+    shutil.copy(folder / "samples/chair.off", folder)
+    for name, mesh in (("mug", trimesh.creation.cylinder(0.04, 0.1)), ("box", trimesh.creation.box((0.1, 0.2, 0.06)))):
+        (folder / "scans").mkdir(exist_ok=True)
+        mesh.export(folder / f"scans/{name}.ply")
+    shutil.copy(folder / "scans/mug.ply", folder)
+    (folder / "mine.py").write_text("def clutter(view):\n    return float(view.seen.mean())\n")
+    (folder / "stand_ins.py").write_text(STAND_INS)
+
+
+STAND_INS = '''"""An arm before a sample object, for the page of a depth camera."""
+import numpy as np
+from arm_over_table import Arm
+import nextview
+
+arm = Arm(nextview.load_mesh("samples/chair.off"), np.random.default_rng(0))
+'''
+STORES = (  # made once, for all pages
+    "nextview render data/ModelNet10 views.zarr --size 112 --workers 1",
+    "nextview predict views.zarr validation.npz --held-out recogniser-modelnet10 --workers 1",
+    "nextview predict views.zarr test.npz --split test --workers 1",
+)
+
+
+def run(command: str, folder: Path) -> tuple[int, str, float]:
+    """Exit status, output and seconds of a command of a shell, with the programs of this environment."""
+    begun = time.monotonic()
+    bin_folder = Path(sys.executable).parent
+    setting = f"export PATH={shlex.quote(str(bin_folder))}:$PATH PYTHONPATH=.:examples:$PYTHONPATH; set -e; "
+    try:
+        done = subprocess.run(
+            ["bash", "-c", setting + command], cwd=folder, capture_output=True, text=True, timeout=LIMIT
+        )
+    except subprocess.TimeoutExpired:
+        return 124, f"took longer than {LIMIT} s", time.monotonic() - begun
+    return done.returncode, done.stdout + done.stderr, time.monotonic() - begun
+
+
+def run_page(page: str, folder: Path) -> list[str]:
+    """Run what a page shows; returns what failed, a line each."""
+    failed = []
+    python: list[str] = [BEFORE[page]] if page in BEFORE else []
+    for step in steps_of(page):
+        where = f"{step.page}:{step.line}"
+        if step.why_not is not None:
+            print(f"  not run  {where}  {step.text}  ({step.why_not})", flush=True)
+            continue
+        command = step.command
+        if step.python:
+            python.append(step.text)
+            (folder / "page_block.py").write_text("\n\n".join(python) + "\n", encoding="utf-8")
+            command = "python page_block.py"
+        status, said, seconds = run(command, folder)
+        print(f"{'ok' if status == 0 else 'FAILED':>9}  {where}  {seconds:.0f} s  {command}", flush=True)
+        if status != 0:
+            print("\n".join(said.splitlines()[-12:]), flush=True)
+            failed.append(f"{where}  {step.text.splitlines()[0]}")
+    return failed
+
+
+def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), only_list: bool = False) -> None:
+    """Run the commands of pages.
+
+    Args:
+        pages: of the repository; all that have commands by default.
+        only_list: only show what would be run, and what not and why.
+    """
+    chosen = pages or PAGES
+    if only_list:
+        for step in (step for page in chosen for step in steps_of(page)):
+            print(f"{step.page}:{step.line}  {step.why_not or step.command}")
+        return
+    failed = []
+    with tempfile.TemporaryDirectory(prefix="documented-") as place:
+        inputs = Path(place) / "inputs"
+        inputs.mkdir()
+        make_inputs(inputs)
+        for command in STORES:
+            status, said, _ = run(command, inputs)
+            if status != 0:
+                raise SystemExit(f"{command}\n{said}")
+        for page in chosen:
+            folder = Path(place) / page.replace("/", "_")
+            shutil.copytree(inputs, folder)
+            print(page, flush=True)
+            failed += run_page(page, folder)
+            shutil.rmtree(folder)
+    if failed:
+        raise SystemExit("\n".join([f"{len(failed)} commands failed:", *failed]))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
