@@ -4,6 +4,7 @@ import doctest
 import importlib
 import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -16,6 +17,9 @@ from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "workflow"))
+import documented_commands
+
 README = (ROOT / "README.md").read_text()
 
 
@@ -50,6 +54,53 @@ def test_an_example_names_what_it_sees(name, monkeypatch):
         assert robot.pose[2, 3] > example.CLEARANCE - 0.02
     else:
         assert not any(view.warnings for view in result.views)
+
+
+def test_tests_that_a_page_names_are_there():
+    tests = [path for folder in ("tests", "research/tests") for path in (ROOT / folder).glob("test_*.py")]
+    names = {name for path in tests for name in re.findall(r"def (test_\w+)", path.read_text())}
+    for page in (ROOT / "docs").glob("*.md"):
+        text = page.read_text()
+        for path in re.findall(r"`((?:research/)?tests/\w+\.py)`", text):
+            assert (ROOT / path).exists(), (page.name, path)
+        column = re.findall(r"\| `(\w+)` \|$", text, re.M) if "| test |" in text else []
+        for part in column:
+            assert any(part in name for name in names), (page.name, part)
+
+
+# The commands of all pages
+
+
+def test_each_page_has_commands_and_each_reason_not_to_run_one_holds():
+    steps = [step for page in documented_commands.PAGES for step in documented_commands.steps_of(page)]
+    assert {"README.md", "docs/arm.md", "docs/training.md", "research/README.md"} <= {step.page for step in steps}
+    for pattern in documented_commands.NOT_RUN:
+        assert any(re.search(pattern, step.text) for step in steps if not step.python), pattern
+    run = [step for step in steps if step.why_not is None]
+    assert len(run) > len(steps) / 2
+    for step in run:
+        if not step.python:
+            assert step.command.startswith(step.text.split()[0])
+
+
+def test_a_command_that_fails_is_told(tmp_path, monkeypatch, capsys):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "```sh\nnextview list models   # fine\nnextview list nonsense\n```\n\n```python\nprint(1 / 0)\n```\n"
+    )
+    monkeypatch.setattr(documented_commands, "ROOT", tmp_path)
+    failed = documented_commands.run_page("page.md", tmp_path)
+    assert [line.split()[0] for line in failed] == ["page.md:3", "page.md:7"]
+    shown = capsys.readouterr().out
+    assert "ZeroDivisionError" in shown
+    assert shown.count("FAILED") == 2
+
+
+@pytest.mark.long
+def test_the_commands_of_all_pages_run():
+    command = [sys.executable, str(ROOT / "workflow/documented_commands.py")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
 
 
 # The README

@@ -191,17 +191,46 @@ def make_inputs(folder: Path) -> None:
         (folder / "scans").mkdir(exist_ok=True)
         mesh.export(folder / f"scans/{name}.ply")
     shutil.copy(folder / "scans/mug.ply", folder)
-    (folder / "mine.py").write_text("def clutter(view):\n    return float(view.seen.mean())\n")
-    (folder / "stand_ins.py").write_text(STAND_INS)
+    for name, content in FILES.items():
+        (folder / name).write_text(content)
 
 
-STAND_INS = '''"""An arm before a sample object, for the page of a depth camera."""
+FILES = {  # modules that pages name as a reader's own, and what their Python blocks take for granted
+    "mine.py": """
+from nextview.data.measures import Measure
+
+def clutter(view):
+    return float(view.seen.mean())
+
+uprightness = Measure(lambda view: float(len(view.pixels[0])), needs="mesh", good="peak")
+""",
+    "spread.py": """
+import numpy as np
+
+class Spread:
+    needs = ()
+
+    def __init__(self, sphere):
+        self.sphere = sphere
+
+    def next_views(self, state, rng):
+        far = np.where(state.visited[:, None, :], self.sphere.arc[None], np.inf).min(2)
+        return np.where(state.free, far, -1.0).argmax(1)
+""",
+    "stops.py": """
+def clear_lead(seen, threshold):
+    return (seen.margin >= threshold) & (seen.n_views >= 2)
+""",
+    "stand_ins.py": """
 import numpy as np
 from arm_over_table import Arm
+from simulated_sensor import INTRINSICS as intrinsics
+
 import nextview
 
 arm = Arm(nextview.load_mesh("samples/chair.off"), np.random.default_rng(0))
-'''
+""",
+}
 STORES = (  # made once, for all pages
     "nextview render data/ModelNet10 views.zarr --size 112 --workers 1",
     "nextview predict views.zarr validation.npz --held-out recogniser-modelnet10 --workers 1",
