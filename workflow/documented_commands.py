@@ -29,7 +29,19 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
 
 PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")), "research/README.md")
-PROGRAMS = ("nextview", "python", "make", "pip", "rerun", "dask", "ros2", "rosdep", "colcon", "for", "pytest")
+PROGRAMS = (
+    "nextview ",
+    "python",
+    "make ",
+    "pip ",
+    "rerun ",
+    "dask ",
+    "ros2 ",
+    "rosdep ",
+    "colcon ",
+    "for ",
+    "cp -r ros2",
+)
 LIMIT = 900  # seconds for one command
 
 NOT_RUN = {  # commands by how they begin, or what is in them; the reason
@@ -47,17 +59,19 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"research\.(train_grid|thing_features)": "trains for hours",
     r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
     r"benchmarks/(render|replay|latency|session_latency)\.py": "measures time, on a quiet machine",
-    r"benchmarks/reproduction\.py|workflow/": "part of make reproduce",
     r"docs/site/explorer_pictures\.py": "needs a Chromium",
     r"research/tests": "they are in make test",
+    r"benchmarks/scenes\.py judge": "needs 200 scenes of each level; tests/test_scene_policies.py judges few",
+    r"SceneLayout\.load": "names one of the drawn scenes; tests/test_scenes.py looks into one of its own",
+    r"nextview_ros": "takes messages of ROS 2; tests/test_ros2.py has recorded ones",
     r"agents/(ppo|mvselect)\.json .*agents/": "needs two agents of a million steps each",
 }
 SMALL = {  # options that make a command quick
     "nextview render": "--size 112 --workers 1",
-    "nextview predict": "--workers 1",
+    "nextview predict": "--workers 1 --overwrite",
     "nextview measure": "--workers 1",
     "nextview learn": "--workers 1",
-    "nextview scenes": "--scenes 1 --levels light --workers 1",
+    "nextview scenes": "--scenes 1 --workers 1",
     "nextview train recogniser": "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
     "nextview train map": "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
     "nextview train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
@@ -102,8 +116,6 @@ class Step:
     @property
     def why_not(self) -> str | None:
         """Why it is not run; None if it is."""
-        if self.python:
-            return None
         return next((why for pattern, why in NOT_RUN.items() if re.search(pattern, self.text)), None)
 
     @property
@@ -116,9 +128,9 @@ class Step:
             return text
         for begin, options in SMALL.items():
             if text.startswith(f"{begin} "):
-                words = options.split()
-                pairs = zip(words[::2], words[1::2], strict=True)
-                text = " ".join([text, *(f"{name} {value}" for name, value in pairs if name not in text)])
+                for option in options.split(" --"):
+                    name = f"--{option.removeprefix('--').split()[0]}"
+                    text += "" if name in text else f" --{option.removeprefix('--')}"
         return text
 
 
@@ -221,6 +233,16 @@ class Spread:
 def clear_lead(seen, threshold):
     return (seen.margin >= threshold) & (seen.n_views >= 2)
 """,
+    "own_recogniser.py": """
+import shutil
+import sys
+from pathlib import Path
+
+from nextview.recognition.model_card import BUNDLED
+
+for path in BUNDLED.glob("recogniser-modelnet10*"):
+    shutil.copy(path, Path(f"{sys.argv[1]}{path.name.removeprefix('recogniser-modelnet10')}"))
+""",
     "stand_ins.py": """
 import numpy as np
 from arm_over_table import Arm
@@ -231,6 +253,13 @@ import nextview
 arm = Arm(nextview.load_mesh("samples/chair.off"), np.random.default_rng(0))
 """,
 }
+PREPARED = {  # what a page takes as made before, by commands or pages that it names
+    "docs/add_a_measure.md": "mkdir models; python own_recogniser.py models/recogniser",
+    "docs/add_a_policy.md": "cp -r views.zarr modelnet10.zarr",
+    "docs/add_a_recogniser.md": "cp test.npz mine.npz; mkdir models; python own_recogniser.py models/linear",
+    "docs/scenes.md": "python own_recogniser.py recogniser",
+}
+BESIDE = ("docs/your_objects.md",)  # pages whose Python blocks do again what their commands did: in a folder of its own
 STORES = (  # made once, for all pages
     "nextview render data/ModelNet10 views.zarr --size 112 --workers 1",
     "nextview predict views.zarr validation.npz --held-out recogniser-modelnet10 --workers 1",
@@ -252,9 +281,19 @@ def run(command: str, folder: Path) -> tuple[int, str, float]:
     return done.returncode, done.stdout + done.stderr, time.monotonic() - begun
 
 
-def run_page(page: str, folder: Path) -> list[str]:
-    """Run what a page shows; returns what failed, a line each."""
+def run_page(page: str, folder: Path, beside: Path | None = None) -> list[str]:
+    """Run what a page shows; returns what failed, a line each.
+
+    Args:
+        page: of the repository.
+        folder: in which the commands run.
+        beside: in which the Python blocks run, if not there.
+    """
     failed = []
+    if page in PREPARED:
+        status, said, _ = run(PREPARED[page], folder)
+        if status != 0:
+            raise SystemExit(f"{page}: {PREPARED[page]}\n{said}")
     python: list[str] = [BEFORE[page]] if page in BEFORE else []
     for step in steps_of(page):
         where = f"{step.page}:{step.line}"
@@ -264,9 +303,9 @@ def run_page(page: str, folder: Path) -> list[str]:
         command = step.command
         if step.python:
             python.append(step.text)
-            (folder / "page_block.py").write_text("\n\n".join(python) + "\n", encoding="utf-8")
+            ((beside or folder) / "page_block.py").write_text("\n\n".join(python) + "\n", encoding="utf-8")
             command = "python page_block.py"
-        status, said, seconds = run(command, folder)
+        status, said, seconds = run(command, (beside or folder) if step.python else folder)
         print(f"{'ok' if status == 0 else 'FAILED':>9}  {where}  {seconds:.0f} s  {command}", flush=True)
         if status != 0:
             print("\n".join(said.splitlines()[-12:]), flush=True)
@@ -299,7 +338,10 @@ def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), only_list: bool = Fa
             folder = Path(place) / page.replace("/", "_")
             shutil.copytree(inputs, folder)
             print(page, flush=True)
-            failed += run_page(page, folder)
+            beside = Path(place) / "beside" if page in BESIDE else None
+            if beside is not None:
+                shutil.copytree(inputs, beside)
+            failed += run_page(page, folder, beside)
             shutil.rmtree(folder)
     if failed:
         raise SystemExit("\n".join([f"{len(failed)} commands failed:", *failed]))
