@@ -12,6 +12,7 @@ from fontTools.fontBuilder import FontBuilder
 from fontTools.pens.ttGlyphPen import TTGlyphPen
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.font_manager import fontManager
+from matplotlib.text import Text
 from pipeline import SAMPLE_FILES, refused, run_python
 
 import nextview
@@ -139,6 +140,13 @@ def test_wrong_models_are_refused():
 def test_inference_never_imports_torch(chair):
     code = f"main(['recognise', {str(chair)!r}, '--json']); assert not {{'torch', 'onnx'}} & {{*sys.modules}}"
     assert run_python(f"import sys; from nextview.cli.main import main; {code}").returncode == 0
+
+
+def test_the_figure_says_what_its_colours_and_angles_mean():
+    figure = nextview.recognise(SAMPLE_FILES / "table.off", start=33).plot()
+    texts = [text.get_text() for text in figure.findobj(Text)]
+    assert {"low", "high"} <= set(texts)
+    assert any(text.endswith("up, 45° around") for text in texts)
 
 
 # Names in any script, and terminals of any encoding

@@ -46,6 +46,7 @@ LIMIT = 900  # seconds for one command
 
 NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^make (test|lint|docs)": "a job of its own in CI",
+    r"^make demo": "installs; .ci/base_installation runs nextview demo, twice",
     r"^make ": "the workflow is run by tests/test_workflow.py",
     r"^(pip|python3 -m pip) ": "installs; tests/test_wheel.py installs the wheel with each extra",
     r"^nextview download": "473 MB from a server of others; tests/test_download.py has a server of its own",
