@@ -68,11 +68,11 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"agents/(ppo|mvselect)\.json .*agents/": "needs two agents of a million steps each",
 }
 SMALL = {  # options that make a command quick
-    "nextview render": "--size 112 --workers 1",
+    "nextview render": "--workers 1",
     "nextview predict": "--workers 1 --overwrite",
     "nextview measure": "--workers 1",
     "nextview learn": "--workers 1",
-    "nextview scenes": "--scenes 1 --workers 1",
+    "nextview scenes": "--scenes 4 --workers 1",
     "nextview train recogniser": "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
     "nextview train map": "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
     "nextview train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
@@ -85,7 +85,7 @@ SMALL = {  # options that make a command quick
     "python benchmarks/things.py": "--runs 1",
 }
 FEWER = {  # what a page says of the published runs, and how many it is here
-    r"--scenes \d+": "--scenes 1",
+    r"--scenes \d+": "--scenes 4",
     r"--objects \d+": "--objects 2",
     r"--runs \d+": "--runs 2",
     r"--epochs \d+": "--epochs 1",
@@ -262,7 +262,7 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
 }
 BESIDE = ("docs/your_objects.md",)  # pages whose Python blocks do again what their commands did: in a folder of its own
 STORES = (  # made once, for all pages
-    "nextview render data/ModelNet10 views.zarr --size 112 --workers 1",
+    "nextview render data/ModelNet10 views.zarr --workers 1",
     "nextview predict views.zarr validation.npz --held-out recogniser-modelnet10 --workers 1",
     "nextview predict views.zarr test.npz --split test --workers 1",
 )
