@@ -60,7 +60,6 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"research\.(train_grid|thing_features)": "trains for hours",
     r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
     r"benchmarks/(render|replay|latency|session_latency)\.py": "measures time, on a quiet machine",
-    r"docs/site/explorer_pictures\.py": "needs a Chromium",
     r"research/tests": "they are in make test",
     r"benchmarks/scenes\.py judge": "needs 200 scenes of each level; tests/test_scene_policies.py judges few",
     r"SceneLayout\.load": "names one of the drawn scenes; tests/test_scenes.py looks into one of its own",
