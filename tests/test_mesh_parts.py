@@ -16,6 +16,7 @@ from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh, mesh_warnings
 from nextview.geometry.mesh_parts import mesh_doubts
 from nextview.geometry.viewsphere import ViewSphere
+from nextview.learning import teaching
 
 NOISE = np.random.default_rng(0)
 
@@ -112,6 +113,13 @@ def test_a_plate_alone_is_its_own_largest_part(tmp_path):
     assert len(load_mesh(path, largest_part=True).faces) == len(disc(0.2).faces)
 
 
+@pytest.mark.parametrize("content", ["v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n"])
+def test_a_broken_file_is_refused_with_the_option_too(tmp_path, content):
+    (tmp_path / "broken.obj").write_text(content)
+    with pytest.raises(MeshError, match=r"broken\.obj: .*vert"):
+        load_mesh(tmp_path / "broken.obj", largest_part=True)
+
+
 def test_a_mesh_of_one_part_is_the_same_with_the_option(tmp_path):
     path = saved(tmp_path / "egg.ply", thing())
     plain = load_mesh(path)
@@ -184,6 +192,20 @@ def test_recognise_warns_and_takes_the_largest_part(tmp_path):
     alone = nextview.recognise(saved(tmp_path / "egg.ply", thing()), start=9)
     first = [result.views[0].observation.depth for result in (part, alone, whole)]
     assert ((first[0] > 0) != (first[1] > 0)).mean() < 0.01 < ((first[0] > 0) != (first[2] > 0)).mean()
+
+
+def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path, monkeypatch):
+    def no_embeddings(observations):  # what they are does not matter here, and they take time
+        return np.zeros((len(observations), 4), np.float32)
+
+    monkeypatch.setattr(teaching, "embeddings", no_embeddings)
+    path = saved(tmp_path / "scan.ply", joined(thing(), disc(0.4)))
+    radii = []
+    for largest, sentence in ((False, "it has 2 parts"), (True, "the largest of its 2 parts was taken")):
+        taught = teaching.teach(path, "egg", teaching.How(unit="m", upright=True, largest_part=largest))
+        assert taught["doubts"].tobytes().decode().startswith(sentence)
+        radii.append(float(taught["radii"][0]))
+    assert radii[0] > 5 * radii[1]
 
 
 def test_the_largest_part_of_what_is_no_mesh_file_is_refused(tmp_path):

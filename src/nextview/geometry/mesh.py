@@ -167,9 +167,11 @@ def load_mesh(
         raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({one_line(reason, 240)})") from None
     if (up or ("y" if suffix == ".glb" else "z")) == "y":
         vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)
-    notes: tuple[str, ...] = ()
-    if largest_part:
-        faces, notes = keep_largest_part(vertices, faces)
-    mesh = replace(make_mesh(vertices, faces, str(path), unit), notes=notes)
+    mesh = make_mesh(vertices, faces, str(path), unit)
     refuse_lost_shape(vertices, mesh.radius, str(path))
+    if largest_part:  # of what has just been checked
+        kept, notes = keep_largest_part(mesh.vertices, mesh.faces)
+        if notes:
+            positions = mesh.vertices * mesh.radius + mesh.centre
+            mesh = replace(make_mesh(positions, kept, str(path), unit), notes=notes)
     return mesh

@@ -96,8 +96,8 @@ def _is_flat(points: NDArray[np.float64]) -> bool:
 
 
 def keep_largest_part(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    vertices: NDArray[np.float64], faces: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], tuple[str, ...]]:
     """Leave out what is not connected to the largest part of a mesh.
 
     The largest part has the largest surface. A plate, thinner than a twentieth of its width, is taken for what the
@@ -110,8 +110,6 @@ def keep_largest_part(
     Returns:
         The faces of the part, and a sentence about what was left out; none if there is one part alone.
     """
-    if len(faces) == 0:
-        return faces, ()
     parts = Parts.of(vertices, faces)
     if len(parts.areas) == 1:
         return faces, ()

@@ -400,6 +400,9 @@ def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:
         look = arrays["pictures"].tobytes() + np.round(np.log(arrays["radii"]), 3).tobytes()
         if (twin := first.setdefault(look, source.name)) != source.name:
             notes.append(f"{twin} and {source.name} look the same: one thing under two names?")
+    for source, arrays in taught:
+        doubts = arrays.get("doubts", np.zeros(0, np.uint8))  # of what was taught now, from a mesh file
+        notes.extend(f"{source.name}: {doubt}" for doubt in doubts.tobytes().decode().splitlines())
     unknown = [source.name for source, arrays in taught if not np.isfinite(arrays["radii"])]
     if unknown and len(taught) > 1:
         notes.append(f"the size of {len(unknown)} of {len(taught)} things is not known; --unit makes it count")
