@@ -130,12 +130,15 @@ def refuse_lost_shape(vertices: NDArray[np.float64], radius: float, name: str) -
         MeshError: neighbouring numbers of single precision are more than a twentieth of the radius apart there, and the
             positions are such numbers.
     """
-    farthest = np.abs(vertices).max()
-    step = float(np.spacing(np.float32(min(farthest, np.finfo(np.float32).max))))
-    if step < LOST_STEP * radius:
-        return
     column = vertices[:, np.abs(vertices).max(0).argmax()]
-    steps = column / np.spacing(np.abs(column).astype(np.float32)).astype(np.float64)
+    farthest = np.abs(column).max()
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # what single precision cannot hold at all is none of its numbers
+        step = float(np.spacing(np.float32(farthest)))
+        if step < LOST_STEP * radius:
+            return
+        steps = column / np.spacing(np.abs(column).astype(np.float32)).astype(np.float64)
     rounded = bool((steps == np.round(steps)).all())
     # A building whose corners stand at whole metres is not rounded: half of rounded numbers are odd multiples.
     if rounded and (step > radius or (steps % 2 == 1).mean() > USED_STEPS):
