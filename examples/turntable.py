@@ -56,7 +56,8 @@ def recognise(turntable: Turntable) -> nextview.Recognition:
         depth, pose = turntable.look()
         mask = np.nan_to_num(depth, nan=9.0) < np.nan_to_num(empty, nan=0.0) - 0.01
         session.update(Frame(depth, INTRINSICS, pose, mask))
-        turntable.turn_to(-azimuth(session.target))
+        if not session.done:
+            turntable.turn_to(-azimuth(session.target))
     return session.result
 
 

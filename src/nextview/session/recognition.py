@@ -29,6 +29,7 @@ class Recognition:
     sphere: Viewpoints  # the candidates
     stopping: Stopping  # the rule that ended it
     stranded: bool = False  # whether it ended because no view that was left could be reached; then it is not confident
+    why_stranded: str = ""  # what became of the views that were left, as "30 too low, 9 failed"; "" if not stranded
     score: Quantiles | None = None  # gives the novelty of views; None if the recogniser has none
     unknown_rate: float = 0.0  # share of objects of known classes that may be called unknown; 0: none
     impossible: tuple[str, ...] = ()  # classes whose objects have not such a size
@@ -106,7 +107,11 @@ class Recognition:
             return f"nothing is seen ({views})"
         if self.unknown:
             return f"{self.none_of_them}: {self.why_unknown} ({views})"
-        sure = "confident" if self.confident else "not confident" + ", no other view in reach" * self.stranded
+        sure = "confident" if self.confident else "not confident"
+        if self.stranded:
+            sure += ", no other view in reach"
+            if self.why_stranded:
+                sure += f": {self.why_stranded}"
         names = dict.fromkeys(warning.name for view in self.views for warning in view.warnings)
         warnings = f", warnings: {', '.join(names)}" if names else ""
         return f"{self.answer} (belief {self.confidence:.3f}, {views}, {sure}{warnings})"

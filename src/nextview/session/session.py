@@ -26,9 +26,11 @@ from nextview.recognition.novelty import Novelty, ViewScore, values_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.plausibility import ViewWarning, check_observation, check_views
 from nextview.session.episode import Episodes, Step
+from nextview.session.limits import Limits, in_words
 from nextview.session.reach import Reach, Reachable, TravelCost, as_reachable, as_travel_cost
 from nextview.session.recognition import SUSPICIOUS, Recognition
 from nextview.session.repeated import REPEATED, after_repeated, is_repeated
+from nextview.session.surroundings import Surroundings
 from nextview.session.view import View
 
 if TYPE_CHECKING:
@@ -44,7 +46,11 @@ CONTRADICTABLE = 3
 
 @runtime_checkable
 class FrameCamera(Protocol):
-    """A camera in the world, with what it is to look at: it gives frames, and need not be where it was asked to be."""
+    """A camera in the world, with what it is to look at: it gives frames, and need not be where it was asked to be.
+
+    Where it has an attribute ``knows_reach`` that is true, it decides alone where it can stand, and is asked for
+    candidates too that ``Session.limits`` would leave out: views that were captured before, for instance.
+    """
 
     @property
     def object(self) -> ObservedObject:
@@ -131,6 +137,8 @@ class Session:
         self._before = 0 if object is None else len(object.sightings)
         self._chooser, self._rng = anywhere(policy, sphere), rng or np.random.default_rng(0)
         self._reach = Reach(np.zeros(len(sphere), bool))
+        self._limits = Limits()
+        self._surroundings: list[Surroundings] = []
         self._lock = RLock()
         self._episodes = self._begin(whole(start, "the first view", 0, len(sphere) - 1))
 
@@ -179,9 +187,9 @@ class Session:
         return object.object_frame.pose_in_world(self.sphere.poses, self.distance)
 
     @property
-    def target(self) -> Float:
-        """Where to look now, one of ``poses``, (4, 4)."""
-        return self.poses[self.view]
+    def target(self) -> Float | None:
+        """Where to look now, one of ``poses``, (4, 4); None where the episode has ended."""
+        return None if self.done else self.poses[self.view]
 
     # What the robot can do
 
@@ -213,6 +221,45 @@ class Session:
         with self._lock:
             self._reach = replace(self._reach, cost=as_travel_cost(given, len(self.sphere)))
 
+    @property
+    def limits(self) -> Limits:
+        """To which candidates no camera is sent, by what the frames show, see ``session.limits.Limits``.
+
+        What is set here counts from now on, as for ``reachable``. Sessions without frames know no place to keep off.
+        """
+        return self._limits
+
+    @limits.setter
+    def limits(self, given: Limits) -> None:
+        if not isinstance(given, Limits):
+            raise UsageError(f"limits are a nextview.session.limits.Limits, not {one_line(repr(given))}")
+        with self._lock:
+            before = self._limits
+            self._limits = given
+            try:
+                self._set_reach(self._reach)
+            except BaseException:
+                self._limits = before
+                raise
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Why each candidate is left out by ``limits`` or has failed, (V,); "" where neither is so."""
+        with self._lock:
+            reasons = self._reasons(self.object)
+            return tuple("failed" if gone else str(why) for gone, why in zip(self._reach.failed, reasons, strict=True))
+
+    def _reasons(self, object: ObservedObject | None) -> NDArray[np.str_]:
+        """See ``Limits.reasons``; all "" before the first frame, and without frames."""
+        if object is None or not object.sightings:
+            return np.full(len(self.sphere), "", "<U1")
+        known = {id(shown.frame): shown for shown in self._surroundings}
+        self._surroundings = [
+            known.get(id(sighting.frame)) or Surroundings.of(sighting, object.object_frame)
+            for sighting in object.sightings
+        ]
+        return self._limits.reasons(self._poses_around(object), object, self._surroundings)
+
     def failed(self, view: int | None = None) -> None:
         """The camera could not be brought to a view, by default the one that was asked for: it is offered no more.
 
@@ -226,7 +273,7 @@ class Session:
 
     def _set_reach(self, reach: Reach) -> None:
         """Choose another view if the one that was chosen can no longer be reached."""
-        if self.done or (self.views and reach.can_reach(np.array([self.view]), lambda: self.poses)[0]):
+        if self.done or (self.views and self._can_go(self.view, reach)):
             self._reach = reach
         elif self.views:
             step = self._episodes.next_choice(lambda state: self._constrained(state, reach, self.object))
@@ -238,6 +285,12 @@ class Session:
         else:  # with frames it begins where the camera is
             episodes = self._begin_nearest(reach) if self.object is None else self._episodes
             self._reach, self._episodes = reach, episodes
+
+    def _can_go(self, view: int, reach: Reach) -> bool:
+        """Whether the camera may be sent to a view, and can be brought there."""
+        if self._reasons(self.object)[view]:
+            return False
+        return bool(reach.can_reach(np.array([view]), lambda: self.poses)[0])
 
     def _begin_nearest(self, reach: Reach) -> Episodes:
         """Before the first view: begin at the nearest view that can be reached. A callable is not asked yet."""
@@ -252,6 +305,8 @@ class Session:
         """The state with where the camera can go from here, by default from where the last view was taken."""
         if here is None:
             here = self.views[-1].observation.pose if object is None else object.sightings[-1].frame.camera_to_world
+        barred = self._reasons(object) != ""
+        reach = replace(reach, failed=reach.failed | barred)
         return reach.constrain(state, self.sphere, here, lambda: self._poses_around(object))
 
     # What is seen
@@ -481,12 +536,19 @@ class Session:
                 enough,
                 self.sphere,
                 self.stopping,
-                stranded=self.done and not enough and not all_taken,
+                stranded=(stranded := self.done and not enough and not all_taken),
+                why_stranded=self._why_stranded() if stranded else "",
                 score=self.models.recogniser.novelty,
                 unknown_rate=self.unknown,
                 impossible=self._impossible(),
             )
             return replace(result, confident=enough and not result.unknown)
+
+    def _why_stranded(self) -> str:
+        """What became of the candidates that were not taken, in words."""
+        taken = {view.index for view in self.views}
+        left = [why or "out of reach" for k, why in enumerate(self.left_out) if k not in taken]
+        return in_words(left)
 
     def _impossible(self) -> tuple[str, ...]:
         """Classes whose objects have not the size of this one; none where it is not known."""

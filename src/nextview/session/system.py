@@ -24,6 +24,7 @@ from nextview.recognition.map_names import SPHERE
 from nextview.recognition.memory import open_recogniser
 from nextview.recognition.model_card import DISCRIMINATE, find_models
 from nextview.recognition.own_stopping import Rule, own_stopping
+from nextview.session.limits import Limits
 from nextview.session.recognition import Recognition
 from nextview.session.session import FrameCamera, Session
 
@@ -59,8 +60,14 @@ class System:
         seed: int = 0,
         object: "ObservedObject | None" = None,
         distance: float | None = None,
+        min_height: float | None = None,
+        max_height: float | None = None,
+        clearance: float | None = None,
     ) -> Session:
         """One object under way, for whoever moves the camera. Those for a robot need no more than a distance.
+
+        Candidate views that touch the table, or what else the frames show, are left out: the last three say more of
+        it, see ``session.limits.Limits``.
 
         Args:
             start: where to look first, an index of ``sphere``; drawn by the seed if not given.
@@ -68,14 +75,27 @@ class System:
             object: which object to find in the frames of a depth camera; by default the one at which the first camera is aimed.
             distance: how far from the object the camera shall stand, metres; 3 object radii by default. With an object
                 or a distance the session takes frames, else what it is given first.
+            min_height: of the camera above the support plane, metres, at least; by default 0.08, and a tenth of the
+                camera's distance from the object.
+            max_height: of the camera above the support plane, metres, at most; by default 2, or as high as it stood.
+            clearance: metres between the camera and what the frames show; 0.1 by default, 0 for any.
         """
         rng = np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1))
-        drawn, options = int(rng.integers(len(self.sphere))), (self.stopping, rng, object, distance, self.unknown)
-        return Session(self.models, self.policy, self.sphere, drawn if start is None else start, *options)
+        drawn = int(rng.integers(len(self.sphere)))
+        start = drawn if start is None else start
+        options = (self.stopping, rng, object, distance, self.unknown)
+        session = Session(self.models, self.policy, self.sphere, start, *options)
+        session.limits = Limits(min_height, max_height, clearance)
+        return session
 
     def session_with(self, camera: Camera | FrameCamera, start: int | None = None, seed: int = 0) -> Session:
         """A session for a camera: where it gives frames, for its object."""
-        return self.session(start, seed, camera.object if isinstance(camera, FrameCamera) else None)
+        if not isinstance(camera, FrameCamera):
+            return self.session(start, seed)
+        session = self.session(start, seed, camera.object)
+        if getattr(camera, "knows_reach", False):
+            session.limits = Limits.none()
+        return session
 
     def recognise(
         self,

@@ -36,6 +36,8 @@ class CapturedCamera:
     ``left_out``: why views were left out, by name. ObservationError if the object is found in none of the views.
     """
 
+    knows_reach = True  # the camera stood there when the frames were captured; see ``session.FrameCamera``
+
     def __init__(
         self,
         capture: Capture,

@@ -39,6 +39,8 @@ class RobotCamera:
     The errors of the sensor are drawn by seed 0.
     """
 
+    knows_reach = True  # the scene says where a camera can stand; see ``session.FrameCamera``
+
     def __init__(self, scene: Scene, sensor: Sensor | SensorMix | str = "none", named: Named = "point") -> None:
         if named not in get_args(Named):
             raise UsageError(f"a target is named by {', '.join(get_args(Named))}, not by {one_line(repr(named))}")

@@ -1,0 +1,124 @@
+"""Candidate views to which no camera is sent, by what the frames show of the place."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.checks import number
+from nextview.session.surroundings import Surroundings
+
+if TYPE_CHECKING:
+    from nextview.sensing.observed_object import ObservedObject
+
+Float = NDArray[np.float64]
+LOWEST = 0.08
+"""Metres above the support plane: a camera on a wrist, its mount and the fingers beside it do not touch it."""
+GRAZING = 0.1
+"""Height over the support plane in parts of the distance to the object, 6 degrees: from lower the plane is a line."""
+HIGHEST = 2.0
+"""Metres above the support plane that no camera of a robot reaches."""
+CLEARANCE = 0.1  # metres between the camera and what the frames show
+TOO_LOW = "too low"
+TOO_HIGH = "too high"
+TOO_NEAR = "too near to something"
+HIDDEN = "behind something"
+BEHIND_WALL = "behind a wall"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where a camera may be sent. What is not given has a default that fits most robots.
+
+    The heights count from the support plane, where one is known. What the frames show as occupied is left out where
+    the object stands on a support plane; in a gripper or on a turntable (``ObservedObject(support=False)``) the room
+    moves against the object, so only a clearance that is given counts.
+
+    Attributes:
+        min_height: of the camera above the support plane, metres, at least. By default 0.08, and a tenth of the
+            camera's distance from the object.
+        max_height: of the camera above the support plane, metres, at most; infinity for none. By default 2, or as
+            high as the camera has stood.
+        clearance: metres between the camera and any surface that the frames show, but for the object and the support
+            plane; views behind walls and behind other things are left out too. 0 leaves none of these out. By default
+            0.1.
+    """
+
+    min_height: float | None = None
+    max_height: float | None = None
+    clearance: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.min_height is not None:
+            number(self.min_height, "the least height of a camera, metres,")
+        if self.max_height is not None and self.max_height != np.inf:
+            number(self.max_height, "the greatest height of a camera, metres,", above=self.min_height or 0.0)
+        if self.clearance is not None:
+            number(self.clearance, "the clearance of a camera, metres,", 0)
+
+    @classmethod
+    def none(cls) -> "Limits":
+        """A camera may be sent everywhere."""
+        return cls(min_height=-1e6, max_height=np.inf, clearance=0.0)
+
+    def reasons(self, poses: Float, object: "ObservedObject", surroundings: Sequence[Surroundings]) -> NDArray[np.str_]:
+        """Why each candidate is left out.
+
+        Args:
+            poses: of the candidates, camera-to-world, metres, (V, 4, 4).
+            object: what is looked at.
+            surroundings: what each frame of it shows.
+
+        Returns:
+            (V,) of ``TOO_LOW``, ``TOO_HIGH``, ``TOO_NEAR``, ``HIDDEN``, ``BEHIND_WALL``, or "" where none applies.
+        """
+        places = poses[:, :3, 3]
+        found = np.full(len(poses), "", f"<U{len(TOO_NEAR)}")
+        for reason, holds in self._occupied(places, object, surroundings):
+            found[holds] = reason
+
+        planes = [sighting.plane for sighting in object.sightings if sighting.plane is not None]
+        if not planes:
+            return found
+
+        height = np.median([plane.height(places) for plane in planes], axis=0)
+        away = np.linalg.norm(places - object.object_frame.centre, axis=1)
+        lowest = np.maximum(LOWEST, GRAZING * away) if self.min_height is None else self.min_height
+        highest = self.max_height
+        if highest is None:
+            stood = [sighting.frame.camera_to_world[:3, 3] for sighting in object.sightings]
+            highest = max(HIGHEST, float(np.max(planes[-1].height(np.array(stood)))))
+        found[height < lowest] = TOO_LOW
+        found[height > highest] = TOO_HIGH
+        return found
+
+    def _occupied(
+        self, places: Float, object: "ObservedObject", surroundings: Sequence[Surroundings]
+    ) -> list[tuple[str, NDArray[np.bool_]]]:
+        """Reasons by what the frames show, each with the places that it holds for; the last one counts most."""
+        clearance = self.clearance
+        if clearance is None:
+            clearance = CLEARANCE if object.support else 0.0
+        if clearance == 0:
+            return []
+
+        nothing = np.zeros(len(places), bool)
+        around = object.object_frame
+        stood = np.array([sighting.frame.camera_to_world[:3, 3] for sighting in object.sightings])
+        walls, near, free, hidden = nothing, nothing, nothing, nothing
+        for shown in surroundings:
+            walls = walls | shown.is_behind_wall(places, clearance, stood)
+            near = near | shown.is_near(places, around, clearance)
+            looked_through, not_seen = shown.look_at(places, around, clearance)
+            free = free | looked_through
+            hidden = hidden | not_seen
+        return [(HIDDEN, hidden & ~free), (BEHIND_WALL, walls), (TOO_NEAR, near)]
+
+
+def in_words(reasons: Sequence[str]) -> str:
+    """How many candidates are left out for which reason: ``12 too low, 3 behind a wall``."""
+    counts = Counter(reason for reason in reasons if reason)
+    return ", ".join(f"{count} {reason}" for reason, count in counts.most_common())
