@@ -107,12 +107,13 @@ class Limits:
 
         nothing = np.zeros(len(places), bool)
         around = object.object_frame
-        stood = np.array([sighting.frame.camera_to_world[:3, 3] for sighting in object.sightings])
         walls, near, free, hidden = nothing, nothing, nothing, nothing
         for shown in surroundings:
-            walls = walls | shown.is_behind_wall(places, clearance, stood)
+            for wall in shown.walls:
+                if not any(other.shows_behind(wall) for other in surroundings):
+                    walls = walls | (wall.height(places) < clearance)
             near = near | shown.is_near(places, around, clearance)
-            looked_through, not_seen = shown.look_at(places, around, clearance)
+            looked_through, not_seen = shown.look_at(places, around, clearance / 2)
             free = free | looked_through
             hidden = hidden | not_seen
         return [(HIDDEN, hidden & ~free), (BEHIND_WALL, walls), (TOO_NEAR, near)]

@@ -24,8 +24,8 @@ WINDOW = 2  # pixels to each side that tell what lies on the line of sight to a 
 MOST_WALLS = 4
 TRIALS = 100  # lines that are tried for each wall
 LEAST_OF_FRAME = 0.05  # share of a frame's points that lie on a wall
-WALL_WIDTH = 1.0  # metres
-WALL_HEIGHT = 0.4  # metres
+WALL_WIDTH = 0.5  # metres that a frame shows of a wall, at least
+WALL_HEIGHT = 0.1  # metres; a camera that looks down on a table sees a strip of the wall behind it
 WALL_TOLERANCE = 0.02  # metres, beside the noise
 BEHIND = 0.15  # metres behind a wall from which on a point does not belong to it
 MOST_BEHIND = 0.03  # share of a frame's points that may lie behind a wall: reflections, a door that stands open
@@ -89,22 +89,11 @@ class Surroundings:
         apart = np.linalg.norm(places[:, None] - self.points[kept][None], axis=2)
         return (apart < clearance).sum(1) >= FEWEST_POINTS
 
-    def is_behind_wall(self, places: Float, clearance: float, stood: Float) -> Mask:
-        """Whether places lie behind a wall.
-
-        Args:
-            places: (V, 3), world, metres.
-            clearance: nearer to a wall than this counts as behind it, metres.
-            stood: where cameras have stood, (K, 3). Behind what looks like a wall there was none then.
-
-        Returns:
-            (V,) bool.
-        """
-        behind = np.zeros(len(places), bool)
-        for wall in self.walls:
-            if (wall.height(stood) > 0).all():
-                behind |= wall.height(places) < clearance
-        return behind
+    def shows_behind(self, wall: Plane) -> bool:
+        """Whether the camera stood behind what another frame took for a wall, or sees something there."""
+        if wall.height(self.frame.camera_to_world[:3, 3]) < 0:
+            return True
+        return _share_behind(wall.height(self.points), self.tolerance) > MOST_BEHIND
 
     def look_at(self, places: Float, around: ObjectFrame, margin: float) -> tuple[Mask, Mask]:
         """Which places the frame looks through, and which ones something else than the object hides from it.
@@ -144,14 +133,19 @@ class Surroundings:
         row = np.floor(seen_at[:, 1] / z * k[1, 1] + k[1, 2])
         inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
 
+        around = np.arange(-WINDOW, WINDOW + 1)
+        rows = np.clip(row[inside, None, None].astype(int) + around[:, None], 0, height - 1)
+        columns = np.clip(column[inside, None, None].astype(int) + around, 0, width - 1)
+        windows = self.frame.depth[rows, columns].astype(np.float64)
+        depth = windows.reshape(len(windows), len(around) ** 2)
+
+        # The middle of what is measured in each window: zeros, which mean nothing, are sorted to the front.
+        depth = np.sort(depth, axis=1)
+        measured = (depth > 0).sum(1)
+        middle = depth.shape[1] - (measured + 1) // 2
         found = np.full(len(seen_at), np.nan)
-        for i in np.flatnonzero(inside):
-            r, c = int(row[i]), int(column[i])
-            rows = slice(max(0, r - WINDOW), r + WINDOW + 1)
-            columns = slice(max(0, c - WINDOW), c + WINDOW + 1)
-            part = self.frame.depth[rows, columns]
-            if (part > 0).any():
-                found[i] = np.median(part[part > 0])
+        median = depth[np.arange(len(depth)), np.minimum(middle, depth.shape[1] - 1)]
+        found[inside] = np.where(measured > 0, median, np.nan)
         return found
 
 
@@ -205,7 +199,7 @@ def _find_walls(points: Float, tolerance: Float, high: Mask, camera: Float, arou
         normal, offset = line
         away = upright[:, :2] @ normal + offset  # the camera is at 0, on the side where this is positive
         on = others & (np.abs(away) < slack)
-        behind = (away < -(BEHIND + slack)).mean()
+        behind = _share_behind(away, tolerance)
         if on.mean() >= LEAST_OF_FRAME and behind <= MOST_BEHIND and _is_large(upright[on], normal):
             world = normal @ around.axes[:2]
             wall = Plane(world, float(offset - world @ camera))
@@ -236,6 +230,11 @@ def _best_line(ground: Float, slack: Float, rng: np.random.Generator) -> tuple[F
     normal = np.linalg.eigh(spread.T @ spread)[1][:, 0]
     offset = float(-normal @ middle)
     return (normal, offset) if offset >= 0 else (-normal, -offset)
+
+
+def _share_behind(away: Float, tolerance: Float) -> float:
+    """Share of points, at distances before a wall, (N,), and off by so much, that lie behind it."""
+    return float((away < -(BEHIND + WALL_TOLERANCE + tolerance)).mean()) if len(away) else 0.0
 
 
 def _is_large(upright: Float, normal: Float) -> bool:
