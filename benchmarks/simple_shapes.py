@@ -41,7 +41,7 @@ def write_shape(path: Path, name: str, radius: float, turn: float) -> Path:
 def main(
     models: str = "ycb",
     radii: tuple[float, ...] = (0.03, 0.06, 0.12),
-    draws: int = 3,
+    draws: int = 1,
     sensor: str = "wrist",
     seed: int = 0,
 ) -> None:
@@ -54,7 +54,7 @@ def main(
         sensor: through which they are looked at.
         seed: of all draws.
     """
-    system = nextview.load(models=models)
+    system = nextview.load(models=models, threads=1)
     rng = np.random.default_rng(seed)
     asked = [(name, radius) for name in SHAPES for radius in radii for _ in range(draws)]
     found: dict[tuple[str, float], list[nextview.Recognition]] = {}

@@ -259,3 +259,12 @@ def test_a_session_with_frames_can_be_pickled_and_goes_on_alike(tiny):
     for one in (session, other):
         one.update(second)
     assert other.left_out == session.left_out
+
+
+def test_the_values_of_a_view_rank_the_candidates():
+    """As the page about cameras says: the largest of those that are left is the target."""
+    session = nextview.load(policy="gain", threshold=1.0, threads=1).session(distance=0.5)
+    view = session.update(look(FROM, BRICK, TABLE))
+    taken = {earlier.index for earlier in session.views}
+    left = [k for k in range(40) if not session.left_out[k] and k not in taken and np.isfinite(view.values[k])]
+    assert session.view == max(left, key=lambda k: view.values[k])
