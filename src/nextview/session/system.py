@@ -72,7 +72,8 @@ class System:
         Args:
             start: where to look first, an index of ``sphere``; drawn by the seed if not given.
             seed: decides the first view and whatever the policy draws.
-            object: which object to find in the frames of a depth camera; by default the one at which the first camera is aimed.
+            object: which object to find in the frames of a depth camera; by default the one at which the first camera
+                is aimed.
             distance: how far from the object the camera shall stand, metres; 3 object radii by default. With an object
                 or a distance the session takes frames, else what it is given first.
             min_height: of the camera above the support plane, metres, at least; by default 0.08, and a tenth of the
