@@ -169,6 +169,27 @@ def test_a_level_part_of_the_object_is_not_its_support(mesh, asked, azimuth):
     assert_is(thing, mesh)
 
 
+# Pieces
+
+
+@pytest.mark.parametrize("gap", [0.01, 0.15, 0.3])
+@pytest.mark.parametrize("elevation", [4, 20])
+def test_a_top_is_held_by_the_foot_that_shows_below_it(elevation, gap):
+    side = 0.2 + 2 * gap
+    table = trimesh.util.concatenate([box((side, 2 * side, 0.05), (0, 0, 0.7)), box((0.2, 0.2, 0.68), (0, 0, 0.34))])
+    thing = ObservedObject(point=middle_of(table))
+    thing.add(frame([table, FLOOR, FAR_WALL], pose_at(elevation, 10, 2.2, middle_of(table))))
+    assert_is(thing, table)
+
+
+def test_what_a_nearer_thing_hides_below_is_not_held_by_it():
+    mug, carton = box((0.1, 0.3, 0.12), (0, 0, 0.06)), box((0.1, 0.2, 0.3), (-0.3, 0, 0.15))
+    thing = ObservedObject(point=middle_of(mug))
+    thing.add(frame([mug, carton, TABLE], pose_at(14, 0, 0.7, middle_of(mug)), sigma=0.001))
+    _, which = cast([mug, carton, TABLE], pose_at(14, 0, 0.7, middle_of(mug)))
+    assert (which == 1)[thing.sightings[0].mask].mean() < 0.02
+
+
 # Extent
 
 

@@ -151,8 +151,9 @@ def _links(footprints: Sequence[Footprint], shared: Float, beside: Mask, joins: 
     """How strongly each two pieces are linked, 0 for not, which stand apart and which may, (N, N) each."""
     every = [f.pieces for f in footprints]
     same, stands = block_diag(*(np.ones_like(p.touch) for p in every)) > 0, np.concatenate([p.stands for p in every])
-    touch, low, inside = (block_diag(*(getattr(p, a) for p in every)) > 0 for a in ("touch", "low", "inside"))
-    inside |= inside.T
+    names = "touch", "low", "inside", "hangs"
+    touch, low, inside, hangs = (block_diag(*(getattr(p, name) for p in every)) > 0 for name in names)
+    inside |= inside.T | hangs | hangs.T
     both, neither = np.logical_and.outer(stands, stands), ~np.logical_or.outer(stands, stands)
     strength = np.where(shared >= np.where(same, OVERLAP, LIES_OVER), shared, 0)
     touch &= ~(both & low) if joins == "by their border" else joins == "always"

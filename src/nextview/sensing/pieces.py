@@ -33,6 +33,8 @@ ENCLOSED = 0.7
 """Share of the border of a piece that it has to one other, from which it lies inside it: the bottom of a bathtub."""
 NEXT: Any = ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))
 """All pairs of pixels side by side: the first of each, and the second."""
+HELD, HIDDEN = 0.1, 0.1
+"""Share of the lower edge of a piece under which what holds it shows, at least; and behind a nearer one, at most."""
 LOWEST = 5  # pixels of a piece that may be so low by noise
 LOW = 2  # pixels, that low, of the border of two things that stand side by side
 
@@ -44,7 +46,8 @@ class Pieces:
     ``label`` is that of each pixel, (H, W) int32, 0 for none; ``grown`` with those of edges, that are less sure.
     ``stands`` tells which pieces reach down to the plane, (pieces + 1,) bool, by label. Of each two pieces ``touch``
     tells whether they touch in space, ``low`` whether their border comes down to the plane, and ``inside`` whether the
-    first lies inside the outline of the second, (pieces + 1, pieces + 1) bool.
+    first lies inside the outline of the second, and ``hangs`` whether the first, which does not reach down to the
+    plane, is held by the second: (pieces + 1, pieces + 1) bool.
     """
 
     label: NDArray[np.int32]
@@ -53,6 +56,7 @@ class Pieces:
     touch: Mask
     low: Mask
     inside: Mask
+    hangs: Mask
 
 
 def cut(
@@ -75,7 +79,7 @@ def cut(
     label, grown = np.zeros((2, *depth.shape), np.int32)
     part = within(above)
     if not above[part].size:
-        return Pieces(label, grown, np.zeros(1, bool), *np.zeros((3, 1, 1), bool))
+        return Pieces(label, grown, np.zeros(1, bool), *np.zeros((4, 1, 1), bool))
     step = max(1, round(depth.shape[1] / WIDTH))
     few = (slice(None, None, step),) * 2
     z, mask, high = depth[part][few], above[part][few], height[part][few]
@@ -106,7 +110,9 @@ def cut(
         shown[part] = np.where(above[part] | own, whole, 0)
     whole = _grown(found, mask, inverse, 4 * tolerance)
     at_plane = _borders(whole, [low[a] | low[b] for a, b in NEXT]) >= LOW
-    return Pieces(label, grown, stands, _touching(whole, inverse, 2 * tolerance), at_plane, _enclosed(around))
+    touch = _touching(whole, inverse, 2 * tolerance)
+    hangs = _hanging(whole, inverse, tolerance, stands)
+    return Pieces(label, grown, stands, touch, at_plane, _enclosed(around), hangs)
 
 
 def _grown(label: NDArray[np.int64], mask: Mask, inverse: Inverse, tolerance: Inverse) -> NDArray[np.int64]:
@@ -201,6 +207,37 @@ def _enclosed(label: NDArray[np.int64]) -> Mask:
     inside = count > ENCLOSED * count.sum(1, keepdims=True)
     inside[0] = inside[:, 0] = False
     return inside
+
+
+def _hanging(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse, stands: Mask) -> Mask:
+    """Which pieces are held by which other one, (pieces + 1, pieces + 1) bool.
+
+    Nothing hangs in the air. Where the lower edge of a piece is in sight, and not on the plane, it is held by the piece
+    that shows below: the legs of a table, which stand back under its top. Where a nearer piece hides the lower edge it
+    may stand behind that.
+    """
+    n = len(stands)
+    beneath, deep = np.zeros_like(label), np.full(inverse.shape, np.nan, np.float32)
+    for step in range(LAG, 0, -1):  # an edge is some pixels wide: the nearest comes last
+        shown = label[step:] > 0
+        beneath[:-step][shown] = label[step:][shown]
+        deep[:-step][shown] = inverse[step:][shown]
+
+    edge = np.zeros(label.shape, bool)
+    edge[:-1] = (label[:-1] > 0) & (label[:-1] != label[1:])
+    edge &= ~stands[label] & (beneath != label)
+    with np.errstate(invalid="ignore"):
+        in_front = edge & (beneath > 0) & (inverse > deep - tolerance)
+    length = np.bincount(label[edge], minlength=n)
+    held = np.bincount(label[in_front] * n + beneath[in_front], minlength=n * n).reshape(n, n)
+    hidden = np.bincount(label[edge & (beneath > 0) & ~in_front], minlength=n)
+
+    holder = held.argmax(1)
+    enough = held[np.arange(n), holder] >= np.maximum(HELD * length, LOW)
+    hangs = np.zeros((n, n), bool)
+    hangs[np.arange(n), holder] = enough & (hidden < HIDDEN * length) & ~stands
+    hangs[0] = hangs[:, 0] = False
+    return hangs
 
 
 def _borders(label: NDArray[np.int64], counted: list[Mask]) -> NDArray[np.int64]:
