@@ -183,11 +183,15 @@ def numbers(values: Any, what: str) -> NDArray[Any]:
 
 
 def array_of(values: Any, what: str) -> NDArray[Any]:
-    """An array of anything; ObservationError if it cannot become one."""
+    """An array of anything, in the byte order of this machine; ObservationError if it cannot become one.
+
+    What a masked array hides becomes 0: nothing was measured there.
+    """
     try:
-        return np.asarray(values)
+        array = np.ma.filled(values, 0) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
     except (ValueError, TypeError) as error:  # rows of different lengths, or what cannot become an array at all
         raise ObservationError(f"{what} cannot be taken for an array of numbers ({error})") from None
+    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
 def depth_image(depth: Any) -> NDArray[Any]:

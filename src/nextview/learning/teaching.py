@@ -12,7 +12,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from nextview.errors import DatasetError, NoViewLeftError, ObservationError
+from nextview.errors import DatasetError, ObservationError
 from nextview.geometry.mesh import Mesh, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import resting_poses, rotated
@@ -116,15 +116,7 @@ def _seen(camera: Camera, poses: NDArray[np.float64]) -> NDArray[np.float32]:
 def _of_capture(capture: Capture) -> Arrays:
     """Of captured frames: each cell of the grid is what the nearest of them shows. Every fourth is held out."""
     camera = CapturedCamera(capture)
-    while True:
-        try:
-            frame = camera.observe(GRID.poses[0])
-        except NoViewLeftError:
-            break
-        try:
-            camera.object.add(frame)
-        except ObservationError as error:
-            camera.refused(error)
+    camera.take_all(GRID.poses[0])
     seen = [view for view in camera.object.observations if view.seen]
     if not seen:
         raise ObservationError(f"{capture.folder}: none of its frames shows an object")

@@ -1,6 +1,6 @@
 """One frame of a depth camera, in the units and axes of nextview, or refused in words."""
 
-from dataclasses import InitVar, dataclass
+from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,11 +8,13 @@ from numpy.typing import ArrayLike, NDArray
 from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.observation import LARGEST, array_of, numbers
+from nextview.sensing.holes import fill_regular_gaps
 
 Part = tuple[slice, slice]  # rows and columns of a picture
 WHOLE = slice(None), slice(None)
 FARTHEST = 65.0  # metres: float depth beyond is nothing; uint16 millimetres reach as far
 LARGEST_MEDIAN = 20.0  # metres; a depth image beyond is of another unit: inches are 39 times as many
+NEAREST_MEDIAN = 0.01  # metres; no depth camera measures nearer
 ASPECTS = (4 / 3, 16 / 9, 16 / 10, 512 / 424, 640 / 576)  # width over height of whole pictures
 AXES = {
     "opencv": np.eye(3),
@@ -30,12 +32,14 @@ class Frame:
 
     Attributes:
         depth: along the optical axis, (H, W). Handed in as float metres, where NaN, infinity, zero and negative numbers
-            mean nothing, or as uint16 millimetres, where 0 and 65535 do. Becomes float32, metres, 0 = nothing.
+            mean nothing, or as uint16 millimetres, where 0 and 65535 do. What a masked array hides means nothing, too.
+            Becomes float32, metres, 0 = nothing; gaps that come again every few pixels are filled.
         intrinsics: pinhole matrix, (3, 3), pixels. Becomes float64, with the first pixel's centre at 0.5.
         pose: camera-to-world, (4, 4), metres, any world frame; becomes OpenCV's axes. None: the camera itself is the
             world; good for a single frame only.
         mask: where the object is, (H, W) bool; None if that is to be found.
         image: grey (H, W) or colour (H, W, 3) uint8, registered to the depth; becomes grey.
+        counted: whether the depth was handed in as uint16, in steps that may be other than millimetres.
         axes: of the pose handed in: "opencv", "opengl" or "ros", see AXES.
         pixel_centre: of the first pixel in the intrinsics handed in: 0 for OpenCV and ROS, 0.5 for OpenGL and for
             nextview's own ``Observation``.
@@ -46,11 +50,14 @@ class Frame:
     pose: NDArray[np.float64] | None = None
     mask: NDArray[np.bool_] | None = None
     image: NDArray[np.uint8] | None = None
+    counted: bool = field(init=False, default=False)
     axes: InitVar[str] = "opencv"
     pixel_centre: InitVar[float] = 0.0
 
     def __post_init__(self, axes: str, pixel_centre: float) -> None:
-        depth = _metres(self.depth)
+        given = numbers(self.depth, "the depth")
+        object.__setattr__(self, "counted", given.dtype == np.uint16)
+        depth, source = fill_regular_gaps(_metres(given))
         intrinsics = _check_intrinsics(self.intrinsics, depth.shape)
         if not isinstance(pixel_centre, int | float) or not abs(pixel_centre) <= 1:
             raise ObservationError(f"the first pixel's centre has the coordinate 0 or 0.5, not {pixel_centre!r}")
@@ -70,7 +77,7 @@ class Frame:
                 raise ObservationError(f"a mask is (H, W) bool as the depth, {depth.shape}, not {given}")
             if not (mask & (depth > 0)).any():
                 raise ObservationError("no pixel of the mask has a depth: a mask of another image, or empty")
-            object.__setattr__(self, "mask", mask.copy())
+            object.__setattr__(self, "mask", mask.copy() if source is None else mask.ravel()[source])
         if self.image is not None:
             image = array_of(self.image, "the image")
             if image.dtype != np.uint8 or image.shape not in (depth.shape, (*depth.shape, 3)):
@@ -98,8 +105,14 @@ class Frame:
 
     def positions(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
         """What some pixels show, (N, 3) float64, world, metres."""
-        (x, y), z, pose = self.rays, self.depth[rows, columns].astype(np.float64), self.camera_to_world
-        return (np.stack([x[columns], y[rows], np.ones(len(z))], 1) * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
+        pose = self.camera_to_world
+        return self.positions_in_camera(rows, columns) @ pose[:3, :3].T + pose[:3, 3]
+
+    def positions_in_camera(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """What some pixels show, (N, 3) float64, camera frame, metres."""
+        x, y = self.rays
+        z = self.depth[rows, columns].astype(np.float64)
+        return np.stack([x[columns], y[rows], np.ones(len(z))], 1) * z[:, None]
 
     def along(self, direction: NDArray[np.float64], offset: float = 0.0, part: Part = WHOLE) -> NDArray[np.float32]:
         """``direction @ position + offset`` of what every pixel shows, world, (H, W) float32; void at depth 0."""
@@ -122,8 +135,7 @@ def spans(low: NDArray[np.floating], high: NDArray[np.floating], shape: tuple[in
     return slice(first[0], last[0]), slice(first[1], last[1])
 
 
-def _metres(depth: ArrayLike) -> NDArray[np.float32]:
-    depth = numbers(depth, "the depth")
+def _metres(depth: NDArray) -> NDArray[np.float32]:
     if depth.ndim != 2 or min(depth.shape) < 2:
         raise ObservationError(f"a depth image is (H, W), not {depth.shape}")
     if depth.dtype == np.uint16:
@@ -140,7 +152,7 @@ def _metres(depth: ArrayLike) -> NDArray[np.float32]:
         wrong = "where metres are expected: millimetres? Divide them by 1000, or hand them in as uint16"
     elif middle > LARGEST_MEDIAN:
         wrong = "m, and no depth camera measures so far: is it in inches or feet?"
-    elif 0 < middle < 0.01:
+    elif 0 < middle < NEAREST_MEDIAN:
         wrong = "m: scaled to 0 .. 1, divided twice, or uint16 of another unit?"
     if wrong:
         raise ObservationError(f"the depth has a median of {middle:.4g} {wrong}")

@@ -22,6 +22,13 @@ TOO_FAR = 2.5  # so many times as far as a frame shows anything an object cannot
 STILL, CHANGED, CHANGED_SHARE = 1e-3, 0.04, 0.03
 """Metres, and parts of a rotation, up to which a pose is the same; and the part of the distance by which a pixel has
 changed, and the share of pixels that have to."""
+TIMES_TOO_LARGE = (2.0, 4.0, 5.0, 8.0, 10.0)
+"""As the depth is if 16 bits in steps of 0.5, 0.25, 0.2, 0.125 and 0.1 mm are taken for millimetres."""
+NOTHING_NEARER, MUCH_FARTHER = 1.2, 1.7
+"""Times the distance of a target: nothing is nearer, and what is seen in its place is so far, if depth is too large."""
+HALF_AGREES, MOST_AGREES = 0.5, 0.8
+"""Share of the surface on which two frames agree: from which their depth scale is right, and that names another one."""
+FEWEST_SHARED = 50  # points on which two frames have to agree or not before a depth scale is named
 FAR_ORIGIN = 30.0  # metres from the origin of the world, within which robots work; where positions in millimetres begin
 
 
@@ -49,6 +56,76 @@ def refuse_far(frame: Frame, last: Frame | None, target: Float | None, radius: f
     if distance - radius > TOO_FAR * farthest:
         what = f"the target is {distance:.0f} m away, and nothing in the frame is farther than {farthest:.1f} m"
         raise ObservationError(f"{what}: is the pose in millimetres, or are target and pose of different worlds?")
+    refuse_depth_scale(frame, last, target, radius)
+
+
+def refuse_depth_scale(frame: Frame, last: Frame | None, target: Float | None, radius: float) -> None:
+    """Refuse depth that is some times too large, as 16 bits in steps of less than a millimetre are.
+
+    Either all that is seen lies behind the target, at so many times its distance. Or the frame and
+    the last one contradict each other, and would not if the depth of both were smaller.
+    """
+    times = 0.0
+    if target is not None and frame.mask is None:
+        times = _times_behind(frame, target, radius)
+    if not times and last is not None:
+        times = _times_too_large(frame, last)
+    if not times:
+        return
+    steps = f"its steps look like {1 / times:.3g} mm" if frame.counted else "is it in another unit?"
+    hint = ", and uint16 is taken for millimetres: hand it in as float metres" if frame.counted else ""
+    raise ObservationError(f"the depth is {times:g} times too large: {steps}{hint}")
+
+
+def _times_behind(frame: Frame, target: Float, radius: float) -> float:
+    """How many times too large the depth is if all that is seen lies behind a target; else 0."""
+    pose = frame.camera_to_world
+    x, y, z = pose[:3, :3].T @ (target - pose[:3, 3])
+    if z <= 0:
+        return 0.0
+    k, (height, width) = frame.intrinsics, frame.shape
+    column, row = int(k[0, 0] * x / z + k[0, 2]), int(k[1, 1] * y / z + k[1, 2])
+    if not (0 <= column < width and 0 <= row < height):
+        return 0.0
+    few = frame.depth[::4, ::4]
+    around = frame.depth[max(0, row - 4) : row + 5, max(0, column - 4) : column + 5]
+    if not (around > 0).any():
+        return 0.0
+    there = float(np.median(around[around > 0]))
+    nearest = float(np.quantile(few[few > 0], 0.02)) if (few > 0).any() else 0.0
+    if nearest < NOTHING_NEARER * (z + radius) or there < MUCH_FARTHER * (z + radius):
+        return 0.0
+    return min(TIMES_TOO_LARGE, key=lambda times: abs(np.log(times * z / there)))
+
+
+def _times_too_large(frame: Frame, last: Frame) -> float:
+    """How many times smaller the depth of two frames has to be for them to agree; 0 if they do, or never."""
+    share, judged = _agreeing(last, frame, 1.0)
+    if share > HALF_AGREES or judged < FEWEST_SHARED:
+        return 0.0
+    found = {times: _agreeing(last, frame, 1 / times) for times in TIMES_TOO_LARGE}
+    best = max(found, key=lambda times: found[times][0])
+    share, judged = found[best]
+    return best if share > MOST_AGREES and judged >= FEWEST_SHARED else 0.0
+
+
+def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[float, int]:
+    """Share of the surface in one frame that another one confirms, of what it confirms or sees through; of how many."""
+    step = max(1, int(np.sqrt(first.depth.size / SAMPLE)))
+    rows, columns = np.nonzero(first.depth[::step, ::step])
+    points = scale * first.positions_in_camera(step * rows, step * columns)
+    there, here = second.camera_to_world, first.camera_to_world
+    points = (points @ here[:3, :3].T + here[:3, 3] - there[:3, 3]) @ there[:3, :3]
+    points = points[points[:, 2] > 1e-3]
+    k, (height, width) = second.intrinsics, second.shape
+    column, row = (points[:, i] / points[:, 2] * k[i, i] + k[i, 2] for i in (0, 1))
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    row, column, z = row[inside].astype(int), column[inside].astype(int), points[inside, 2]
+    seen = scale * second.depth[row, column]
+    confirmed = int(((seen > 0) & (np.abs(seen - z) < CHANGED * z)).sum())
+    seen_through = int((seen > (1 + CHANGED) * z).sum())
+    judged = confirmed + seen_through
+    return confirmed / max(judged, 1), judged
 
 
 def check_frame(frame: Frame) -> list[ViewWarning]:

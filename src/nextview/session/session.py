@@ -385,7 +385,9 @@ class Session:
         """Refuse targets inside the object or far from it, as soon as its radius is known."""
         if self.distance is None or radius < self.distance <= FARTHEST_TARGET * radius:
             return
-        why = f"within {FARTHEST_TARGET:g} radii: is it in millimetres?" if self.distance > radius else "outside of it"
+        why = "outside of it: is the depth too large (uint16 is taken for millimetres)?"
+        if self.distance > radius:
+            why = f"within {FARTHEST_TARGET:g} radii: is it in millimetres?"
         raise UsageError(
             f"the distance of {self.distance:g} m from the centre of an object of {radius:.2g} m radius has to be {why}"
         )

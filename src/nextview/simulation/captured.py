@@ -4,7 +4,7 @@ BOP: Hodan et al., ECCV 2018. TUM RGB-D: Sturm et al., IROS 2012. 7-Scenes: Shot
 """
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from nextview.errors import DatasetError, ObservationError, UsageError
 from nextview.files import read_record, regular_file
 from nextview.geometry.mesh import FORMATS
-from nextview.sensing.frame import Frame, check_pose
+from nextview.sensing.frame import LARGEST_MEDIAN, NEAREST_MEDIAN, Frame, check_pose
 from nextview.sensing.object_frame import Box
 
 NOTHING = np.iinfo(np.uint16).max  # what some sensors give for "nothing" besides 0
@@ -29,6 +29,7 @@ LARGEST_TEXT = 2**28  # bytes of a list of images or poses
 MILLIMETRES = 0.001
 TUM_STEP = 1 / 5000  # metres that one step of TUM's depth images stands for
 TOGETHER = 0.02  # seconds that an image and its pose, or depth and colour, may be apart
+MOST_LOST = 0.1  # share of the lines of a trajectory that may hold no pose
 KINECT = (585.0, 585.0, 320.0, 240.0)  # fx, fy, cx, cy of the depth camera of 7-Scenes, for all of its scenes
 Float = NDArray[np.float64]
 Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
@@ -60,12 +61,28 @@ class CapturedFrame:
             raise DatasetError(f"{self.depth}: depth is a grey PNG of 16 bits, this one has 8 (mode {deep.mode})")
         raw = np.asarray(deep).astype(np.uint16)
         depth = np.where(raw == NOTHING, 0, raw) * np.float32(self.scale)
+        self._check_scale(depth)
         mask = _as_grey(self.mask, raw.shape) > 0 if masked and self.mask is not None else None
         image = None if self.image is None else _as_grey(self.image, raw.shape)
         return Frame(depth, self.intrinsics, self.pose, mask, image)
 
+    def _check_scale(self, depth: NDArray[np.float32]) -> None:
+        """Refuse depth that no camera measures: ``Frame`` would speak of other mistakes."""
+        measured = depth[depth > 0]
+        middle = float(np.median(measured)) if len(measured) else NEAREST_MEDIAN
+        if not NEAREST_MEDIAN <= middle <= LARGEST_MEDIAN:
+            what = f"the depth has a median of {middle:.3g} m with steps of {1000 * self.scale:.3g} mm"
+            raise ObservationError(f"{self.depth}: {what}: the depth scale is wrong")
 
-Frames = tuple[list[CapturedFrame], list[str]]  # and what was assumed or left out, a phrase each
+
+@dataclass
+class _Views:
+    """What a layout's reader finds; the fields are those of ``Capture``."""
+
+    frames: list[CapturedFrame]
+    notes: list[str]
+    unreadable: dict[str, str] = field(default_factory=dict)
+    object_is_world: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,6 +94,8 @@ class Capture:
     frames: tuple[CapturedFrame, ...]  # in the folder's order, at least one
     up: tuple[float, float, float] | None  # direction against gravity in its world; None if the layout says nothing
     notes: tuple[str, ...]  # what was assumed or left out, a phrase each
+    unreadable: tuple[tuple[str, str], ...] = ()  # frames without a usable pose: name and reason
+    object_is_world: bool = False  # the poses are relative to the object: what is around it may move
 
     def __repr__(self) -> str:
         return f"{self.folder}: {self.layout} layout, {len(self.frames)} frames; " + "; ".join(self.notes)
@@ -109,11 +128,12 @@ def read_capture(folder: str | Path, intrinsics: Intrinsics = None, object_id: i
         k, said = pinhole_of(*intrinsics), ["intrinsics as given"]
     elif intrinsics is not None or path.exists():
         k, said = read_table(path, "the pinhole matrix", 3), [f"intrinsics of {path.name}"]
-    frames, notes = LAYOUTS[layout][1](folder, k, object_id)
-    if not frames:
-        raise DatasetError(f"{folder}: no image shows the object")
+    views = LAYOUTS[layout][1](folder, k, object_id)
+    if not views.frames:
+        raise DatasetError(next(iter(views.unreadable.values()), f"{folder}: no image shows the object"))
     up = None if layout == "7-Scenes" else (0.0, 0.0, 1.0)  # the world of 7-Scenes is that of its first camera
-    return Capture(folder, layout, tuple(frames), up, (*said, *notes))
+    notes, unreadable = (*said, *views.notes), tuple(views.unreadable.items())
+    return Capture(folder, layout, tuple(views.frames), up, notes, unreadable, views.object_is_world)
 
 
 def _no_capture(folder: Path) -> str:
@@ -158,7 +178,7 @@ class _Object(Struct):
     cam_t_m2c: Three | None = None
 
 
-def _read_bop(folder: Path, intrinsics: Float | None, object_id: int | None) -> Frames:
+def _read_bop(folder: Path, intrinsics: Float | None, object_id: int | None) -> _Views:
     """Views of scene_camera.json. Without camera poses, the world is the object's model, by scene_gt.json."""
     path, truth = folder / "scene_camera.json", folder / "scene_gt.json"
     cameras = read_record(path, dict[int, _Camera], "the cameras of a BOP scene", DatasetError)
@@ -174,7 +194,7 @@ def _read_bop(folder: Path, intrinsics: Float | None, object_id: int | None) -> 
     notes = ["intrinsics of scene_camera.json"] if intrinsics is None else []
     if single is None and numbers:
         notes.append(f"objects {named}: name one with --object-id, and its masks are used")
-    frames, from_model = [], False
+    views, from_model = _Views([], notes), False
     for number, camera in sorted(cameras.items()):
         objects, name = all_objects.get(number, []), f"{number:06d}"
         here = [i for i, one in enumerate(objects) if one.obj_id == single]
@@ -187,8 +207,11 @@ def _read_bop(folder: Path, intrinsics: Float | None, object_id: int | None) -> 
         if rotation is None or translation is None:
             what = f"{where}: lacks the camera's pose (cam_R_w2c, cam_t_w2c); an object's pose in scene_gt.json will do"
             raise DatasetError(f"{what}, named with --object-id if there are several")
-        pose, turn = np.eye(4), np.reshape(rotation, (3, 3))
-        pose[:3, :3], pose[:3, 3] = turn.T, -turn.T @ (np.array(translation) * MILLIMETRES)
+        try:
+            pose = _from_world_to_camera(rotation, translation, where)
+        except DatasetError as error:
+            views.unreadable[name] = str(error)
+            continue
         k = np.reshape(camera.cam_K, (3, 3)) if intrinsics is None else intrinsics
         masks: list[Path] = []  # those of the object; without scene_gt.json, all that there are
         if len(here) == 1 or not numbers:
@@ -197,15 +220,24 @@ def _read_bop(folder: Path, intrinsics: Float | None, object_id: int | None) -> 
         images = (folder / file for file in (f"rgb/{name}.png", f"rgb/{name}.jpg", f"gray/{name}.png"))
         image, depth = next(filter(Path.exists, images), None), folder / f"depth/{name}.png"
         step = camera.depth_scale * MILLIMETRES
-        frames.append(CapturedFrame(name, depth, step, k, _rigid(pose, where), mask, image))
+        views.frames.append(CapturedFrame(name, depth, step, k, pose, mask, image))
     if from_model:
         notes.append("there are no camera poses: the world is the object's model in scene_gt.json")
-    if any(frame.mask for frame in frames):
+        views.object_is_world = True
+    if any(frame.mask for frame in views.frames):
         notes.append("masks of mask_visib")
-    return frames, notes
+    return views
 
 
-def _read_tum(folder: Path, intrinsics: Float | None, _: int | None) -> Frames:
+def _from_world_to_camera(rotation: list[float], translation: list[float], where: str) -> Float:
+    """The camera-to-world pose of BOP's world-to-camera rotation, row by row, and translation, millimetres."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.reshape(rotation, (3, 3)).T
+    pose[:3, 3] = -pose[:3, :3] @ (np.array(translation) * MILLIMETRES)
+    return _rigid(pose, where)
+
+
+def _read_tum(folder: Path, intrinsics: Float | None, _: int | None) -> _Views:
     """Views by depth.txt and groundtruth.txt; images of rgb.txt, and masks of the depth images' names in mask/."""
     if intrinsics is None:
         raise DatasetError(
@@ -213,7 +245,7 @@ def _read_tum(folder: Path, intrinsics: Float | None, _: int | None) -> Frames:
             "camera-intrinsics.txt or give --intrinsics FX FY CX CY (TUM's recordings: 525 525 319.5 239.5)"
         )
     times, depths = _images(folder / "depth.txt")
-    moments, poses = _trajectory(folder / "groundtruth.txt")
+    moments, poses, bad_lines = _trajectory(folder / "groundtruth.txt")
     colour_times, colours = _images(folder / "rgb.txt") if (folder / "rgb.txt").exists() else (np.zeros(0), [])
     frames = []
     for time, depth in zip(times, depths, strict=True):
@@ -224,23 +256,32 @@ def _read_tum(folder: Path, intrinsics: Float | None, _: int | None) -> Frames:
     if not frames:
         what = f"{folder}: no image of depth.txt has a pose in groundtruth.txt within {TOGETHER} s"
         raise DatasetError(f"{what}; are the times of one clock, in seconds?")
-    lost = len(times) - len(frames)
-    return frames, [f"{lost} depth images have no pose within {TOGETHER} s and are left out"] if lost else []
+    notes = []
+    if bad_lines:
+        notes.append(f"{bad_lines} lines of groundtruth.txt hold no pose and are left out")
+    if lost := len(times) - len(frames):
+        notes.append(f"{lost} depth images have no pose within {TOGETHER} s and are left out")
+    return _Views(frames, notes)
 
 
-def _read_seven_scenes(folder: Path, intrinsics: Float | None, _: int | None) -> Frames:
+def _read_seven_scenes(folder: Path, intrinsics: Float | None, _: int | None) -> _Views:
     """Views by frame-*.depth.png and .pose.txt, and masks in .mask.png. The colour images are not registered."""
     notes = []
     if intrinsics is None:
         intrinsics = pinhole_of(*KINECT)
         notes.append("there is no camera-intrinsics.txt: the Kinect's fx = fy = 585, cx = 320, cy = 240 are assumed")
-    frames = []
+    views = _Views([], notes)
     for depth in sorted(folder.glob("frame-*.depth.png")):
         name = depth.name.removeprefix("frame-").removesuffix(".depth.png")
         path, mask = folder / f"frame-{name}.pose.txt", folder / f"frame-{name}.mask.png"
-        pose = _rigid(read_table(path, "the camera's pose", 4), str(path))
-        frames.append(CapturedFrame(name, depth, MILLIMETRES, intrinsics, pose, mask if mask.exists() else None))
-    return frames, notes
+        try:
+            pose = _rigid(read_table(path, "the camera's pose", 4), str(path))
+        except DatasetError as error:
+            views.unreadable[name] = str(error)
+            continue
+        shown = mask if mask.exists() else None
+        views.frames.append(CapturedFrame(name, depth, MILLIMETRES, intrinsics, pose, shown))
+    return views
 
 
 def is_capture(folder: Path) -> bool:
@@ -276,17 +317,22 @@ def _images(path: Path) -> tuple[Float, list[Path]]:
     return _numbers(path, [line[:1] for line in lines])[:, 0], [path.parent / word for _, word in lines]
 
 
-def _trajectory(path: Path) -> tuple[Float, Float]:
-    """Times, (N,) seconds, and camera-to-world poses, (N, 4, 4)."""
-    values = _numbers(path, _lines(path, 8, "times, positions and quaternions (x, y, z, w)"))
+def _trajectory(path: Path) -> tuple[Float, Float, int]:
+    """Times, (N,) seconds, camera-to-world poses, (N, 4, 4), and how many lines hold none: the camera was lost."""
+    words = _lines(path, 8, "times, positions and quaternions (x, y, z, w)")
+    values = _numbers(path, words, finite=False)
     length = np.linalg.norm(values[:, 4:], axis=1)
-    worst = max(length, key=lambda n: abs(n - 1))
-    if abs(worst - 1) > 0.01:
+    good = np.isfinite(values).all(1) & (np.abs(length - 1) <= 0.01)
+
+    if np.mean(~good) > MOST_LOST:
+        values = _numbers(path, words)  # says where NaN is the reason
+        worst = max(length, key=lambda n: abs(n - 1))
         raise DatasetError(f"{path}: a quaternion has the length {worst:.3g}, not 1")
+    values = values[good]
     poses = np.tile(np.eye(4), (len(values), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(values[:, 4:]).as_matrix()
     poses[:, :3, 3] = values[:, 1:4]
-    return values[:, 0], poses
+    return values[:, 0], poses, int((~good).sum())
 
 
 def _lines(path: Path, columns: int, what: str) -> list[list[str]]:
@@ -304,12 +350,12 @@ def _lines(path: Path, columns: int, what: str) -> list[list[str]]:
     return [words for _, words in lines]
 
 
-def _numbers(path: Path, words: list[list[str]]) -> Float:
+def _numbers(path: Path, words: list[list[str]], finite: bool = True) -> Float:
     try:
         values = np.array(words, np.float64)
     except ValueError as error:
         raise DatasetError(f"{path}: a number is expected ({error})") from None
-    if not np.isfinite(values).all():
+    if finite and not np.isfinite(values).all():
         raise DatasetError(f"{path}: holds NaN or infinity; was the camera lost here? Remove this frame")
     return values
 

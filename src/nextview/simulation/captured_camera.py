@@ -6,14 +6,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.errors import NoViewLeftError, ObservationError
+from nextview.errors import DatasetError, NoViewLeftError, ObservationError
 from nextview.geometry.viewsphere import angle_between
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box, ObjectFrame, upright_axes
 from nextview.sensing.observed_object import ObservedObject
 from nextview.simulation.captured import Capture, CapturedFrame, Float
+from nextview.simulation.captured_check import check_capture, refuse_many
 
 UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}  # the axes of a world that may be called up by name
+AROUND = 3  # pixels around the object's centre that tell whether it is hidden
+HIDDEN = 1.5  # object radii before its centre from which something else hides it
 
 
 @dataclass(frozen=True)
@@ -25,15 +28,30 @@ class Taken:
 
 
 class CapturedCamera:
-    """Answers each request with the captured view that is nearest in direction, as seen from the object, and unused.
+    """Answers each request with the nearest captured view, as seen from the object, that is unused.
 
-    The object is found by the masks of the folder, unless a point or a box is given. Views whose picture does not hold
-    its centre come last. A view that does not show the object is left out, and the next nearest answers.
+    The object is found by the masks of the folder, unless a point or a box is given. Views whose
+    picture does not hold its centre come last. A view that does not show the object is left out,
+    and the next nearest answers.
 
-    ``up``: against gravity, world, (3,); by default by the layout, or the normal of the support plane. ``point``: near
-    the object, world, metres, (3,), if not the largest thing on the support plane is meant. ``box``: upright, into
-    which the object just fits. The others as for ``ObservedObject``. ``taken``: the views that answered, in order;
-    ``left_out``: why views were left out, by name. ObservationError if the object is found in none of the views.
+    Args:
+        capture: is checked first, see ``check_capture``.
+        up: against gravity, world, (3,); by default by the layout, or the normal of the support
+            plane.
+        point: near the object, world, metres, (3,), if not the largest thing on the support plane
+            is meant.
+        box: upright, into which the object just fits.
+        denoise: as for ``ObservedObject``.
+        life_size: as for ``ObservedObject``.
+
+    Attributes:
+        capture: the views that can be used.
+        taken: the views that answered, in order.
+        left_out: why views were left out, by name.
+
+    Raises:
+        DatasetError: more than a tenth of the views cannot be used, or their poses cannot be right.
+        ObservationError: the object is found in none of the views.
     """
 
     knows_reach = True  # the camera stood there when the frames were captured; see ``session.FrameCamera``
@@ -47,17 +65,24 @@ class CapturedCamera:
         denoise: bool = True,
         life_size: bool = True,
     ) -> None:
-        self.capture, self.taken, self.left_out = capture, list[Taken](), dict[str, str]()
-        self._masked, self._left = point is None and box is None, list(capture.frames)
+        self._masked = point is None and box is None
+        self._total = len(capture.frames) + len(capture.unreadable)
+        self.capture, self.left_out = check_capture(capture, self._masked)
+        self.taken: list[Taken] = []
+        self._misses: dict[str, str] = dict(self.left_out)  # those that are no view from elsewhere
+        self._left = list(self.capture.frames)
+
         up = capture.up if up is None else up
         same: dict[str, Any] = {"denoise": denoise, "life_size": life_size}
         if box is not None:
             up = box.axes[2] if up is None else up
-            self.object, self._about = ObservedObject(up, box=box, **same), box.object_frame
+            self.object = ObservedObject(up, box=box, **same)
+            self._about = box.object_frame
             return
         self._about = self._find(up, point)
-        masked = self._masked and any(frame.mask is not None for frame in capture.frames)
-        self.object = ObservedObject(self._about.axes[2], None if masked else self._about.centre, **same)
+        masked = self._masked and any(frame.mask is not None for frame in self.capture.frames)
+        known_place = None if masked else self._about.centre
+        self.object = ObservedObject(self._about.axes[2], known_place, **same)
 
     @property
     def object_frame(self) -> ObjectFrame:
@@ -65,7 +90,15 @@ class CapturedCamera:
         return self.object.object_frame if self.object.sightings else self._about
 
     def observe(self, pose: Float) -> Frame:
-        """The nearest unused view to a pose, (4, 4), object frame, object radii; NoViewLeftError if none is left."""
+        """The nearest unused view to a pose.
+
+        Args:
+            pose: (4, 4), object frame, object radii.
+
+        Raises:
+            NoViewLeftError: all views were used or left out.
+            DatasetError: more than a tenth of the views cannot be used.
+        """
         asked = np.asarray(pose, np.float64)[:3, 3]
         while self._left:
             found = self.object_frame
@@ -75,6 +108,9 @@ class CapturedCamera:
                 frame = captured.read(self._masked)
             except ObservationError as error:
                 self.left_out[captured.name] = str(error)
+            except DatasetError as error:
+                self.left_out[captured.name] = self._misses[captured.name] = str(error)
+                refuse_many(self.capture, self._misses, self._total)
             else:
                 self.taken.append(Taken(captured, _degrees_off(captured, asked, found)))
                 return frame
@@ -82,8 +118,46 @@ class CapturedCamera:
         raise NoViewLeftError(f"{self.capture.folder}: no view is left that shows the object{why}")
 
     def refused(self, error: ObservationError) -> None:
-        """The last view that answered does not show the object."""
+        """Say that the last view that answered does not show the object."""
         self.left_out[self.taken.pop().frame.name] = str(error)
+
+    def take_all(self, pose: Float) -> ObservedObject:
+        """Look at the object from all views, those nearest to a pose first.
+
+        Args:
+            pose: (4, 4), object frame, object radii.
+
+        Returns:
+            The object with the observations of all views that show it.
+
+        Raises:
+            DatasetError: the object is not found in more than a tenth of the views that look at it.
+        """
+        while True:
+            try:
+                frame = self.observe(pose)
+            except NoViewLeftError:
+                break
+            try:
+                self.object.add(frame)
+            except ObservationError as error:
+                captured = self.taken[-1].frame
+                self.refused(error)
+                if self._looks_at_it(captured, frame):
+                    self._misses[captured.name] = str(error)
+        refuse_many(self.capture, self._misses, self._total)
+        return self.object
+
+    def _looks_at_it(self, captured: CapturedFrame, frame: Frame) -> bool:
+        """Whether the object's centre is in the picture, and nothing hides it."""
+        found = self.object_frame
+        column, row, depth = _projected(captured, found.centre)
+        height, width = frame.shape
+        if not (depth > 0 and 0 <= column < width and 0 <= row < height):
+            return False
+        around = frame.depth[_near(row, height), _near(column, width)]
+        measured = around[around > 0]
+        return not len(measured) or bool(np.median(measured) > depth - HIDDEN * found.radius)
 
     def _find(self, up: ArrayLike | None, point: ArrayLike | None) -> ObjectFrame:
         """About where the object is."""
@@ -92,7 +166,7 @@ class CapturedCamera:
             thing = ObservedObject(up, point)
             try:
                 thing.add(frame.read(self._masked))
-            except ObservationError as error:
+            except (DatasetError, ObservationError) as error:
                 reason = reason or str(error)
                 continue
             found = thing.object_frame
@@ -107,8 +181,20 @@ def _degrees_off(frame: CapturedFrame, asked: Float, found: ObjectFrame) -> floa
     return float(np.degrees(angle_between(asked, found.axes @ (frame.pose[:3, 3] - found.centre))))
 
 
+def _projected(captured: CapturedFrame, point: Float) -> tuple[float, float, float]:
+    """Column and row in which a point, world, (3,), is seen, and its depth, metres."""
+    pose = captured.pose
+    x, y, z = captured.intrinsics @ (pose[:3, :3].T @ (point - pose[:3, 3]))
+    return (x / z, y / z, z) if z > 0 else (-1.0, -1.0, z)
+
+
+def _near(at: float, size: int) -> slice:
+    """Rows or columns around one of them."""
+    return slice(max(0, int(at) - AROUND), min(size, int(at) + AROUND + 1))
+
+
 def _cost(frame: CapturedFrame, asked: Float, found: ObjectFrame) -> float:
     """Degrees off; 180 more where the object's centre is outside the picture."""
-    x, y, z = frame.intrinsics @ (frame.pose[:3, :3].T @ (found.centre - frame.pose[:3, 3]))
-    inside = z > 0 and 0 <= x / z < frame.size[0] and 0 <= y / z < frame.size[1]
-    return _degrees_off(frame, asked, found) + 180 * (not inside)
+    column, row, depth = _projected(frame, found.centre)
+    inside = depth > 0 and 0 <= column < frame.size[0] and 0 <= row < frame.size[1]
+    return _degrees_off(frame, asked, found) + (0 if inside else 180)

@@ -57,7 +57,8 @@ def read_turntable(folder: Path, turn: str) -> Capture:
         back, pose = _turned(-way * i, len(frames)), np.eye(4)
         pose[:3, :3], pose[:3, 3] = back @ axes, back @ [*-axis, plane[3]]
         posed.append(replace(frame, pose=pose))
-    return Capture(folder, "turntable", tuple(posed), (0.0, 0.0, 1.0), (f"{len(posed)} even steps {turn}",))
+    notes = (f"{len(posed)} even steps {turn}",)
+    return Capture(folder, "turntable", tuple(posed), (0.0, 0.0, 1.0), notes, object_is_world=True)
 
 
 def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:

@@ -1,0 +1,274 @@
+"""The usual mistakes in the poses of captured frames, and which of them makes the frames agree."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from nextview.sensing.agreement import Agreement, SurfaceView, compare
+from nextview.sensing.frame import AXES
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+FEWEST_JUDGED = 100  # points that two frames or more have to share before anything is said
+CERTAIN_SHARE = 0.99  # share of confirmed points from which no mistake is searched for
+GOOD_SHARE = 0.9  # the same, from which only shifted poses are: they leave most pairs of frames right
+FEWER_CONTRADICTIONS = 0.5  # a mistake is named if without it at most this part of them is left
+LEAST_CONTRADICTED = 0.08  # ... of at least this share of the points that it concerns
+LEAST_OVERLAP = 0.5  # and if at least this part of the points can still be judged without it
+NO_OVERLAP = 0.25  # as read, frames that see less than this part of what they could see in common look past each other
+WELL_EXPLAINED = 0.85  # share of the points that are confirmed without the mistake
+ONE_PLACE = 0.1  # cameras within this part of the depth stand in one place: no capture of an object
+SAME_POSE = 1e-3  # metres, and parts of a rotation, up to which two poses are the same
+FRAME_SHIFTS = (1, -1, 2, -2)  # by how many frames poses may be late
+UNIT_NAMES = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches", 0.3048: "feet"}
+DEPTH_SCALES = (1000, 100, 10, 5, 4, 2.5, 2, 0.5, 0.4, 0.25, 0.2, 0.1, 0.01, 0.001)
+"""By which the depth may be too large: the steps of cameras are 1, 0.5, 0.25, 0.2, 0.125 and 0.1 mm."""
+COMMON_SCALES = (1000, 0.001, 10, 0.1, 5, 0.2, 4, 0.25)  # that are tried together with another mistake
+
+
+@dataclass(frozen=True)
+class PoseMistake:
+    """One mistake that captured poses may have.
+
+    Attributes:
+        kind: "inverse", "quaternion", "axes", "scale", "shift" or "mixed".
+        sentence: what it looks like, the end of a sentence; empty for a scale, which may be that
+            of the translations or of the depth.
+        corrected: makes the right poses of the wrong ones, both camera-to-world, (N, 4, 4).
+        shift: by how many frames the poses are late.
+        scale: by which the translations are multiplied.
+    """
+
+    kind: str
+    sentence: str
+    corrected: Callable[[Float], Float]
+    shift: int = 0
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Posed:
+    """Frames that are compared, among all those of a capture.
+
+    Attributes:
+        views: N frames.
+        indices: which of all frames they are, (N,).
+        poses: of all frames, in their order, as read, camera-to-world, (M, 4, 4).
+        to_world: whether the layout stores camera-to-world poses.
+        unit: of the translations that the layout stores, metres.
+    """
+
+    views: Sequence[SurfaceView]
+    indices: Index
+    poses: Float
+    to_world: bool
+    unit: float
+
+    def as_read(self) -> Float:
+        """The poses of the views, (N, 4, 4)."""
+        return self.poses[self.indices]
+
+
+def find_mistake(posed: Posed, as_read: Agreement) -> PoseMistake | None:
+    """The mistake without which frames agree much better; None if there is none.
+
+    First each mistake alone is tried, then two at once.
+    """
+    overlap = as_read.judged / max(_judgeable(posed.views), 1)
+    if overlap > NO_OVERLAP and as_read.share > CERTAIN_SHARE:
+        return None
+    shifts = [_shifted(frames) for frames in FRAME_SHIFTS]
+    if overlap > NO_OVERLAP and as_read.share > GOOD_SHARE:
+        return _best(posed, as_read, shifts)
+    single = _single_mistakes(posed.to_world, posed.unit)
+    return _best(posed, as_read, single + shifts) or _best(posed, as_read, _pairs(single))
+
+
+def _best(posed: Posed, as_read: Agreement, mistakes: Sequence[PoseMistake]) -> PoseMistake | None:
+    """Of the mistakes that explain much better what is seen, the one with the most confirmed points."""
+    best = None
+    most_confirmed = 0.0
+    for mistake in mistakes:
+        confirmed = _explained(posed, as_read, mistake)
+        if confirmed > most_confirmed:
+            best, most_confirmed = mistake, confirmed
+    return best
+
+
+def _explained(posed: Posed, as_read: Agreement, mistake: PoseMistake) -> float:
+    """How many points are confirmed without a mistake; 0 if that is not much better than with it.
+
+    Only the pairs of frames count whose poses relative to each other the mistake changes.
+    """
+    late = posed.indices + mistake.shift
+    kept = (late >= 0) & (late < len(posed.poses))
+    if kept.sum() < 2:
+        return 0.0
+    views = [view for view, keep in zip(posed.views, kept, strict=True) if keep]
+    poses = mistake.corrected(posed.poses[late[kept]])
+    if _in_one_place(views, poses):
+        return 0.0
+
+    changed = _relative_change(poses, posed.as_read()[kept])
+    with_it = Agreement(as_read.confirmed[np.ix_(kept, kept)], as_read.contradicted[np.ix_(kept, kept)]).among(changed)
+    without = compare(views, poses).among(changed)
+    if without.judged < FEWEST_JUDGED or without.share < WELL_EXPLAINED:
+        return 0.0
+
+    possible = _judgeable(views) * changed.sum() / max(changed.size - len(changed), 1)
+    looks_past = with_it.judged < NO_OVERLAP * without.judged and without.judged > possible / 2
+    wrong = 1 - with_it.share
+    contradicted = (
+        with_it.judged >= FEWEST_JUDGED
+        and wrong > LEAST_CONTRADICTED
+        and 1 - without.share < FEWER_CONTRADICTIONS * wrong
+        and without.judged > LEAST_OVERLAP * with_it.judged
+    )
+    return float(without.confirmed.sum()) if looks_past or contradicted else 0.0
+
+
+def _judgeable(views: Sequence[SurfaceView]) -> float:
+    """How many points could be judged if all frames showed all of them."""
+    return float(sum(len(view.points) for view in views) * (len(views) - 1))
+
+
+def _in_one_place(views: Sequence[SurfaceView], poses: Float) -> bool:
+    """Whether all cameras stand in one place: then a round thing agrees with itself however they are turned."""
+    depths = [np.median(view.points[:, 2]) for view in views if len(view.points)]
+    places = poses[:, :3, 3]
+    apart = np.linalg.norm(places - np.median(places, 0), axis=1)
+    return not depths or bool(np.quantile(apart, 0.9) < ONE_PLACE * np.median(depths))
+
+
+def _relative_change(poses: Float, others: Float) -> NDArray[np.bool_]:
+    """Of which two cameras the pose relative to each other differs, (N, N)."""
+    relative, other_relative = (np.linalg.inv(each)[:, None] @ each[None] for each in (poses, others))
+    return np.abs(relative - other_relative).max((2, 3)) > SAME_POSE
+
+
+# The mistakes
+
+
+def _single_mistakes(to_world: bool, unit: float) -> list[PoseMistake]:
+    """All but shifts, of poses that a layout stores as camera-to-world or not, in some unit, metres."""
+    stored, other = "camera-to-world", "world-to-camera"
+    if not to_world:
+        stored, other = other, stored
+    found = [
+        PoseMistake(
+            "inverse",
+            f"the poses are inverse: this layout has {stored} poses, and these are {other}",
+            _inverted,
+        ),
+        PoseMistake(
+            "mixed",
+            f"the rotations are inverse: this layout has {stored} poses, and only the translations are",
+            _in_stored(_rotation_inverted, to_world),
+        ),
+        PoseMistake(
+            "mixed",
+            f"the translations are those of inverse poses: this layout has {stored} poses, and only the rotations are",
+            _in_stored(_translation_inverted, to_world),
+        ),
+    ]
+    for name, axes in (("OpenGL", AXES["opengl"]), ("a ROS body", AXES["ros"])):
+        sentence = f"the camera's axes are those of {name}, and OpenCV's are expected (x right, "
+        sentence += "y down, z forward)"
+        found.append(PoseMistake("axes", sentence, _turned_by(axes)))
+    for steps, wrong, right in ((1, "w, x, y, z", "x, y, z, w"), (-1, "x, y, z, w", "w, x, y, z")):
+        sentence = f"the quaternions are in the order {wrong}, and were taken for {right}"
+        for in_world in (True, False):
+            corrected = _in_stored(_quaternion_rolled(steps), in_world)
+            found.append(PoseMistake("quaternion", sentence, corrected))
+    units = {round(other / unit, 6) for other in UNIT_NAMES if other != unit}
+    return found + [_scaled(scale) for scale in sorted(units | set(DEPTH_SCALES))]
+
+
+def _pairs(single: Sequence[PoseMistake]) -> list[PoseMistake]:
+    """Two mistakes at once, of two kinds; of the scales only the commonest."""
+    single = [m for m in single if m.scale == 1 or m.scale in COMMON_SCALES]
+    found = []
+    for i, first in enumerate(single):
+        for second in single[i + 1 :]:
+            if first.kind == second.kind or {first.kind, second.kind} == {"mixed", "inverse"}:
+                continue
+            found.append(
+                PoseMistake(
+                    f"{first.kind} and {second.kind}",
+                    " and ".join(filter(None, (first.sentence, second.sentence))),
+                    _one_after_the_other(first.corrected, second.corrected),
+                    scale=first.scale * second.scale,
+                )
+            )
+    return found
+
+
+def _one_after_the_other(first: Callable[[Float], Float], second: Callable[[Float], Float]) -> Callable[[Float], Float]:
+    return lambda poses: second(first(poses))
+
+
+def _shifted(frames: int) -> PoseMistake:
+    many = "one frame" if abs(frames) == 1 else f"{abs(frames)} frames"
+    where = "late: each frame has the pose of an earlier one"
+    if frames < 0:
+        where = "early: each frame has the pose of a later one"
+    return PoseMistake("shift", f"the poses are {many} {where}", np.copy, shift=frames)
+
+
+def _scaled(scale: float) -> PoseMistake:
+    def corrected(poses: Float) -> Float:
+        poses = poses.copy()
+        poses[:, :3, 3] *= scale
+        return poses
+
+    return PoseMistake("scale", "", corrected, scale=scale)
+
+
+def _turned_by(axes: Float) -> Callable[[Float], Float]:
+    def corrected(poses: Float) -> Float:
+        poses = poses.copy()
+        poses[:, :3, :3] = poses[:, :3, :3] @ axes
+        return poses
+
+    return corrected
+
+
+def _in_stored(change: Callable[[Float], Float], to_world: bool) -> Callable[[Float], Float]:
+    """A change of camera-to-world poses by one of the poses as they are stored."""
+    if to_world:
+        return change
+    return lambda poses: _inverted(change(_inverted(poses)))
+
+
+def _inverted(poses: Float) -> Float:
+    return np.asarray(np.linalg.inv(poses), np.float64)
+
+
+def _rotation_inverted(poses: Float) -> Float:
+    poses = poses.copy()
+    poses[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
+    return poses
+
+
+def _translation_inverted(poses: Float) -> Float:
+    poses = poses.copy()
+    poses[:, :3, 3] = -(poses[:, :3, :3] @ poses[:, :3, 3, None])[:, :, 0]
+    return poses
+
+
+def _quaternion_rolled(steps: int) -> Callable[[Float], Float]:
+    """The rotations if the quaternions x, y, z, w that give them are in another order."""
+
+    def corrected(poses: Float) -> Float:
+        poses = poses.copy()
+        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        # (x, y, z, w) as read are w, x, y, z in truth: they move to the left by one.
+        rolled = np.roll(quaternions, -steps, axis=1)
+        poses[:, :3, :3] = Rotation.from_quat(rolled).as_matrix()
+        return poses
+
+    return corrected
