@@ -9,14 +9,20 @@ import numpy as np
 import pytest
 from PIL import Image
 from pipeline import refused
+from scipy.spatial.transform import Rotation
 
 import nextview
 from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
+from nextview.errors import DatasetError
+from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.learning.learn import learn
 from nextview.simulation.captured import read_box, read_capture
 from nextview.simulation.captured_camera import CapturedCamera
+from nextview.simulation.captured_check import check_capture
 from nextview.simulation.capturing import write_capture
+from nextview.simulation.scene import square
 
 TWELVE = ViewSphere.named("12")
 RADIUS = 0.55
@@ -173,6 +179,167 @@ def test_the_section_of_the_guide_runs(tmp_path, monkeypatch, capsys):
     assert "It is a chair" in capsys.readouterr().out
     exec(re.search(r"```python\n(.*?)```", section, re.S)[1], {"nextview": nextview})
     assert "chair (belief" in capsys.readouterr().out
+
+
+# Frames that do not fit together
+
+
+SMALL_K = np.array([[131.25, 0, 80], [0, 131.25, 60], [0, 0, 1]])
+STEPS = {"bop": 0.001, "tum": 1 / 5000, "7scenes": 0.001}  # metres, of the depth images
+
+
+def seen(count=9, moved=0.0, turned=0.0):
+    """Depth images, metres, of the sample chair on a table, and poses that are off by some metres and degrees."""
+    rng = np.random.default_rng(3)
+    mesh = sample_mesh("chair")
+    vertices = 0.3 * (mesh.vertices - [0, 0, mesh.vertices[:, 2].min()])
+    caster = RayCaster([(vertices, mesh.faces), square(0.6, 0.0)])
+    rays = pixel_rays(SMALL_K, (120, 160)).reshape(-1, 3)
+    poses = look_at_origin(np.radians(rng.uniform(20, 70, count)), rng.uniform(0, 2 * np.pi, count), 1.0)
+    poses[:, 2, 3] += 0.25
+    depths = []
+    for pose in poses:
+        turn = Rotation.from_rotvec(rng.normal(0, turned, 3), degrees=True).as_matrix()
+        there = pose[:3, 3] + rng.normal(0, moved, 3)
+        depth, which = caster.cast(there, rays @ np.ascontiguousarray((pose[:3, :3] @ turn).T, np.float32))
+        depths.append(np.where(which < 0, 0, depth).reshape(120, 160))
+    return depths, poses
+
+
+def reordered(rotations):
+    """Rotations of quaternions w, x, y, z that are taken for x, y, z, w."""
+    return Rotation.from_quat(np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=1)).as_matrix()
+
+
+def write_frames(folder, layout, depths, poses, step=1.0, unit=1.0, swapped=False):
+    """Frames in a layout; the depth images have steps other than the layout's, the translations another unit."""
+    stored = np.linalg.inv(poses) if layout == "bop" else poses.copy()
+    if swapped and layout != "tum":
+        stored[:, :3, :3] = reordered(stored[:, :3, :3])
+    stored[:, :3, 3] *= unit * (1000 if layout == "bop" else 1)
+    k, cameras, times, lines = SMALL_K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), {}, [], []
+    for i, (depth, pose) in enumerate(zip(depths, stored, strict=True)):
+        name = {"bop": f"depth/{i:06d}.png", "tum": f"depth/{i}.png", "7scenes": f"frame-{i:06d}.depth.png"}[layout]
+        write_png(folder / name, np.minimum(np.rint(depth / (step * STEPS[layout])), 65534))
+        if layout == "bop":
+            there = {"cam_R_w2c": pose[:3, :3].ravel().tolist(), "cam_t_w2c": pose[:3, 3].tolist()}
+            cameras[str(i)] = {"cam_K": k.ravel().tolist(), "depth_scale": 1.0, **there}
+        elif layout == "tum":
+            quaternion = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), int(swapped))
+            lines.append(" ".join(f"{value:.6f}" for value in (i, *pose[:3, 3], *quaternion)))
+            times.append(f"{i} {name}")
+        else:
+            np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose)
+    if layout == "bop":
+        (folder / "scene_camera.json").write_text(json.dumps(cameras))
+    else:
+        np.savetxt(folder / "camera-intrinsics.txt", k)
+    if layout == "tum":
+        (folder / "depth.txt").write_text("\n".join(times))
+        (folder / "groundtruth.txt").write_text("\n".join(lines))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def nine():
+    return seen()
+
+
+UNITS = {"bop": 0.001, "tum": 1000, "7scenes": 1000}  # metres for millimetres, and back
+OPENGL = np.diag([1.0, -1, -1, 1])
+MISTAKES = {
+    "quaternions": (lambda p: p, {"swapped": True}, "in the order w, x, y, z"),
+    "inverse": (np.linalg.inv, {}, "the poses are inverse"),
+    "unit": (lambda p: p, {"unit": UNITS}, "the translations are in m"),
+    "five times too large": (lambda p: p, {"step": 0.2}, "the depth is 5 times too large"),
+    "four times too large": (lambda p: p, {"step": 0.25}, "the depth is 4 times too large"),
+    "five times too small": (lambda p: p, {"step": 5}, "the depth is 5 times too small"),
+    "late": (lambda p: np.concatenate([p[:1], p[:-1]]), {}, "one frame late"),
+    "early": (lambda p: np.concatenate([p[1:], p[-1:]]), {}, "one frame early"),
+    "axes": (lambda p: p @ OPENGL, {}, "those of OpenGL"),
+    "inverse, and axes": (lambda p: np.linalg.inv(p @ OPENGL), {}, "are inverse"),
+}
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("what", MISTAKES)
+def test_a_mistake_in_all_poses_is_named(what, layout, nine, tmp_path):
+    depths, poses = nine
+    change, options, said = MISTAKES[what]
+    options = {name: value[layout] if isinstance(value, dict) else value for name, value in options.items()}
+    write_frames(tmp_path, layout, depths, change(poses), **options)
+    with pytest.raises(DatasetError, match=said):
+        CapturedCamera(read_capture(tmp_path))
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize(("count", "moved", "turned"), [(9, 0, 0), (9, 0.004, 0.5), (5, 0.004, 0.5), (2, 0, 0)])
+def test_right_frames_pass(layout, count, moved, turned, tmp_path):
+    write_frames(tmp_path, layout, *seen(count, moved, turned))
+    checked, left_out = check_capture(read_capture(tmp_path))
+    assert len(checked.frames) == count
+    assert left_out == {}
+
+
+def test_a_thing_that_looks_the_same_from_all_sides_contradicts_nothing(tmp_path):
+    """A ball without a table around: shifted poses are as good as others."""
+    poses = seen(5)[1]
+    y, x = np.mgrid[:120, :160]
+    across = np.hypot((x + 0.5 - 80) / 131.25, (y + 0.5 - 60) / 131.25)
+    depth = np.where(across < 0.18, 1 - 0.2 * np.sqrt(np.maximum(0, 1 - (across / 0.2) ** 2)), 0)
+    write_frames(tmp_path, "7scenes", [depth] * 5, np.roll(poses, 1, axis=0))
+    assert check_capture(read_capture(tmp_path))[1] == {}
+
+
+def lose_pose(folder):
+    np.savetxt(folder / "frame-000004.pose.txt", np.full((4, 4), np.nan))
+
+
+def turn_pose(folder):
+    """The pose of another place altogether."""
+    pose = np.loadtxt(folder / "frame-000004.pose.txt")
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([0.3, 0.2, 0.9]).as_matrix()
+    np.savetxt(folder / "frame-000004.pose.txt", pose)
+
+
+def cut_image(folder, number=4):
+    path = folder / f"frame-00000{number}.depth.png"
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+ONE_BAD = {
+    "a lost pose": (lose_pose, "NaN"),
+    "a wrong pose": (turn_pose, "contradicts the other frames"),
+    "a cut image": (cut_image, "damaged"),
+    "an empty image": (lambda f: write_png(f / "frame-000004.depth.png", np.zeros((120, 160))), "no pixel has a depth"),
+}
+
+
+@pytest.mark.parametrize("what", ONE_BAD)
+def test_one_bad_frame_is_left_out_and_named_and_several_are_refused(what, nine, tmp_path):
+    harm, said = ONE_BAD[what]
+    write_frames(tmp_path, "7scenes", *nine)
+    harm(tmp_path)
+    camera = CapturedCamera(read_capture(tmp_path))
+    assert list(camera.left_out) == ["000004"]
+    assert said in camera.left_out["000004"]
+    cut_image(tmp_path, 7)
+    with pytest.raises(DatasetError, match="2 of 9 frames cannot be used"):
+        CapturedCamera(read_capture(tmp_path))
+
+
+def test_learn_names_the_frames_that_it_leaves_out_and_refuses_wrong_poses(nine, tmp_path):
+    depths, poses = nine
+    for name in ("chair", "stool"):
+        write_frames(tmp_path / "things" / name, "7scenes", depths, poses)
+    cut_image(tmp_path / "things/stool")
+    write_frames(tmp_path / "things/wrong", "7scenes", depths, np.linalg.inv(poses))
+    learned = learn(tmp_path / "things", tmp_path / "mine", workers=0)
+    assert learned.things == 2
+    wrong, frame = sorted(learned.left_out, key=lambda phrase: "stool" in phrase)
+    assert "the poses are inverse" in wrong
+    assert "1 of 9 frames" in frame
+    assert "000004" in frame
 
 
 # What is wrong is said in one sentence

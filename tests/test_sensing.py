@@ -18,7 +18,7 @@ from nextview.geometry.viewsphere import look_at_origin
 from nextview.recognition.inference import Recogniser
 from nextview.sensing import Box, Frame, ObjectFrame, ObservedObject, check_observation, check_views
 from nextview.sensing.facets import fit_facets, look_again, virtual_pose
-from nextview.sensing.plausibility import check_frame
+from nextview.sensing.plausibility import check_frame, refuse_far
 
 WEDGE = trimesh.util.concatenate([box((0.2, 0.16, 0.1), (0, 0, 0.05)), box((0.06, 0.16, 0.08), (-0.07, 0, 0.14))])
 """A little sofa, 0.18 m high."""
@@ -318,6 +318,27 @@ def test_poses_in_millimetres_are_refused_where_the_target_or_another_frame_tell
     with pytest.raises(ObservationError, match=r"from where it was.* in millimetres"):
         thing.add(in_millimetres(second))
     assert len(thing.observations) == 1
+
+
+@pytest.mark.parametrize("steps", [0.1, 0.2, 0.25])  # millimetres
+def test_sixteen_bits_in_other_steps_are_refused_with_the_depth_scale(steps):
+    """The target, or another frame, tells; a target that is not asked for and right millimetres are taken."""
+
+    def counted(azimuth, of):
+        seen = frame([TABLE, WEDGE], pose_at(azimuth, azimuth, 0.7))
+        return Frame(np.rint(1000 / of * seen.depth).astype(np.uint16), INTRINSICS, seen.pose, pixel_centre=0.5)
+
+    said = f"{1 / steps:g} times too large: its steps look like {steps:g} mm"
+    for target in ({"point": (0, 0, 0.1)}, {"known": true_frame(WEDGE)}):
+        with pytest.raises(ObservationError, match=said):
+            ObservedObject(**target).add(counted(25, steps))
+    with pytest.raises(ObservationError, match=said):
+        refuse_far(counted(60, steps), counted(25, steps), None, 0.0)
+    for target in ({}, {"point": (0, 0, 0.1)}):
+        thing = ObservedObject(**target)
+        thing.add(counted(25, 1))
+        thing.add(counted(60, 1))
+        assert thing.warnings == []
 
 
 def test_depth_along_the_rays_is_refused():

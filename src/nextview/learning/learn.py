@@ -22,7 +22,7 @@ from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, command, new_file, new_folder, only_one, sha256_of, unfinished
 from nextview.learning.learned_picture import draw_learned
 from nextview.learning.memory_fit import VIEWS, Fit, fit_memory, size_evidence
-from nextview.learning.teaching import Arrays, How, teach
+from nextview.learning.teaching import LEFT_OUT, Arrays, How, teach
 from nextview.learning.things import Found, Source, find_things
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import Features
@@ -199,7 +199,7 @@ def _teach(
         stamp = _stamp(source, how)
         arrays = _finished(_part_of(part, source), stamp)
         if arrays is not None:
-            taught.append((source, arrays))
+            taught.append((source, _without_phrase(source, arrays, left_out)))
         else:
             waiting.append((source, stamp))
     waiting.sort(key=lambda item: -item[0].path.stat().st_size)  # the longest first: none is left alone at the end
@@ -212,8 +212,16 @@ def _teach(
         if isinstance(result, str | WorkerDied):
             left_out.append(f"{source.name}: {result}")
         else:
-            taught.append((source, result))
+            taught.append((source, _without_phrase(source, result, left_out)))
         yield count
+
+
+def _without_phrase(source: Source, arrays: Arrays, left_out: list[str]) -> Arrays:
+    """The arrays of a thing; which of its frames were not used is told instead."""
+    phrase = arrays.get(LEFT_OUT)
+    if phrase is not None:
+        left_out.append(f"{source.name}: {bytes(phrase.tobytes()).decode()}")
+    return {name: values for name, values in arrays.items() if name != LEFT_OUT}
 
 
 def _stamp(source: Source, how: How) -> str:

@@ -1,7 +1,7 @@
 """Look at one thing from everywhere, without and with a sensor's errors, and note what its views are like."""
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -23,6 +23,7 @@ from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import unit
 from nextview.simulation.captured import Capture, is_capture, read_capture
 from nextview.simulation.captured_camera import CapturedCamera
+from nextview.simulation.captured_check import summary
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.simulation.turntable import read_turntable
@@ -34,6 +35,7 @@ BATCH = 20
 NEAR = np.radians(30)  # a captured view teaches what the thing looks like from no farther than this
 GRID = ViewSphere(RINGS, AZIMUTHS)
 SENSED = GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4, 4)  # poses of views through the sensor
+LEFT_OUT = "left_out"  # of a thing's arrays: a phrase about the frames that were not used; it is not remembered
 Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
 
 
@@ -56,8 +58,9 @@ class How:
 def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
     """What is to be remembered of one thing, by the names of the fields of ``recognition.memory.Memory``.
 
-    Of a mesh file or a folder of captured frames; name and seed decide all random draws. MeshError, DatasetError,
-    ObservationError: why it cannot be looked at, in one sentence.
+    Of a mesh file or a folder of captured frames; name and seed decide all random draws. Where some of the frames were
+    not used, there is a phrase about them under LEFT_OUT. MeshError, DatasetError, ObservationError: why it cannot be
+    looked at, in one sentence.
     """
     rng = np.random.default_rng([how.seed, zlib.crc32(name.encode())])
     if path.is_dir():
@@ -134,7 +137,16 @@ def _of_capture(capture: Capture) -> Arrays:
         "held_out_views": angles[held_out].astype(np.float32),
         "radii": np.array([camera.object.object_frame.radius], np.float32),
         "pictures": _picture(seen[0]),
+        **_said(camera.left_out, len(capture.frames) + len(capture.unreadable)),
     }
+
+
+def _said(left_out: Mapping[str, str], total: int) -> Arrays:
+    """Which frames were left out and why, UTF-8 under LEFT_OUT; nothing if all were used."""
+    if not left_out:
+        return {}
+    phrase = f"{len(left_out)} of {total} frames: {summary(left_out)}"
+    return {LEFT_OUT: np.frombuffer(phrase.encode(), np.uint8)}
 
 
 def _picture(view: Observation) -> NDArray[np.uint8]:

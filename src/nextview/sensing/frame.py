@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.observation import LARGEST, array_of, numbers
-from nextview.sensing.holes import fill_regular_gaps
+from nextview.sensing.holes import fill_regular_gaps, filled_mask
 
 Part = tuple[slice, slice]  # rows and columns of a picture
 WHOLE = slice(None), slice(None)
@@ -55,9 +55,9 @@ class Frame:
     pixel_centre: InitVar[float] = 0.0
 
     def __post_init__(self, axes: str, pixel_centre: float) -> None:
-        given = numbers(self.depth, "the depth")
-        object.__setattr__(self, "counted", given.dtype == np.uint16)
-        depth, source = fill_regular_gaps(_metres(given))
+        values = numbers(self.depth, "the depth")
+        object.__setattr__(self, "counted", values.dtype == np.uint16)
+        depth, source = fill_regular_gaps(_metres(values))
         intrinsics = _check_intrinsics(self.intrinsics, depth.shape)
         if not isinstance(pixel_centre, int | float) or not abs(pixel_centre) <= 1:
             raise ObservationError(f"the first pixel's centre has the coordinate 0 or 0.5, not {pixel_centre!r}")
@@ -77,7 +77,7 @@ class Frame:
                 raise ObservationError(f"a mask is (H, W) bool as the depth, {depth.shape}, not {given}")
             if not (mask & (depth > 0)).any():
                 raise ObservationError("no pixel of the mask has a depth: a mask of another image, or empty")
-            object.__setattr__(self, "mask", mask.copy() if source is None else mask.ravel()[source])
+            object.__setattr__(self, "mask", mask.copy() if source is None else filled_mask(mask, source))
         if self.image is not None:
             image = array_of(self.image, "the image")
             if image.dtype != np.uint8 or image.shape not in (depth.shape, (*depth.shape, 3)):

@@ -46,6 +46,19 @@ def fill_regular_gaps(depth: Depth) -> tuple[Depth, NDArray[np.int64] | None]:
     return np.where(measured, depth, filled), source
 
 
+def filled_mask(mask: Mask, source: NDArray[np.int64]) -> Mask:
+    """The mask of an image whose gaps were filled: where it has the same gaps, they are filled, too.
+
+    Args:
+        mask: (H, W) bool.
+        source: of each pixel, from ``fill_regular_gaps``.
+    """
+    added = mask.ravel()[source] & (source != np.arange(source.size).reshape(source.shape))
+    # A mask from a colour image has no gaps: it knows better where the object ends.
+    has_gaps = np.count_nonzero(added & ~mask) > np.count_nonzero(added & mask)
+    return mask | added if has_gaps else mask.copy()
+
+
 def _period(measured: Mask) -> int:
     """After how many columns gaps come again; 0 if they do not, or there are next to none."""
     begins = measured[:, :-1] & ~measured[:, 1:]

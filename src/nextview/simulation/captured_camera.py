@@ -48,6 +48,8 @@ class CapturedCamera:
         capture: the views that can be used.
         taken: the views that answered, in order.
         left_out: why views were left out, by name.
+        misses: those of them that should show the object: they cannot be read, contradict the
+            others, or look at it and do not show it.
 
     Raises:
         DatasetError: more than a tenth of the views cannot be used, or their poses cannot be right.
@@ -69,7 +71,7 @@ class CapturedCamera:
         self._total = len(capture.frames) + len(capture.unreadable)
         self.capture, self.left_out = check_capture(capture, self._masked)
         self.taken: list[Taken] = []
-        self._misses: dict[str, str] = dict(self.left_out)  # those that are no view from elsewhere
+        self.misses: dict[str, str] = dict(self.left_out)
         self._left = list(self.capture.frames)
 
         up = capture.up if up is None else up
@@ -109,8 +111,8 @@ class CapturedCamera:
             except ObservationError as error:
                 self.left_out[captured.name] = str(error)
             except DatasetError as error:
-                self.left_out[captured.name] = self._misses[captured.name] = str(error)
-                refuse_many(self.capture, self._misses, self._total)
+                self.left_out[captured.name] = self.misses[captured.name] = str(error)
+                refuse_many(self.capture, self.misses, self._total)
             else:
                 self.taken.append(Taken(captured, _degrees_off(captured, asked, found)))
                 return frame
@@ -144,8 +146,8 @@ class CapturedCamera:
                 captured = self.taken[-1].frame
                 self.refused(error)
                 if self._looks_at_it(captured, frame):
-                    self._misses[captured.name] = str(error)
-        refuse_many(self.capture, self._misses, self._total)
+                    self.misses[captured.name] = str(error)
+        refuse_many(self.capture, self.misses, self._total)
         return self.object
 
     def _looks_at_it(self, captured: CapturedFrame, frame: Frame) -> bool:
