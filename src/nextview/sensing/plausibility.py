@@ -100,17 +100,17 @@ def _times_behind(frame: Frame, target: Float, radius: float) -> float:
 
 def _times_too_large(frame: Frame, last: Frame) -> float:
     """How many times smaller the depth of two frames has to be for them to agree; 0 if they do, or never."""
-    share, judged = _agreeing(last, frame, 1.0)
-    if share > HALF_AGREES or judged < FEWEST_SHARED:
+    as_given, share = _agreeing(last, frame, 1.0)
+    if as_given >= FEWEST_SHARED and share > HALF_AGREES:
         return 0.0
     found = {times: _agreeing(last, frame, 1 / times) for times in TIMES_TOO_LARGE}
     best = max(found, key=lambda times: found[times][0])
-    share, judged = found[best]
-    return best if share > MOST_AGREES and judged >= FEWEST_SHARED else 0.0
+    confirmed, share = found[best]
+    return best if share > MOST_AGREES and confirmed > 2 * max(as_given, FEWEST_SHARED) else 0.0
 
 
-def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[float, int]:
-    """Share of the surface in one frame that another one confirms, of what it confirms or sees through; of how many."""
+def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[int, float]:
+    """How many points of a frame another one confirms, and their share of those that it confirms or sees through."""
     step = max(1, int(np.sqrt(first.depth.size / SAMPLE)))
     rows, columns = np.nonzero(first.depth[::step, ::step])
     points = scale * first.positions_in_camera(step * rows, step * columns)
@@ -124,8 +124,7 @@ def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[float, int]:
     seen = scale * second.depth[row, column]
     confirmed = int(((seen > 0) & (np.abs(seen - z) < CHANGED * z)).sum())
     seen_through = int((seen > (1 + CHANGED) * z).sum())
-    judged = confirmed + seen_through
-    return confirmed / max(judged, 1), judged
+    return confirmed, confirmed / max(confirmed + seen_through, 1)
 
 
 def check_frame(frame: Frame) -> list[ViewWarning]:
