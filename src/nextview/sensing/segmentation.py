@@ -169,7 +169,8 @@ def lies_better_as_range(
     depth = along @ frame.camera_to_world[:3, 2]
     nearer = replace(samples, points=samples.camera + along * (depth / np.linalg.norm(along, axis=1))[:, None])
     other = find_plane(nearer, deepcopy(rng), up, above)
-    if other is None:
+    usual = 0.0 if plane is None else float(plane.holds(samples).mean())
+    if other is None or other.holds(nearer).mean() <= RANGE * usual:
         return False
 
     # Two planes of one room may be found: each is refined for both readings of the depth, so that like is compared.
