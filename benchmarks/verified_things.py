@@ -69,7 +69,7 @@ COLUMNS = (
     "in the world: median",
     "ADD-S < 0.1 d",
     "resting pose",
-    "ms: median, worst",
+    "ms of CPU: median, worst",
 )
 ORDERS = (1, 2, 3, 4, 5, 6, 7, 8)  # of symmetries about the vertical
 
@@ -103,7 +103,7 @@ class Outcome:
         by_features: whether the features alone name it right.
         answer: the thing believed most.
         confidence: belief in it.
-        seconds: that the verification took.
+        seconds: of CPU that the verification took.
         residual: how badly the likeliest hypothesis explains the views.
         named: the thing that it is of.
         azimuth: error, degrees; None for a thing with every symmetry, too.
@@ -219,9 +219,9 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, sensor_na
 
 def judged(things: TaughtThings, taught: Taught, some: NDArray[np.int64], episode: Episode, views: int) -> Outcome:
     """Recognise the thing of an episode after some views, among some things."""
-    begun = time.perf_counter()
+    begun = time.process_time()  # one thread; others on the machine do not count
     found = things.verify(episode.observations[:views], episode.log_evidence[:views])
-    seconds = time.perf_counter() - begun
+    seconds = time.process_time() - begun
 
     answer = int(some[found.belief.argmax()])
     truth = int(np.searchsorted(some, episode.thing)) if episode.thing in some else -1

@@ -8,11 +8,12 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from nextview.errors import MeshError, ModelError, ObservationError
-from nextview.geometry.mesh import Mesh, make_mesh
+from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
+from nextview.recognition.memory import TaughtRecogniser
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, depth_view
 from nextview.things.proposals import propose
@@ -26,9 +27,11 @@ from nextview.things.registration import (
     start,
 )
 from nextview.things.surface import Surface, SurfaceCaster
+from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verification import likelihood
 from nextview.things.verifier import Verified, Verifier
+from nextview.things.weighing import CORRELATIONS, EvidenceWeights, JudgedEpisode, fit_weights
 
 SIDE = 40
 VIEWS = ((25.0, 20.0), (50.0, 140.0), (35.0, 260.0))  # elevation and azimuth, degrees
@@ -231,8 +234,7 @@ def test_kinds_of_pixels():
     assert len(view.kind) == np.prod(view.shape)
     assert (view.edge[view.kind == THING] < 0).all()
     assert (view.edge[view.kind != THING] > 0).all()
-    points = view.points[view.kind == THING]
-    reach = np.linalg.norm(points, axis=1).max()
+    reach = np.linalg.norm(view.thing_points, axis=1).max()
     assert reach == pytest.approx(observation.radius, rel=0.1)  # metres, about the centre
     nothing = replace(observation, depth=np.zeros_like(observation.depth))
     assert depth_view(nothing, SIDE) is None
@@ -352,3 +354,57 @@ def test_what_no_hypothesis_explains_has_a_small_p_value():
     taught, strange = residual_of(verifier, l_block()), residual_of(verifier, stranger)
     assert known.p_value(strange.residual, int(strange.things[0]), 2) == pytest.approx(0.2)  # the least of 1 in 5
     assert known.p_value(taught.residual, int(taught.things[0]), 2) > 0.5
+
+
+def episode(geometry: float, features: float, truth: int = 0, views: int = 1) -> JudgedEpisode:
+    """Two things; by how much geometry, in each view, and features speak for the first one."""
+    mean = np.tile([[geometry], [0.0]], (1, views))
+    by_features = np.exp([features, 0.0])
+    by_features /= by_features.sum()
+    costs = np.zeros((2, views))
+    return JudgedEpisode(truth, np.array([0, 1]), mean, costs, np.log(by_features), by_features)
+
+
+def test_the_belief_follows_from_the_sum_of_what_is_weighed():
+    weights = EvidenceWeights(geometry=10, features=0.5, cameras=0.2, correlation=0.5, doubt=0.0)
+    log_odds = 10 * 0.3 * 2 / 1.5 + 0.5 * -1.0
+    belief = episode(0.3, -1.0, views=2).belief(weights)
+    np.testing.assert_allclose(belief[0] / belief[1], np.exp(log_odds))
+    doubting = replace(weights, doubt=0.1)
+    by_features = 1 / (1 + np.exp(1.0))
+    mixed = 0.9 * belief[0] + 0.1 * by_features
+    np.testing.assert_allclose(episode(0.3, -1.0, views=2).belief(doubting)[0], mixed)
+
+
+@pytest.mark.parametrize(("trusted", "geometry", "features"), [("geometry", 0.1, -1.0), ("features", -0.1, 1.0)])
+def test_what_misleads_is_given_the_least_weight(trusted, geometry, features):
+    fitted = fit_weights([episode(geometry, features), episode(-geometry, -features, truth=1)])
+    assert fitted.geometry == (60 if trusted == "geometry" else 5)
+    assert fitted.features == (0.2 if trusted == "geometry" else 1)
+
+
+def test_views_that_err_together_are_not_trusted_as_many():
+    # Four views are wrong as often as one: a quarter of the cases.
+    both = [episode(0.1, 0.0, truth=int(case == 0), views=views) for views in (1, 4) for case in range(4)]
+    fitted = fit_weights(both)
+    assert fitted.correlation == max(CORRELATIONS)
+    assert fitted.geometry == 10  # log-odds of 3 to 1 are 1.1
+    with pytest.raises(ModelError, match="fitted to episodes, and there is none"):
+        fit_weights([])
+
+
+def test_a_memory_and_scans_name_a_thing_and_tell_its_pose(taught, scans):
+    recogniser = TaughtRecogniser(taught / "memory.json", threads=1)
+    meshes = {name: load_mesh(scans / f"{name}.off", unit="m") for name in ("chair", "table")}
+    things = TaughtThings(recogniser, [Surface.from_mesh(mesh, name) for name, mesh in meshes.items()])
+    for number, (name, mesh) in enumerate(meshes.items()):
+        found = things(views_of(mesh, 1.1)[:2])
+        assert things.names[found.belief.argmax()] == name
+        assert found.things[0] == number
+        turn, moved = off_by(found.poses[0], true_pose(mesh, 1.1), mesh.centre)
+        assert moved < 0.01 * 1000 * mesh.metres
+        assert turn < 1 or name == "table"  # from four azimuths it looks the same
+    with pytest.raises(ModelError, match="sofa is none of them"):
+        TaughtThings(recogniser, [Surface.from_mesh(meshes["chair"], "sofa")])
+    with pytest.raises(ObservationError, match="nothing can be recognised"):
+        things([])

@@ -60,9 +60,10 @@ class DepthView:
     whole: int
 
     @property
-    def points(self) -> Float32:
-        """What the pixels show, (P, 3) float32, object frame; not finite where nothing is."""
-        return self.origin.astype(np.float32) + self.rays * self.depth[:, None]
+    def thing_points(self) -> Float32:
+        """Where the pixels of the thing end, (N, 3) float32, object frame, metres."""
+        thing = self.kind == THING
+        return self.origin.astype(np.float32) + self.rays[thing] * self.depth[thing, None]
 
 
 def depth_view(

@@ -124,6 +124,9 @@ def start(things: NDArray[np.integer], rotations: Float, views: int) -> Alignmen
         things: number of the surface of each, (H,) int.
         rotations: from the axes of the scan file to those of the object frame, (H, 3, 3).
         views: how many views there are.
+
+    Returns:
+        The hypotheses, with no error of any camera.
     """
     count = len(things)
     rotations = np.asarray(rotations, np.float64)
@@ -134,41 +137,6 @@ def start(things: NDArray[np.integer], rotations: Float, views: int) -> Alignmen
         centres=np.zeros((count, 3)),
         cameras=np.zeros((count, views, 3)),
     )
-
-
-def centred(caster: SurfaceCaster, alignment: Alignment, views: Sequence[DepthView]) -> Alignment:
-    """Move each hypothesis so that what shows of it lies about where the thing was measured.
-
-    The centre of the object frame is that of what was seen, which need not be the centre of the
-    thing. A hypothesis that covers the outline of the thing better where it was stays there.
-    """
-    change = np.zeros((len(alignment), 3))
-    before = np.zeros(len(alignment))
-    for number, view in enumerate(views):
-        rendered = render(caster, alignment, view, number)
-        shows = np.isfinite(rendered.depth)
-        before += _overlap(view, shows)
-
-        seen = np.median(view.points[view.kind == THING], axis=0)
-        depth = np.where(shows, rendered.depth, np.nan)
-        some = shows.any(1)
-        points = view.origin + view.rays * depth[some, :, None]
-        change[some] += (seen - np.nanmedian(points, axis=1)) / len(views)
-
-    moved = replace(alignment, centres=alignment.centres + change)
-    after = np.zeros(len(alignment))
-    for number, view in enumerate(views):
-        after += _overlap(view, np.isfinite(render(caster, moved, view, number).depth))
-    better = after > before
-    return replace(alignment, centres=np.where(better[:, None], moved.centres, alignment.centres))
-
-
-def _overlap(view: DepthView, shows: NDArray[np.bool_]) -> Float:
-    """Intersection over union of where hypotheses show, (H, P), with the thing's pixels, (H,)."""
-    thing = view.kind == THING
-    hidden = view.kind == NOT_MEASURED
-    union = ((shows & ~hidden) | thing).sum(1)
-    return (shows & thing).sum(1) / np.maximum(union, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +160,9 @@ def render(caster: SurfaceCaster, alignment: Alignment, view: DepthView, number:
         alignment: the hypotheses.
         view: the view, which is the one of this ``number``.
         number: decides which of the cameras' errors is its own.
+
+    Returns:
+        What shows of each hypothesis alone, as if the others were not there.
     """
     centres = alignment.centres + alignment.cameras[:, number]
     from_centre = np.einsum("hji,hj->hi", alignment.rotations, view.origin - centres)
@@ -200,6 +171,49 @@ def render(caster: SurfaceCaster, alignment: Alignment, view: DepthView, number:
 
     depth, normals = caster.cast(alignment.things, origins.astype(np.float32), view.rays @ turns)
     return Rendered(depth, normals @ turns.swapaxes(1, 2))
+
+
+def centred(caster: SurfaceCaster, alignment: Alignment, views: Sequence[DepthView]) -> Alignment:
+    """Move each hypothesis so that what shows of it lies about where the thing was measured.
+
+    The centre of the object frame is that of what was seen, which need not be the centre of the
+    thing. A hypothesis that covers the outline of the thing better where it was stays there.
+
+    Args:
+        caster: of all surfaces.
+        alignment: the hypotheses.
+        views: the views, in the order of ``alignment.cameras``.
+
+    Returns:
+        The same hypotheses, turned as they were.
+    """
+    change = np.zeros((len(alignment), 3))
+    before = np.zeros(len(alignment))
+    for number, view in enumerate(views):
+        rendered = render(caster, alignment, view, number)
+        shows = np.isfinite(rendered.depth)
+        before += _overlap(view, shows)
+
+        seen = np.median(view.thing_points, axis=0)
+        depth = np.where(shows, rendered.depth, np.nan)
+        some = shows.any(1)
+        points = view.origin + view.rays * depth[some, :, None]
+        change[some] += (seen - np.nanmedian(points, axis=1)) / len(views)
+
+    moved = replace(alignment, centres=alignment.centres + change)
+    after = np.zeros(len(alignment))
+    for number, view in enumerate(views):
+        after += _overlap(view, np.isfinite(render(caster, moved, view, number).depth))
+    better = after > before
+    return replace(alignment, centres=np.where(better[:, None], moved.centres, alignment.centres))
+
+
+def _overlap(view: DepthView, shows: NDArray[np.bool_]) -> Float:
+    """Intersection over union of where hypotheses show, (H, P), with the thing's pixels, (H,)."""
+    thing = view.kind == THING
+    hidden = view.kind == NOT_MEASURED
+    union = ((shows & ~hidden) | thing).sum(1)
+    return (shows & thing).sum(1) / np.maximum(union, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,11 +39,11 @@ class EvidenceWeights:
         doubt: share of the belief that is left to features and size alone.
     """
 
-    geometry: float = 20.0
+    geometry: float = 40.0
     features: float = 0.6
-    cameras: float = 0.2
-    correlation: float = 0.2
-    doubt: float = 0.003
+    cameras: float = 0.1
+    correlation: float = 0.5
+    doubt: float = 0.001
 
     def scores(self, mean: Float, camera_costs: Float, log_belief: Float) -> Float:
         """Log-likelihood of hypotheses by all evidence, up to a constant.
