@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from nextview.data.folders import list_dataset, scan_dataset
+from nextview.data.folders import left_out_phrases, list_dataset, read_folder, scan_dataset
 from nextview.errors import DatasetError
 
 
@@ -55,17 +55,132 @@ def test_what_is_understood_and_what_is_left_out_is_said(tmp_path):
     root = meshes(tmp_path, "loose.off", ".trash/bed/a.off", "bed/train/a.off", "bed/val/b.off", "bed/9/m/c.off")
     (root / "bed/gone.off").symlink_to(root / "nowhere.off")
     assert scan_dataset(root).summary() == (
-        "3 of 6 objects: 1 in CLASS/train/MESH, 1 in CLASS/val/MESH, 1 in CLASS/.../MESH; left out: "
-        "1 (hidden): .trash/bed/a.off; 1 (no file): bed/gone.off; 1 (not in a class folder): loose.off"
+        "3 objects: 1 in CLASS/train/MESH, 1 in CLASS/val/MESH, 1 in CLASS/.../MESH; left out: "
+        ".trash: hidden; bed/gone.off: a link that leads nowhere; loose.off: not in a class folder"
     )
 
 
-def test_meshes_of_one_name_in_one_place_are_refused(tmp_path):
-    with pytest.raises(DatasetError, match=r"1\.obj and .*1\.off would both be called jar_1; rename one"):
-        list_dataset(meshes(tmp_path, "jar/1.off", "jar/1.obj", "cup/1.off"))
+CASES = {  # what lies in a folder; what is taken, (name, label, split); and what is left out, by a part of the reason
+    "formats": (
+        ["tin.stl", "tin.ply", "tin.OBJ", "box.stl", "cup/a.stl", "cup/a.off", "textures/wood.png"],
+        [("a", "cup", ""), ("box", "box", ""), ("tin", "tin", "")],
+        {
+            "tin.OBJ, tin.stl": "the PLY file of the same model is taken",
+            "cup/a.stl": "the OFF file",
+            "textures": "holds no mesh",
+        },
+    ),
+    "ycb": (
+        [
+            *("011_banana/google_16k/" + name for name in ("nontextured.stl", "textured.obj", "nontextured.ply")),
+            "011_banana/google_64k/nontextured.ply",
+            "011_banana/clouds/merged_cloud.ply",
+            "065-a_cups/tsdf/textured.obj",
+            "065-a_cups/tsdf/textured.mtl",
+        ],
+        [("011_banana", "011_banana", ""), ("065-a_cups", "065-a_cups", "")],
+        {
+            "textured.obj": "the PLY file of the same model",
+            "google_64k/nontextured.ply": "another file of the same model",
+            "065-a_cups/tsdf/textured.mtl": "no mesh",
+        },
+    ),
+    "ycb of one class": (
+        ["fruit/011_banana/google_16k/nontextured.ply", "fruit/lemon.ply"],
+        [("011_banana", "fruit", ""), ("lemon", "fruit", "")],
+        {},
+    ),
+    "a toy": (
+        ["train/a.ply", "train/b.ply", "box.ply"],
+        [("box", "box", ""), ("a", "train", ""), ("b", "train", "")],
+        {},
+    ),
+    "splits of single things": (
+        ["train/a.ply", "test/b.ply", "test/c.ply"],
+        [("a", "a", "train"), ("b", "b", "test"), ("c", "c", "test")],
+        {},
+    ),
+    "a mesh beside the classes of a split": (
+        ["train/cup/a.ply", "train/loose.ply"],
+        [("a", "cup", "train")],
+        {"train/loose.ply": "not in a class folder"},
+    ),
+    "one name in several places": (
+        ["box.ply", "cups/box.ply", "cups/old/box.ply"],
+        [("box", "box", ""), ("cups_box", "cups", ""), ("cups_old_box", "cups", "")],
+        {},
+    ),
+    "what is no mesh": (
+        ["a.ply", "b.step", "c.3MF", "d/e.gltf", "d/f.usdz", "notes.txt", "__MACOSX/._a.ply", "._a.ply", "x/y/z.txt"],
+        [("a", "a", "")],
+        {
+            "b.step, c.3MF, d/e.gltf and 1 more": "of a format that is not read; export it as .off",
+            "notes.txt": "no mesh",
+            "._a.ply, __MACOSX": "hidden",
+            "x": "holds no mesh",
+        },
+    ),
+    "names that cannot be printed": (
+        ["a.ply", "b\nc.ply", b"caf\xe9.ply".decode("utf-8", "surrogateescape"), "cl\x1bass/d.ply"],
+        [("a", "a", "")],
+        {r"b c.ply, caf\udce9.ply, cl\x1bass": "its name cannot be printed; rename it"},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_all_that_is_in_a_folder_is_taken_or_left_out_with_a_reason(tmp_path, case):
+    places, expected, left_out = CASES[case]
+    listing = read_folder(meshes(tmp_path, *places), loose=True)
+    assert [(entry.name, entry.label, entry.split) for entry in listing.entries] == sorted(
+        expected, key=lambda e: e[1:]
+    )
+    phrases = left_out_phrases(listing.left_out)
+    for path, reason in left_out.items():
+        assert any(path in phrase.partition(": ")[0] and reason in phrase for phrase in phrases), phrases
+    assert len(phrases) >= len(left_out)
+    assert bool(phrases) == bool(left_out)
+    taken = {entry.path for entry in listing.entries}
+    said = {tmp_path / place for place, _ in listing.left_out}
+    for place in places:
+        path = tmp_path / place
+        assert path in taken or path in said or any(above in said for above in path.parents), place
+
+
+def test_links_that_lead_nowhere_and_folders_of_results_are_left_out(tmp_path):
+    root = meshes(
+        tmp_path / "scans", "a.ply", "old/memory.json", "views.zarr/zarr.json", "views.zarr/c/0.off", "new/b.ply"
+    )
+    (root / "empty").mkdir()
+    (root / "gone").symlink_to("nowhere")
+    (root / "gone.ply").symlink_to("nowhere.ply")
+    (root / "circle.ply").symlink_to("circle.ply")
+    listing = read_folder(root, loose=True, skip={root / "new": "a result", root / "not there": "nothing"})
+    assert [entry.name for entry in listing.entries] == ["a"]
+    assert dict(listing.left_out) == {
+        Path("circle.ply"): "a link that leads nowhere",
+        Path("gone"): "a link that leads nowhere",
+        Path("gone.ply"): "a link that leads nowhere",
+        Path("views.zarr"): "a view store",
+        Path("new"): "a result",
+        Path("old"): "holds no mesh",
+        Path("empty"): "holds no mesh",
+    }
+
+
+def test_a_folder_called_as_a_split_is_a_class_only_with_a_word(tmp_path):
+    summary = scan_dataset(meshes(tmp_path, "train/a.ply", "plane/b.ply")).summary()
+    assert summary == "2 objects: 2 in CLASS/MESH; the folder train is taken for a class, not for a split"
+
+
+def test_a_dataset_without_meshes_is_refused_and_says_what_it_holds(tmp_path, caplog):
     with pytest.raises(DatasetError, match="no such folder"):
         list_dataset(tmp_path / "nowhere")
-    with pytest.raises(DatasetError, match="no meshes in CLASS/NAME"):
-        list_dataset(meshes(tmp_path / "empty", "notes.txt"))
+    with pytest.raises(DatasetError, match=r"no meshes in CLASS/NAME.*; left out: cup/a\.dae: of a format"):
+        list_dataset(meshes(tmp_path / "empty", "cup/a.dae"))
+    with pytest.raises(DatasetError, match=r"a/b_c\.off and .*a_b/c\.off would both be called a_b_c; rename one"):
+        list_dataset(meshes(tmp_path / "twice", "a/b_c.off", "a_b/c.off", "d/c.off", "d/e/c.off", "f/b_c.off"))
+    list_dataset(meshes(tmp_path / "loose", "loose.off", "cup/a.off"))
+    assert "loose: left out: loose.off: not in a class folder" in caplog.text
     flat = list_dataset(meshes(tmp_path / "flat", "a.off", "b.off"))  # each is a class of its own
     assert [(entry.label, entry.name) for entry in flat] == [("a", "a"), ("b", "b")]

@@ -1,25 +1,67 @@
 """Folders of meshes: which files are objects, of which class and split, and what is left out.
 
-Understood are CLASS/MESH, CLASS/SPLIT/MESH and SPLIT/CLASS/MESH, each also with folders before the mesh
-(CLASS/ID/models/MESH). Where all meshes lie in the folder itself, each is a class of its own. Links are followed.
+Understood are, with MESH for a file:
+
+- MESH in the folder itself: each is a class of its own, if all meshes lie there.
+- CLASS/MESH, CLASS/SPLIT/MESH and SPLIT/CLASS/MESH, each also with folders before the mesh
+  (CLASS/ID/models/MESH).
+- SPLIT/MESH, with two splits or more: each mesh is a class of its own.
+- NAME/google_16k/nontextured.ply, the download of the YCB object set: each NAME is one object.
+
+Files of one name beside each other, in several formats, are one model, of which the best is taken. Links
+are followed. ``read_folder`` does all that, and leaves nothing out without saying so.
 """
 
+import logging
 import os
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from nextview.checks import one_line
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import FORMATS
 from nextview.recognition.model_card import find_card
 
 SPLITS = ("train", "test", "val")
-FEW = 3  # files that are named of those left out for one reason
+NAMED_FILES = 3  # that are named of those left out for one reason
+LONGEST_PATH = 200  # letters of a path in a sentence
+
+# The best first: STL knows no corners that faces share, and the axes of a GLB file are often wrong.
+BEST_FORMATS = (".ply", ".off", ".obj", ".glb", ".stl")
+# Formats of shapes that are not read; other files beside the meshes are pictures, materials and notes.
+OTHER_SHAPES = (
+    ".3ds", ".3mf", ".abc", ".blend", ".brep", ".ctm", ".dae", ".dwg", ".dxf", ".fbx", ".gltf",
+    ".iges", ".igs", ".jt", ".ma", ".max", ".mb", ".nif", ".pcd", ".prt", ".skp", ".sldprt",
+    ".step", ".stp", ".usd", ".usda", ".usdc", ".usdz", ".vrml", ".vtk", ".vtp", ".wrl", ".x3d",
+    ".x_t", ".xyz",
+)  # fmt: skip
+YCB_SCANS = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "clouds")  # of one object, the best first
+METADATA_FOLDERS = ("__MACOSX",)
+
+_log = logging.getLogger("nextview")
+
+HIDDEN = "hidden"
+LISTED_ALREADY = "a folder that is listed already"
+NO_CLASS = "not in a class folder"
+NOT_READ = f"of a format that is not read; export it as {', '.join(FORMATS)}"
+NOWHERE = "a link that leads nowhere"
+UNPRINTABLE = "its name cannot be printed; rename it"
+VIEW_STORE = "a view store"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One mesh of a dataset: its path, name (unique), class, split (of SPLITS, or "") and the layout it lies in."""
+    """One object of a dataset.
+
+    Attributes:
+        path: its file.
+        name: unique in the dataset.
+        label: its class.
+        split: one of SPLITS, or "".
+        layout: in which it lies, such as "CLASS/MESH".
+    """
 
     path: Path
     name: str
@@ -30,52 +72,125 @@ class Entry:
 
 @dataclass(frozen=True)
 class Listing:
-    """The objects of a dataset folder, sorted by class, split and name; and what was left out, with the reason."""
+    """What a folder holds.
+
+    Attributes:
+        entries: the objects, sorted by class, split and name.
+        left_out: paths in the folder that are not taken, with the reason of each.
+        notes: what was decided about the layout, a sentence each.
+    """
 
     entries: list[Entry]
     left_out: list[tuple[Path, str]]
+    notes: list[str] = field(default_factory=list)
 
     def summary(self) -> str:
         """How many objects lie in which layout, and what was left out, for people to read."""
+        objects = "1 object" if len(self.entries) == 1 else f"{len(self.entries)} objects"
+        text = "; ".join([f"{objects}: {self.layout()}", *self.notes])
+        phrases = left_out_phrases(self.left_out)
+        return f"{text}; left out: {'; '.join(phrases)}" if phrases else text
+
+    def layout(self) -> str:
+        """How many objects lie in which layout."""
         layouts = Counter(entry.layout for entry in self.entries)
-        total = len(self.entries) + len(self.left_out)
-        text = f"{len(self.entries)} of {total} objects: " + ", ".join(f"{n} in {at}" for at, n in layouts.items())
-        reasons: dict[str, list[str]] = {}
-        for path, reason in self.left_out:
-            reasons.setdefault(reason, []).append(str(path))
-        parts = [
-            f"{len(p)} ({why}): {', '.join(p[:FEW])}{', ...' if len(p) > FEW else ''}" for why, p in reasons.items()
-        ]
-        return f"{text}; left out: {'; '.join(parts)}" if parts else text
+        return ", ".join(f"{count} in {layout}" for layout, count in layouts.items())
+
+
+def left_out_phrases(left_out: Iterable[tuple[Path, str]]) -> list[str]:
+    """What was left out, a phrase for each reason, for people to read.
+
+    Args:
+        left_out: paths, and the reason of each.
+
+    Returns:
+        Phrases such as "a.step, b.step: of a format that is not read".
+    """
+    reasons: dict[str, list[str]] = {}
+    for path, reason in left_out:
+        reasons.setdefault(reason, []).append(one_line(str(path), LONGEST_PATH))
+
+    phrases = []
+    for reason, paths in reasons.items():
+        named = ", ".join(paths[:NAMED_FILES])
+        if len(paths) > NAMED_FILES:
+            named += f" and {len(paths) - NAMED_FILES} more"
+        phrases.append(f"{named}: {reason}")
+    return phrases
 
 
 def list_dataset(root: str | Path) -> list[Entry]:
-    """All meshes of a dataset folder; see ``scan_dataset``."""
-    return scan_dataset(root).entries
+    """All meshes of a dataset folder, see ``scan_dataset``; what is left out is logged."""
+    listing = scan_dataset(root)
+    for phrase in left_out_phrases(listing.left_out):
+        _log.warning("%s: left out: %s", root, phrase)
+    return listing.entries
 
 
 def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> Listing:
-    """All meshes of a dataset folder, or other files in its layout, and those that were left out.
+    """List the objects of a dataset folder, and what was left out; see ``read_folder``.
 
-    DatasetError if there is no such folder, it holds none, or two of them would have one name.
+    Raises:
+        DatasetError: there is no such folder, it holds no object, or two of them would have one name.
     """
-    root = Path(root)
+    listing = read_folder(Path(root), suffixes)
+    if listing.entries:
+        return listing
+
+    what = "meshes" if suffixes == FORMATS else "scenes"
+    text = f"{root}: no {what} in CLASS/NAME, CLASS/SPLIT/NAME or SPLIT/CLASS/NAME below it"
+    phrases = left_out_phrases(listing.left_out)
+    raise DatasetError(f"{text}; left out: {'; '.join(phrases)}" if phrases else text)
+
+
+def read_folder(
+    root: Path,
+    suffixes: tuple[str, ...] = FORMATS,
+    loose: bool = False,
+    skip: Mapping[Path, str] = {},
+) -> Listing:
+    """Find out what a folder holds: its objects, in which layout they lie, and what is left out.
+
+    Args:
+        root: the folder.
+        suffixes: of the files that are objects, in lower case.
+        loose: whether a mesh in the folder itself is a class of its own also beside class folders; else it is left out
+            there.
+        skip: folders below it that are left out, with the reason of each; where that is empty, nothing is said.
+
+    Returns:
+        What it holds; there may be no object.
+
+    Raises:
+        DatasetError: there is no such folder, or two objects would have one name.
+    """
     if not root.is_dir():
         raise DatasetError(f"{root}: there is no such folder")
-    files, left_out = _walk(root, suffixes)
-    split_first = {place.parts[0] for place in files if len(place.parts) > 1} <= set(SPLITS)
-    found = {place: _entry(place, path, split_first) for place, path in files.items()}
-    if all(len(place.parts) == 1 for place in files) and suffixes == FORMATS:
-        found = {place: Entry(path, path.stem, path.stem, "", "MESH") for place, path in files.items()}
-    left_out += [(place, "not in a class folder") for place, entry in found.items() if entry is None]
-    entries = [entry for entry in found.values() if entry is not None]
-    if not entries:
-        what = "meshes" if suffixes == FORMATS else "scenes"
-        raise DatasetError(f"{root}: no {what} in CLASS/NAME, CLASS/SPLIT/NAME or SPLIT/CLASS/NAME below it")
-    for entry in entries:
-        if not (entry.label + entry.name).isprintable():
-            raise DatasetError(f"{entry.path}: its name holds what cannot be printed; rename it")
-    return Listing(sorted(_named(entries, root), key=lambda e: (e.label, e.split != "train", e.name)), left_out)
+    content = _walk(root, suffixes, skip)
+    models, left_out = _best_files(content.files)
+    left_out = content.left_out + left_out + content.without_objects("mesh" if suffixes == FORMATS else "scene")
+
+    in_folders = [model for model in models if len(model.parts) > 1]
+    split_first = _split_first(in_folders)
+    classes_in_splits = any(len(model.parts) > 2 for model in in_folders)
+    flat = suffixes == FORMATS and not in_folders
+
+    found: dict[Path, Entry] = {}
+    for model, place in models.items():
+        alone = (loose or flat) if len(model.parts) < 2 else not classes_in_splits
+        named_by_folder = model != place.with_suffix("")
+        entry = _entry(root, model, root / place, split_first, alone or named_by_folder)
+        if entry is None:
+            left_out.append((place, NO_CLASS))
+            continue
+        if named_by_folder:
+            layout = f"{entry.layout.removesuffix('MESH')}NAME/{place.parent.name}/MESH"
+            entry = replace(entry, layout=layout)
+        found[model] = entry
+
+    entries = _uniquely_named(found)
+    entries.sort(key=lambda entry: (entry.label, entry.split != "train", entry.name))
+    return Listing(entries, left_out, _split_notes(entries))
 
 
 def select(entries: list[Entry], dataset: Path, split: str | None, held_out: str | Path | None) -> list[Entry]:
@@ -91,64 +206,187 @@ def select(entries: list[Entry], dataset: Path, split: str | None, held_out: str
     return entries
 
 
-def _walk(root: Path, suffixes: tuple[str, ...]) -> tuple[dict[Path, Path], list[tuple[Path, str]]]:
-    """All files with one of the suffixes by their relative paths, each folder once; and those that are left out."""
-    files: dict[Path, Path] = {}
-    left_out: list[tuple[Path, str]] = []
+@dataclass(frozen=True)
+class _Content:
+    """What lies below a folder, all paths relative to it.
+
+    Attributes:
+        files: that may be objects.
+        left_out: what cannot be, with reasons.
+        other_files: files of other kinds.
+        folders: all folders that were entered.
+    """
+
+    files: list[Path] = field(default_factory=list)
+    left_out: list[tuple[Path, str]] = field(default_factory=list)
+    other_files: list[Path] = field(default_factory=list)
+    folders: list[Path] = field(default_factory=list)
+
+    def without_objects(self, kind: str) -> list[tuple[Path, str]]:
+        """The files that are no objects, and, instead of all that is in them, the folders that hold none."""
+        told = [*self.files, *(place for place, _ in self.left_out)]
+        worth_entering = {Path(), *(folder for place in told for folder in place.parents)}
+        found: dict[Path, str] = {}
+        for place in [*self.other_files, *self.folders]:
+            empty = [folder for folder in reversed(place.parents) if folder not in worth_entering]
+            top = empty[0] if empty else place
+            if top not in worth_entering:
+                found[top] = f"no {kind}" if top in self.other_files else f"holds no {kind}"
+        return list(found.items())
+
+
+def _walk(root: Path, suffixes: tuple[str, ...], skip: Mapping[Path, str]) -> _Content:
+    """All that lies below a folder; each folder once, also where links lead to it twice or in a circle."""
+    content = _Content()
     unreadable: list[OSError] = []
-    seen, top = set[Path](), root.resolve()
+    top = _real(root)
+    skipped = {_real(folder): reason for folder, reason in skip.items()}
+    seen = set[Path]()
+
     for folder, below, names in os.walk(root, onerror=unreadable.append, followlinks=True):
-        for path in sorted(Path(folder, name) for name in names):
-            place = path.relative_to(root)
-            if path.suffix.lower() not in suffixes:
-                continue
-            if any(part.startswith(".") for part in place.parts):
-                left_out.append((place, "hidden"))
-            elif not path.is_file():
-                left_out.append((place, "no file"))
-            else:
-                files[place] = path
+        here = Path(folder).relative_to(root)
+        for name in sorted(names):
+            _note_file(content, root, here / name, suffixes)
+
+        entered = []
         for name in sorted(below):
-            real = Path(folder, name).resolve()
+            real = _real(Path(folder, name))
+            reason = skipped.get(real, _not_entered(Path(folder, name)))
             if real in seen or top.is_relative_to(real):
-                left_out.append((Path(folder, name).relative_to(root), "a folder that is listed already"))
-                below.remove(name)
+                reason = LISTED_ALREADY
             seen.add(real)
-        below.sort()
-    return files, left_out + [(Path(error.filename).relative_to(root), f"{error.strerror}") for error in unreadable]
+            if reason is None:
+                entered.append(name)
+                content.folders.append(here / name)
+            elif reason:
+                content.left_out.append((here / name, reason))
+        below[:] = entered
+
+    for error in unreadable:
+        content.left_out.append((Path(error.filename).relative_to(root), f"{error.strerror}"))
+    return content
 
 
-def _entry(place: Path, path: Path, split_first: bool) -> Entry | None:
-    """What a file's relative path says of it; None if it names no class."""
-    *folders, _ = place.parts
-    if split_first and len(folders) > 1:
-        (split, label), rest, layout = folders[:2], folders[2:], f"{folders[0]}/CLASS"
-    elif not folders or split_first:
-        return None
-    elif len(folders) > 1 and folders[1] in SPLITS:
-        (label, split), rest, layout = folders[:2], folders[2:], f"CLASS/{folders[1]}"
+def _real(path: Path) -> Path:
+    return Path(os.path.realpath(path))  # Path.resolve raises where links lead in a circle
+
+
+def _not_entered(folder: Path) -> str | None:
+    """Why a folder holds no objects of a dataset, whatever is in it."""
+    if folder.name.startswith(".") or folder.name in METADATA_FOLDERS:
+        return HIDDEN
+    if not folder.name.isprintable():
+        return UNPRINTABLE
+    return VIEW_STORE if (folder / "zarr.json").exists() else None
+
+
+def _note_file(content: _Content, root: Path, place: Path, suffixes: tuple[str, ...]) -> None:
+    """Put a file, by its place in a folder, where it belongs."""
+    suffix = place.suffix.lower()
+    wanted = suffix in suffixes
+    shape = wanted or suffix in OTHER_SHAPES
+    if place.name.startswith("."):
+        if shape:
+            content.left_out.append((place, HIDDEN))
+    elif not place.name.isprintable():
+        content.left_out.append((place, UNPRINTABLE))
+    elif not (root / place).is_file():
+        content.left_out.append((place, NOWHERE if (root / place).is_symlink() else "no file"))
+    elif wanted:
+        content.files.append(place)
+    elif shape and suffixes == FORMATS:
+        content.left_out.append((place, NOT_READ))
     else:
-        label, split, rest, layout = folders[0], "", folders[1:], "CLASS"
-    return Entry(path, path.stem, label, split, layout + ("/.../MESH" if rest else "/MESH"))
+        content.other_files.append(place)
 
 
-def _named(entries: list[Entry], root: Path) -> list[Entry]:
-    """The entries with unique names: their file's, or as much of their path before it as it takes."""
+def _best_files(files: list[Path]) -> tuple[dict[Path, Path], list[tuple[Path, str]]]:
+    """Of the files of each model the best one, by what they have in common; and the others."""
+    models: dict[Path, list[Path]] = {}
+    for place in files:
+        models.setdefault(_model_of(place), []).append(place)
 
-    def below(entry: Entry) -> tuple[str, ...]:  # CLASS/ID/models/MESH: ID, models, MESH
-        return entry.path.relative_to(root).with_suffix("").parts[1 + bool(entry.split) :]
+    best: dict[Path, Path] = {}
+    others: list[tuple[Path, str]] = []
+    for model, places in models.items():
+        best[model], *rest = sorted(places, key=_preference)
+        taken = best[model].suffix.lower()
+        for place in rest:
+            which = "another" if place.suffix.lower() == taken else f"the {taken[1:].upper()}"
+            others.append((place, f"{which} file of the same model is taken"))
+    return best, others
 
-    rules = [
-        lambda e: e.path.stem,
-        lambda e: below(e)[0],
-        lambda e: f"{e.label}_{e.path.stem}",
-        lambda e: "_".join([e.label, *filter(None, [e.split]), *below(e)]),
+
+def _model_of(place: Path) -> Path:
+    """What the files of one model have in common: the path without a suffix; in a YCB download, the object's folder."""
+    return place.parent.parent if place.parent.name in YCB_SCANS else place.with_suffix("")
+
+
+def _preference(place: Path) -> tuple[int, bool, int, str]:
+    """Sorts the files of one model, the best first."""
+    folder = place.parent.name
+    scan = YCB_SCANS.index(folder) if folder in YCB_SCANS else 0
+    suffix = place.suffix.lower()
+    kind = BEST_FORMATS.index(suffix) if suffix in BEST_FORMATS else len(BEST_FORMATS)
+    return scan, place.stem != "nontextured", kind, str(place)
+
+
+def _split_first(in_folders: list[Path]) -> bool:
+    """Whether the folders at the top are splits.
+
+    One folder called "train" that holds meshes, and no class folders, is a class.
+    """
+    tops = {model.parts[0] for model in in_folders}
+    with_classes = any(len(model.parts) > 2 for model in in_folders)
+    return bool(tops) and tops <= set(SPLITS) and (with_classes or len(tops) > 1)
+
+
+def _entry(root: Path, model: Path, path: Path, split_first: bool, own_class: bool) -> Entry | None:
+    """What the place of a model says of it; None if it names no class."""
+    *folders, stem = model.parts or (_real(root).name,)  # the folder may be that of one object of a YCB download
+    split = ""
+    layout = ""
+    if split_first and folders:
+        split = folders.pop(0)
+        layout = f"{split}/"
+    if not folders:
+        return Entry(path, stem, stem, split, f"{layout}MESH") if own_class else None
+
+    label, *rest = folders
+    layout += "CLASS/"
+    if rest and rest[0] in SPLITS and not split_first:
+        split = rest.pop(0)
+        layout += f"{split}/"
+    return Entry(path, stem, label, split, layout + (".../MESH" if rest else "MESH"))
+
+
+def _uniquely_named(found: Mapping[Path, Entry]) -> list[Entry]:
+    """Entries, by their models' places, with unique names: their file's, or as much of the path as it takes."""
+
+    def below(model: Path, entry: Entry) -> tuple[str, ...]:  # CLASS/ID/models/MESH: ID, models, MESH
+        return model.parts[1 + bool(entry.split) :]
+
+    def whole(model: Path, entry: Entry) -> str:
+        return "_".join([entry.label, *filter(None, [entry.split]), *below(model, entry)])
+
+    rules: list[Callable[[Path, Entry], str]] = [
+        lambda model, entry: entry.name,
+        lambda model, entry: next(iter(below(model, entry)), entry.name),
+        lambda model, entry: f"{entry.label}_{entry.name}" if below(model, entry) else entry.name,
+        whole,
     ]
     for rule in rules:
-        named = [replace(entry, name=rule(entry)) for entry in entries]
+        named = [replace(entry, name=rule(model, entry)) for model, entry in found.items()]
         if len({entry.name for entry in named}) == len(named):
             return named
+
     first: dict[str, Entry] = {}
     twice = next(entry for entry in named if first.setdefault(entry.name, entry) is not entry)
     both = f"{first[twice.name].path} and {twice.path}"
     raise DatasetError(f"{both} would both be called {twice.name}; rename one of them")
+
+
+def _split_notes(entries: Iterable[Entry]) -> list[str]:
+    """What was decided about folders that are called as splits."""
+    taken = sorted({entry.label for entry in entries if entry.label in SPLITS})
+    return [f"the folder {label} is taken for a class, not for a split" for label in taken]

@@ -22,6 +22,7 @@ from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, command, new_file, new_folder, only_one, sha256_of, unfinished
 from nextview.learning.learned_picture import draw_learned
 from nextview.learning.memory_fit import VIEWS, Fit, fit_memory, size_evidence
+from nextview.learning.sizes import check_sizes
 from nextview.learning.teaching import LEFT_OUT, Arrays, How, teach
 from nextview.learning.things import Found, Source, find_things
 from nextview.recognition.belief import Calibration
@@ -44,7 +45,6 @@ NAME = "memory"  # of the card in a folder of taught things, and of the file bes
 CARD, WEIGHTS, PICTURE = f"{NAME}.json", f"{NAME}{MEMORY_SUFFIX}", "learned.png"
 PARTS = "things"  # the key of the things that a run that was stopped has taught, see ``files.unfinished``
 Pair = tuple[Source, Arrays]  # a thing, and what is remembered of it
-ODD_SIZE = 300  # a thing so many times larger or smaller than the median of the others is asked about
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def learn_things(
     keeps = add or bool(remove)
     _check_places(out, keeps, overwrite)
     nothing_new = bool(remove) and folder.resolve() == out.resolve()
-    found = Found([], []) if nothing_new else find_things(folder)
+    found = Found([], []) if nothing_new else find_things(folder, out)
     left_out = list(found.left_out)
 
     with only_one(out), unfinished(out, PARTS) as part:
@@ -124,8 +124,10 @@ def learn_things(
             raise DatasetError(f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})")
         taught.sort(key=lambda pair: (pair[0].label, pair[0].name))
         if not how.any_size:
-            _check_sizes(taught)
-        return _write(out, taught, left_out, () if old is None else old[0].training.commands)
+            radii = np.concatenate([arrays["radii"] for _, arrays in taught])
+            check_sizes([source.path for source, _ in taught], radii, how.unit)
+        learned = _write(out, taught, left_out, () if old is None else old[0].training.commands)
+    return replace(learned, notes=found.notes + learned.notes)
 
 
 def _check_places(out: Path, keeps: bool, overwrite: bool) -> None:
@@ -287,19 +289,6 @@ def _teach_one(how: How, part: Path, threads: int, item: tuple[Source, str]) -> 
     with new_file(_part_of(part, source), overwrite=True) as file:
         save_file(arrays | {"stamp": noted}, file)
     return arrays
-
-
-def _check_sizes(taught: Sequence[Pair]) -> None:
-    """Ask about a thing a thousand times larger than the others: its file is in another unit."""
-    radii = np.concatenate([arrays["radii"] for _, arrays in taught])
-    if np.isfinite(radii).sum() < 2:
-        return
-    ratio = radii / np.nanmedian(radii)
-    for (source, _), times in zip(taught, ratio, strict=True):
-        if times > ODD_SIZE or times < 1 / ODD_SIZE:
-            how = f"{times:,.0f} times larger" if times > 1 else f"{1 / times:,.0f} times smaller"
-            hint = "is it in another unit? --any-size takes it as it is"
-            raise DatasetError(f"{source.path}: is {how} than most others; {hint}")
 
 
 def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], commands: tuple[str, ...]) -> Learned:

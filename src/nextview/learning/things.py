@@ -3,16 +3,25 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from nextview.data.folders import scan_dataset
+from nextview.checks import one_line
+from nextview.data.folders import Entry, left_out_phrases, read_folder
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import FORMATS
 from nextview.simulation.captured import is_capture
 from nextview.simulation.turntable import is_turntable
 
+RESULT_FOLDER = "is where the result goes"
+
 
 @dataclass(frozen=True)
 class Source:
-    """One thing to be taught: its name, its class, and the mesh file or the folder of captured frames."""
+    """One thing to be taught.
+
+    Attributes:
+        name: of the thing.
+        label: its class.
+        path: its mesh file, or the folder of captured frames.
+    """
 
     name: str
     label: str
@@ -21,53 +30,83 @@ class Source:
 
 @dataclass(frozen=True)
 class Found:
-    """The things of a folder, sorted by class and name; what was left out and why, a phrase each."""
+    """What a folder teaches.
+
+    Attributes:
+        things: sorted by class and name.
+        left_out: what was left out and why, a phrase each.
+        notes: how the folder was understood, a sentence each.
+    """
 
     things: list[Source]
     left_out: list[str]
+    notes: tuple[str, ...] = ()
 
 
-def find_things(folder: Path) -> Found:
-    """The things that a folder teaches.
+def find_things(folder: Path, out: Path | None = None) -> Found:
+    """Find the things that a folder teaches.
 
-    A mesh in the folder itself, and a folder of captured frames, is a thing and a class of its own name. All else is a
-    class folder, as in a dataset (``data.folders``): each of its meshes is a thing of that class; where there are
-    splits, those of "train". DatasetError: there is no such folder, nothing in it can be taught, or two things have one
-    name.
+    A mesh in the folder itself, and a folder of captured frames, is a thing and a class of its own name. All else is as
+    in a dataset (``data.folders``): each mesh in a class folder is a thing of that class; where there are splits, those
+    of "train".
+
+    Args:
+        folder: to be looked through.
+        out: where the result goes, which is no source of things if it lies in the folder.
+
+    Returns:
+        The things, and all that was left out.
+
+    Raises:
+        DatasetError: there is no such folder, nothing in it can be taught, or two things have one name.
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: there is no such folder")
-    inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    captures = [path for path in inside if path.is_dir() and (is_capture(path) or is_turntable(path))]
+    if not str(folder).isprintable():
+        raise DatasetError(f"{one_line(str(folder), 200)}: its name cannot be printed; rename it")
+
+    captures = _captures(folder)
+    skip = dict.fromkeys(captures, "")
+    if out is not None and out.is_dir() and not out.samefile(folder):
+        skip[out] = RESULT_FOLDER
+    listing = read_folder(folder, loose=True, skip=skip)
+
+    entries, other_splits = _to_be_taught(listing.entries)
+    left_out = left_out_phrases(
+        listing.left_out + [(e.path.relative_to(folder), f"of the split {e.split}") for e in other_splits]
+    )
     things = [Source(path.name, path.name, path) for path in captures]
-    things += [Source(path.stem, path.stem, path) for path in inside if path.suffix.lower() in FORMATS]
-    pictures = [path for path in inside if path.is_file() and path.suffix.lower() in PICTURES]
-    left_out = [f"{path.name}: neither a mesh nor a folder" for path in pictures]
-    nothing = f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with poses"
-    if any(path.is_dir() and path not in captures for path in inside):
-        try:
-            listing = scan_dataset(folder)
-        except DatasetError:
-            if not things:
-                raise DatasetError(nothing) from None
-        else:
-            splits = {entry.split for entry in listing.entries}
-            for entry in listing.entries:
-                if entry.label in {path.name for path in captures}:
-                    continue
-                if "train" in splits and entry.split not in ("train", ""):
-                    left_out.append(f"{entry.path.relative_to(folder)}: of the split {entry.split}")
-                else:
-                    things.append(Source(entry.name, entry.label, entry.path))
+    things += [Source(entry.name, entry.label, entry.path) for entry in entries]
     if not things:
-        raise DatasetError(nothing)
+        text = f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with poses"
+        raise DatasetError("; left out: ".join([text, *filter(None, ["; ".join(left_out)])]))
     things.sort(key=lambda thing: (thing.label, thing.name))
+    _check_names(things)
+
+    layout = [listing.layout()] if entries else []
+    if captures:
+        layout.append("1 folder of depth frames" if len(captures) == 1 else f"{len(captures)} folders of depth frames")
+    notes = (f"in {folder}: {', '.join(layout)}", *listing.notes)
+    return Found(things, left_out, notes)
+
+
+def _captures(folder: Path) -> list[Path]:
+    """The folders of captured frames in a folder, sorted by name."""
+    inside = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    return [path for path in inside if path.name.isprintable() and (is_capture(path) or is_turntable(path))]
+
+
+def _to_be_taught(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:
+    """Those that are taught, and those of other splits: a test is of things that nobody was taught."""
+    if not any(entry.split == "train" for entry in entries):
+        return entries, []
+    taught = [entry for entry in entries if entry.split in ("train", "")]
+    return taught, [entry for entry in entries if entry.split not in ("train", "")]
+
+
+def _check_names(things: list[Source]) -> None:
     first: dict[str, Source] = {}
     for thing in things:
         if first.setdefault(thing.name, thing) is not thing:
             both = f"{first[thing.name].path} and {thing.path}"
             raise DatasetError(f"{both} would both be called {thing.name}; rename one of them")
-    return Found(things, left_out)
-
-
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".bmp")  # no views: without depth and a pose they teach nothing

@@ -1,0 +1,67 @@
+"""Sizes of taught things that give away a wrong unit of length."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import DatasetError
+from nextview.geometry.mesh import UNITS
+
+ODD_SIZE = 300  # a thing so many times larger or smaller than the median of the others is asked about
+LARGEST_RADIUS = 20.0  # metres, of the median thing: no camera looks at larger ones from all around
+SMALLEST_RADIUS = 0.001  # and at smaller ones no depth camera
+USUAL_RADII = (0.01, 3.0)  # metres, of things of which one takes views
+
+
+def check_sizes(paths: Sequence[Path], radii: NDArray[np.floating], unit: str | None) -> None:
+    """Ask about things whose size says that their files are in another unit of length.
+
+    Args:
+        paths: of the things.
+        radii: their object radii, (N,), metres; NaN where they are not known.
+        unit: of the mesh files, as it was given; None if it was not.
+
+    Raises:
+        DatasetError: a thing is hundreds of times larger or smaller than most, or most are larger than a house or
+            smaller than what a depth camera sees.
+    """
+    known = np.isfinite(radii)
+    if not known.any():
+        return
+    median = float(np.median(radii[known]))
+    if unit is not None and not SMALLEST_RADIUS < median < LARGEST_RADIUS:
+        raise DatasetError(_all_odd(paths, radii, unit, median))
+
+    for path, times in zip(paths, radii / median, strict=True):
+        if times > ODD_SIZE or times < 1 / ODD_SIZE:
+            how = f"{times:,.0f} times larger" if times > 1 else f"{1 / times:,.0f} times smaller"
+            hint = "is it in another unit? --any-size takes it as it is"
+            raise DatasetError(f"{path}: is {how} than most others; {hint}")
+
+
+def _all_odd(paths: Sequence[Path], radii: NDArray[np.floating], unit: str, median: float) -> str:
+    """The sentence about things that are all too large or too small: the unit that would make them usual."""
+    middle = int(np.nanargmin(np.abs(radii - median)))
+    size = f"has a radius of {_length(float(radii[middle]))} if --unit {unit} is right"
+    who = (
+        f"{paths[middle]}: {size}"
+        if len(paths) == 1
+        else f"{paths[middle]}: {size}, and half of the others are like it"
+    )
+
+    likely = []
+    for other, metres in UNITS.items():
+        radius = median / UNITS[unit] * metres
+        if USUAL_RADII[0] <= radius <= USUAL_RADII[1]:
+            likely.append(f"--unit {other} ({_length(radius)})")
+    hint = f"is it {' or '.join(likely)}?" if likely else "is that so?"
+    return f"{who}; {hint} --any-size takes it as it is"
+
+
+def _length(metres: float) -> str:
+    """A length for people to read."""
+    if metres >= 1:
+        return f"{metres:.3g} m" if metres < 1000 else f"{metres / 1000:,.3g} km"
+    return f"{100 * metres:.2g} cm" if metres >= 0.01 else f"{1000 * metres:.2g} mm"
