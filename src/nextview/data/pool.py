@@ -2,12 +2,15 @@
 
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from multiprocessing import spawn
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -17,6 +20,8 @@ from nextview.errors import DatasetError
 
 MOST = 1024  # processes on one machine
 PATIENCE = "10s"  # how long a scheduler may take to answer
+
+_starting = threading.Lock()
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -46,9 +51,10 @@ def each(
 ) -> Iterator[tuple[Item, Result | WorkerDied]]:
     """Call ``function(item)`` for every item, side by side; yields (item, result) as they come, in any order.
 
-    Function and items are picklable, items hashable. A process that dies costs its item, if it dies again with that
-    alone. What the function raises ends the run. ``workers`` are processes, one for each core by default, 0 to work in
-    this one; ``scheduler`` is the address of a dask.distributed scheduler to use instead.
+    Function and items are picklable, items hashable. A script that hands in functions or classes of its own has to
+    guard what it does by ``if __name__ == "__main__"``; any other need not. A process that dies costs its item, if it
+    dies again with that alone. What the function raises ends the run. ``workers`` are processes, one for each core by
+    default, 0 to work in this one; ``scheduler`` is the address of a dask.distributed scheduler to use instead.
     """
     if scheduler is not None:
         yield from _on_cluster(function, items, scheduler)
@@ -94,13 +100,49 @@ def counted(
 
 
 def _in_pool(function: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[tuple[Item, Result]]:
-    pool = ProcessPoolExecutor(min(workers, len(items)), multiprocessing.get_context("spawn"), _begin_worker)
+    start = multiprocessing.get_context("spawn") if _of_script(function, items) else _OwnMainContext()
+    pool = ProcessPoolExecutor(min(workers, len(items)), start, _begin_worker)
     try:
         jobs = {pool.submit(function, item): item for item in items}
         for job in as_completed(jobs):
             yield jobs[job], job.result()
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _of_script(function: Callable, items: Sequence[Any]) -> bool:
+    """Whether a worker needs the script that runs: the function, or what it is called with, is defined there."""
+    return b"__main__" in pickle.dumps((function, items))
+
+
+class _OwnMain(SpawnProcess):
+    """A worker that does not run the caller's script.
+
+    A process of multiprocessing imports it, so a script that calls a function of this package would have to stand below
+    ``if __name__ == "__main__"``: else each worker calls that function again.
+    """
+
+    @staticmethod
+    def _Popen(process_obj: Any) -> Any:
+        def without_script(name: str) -> dict[str, Any]:
+            told = usual(name)
+            if name != process_obj.name:  # another thread starts a process of its own meanwhile
+                return told
+            return {key: value for key, value in told.items() if not key.startswith("init_main_from")}
+
+        with _starting:
+            usual = spawn.get_preparation_data
+            spawn.get_preparation_data = without_script
+            try:
+                return SpawnProcess._Popen(process_obj)  # type: ignore[attr-defined]
+            finally:
+                spawn.get_preparation_data = usual
+
+
+class _OwnMainContext(SpawnContext):
+    """Starts such workers."""
+
+    Process = _OwnMain  # type: ignore[assignment]
 
 
 def _begin_worker() -> None:

@@ -1,0 +1,61 @@
+"""Workers on this machine: what a script has to look like that uses them."""
+
+import subprocess
+import sys
+
+import pytest
+from pipeline import run_python
+
+LINES = """
+import math
+print("script runs", flush=True)
+from nextview.data.pool import each
+print(sorted(result for _, result in each(math.sqrt, [1, 4, 9], 2)), flush=True)
+"""
+
+OWN_FUNCTION = """
+from nextview.data.pool import each
+
+def double(x):
+    return 2 * x
+
+if __name__ == "__main__":
+    print(sorted(result for _, result in each(double, [1, 4, 9], 2)))
+"""
+
+
+@pytest.mark.parametrize("way", ["a file", "a module", "standard input", "a line"])
+def test_a_plain_script_without_a_guard_may_use_workers(tmp_path, way):
+    (tmp_path / "script.py").write_text(LINES)
+    call = {
+        "a file": ["script.py"],
+        "a module": ["-m", "script"],
+        "standard input": ["-"],
+        "a line": ["-c", LINES],
+    }[way]
+    done = subprocess.run([sys.executable, *call], input=LINES, cwd=tmp_path, capture_output=True, text=True)
+    assert done.stderr == ""
+    assert done.stdout == "script runs\n[1.0, 2.0, 3.0]\n"
+
+
+def test_functions_of_a_guarded_script_reach_the_workers(tmp_path):
+    (tmp_path / "script.py").write_text(OWN_FUNCTION)
+    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.stderr, done.stdout) == ("", "[2, 8, 18]\n")
+
+
+def test_other_processes_of_a_program_are_started_as_ever(tmp_path):
+    """Also in the very moment in which a worker is started."""
+    done = run_python(
+        "from multiprocessing import spawn; from nextview.data import pool\n"
+        "usual, names = spawn.get_preparation_data, []\n"
+        "import multiprocessing.context as context\n"
+        "def popen(process):\n"
+        "    data = spawn.get_preparation_data(process.name), spawn.get_preparation_data('another')\n"
+        "    names.extend(any(key.startswith('init_main') for key in of) for of in data)\n"
+        "context.SpawnProcess._Popen = staticmethod(popen)\n"
+        "import sys; sys.modules['__main__'].__file__ = 'script.py'\n"
+        "pool._OwnMain._Popen(pool._OwnMain(target=print))\n"
+        "print(names, spawn.get_preparation_data is usual)\n"
+    )
+    assert done.stdout == "[False, True] True\n", done.stderr
