@@ -4,6 +4,27 @@ Each message is one sentence: what is wrong, in which file, what to do. The comm
 2. Any other exception is a bug of nextview and keeps its traceback.
 """
 
+import struct
+import zipfile
+import zlib
+
+# What the readers of NumPy, zarr, Pillow and others raise for a damaged file, which may lead them anywhere. A package
+# that is missing, memory that runs out, and a bug in this package's own names are not among them.
+DAMAGED = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
 
 class NextviewError(ValueError):
     """The base of all errors that nextview raises on purpose."""

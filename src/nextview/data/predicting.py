@@ -14,7 +14,7 @@ from nextview.data.pool import counted
 from nextview.data.predictions import Predictions
 from nextview.data.splits import some_objects
 from nextview.data.store import ViewStore, writing
-from nextview.errors import PredictionsError
+from nextview.errors import DAMAGED, PredictionsError
 from nextview.files import check_new, command, unfinished
 from nextview.geometry.observation import enough_shows
 from nextview.recognition.inference import MapNetwork, Recogniser
@@ -125,6 +125,6 @@ def _together(files: Sequence[Path]) -> dict[str, NDArray[np.float32]]:
         try:
             with np.load(file, allow_pickle=False) as arrays:
                 objects.append(dict(arrays))
-        except Exception as error:  # zipfile and numpy raise whatever a damaged file makes them raise
+        except DAMAGED as error:
             raise PredictionsError(f"{file}: is damaged ({error}); delete it and run again") from None
     return {name: np.stack([arrays[name] for arrays in objects]) for name in objects[0]}

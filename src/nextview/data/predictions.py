@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nextview.data.splits import deduplicated, duplicate_groups, some_objects
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, PredictionsError
+from nextview.errors import DAMAGED, DatasetError, PredictionsError
 from nextview.files import decode_record, new_file, regular_file
 from nextview.geometry.observation import enough_shows
 from nextview.geometry.viewsphere import ViewSphere
@@ -237,7 +237,7 @@ class Predictions:
             raise PredictionsError(f"{path}: lacks {error.args[0]}") from None
         except PredictionsError as error:
             raise PredictionsError(f"{path}: {error}") from None
-        except Exception as error:  # zipfile, zlib and numpy raise whatever a damaged file makes them raise
+        except DAMAGED as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise PredictionsError(f"{path}: not a predictions file ({reason})") from None
 

@@ -17,7 +17,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from nextview.data.folders import Entry
 from nextview.data.pool import WorkerDied, each
-from nextview.errors import DatasetError
+from nextview.errors import DAMAGED, DatasetError
 from nextview.files import decode_record, new_folder, only_one
 from nextview.geometry.depth import POINTS
 from nextview.geometry.mesh import UNITS
@@ -113,7 +113,7 @@ class ViewStore:
             raise DatasetError(f"{path}: there is no view store; make one with nextview render")
         try:
             group = zarr.open_group(path, mode="r+")
-        except Exception as error:  # zarr and JSON raise whatever a damaged file makes them raise
+        except DAMAGED as error:
             raise DatasetError(f"{path}: zarr.json is damaged ({error}); copy it back or render again") from None
         content = group.attrs.asdict()
         if content.get("format") != FORMAT:
@@ -175,7 +175,7 @@ class ViewStore:
             array = self.group[name]
         except KeyError:
             raise DatasetError(f"{self.path}: the array {name} is missing; {self._remedy(name)}") from None
-        except Exception as error:  # zarr and JSON raise whatever a damaged file makes them raise
+        except DAMAGED as error:
             raise DatasetError(f"{self.path}: the array {name} cannot be opened ({error})") from None
         shape, dtype, _ = self._layout(name)
         wanted = ((len(self), *shape), (1, *shape), dtype)
@@ -217,13 +217,13 @@ class ViewStore:
     def _values(self, array: zarr.Array, at: int | slice, what: str) -> NDArray:
         try:
             return array[at]
-        except Exception as error:  # a damaged chunk raises whatever its codec makes of it
+        except DAMAGED as error:
             raise DatasetError(f"{self.path}: {what} cannot be read ({error}); {self._remedy(array.path)}") from None
 
     def rows(self, name: str) -> NDArray:
         """One of the arrays, as it is stored, (N, ...). Rows of objects that are not rendered may hold anything."""
         done, array = self.done, self.array(name)
-        with suppress(Exception):  # a damaged chunk, of which it matters whose it is
+        with suppress(*DAMAGED):  # a damaged chunk, of which it matters whose it is
             values = array[:]
             if self.held(name)[done].all():
                 return values

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.errors import MeshError
+from nextview.errors import DAMAGED, MeshError
 from nextview.geometry.mesh_text import lines_of_words, numbers, plain_text, whole_numbers
 from nextview.geometry.ply_file import read_ply
 from nextview.geometry.stl_file import read_stl
@@ -155,7 +155,7 @@ def read_glb(data: bytes, max_faces: int = MAX_FACES) -> Shape:
         parts = _glb_parts(data)
     except (MeshError, MemoryError):
         raise
-    except Exception as error:  # a broken file makes trimesh, and a look at its JSON, raise errors of any kind
+    except (*DAMAGED, AssertionError, NameError) as error:  # the last two are what trimesh raises on purpose
         raise MeshError(f"{type(error).__name__}: {error}") from error
     check_faces(sum(len(shape.faces) for _, shape in parts), max_faces)
     vertices = [np.zeros((0, 3))]

@@ -14,7 +14,7 @@ from nextview.checks import extras
 from nextview.data.pool import WorkerDied, each
 from nextview.data.progress import Track, silently
 from nextview.data.store import ViewStore
-from nextview.errors import DatasetError
+from nextview.errors import DAMAGED, DatasetError
 from nextview.files import new_folder, only_one
 from nextview.recognition.network_input import CHANNELS_OF, InputKind, InputSpec, from_store
 
@@ -104,7 +104,7 @@ def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedVi
         packed = np.memmap(file, np.uint8, "r") if file.stat().st_size else np.zeros(0, np.uint8)
         if len(packed) != places[..., 1].sum():
             raise ValueError(f"{len(packed)} bytes of {places[..., 1].sum()}")
-    except Exception as error:  # zip files and NumPy raise whatever a damaged file makes them raise
+    except DAMAGED as error:
         raise DatasetError(f"{target}: is damaged ({error}); {AGAIN}") from None
     there = places[..., 1].all(1)
     if there.shape != (len(store),) or (store.done & ~there).any():

@@ -84,7 +84,8 @@ def learn_things(
     folder: Path,  # what is to be taught
     out: Path,  # folder to write
     how: How = How(),
-    add: bool = False,  # put the things beside those that OUT knows; the old ones are not looked at again
+    # put the things beside those that OUT knows, which are not looked at again; so FOLDER holds the new ones alone
+    add: bool = False,
     # forget the things of these names in OUT; nothing is added where FOLDER is OUT, too
     remove: tuple[str, ...] = (),
     workers: int | None = None,  # processes; one for each core by default; 0 to work in this one

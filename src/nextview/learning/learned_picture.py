@@ -10,21 +10,86 @@ from numpy.typing import NDArray
 
 from nextview.learning.memory_fit import VIEWS, Fit
 
-PAIRS, THINGS = 4, 12
+PAGE_WIDTH = 11.0  # inches
+PICTURE_WIDTH = 1.05  # inches, and as high
+GAP = 0.11  # between pictures, inches
+LINE = 0.22  # height of a name below a picture, inches
+MARGIN = 0.33
+COLUMNS, ROWS = 6, 2  # of things beside the bars
+ALL_COLUMNS = 9  # of things below the bars
+ROW = PICTURE_WIDTH + LINE + GAP
+TITLE_HEIGHT = 0.75
+MOST_THINGS = 120  # of more an even choice is shown
+MOST_PAIRS = 4
+LONGEST_NAME = 18  # letters
+PIXELS_PER_INCH = 120
 INK, QUIET, BAR = "#1d1d1f", "#8a8a8e", "#2f6fde"
 
+Pictures = Mapping[str, NDArray[np.uint8]]
 
-def draw_learned(path: Path, pictures: Mapping[str, NDArray[np.uint8]], fit: Fit) -> None:
-    """Write it: the things, the share named right by the number of views, and the pairs that are confused most."""
+
+def draw_learned(path: Path, pictures: Pictures, fit: Fit) -> None:
+    """Write the picture: the things, the share named right by the number of views, and the pairs confused most.
+
+    It is as high as what is on it.
+
+    Args:
+        path: of the PNG file.
+        pictures: one for each thing, by its name, (64, 64) uint8; 0 where nothing is seen.
+        fit: what was fitted to the things.
+    """
     names = list(pictures)
-    figure = Figure(figsize=(11, 6), dpi=120, facecolor="white")
+    shown = _even_choice(names)
+    pairs = [(names[a], names[b], share) for a, b, share in fit.confused[:MOST_PAIRS]]
+    rows = max(ROWS, 1 + _place(len(shown) - 1)[0])
+    pairs_height = LINE + (LINE + ROW if pairs else 0)
+    height = TITLE_HEIGHT + rows * ROW + pairs_height + MARGIN
+
+    figure = Figure(figsize=(PAGE_WIDTH, height), dpi=PIXELS_PER_INCH, facecolor="white")
     page = figure.add_axes((0, 0, 1, 1))  # one for all pictures: axes take longer than what is in them
     page.set_axis_off()
-    figure.text(0.03, 0.94, f"{len(names)} things learned", size=17, color=INK, weight="bold")
-    shown = names[:: max(1, -(-len(names) // THINGS))][:THINGS]
+    page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0))  # inches from the top left corner
+    _draw_things(page, pictures, shown)
+    _draw_bars(figure, fit, height)
+    _draw_pairs(page, pictures, pairs, TITLE_HEIGHT + rows * ROW + LINE)
+    page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0), aspect="auto")  # a picture sets them anew
+    figure.savefig(path)
+
+
+def _even_choice(names: list[str]) -> list[str]:
+    """All names, or an even choice of MOST_THINGS."""
+    if len(names) <= MOST_THINGS:
+        return names
+    return [names[k * len(names) // MOST_THINGS] for k in range(MOST_THINGS)]
+
+
+def _draw_things(page: Axes, pictures: Pictures, shown: list[str]) -> None:
+    title = "1 thing learned" if len(pictures) == 1 else f"{len(pictures)} things learned"
+    page.text(MARGIN, 0.45, title, size=17, color=INK, weight="bold")
+    if len(shown) < len(pictures):
+        page.text(MARGIN, 0.66, f"{len(shown)} of them, evenly chosen:", size=9, color=QUIET)
     for k, name in enumerate(shown):
-        _picture(page, (0.03 + (k % 6) * 0.105, 0.66 - k // 6 * 0.26, 0.095, 0.19), pictures[name], name)
-    axes = figure.add_axes((0.73, 0.47, 0.24, 0.38))
+        row, column = _place(k)
+        left = MARGIN + column * (PICTURE_WIDTH + GAP)
+        _draw_picture(page, left, TITLE_HEIGHT + row * ROW, pictures[name], name)
+
+
+def _place(k: int) -> tuple[int, int]:
+    """Row and column of a thing, by its number: the rows below the bars are longer."""
+    beside = COLUMNS * ROWS
+    if k < beside:
+        return divmod(k, COLUMNS)
+    row, column = divmod(k - beside, ALL_COLUMNS)
+    return ROWS + row, column
+
+
+def _draw_bars(figure: Figure, fit: Fit, height: float) -> None:
+    left = MARGIN + COLUMNS * (PICTURE_WIDTH + GAP) + 0.4
+    size = ROWS * ROW - 2 * LINE - 0.5
+    bottom = height - TITLE_HEIGHT - 0.3 - size
+    width = PAGE_WIDTH - MARGIN - left
+    axes = figure.add_axes((left / PAGE_WIDTH, bottom / height, width / PAGE_WIDTH, size / height))
+
     bars = axes.bar([str(k) for k in VIEWS], [100 * a for a in fit.accuracy], color=BAR, width=0.6)
     axes.bar_label(bars, fmt="%.0f", color=INK, size=11)
     axes.set_ylim(0, 110)
@@ -35,23 +100,25 @@ def draw_learned(path: Path, pictures: Mapping[str, NDArray[np.uint8]], fit: Fit
     axes.tick_params(axis="x", length=0, colors=INK)
     axes.set_title("named right, % of cases", size=10, color=INK, loc="left")
     axes.set_xlabel("views", size=10, color=INK)
-    pairs = [(names[a], names[b], share) for a, b, share in fit.confused[:PAIRS]]
+
+
+def _draw_pairs(page: Axes, pictures: Pictures, pairs: list[tuple[str, str, float]], top: float) -> None:
     heading = "confused most, share of the cases after two views" if pairs else "no two things are confused"
-    figure.text(0.03, 0.32, heading, size=11, color=INK, weight="bold")
-    for k, (a, b, share) in enumerate(pairs):
-        left = 0.03 + k * 0.245
-        _picture(page, (left, 0.08, 0.095, 0.19), pictures[a], a)
-        _picture(page, (left + 0.1, 0.08, 0.095, 0.19), pictures[b], b)
-        figure.text(left + 0.0975, 0.275, f"{share:.0%}", size=10, color=QUIET, ha="center")
-    page.set(xlim=(0, 1), ylim=(0, 1), aspect="auto")
-    figure.savefig(path)
+    page.text(MARGIN, top, heading, size=11, color=INK, weight="bold")
+    each = (PAGE_WIDTH - 2 * MARGIN + GAP) / MOST_PAIRS
+    for k, (first, second, share) in enumerate(pairs):
+        left = MARGIN + k * each
+        _draw_picture(page, left, top + 1.6 * LINE, pictures[first], first)
+        _draw_picture(page, left + PICTURE_WIDTH + GAP, top + 1.6 * LINE, pictures[second], second)
+        page.text(left + PICTURE_WIDTH + GAP / 2, top + 1.3 * LINE, f"{share:.0%}", size=10, color=QUIET, ha="center")
 
 
-def _picture(page: Axes, place: tuple[float, float, float, float], picture: NDArray[np.uint8], name: str) -> None:
-    left, bottom, width, _ = place
-    height = width * 11 / 6
+def _draw_picture(page: Axes, left: float, top: float, picture: NDArray[np.uint8], name: str) -> None:
+    """A small picture with its name below, at a place in inches."""
     shade = np.where(picture > 0, 60 + 0.7 * picture.astype(float), 255)
-    extent = (left, left + width, bottom, bottom + height)
+    extent = (left, left + PICTURE_WIDTH, top + PICTURE_WIDTH, top)
     page.imshow(shade, cmap="gray", vmin=0, vmax=255, interpolation="bilinear", extent=extent)
-    below = left + width / 2, bottom - 0.025
-    page.text(*below, name.replace("_", " ")[:18], size=7.5, color=INK, ha="center", va="center")
+    words = name.replace("_", " ")
+    short = words if len(words) <= LONGEST_NAME else f"{words[: LONGEST_NAME - 3]}..."
+    middle = left + PICTURE_WIDTH / 2
+    page.text(middle, top + PICTURE_WIDTH + LINE / 2, short, size=7.5, color=INK, ha="center", va="center")

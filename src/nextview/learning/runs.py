@@ -3,6 +3,7 @@
 import csv
 import io
 import logging
+import pickle
 import re
 import time
 import warnings
@@ -18,7 +19,7 @@ import numpy as np
 from nextview.checks import extras
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
-from nextview.errors import ModelError
+from nextview.errors import DAMAGED, ModelError
 from nextview.files import command, decode_record, new_file, only_one, read_record, sha256_of, write_record
 from nextview.learning.architectures import LiteNet, ResNet
 from nextview.learning.recipes import Hardware
@@ -96,7 +97,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise ModelError(f"{path}: there is no such checkpoint") from None
-    except Exception as error:  # a damaged or foreign file raises whatever the reader stumbles over
+    except (*DAMAGED, pickle.UnpicklingError) as error:
         what = f"a damaged checkpoint or one that torch cannot read safely ({type(error).__name__})"
         raise ModelError(f"{path}: {what}; give another, or delete it to begin this training anew") from None
 

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from onnxruntime.capi import onnxruntime_pybind11_state as runtime
 
 from nextview.checks import one_line
-from nextview.errors import ModelError
+from nextview.errors import DAMAGED, ModelError
 from nextview.files import checked_bytes
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import direction_of, elevation_of
@@ -26,6 +27,11 @@ FEATURES_OUTPUT = "features"
 EMBEDDING_OUTPUT = "embedding"
 """Ends of ONNX files; "features" are what the last layers of a recogniser make the logits of, (B, F)."""
 LONGEST = 300  # letters of what the runtime says
+# The runtime has a class of exception for every reason, without a common one.
+RUNTIME_ERRORS = (
+    *DAMAGED,
+    *(kind for kind in vars(runtime).values() if isinstance(kind, type) and issubclass(kind, Exception)),
+)
 Shape = tuple[int | None, ...]  # without the batch; None for a size that is free
 
 
@@ -55,7 +61,7 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> OnnxFile:
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(path))
     try:
         return OnnxFile(content, options, (Path(path).absolute(), sha256, threads))
-    except Exception as error:  # the runtime has a class of exception for every reason
+    except RUNTIME_ERRORS as error:
         raise ModelError(f"{path}: not a usable ONNX model ({one_line(str(error), LONGEST)})") from None
 
 
@@ -63,7 +69,7 @@ def run_onnx(path: Path, session: ort.InferenceSession, names: Sequence[str], in
     """The named outputs of a network with one input, (B, ...); ModelError if they are not B rows of finite numbers."""
     try:
         answers = session.run(list(names), {session.get_inputs()[0].name: inputs})
-    except Exception as error:  # as above
+    except RUNTIME_ERRORS as error:
         raise ModelError(f"{path}: fails when it is run ({one_line(str(error), LONGEST)})") from None
     declared = {end.name: end.shape for end in session.get_outputs()}
     for name, values in zip(names, answers, strict=True):

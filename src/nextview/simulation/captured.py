@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nextview.errors import DatasetError, ObservationError, UsageError
+from nextview.errors import DAMAGED, DatasetError, ObservationError, UsageError
 from nextview.files import read_record, regular_file
 from nextview.geometry.mesh import FORMATS
 from nextview.sensing.frame import LARGEST_MEDIAN, NEAREST_MEDIAN, Frame, check_pose
@@ -385,5 +385,5 @@ def _open(path: Path, formats: tuple[str, ...], load: bool = True) -> Image.Imag
             if load:
                 image.load()
             return image  # its file is closed, its pixels stay
-    except Exception as error:  # Pillow raises many kinds
+    except (*DAMAGED, Image.DecompressionBombError) as error:
         raise DatasetError(f"{path}: the image is damaged or cannot be read ({error})") from None

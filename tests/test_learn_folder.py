@@ -1,0 +1,143 @@
+"""What a folder teaches, wherever the result goes; sizes that give a wrong unit away; the picture of all things."""
+
+import os
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import nextview.learning.learn as learning
+from nextview.cli.main import main
+from nextview.errors import DatasetError
+from nextview.learning.learned_picture import draw_learned
+from nextview.learning.sizes import check_sizes
+from nextview.learning.things import find_things
+from nextview.recognition.memory import AZIMUTHS, RINGS
+from nextview.recognition.model_card import read_card
+from nextview.recognition.novelty import unit
+
+FEATURES = 256
+
+
+@pytest.fixture
+def quickly(monkeypatch):
+    """Teaching without looking: what is remembered is drawn."""
+
+    def drawn(path, name, how, threads=1):
+        assert path.is_file()
+        rng = np.random.default_rng(len(name))
+        views = unit(rng.normal(size=(1, len(RINGS), AZIMUTHS, FEATURES)))
+        return {
+            "views": views.astype(np.float16),
+            "rotations": np.eye(3, dtype=np.float32)[None],
+            "held_out": views[0, :2, ::4].reshape(8, FEATURES).astype(np.float16),
+            "held_out_views": np.zeros((8, 2), np.float32),
+            "radii": np.array([0.1], np.float32),
+            "pictures": rng.integers(0, 255, (64, 64)).astype(np.uint8),
+        }
+
+    monkeypatch.setattr(learning, "teach", drawn)
+
+
+def scans_in(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("OFF\n")
+    return folder
+
+
+def test_frames_meshes_and_classes_are_found_together(tmp_path):
+    scans_in(tmp_path, "box.ply", "cups/a.ply", "cups/a.stl", "frames/frame-0.depth.png", "mine/learned.png", "b.dae")
+    found = find_things(tmp_path, tmp_path / "mine")
+    assert [(thing.name, thing.label) for thing in found.things] == [
+        ("box", "box"),
+        ("a", "cups"),
+        ("frames", "frames"),
+    ]
+    assert set(found.left_out) == {
+        "cups/a.stl: the PLY file of the same model is taken",
+        "mine: is where the result goes",
+        "b.dae: of a format that is not read; export it as .off, .obj, .ply, .stl, .glb",
+    }
+    assert found.notes == (f"in {tmp_path}: 1 in MESH, 1 in CLASS/MESH, 1 folder of depth frames",)
+
+
+def test_what_is_for_tests_is_not_taught(tmp_path):
+    scans_in(tmp_path, "cup/train/a.ply", "cup/test/b.ply", "box.ply")
+    found = find_things(tmp_path)
+    assert [thing.name for thing in found.things] == ["box", "a"]
+    assert found.left_out == ["cup/test/b.ply: of the split test"]
+    with pytest.raises(DatasetError, match=r"holds no mesh .*; left out: a\.step: of a format that is not read"):
+        find_things(scans_in(tmp_path / "drawings", "a.step"))
+
+
+@pytest.mark.parametrize(("folder", "out"), [(".", "mine"), ("../things", "."), ("../things", "../things/mine")])
+def test_the_result_may_lie_beside_the_things_or_in_the_working_folder(
+    tmp_path, monkeypatch, capsys, quickly, folder, out
+):
+    scans_in(tmp_path / "things", "box.ply", "tin.ply")
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / ("things" if folder == "." else "empty"))
+    for again in ([], ["--overwrite"]):
+        main(["learn", folder, out, "--workers", "0", *again])
+        assert read_card(Path(out) / "memory.json").classes == ("box", "tin")
+    printed = capsys.readouterr().out
+    assert f"in {folder}: 2 in MESH" in printed
+    assert ("mine: is where the result goes" in printed) == (out != ".")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes on Linux alone")
+def test_a_file_that_cannot_be_taught_does_not_keep_the_others_from_it(tmp_path, quickly, capsys):
+    long = "n" * 251
+    root = scans_in(tmp_path / "things", "box.ply", f"{long}.ply", "tin.ply")
+    (root / "gone.ply").symlink_to("nowhere")
+    (root / os.fsdecode(b"caf\xe9.ply")).write_text("OFF\n")
+    main(["learn", str(root), str(tmp_path / "mine"), "--workers", "0"])
+    assert set(read_card(tmp_path / "mine/memory.json").classes) >= {"box", "tin"}
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "gone.ply: a link that leads nowhere" in printed
+    assert r"caf\udce9.ply: its name cannot be printed; rename it" in printed
+
+
+@pytest.mark.parametrize(
+    ("radii", "unit_given", "said"),
+    [
+        ([71.0, 80, 65], "m", r"b\.ply: has a radius of 71 m if --unit m is right.* --unit mm \(7\.1 cm\)"),
+        ([71.0], "m", "--unit mm"),
+        ([0.0001, 0.00012], "mm", r"--unit m \("),
+        ([0.1, 0.12, 100.0], "m", r"c\.ply: is 833 times larger than most others"),
+        ([0.1, 0.12, 0.0001], "m", "times smaller than most others"),
+        ([0.1, np.nan, 0.3], "cm", None),
+        ([np.nan, np.nan], None, None),
+        ([15.0, 3.0], "m", None),
+    ],
+)
+def test_sizes_that_give_a_wrong_unit_away_are_asked_about(radii, unit_given, said):
+    names = [Path(f"{name}.ply") for name in ("b", "a", "c")][: len(radii)]
+    if said is None:
+        return check_sizes(names, np.array(radii), unit_given)
+    with pytest.raises(DatasetError, match=said) as raised:
+        check_sizes(names, np.array(radii), unit_given)
+    assert "--any-size takes it as it is" in str(raised.value)
+
+
+@pytest.mark.parametrize(("count", "shown"), [(1, 1), (7, 7), (14, 14), (90, 90), (400, 120)])
+def test_the_picture_shows_all_things_that_fit_each_in_a_place_of_its_own(tmp_path, monkeypatch, count, shown):
+    pages = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, path: pages.append(self))
+    pictures = {f"thing_{k}": np.full((64, 64), 99, np.uint8) for k in range(count)}
+    draw_learned(tmp_path / "p.png", pictures, SimpleNamespace(accuracy=(0.5, 0.6, 0.7, 0.8), confused=()))
+    (figure,) = pages
+    page = figure.axes[0]
+    places = np.array([image.get_extent() for image in page.images])
+    assert len(places) == shown
+    width, height = figure.get_size_inches()
+    assert (places[:, :2] >= 0).all()
+    assert (places[:, :2] <= width).all()
+    assert (places[:, 2:] <= height).all()
+    apart = np.abs(places[:, None, [0, 3]] - places[None, :, [0, 3]]).max(-1) + 9 * np.eye(shown)
+    assert apart.min() > 1.05  # inches: none lies on another
+    assert (f"{shown} of them" in "".join(text.get_text() for text in page.texts)) == (shown < count)
