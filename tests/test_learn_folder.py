@@ -84,7 +84,7 @@ def test_the_result_may_lie_beside_the_things_or_in_the_working_folder(
     for again in ([], ["--overwrite"]):
         main(["learn", folder, out, "--workers", "0", *again])
         assert read_card(Path(out) / "memory.json").classes == ("box", "tin")
-    printed = capsys.readouterr().out
+    printed = " ".join("".join(capsys.readouterr()).split())
     assert f"in {folder}: 2 in MESH" in printed
     assert ("mine: is where the result goes" in printed) == (out != ".")
 
@@ -97,7 +97,7 @@ def test_a_file_that_cannot_be_taught_does_not_keep_the_others_from_it(tmp_path,
     (root / os.fsdecode(b"caf\xe9.ply")).write_text("OFF\n")
     main(["learn", str(root), str(tmp_path / "mine"), "--workers", "0"])
     assert set(read_card(tmp_path / "mine/memory.json").classes) >= {"box", "tin"}
-    printed = " ".join(capsys.readouterr().out.split())
+    printed = " ".join("".join(capsys.readouterr()).split())
     assert "gone.ply: a link that leads nowhere" in printed
     assert r"caf\udce9.ply: its name cannot be printed; rename it" in printed
 

@@ -134,7 +134,7 @@ class _OwnMain(SpawnProcess):
             usual = spawn.get_preparation_data
             spawn.get_preparation_data = without_script
             try:
-                return SpawnProcess._Popen(process_obj)  # type: ignore[attr-defined]
+                return SpawnProcess._Popen(process_obj)
             finally:
                 spawn.get_preparation_data = usual
 
@@ -142,7 +142,7 @@ class _OwnMain(SpawnProcess):
 class _OwnMainContext(SpawnContext):
     """Starts such workers."""
 
-    Process = _OwnMain  # type: ignore[assignment]
+    Process = _OwnMain
 
 
 def _begin_worker() -> None:
