@@ -28,7 +28,7 @@ EMBEDDING_OUTPUT = "embedding"
 """Ends of ONNX files; "features" are what the last layers of a recogniser make the logits of, (B, F)."""
 LONGEST = 300  # letters of what the runtime says
 # The runtime has a class of exception for every reason, without a common one.
-RUNTIME_ERRORS = (
+RUNTIME_ERRORS: tuple[type[Exception], ...] = (
     *DAMAGED,
     *(kind for kind in vars(runtime).values() if isinstance(kind, type) and issubclass(kind, Exception)),
 )
