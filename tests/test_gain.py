@@ -319,7 +319,7 @@ def test_few_objects_have_a_fold_each(unseen, tmp_path, capsys):
     assert "judged by networks of 3 other folds" in json.loads((tmp_path / "few.json").read_text())["learned_from"]
     Predictions.load(unseen).of_objects(np.arange(1)).save(tmp_path / "one.npz")
     words = refused(capsys, "train", "gain", tmp_path / "one.npz", tmp_path / "one.json")
-    assert "1 objects cannot be divided into 1 folds: there have to be two at least" in words
+    assert "1 objects cannot be divided into 1 folds: two folds and as many objects are needed at least" in words
 
 
 def test_it_learns_from_what_sensors_made_of_the_same_objects(unseen, tmp_path, capsys):
