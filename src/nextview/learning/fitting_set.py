@@ -26,7 +26,9 @@ Indices = NDArray[np.int64]
 def hold_out(labels: Indices, measured: NDArray[np.floating], folds: int, seed: int) -> list[Indices]:
     """Divide objects into parts, each to be held out from one network; every class is spread evenly."""
     if not 2 <= folds <= len(labels):
-        raise DatasetError(f"{len(labels)} objects cannot be divided into {folds} folds: two folds and as many objects are needed at least")
+        raise DatasetError(
+            f"{len(labels)} objects cannot be divided into {folds} folds: two folds and as many objects are needed at least"
+        )
     rng = np.random.default_rng([seed, folds])
     group = duplicate_groups(measured)
     first = rng.permutation(np.unique(group, return_index=True)[1])  # one object stands for its group
