@@ -27,7 +27,8 @@ def hold_out(labels: Indices, measured: NDArray[np.floating], folds: int, seed: 
     """Divide objects into parts, each to be held out from one network; every class is spread evenly."""
     if not 2 <= folds <= len(labels):
         raise DatasetError(
-            f"{len(labels)} objects cannot be divided into {folds} folds: two folds and as many objects are needed at least"
+            f"{len(labels)} objects cannot be divided into {folds} folds: two folds and as many objects are needed "
+            "at least"
         )
     rng = np.random.default_rng([seed, folds])
     group = duplicate_groups(measured)
