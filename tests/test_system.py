@@ -67,6 +67,7 @@ def test_importing_and_a_robot_need_no_ray_caster():
 
 
 @pytest.mark.skipif(not os.environ.get("NEXTVIEW_DATA"), reason="NEXTVIEW_DATA names no folder with ModelNet10")
+@pytest.mark.filterwarnings("ignore:.*is it a table")  # asked of a monitor on a wide plate
 def test_the_bundled_models_keep_their_accuracy():
     """The card says that 0.907 of single views are right; of 30 objects fewer than 0.8 are so by chance in 1 of 40."""
     meshes = sorted(Path(os.environ["NEXTVIEW_DATA"], "ModelNet10").glob("*/test/*.off"))[:30]

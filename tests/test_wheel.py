@@ -176,7 +176,7 @@ def test_it_holds_the_package_and_nothing_else(wheel):
     tops = {name.split("/")[0] for name in names}
     assert {re.sub(r"-.*\.dist-info", "", top) for top in tops} == {"nextview", "nextview_command.py"}
     source = ROOT / "src/nextview"
-    data = [path for path in source.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")]
+    data = [path for path in source.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc", ".toml")]
     assert {f"nextview/{path.relative_to(source).as_posix()}" for path in data} <= set(names)
 
 

@@ -94,7 +94,10 @@ def save_whole(values: dict[str, Any], path: Path) -> None:
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """What ``save_whole`` wrote, by torch's reader that makes nothing but tensors and containers."""
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            # Torch warns of pickles that are not its own before it refuses them.
+            warnings.filterwarnings("ignore", "Detected pickle protocol")
+            return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise ModelError(f"{path}: there is no such checkpoint") from None
     except (*DAMAGED, pickle.UnpicklingError) as error:

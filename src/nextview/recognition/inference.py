@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from onnxruntime.capi import onnxruntime_pybind11_state as runtime
 
 from nextview.checks import one_line
 from nextview.errors import DAMAGED, ModelError
@@ -19,7 +18,7 @@ from nextview.recognition.map_names import SPHERE, maps_among
 from nextview.recognition.model_card import FEATURES, RECOGNISER, ModelCard, find_card
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, novelty_path, read_novelty
-from nextview.recognition.runtime import ort
+from nextview.recognition.runtime import RUNTIME_FAILURES, ort
 
 INPUT = "input"
 BINS_OUTPUT = "sides"
@@ -27,11 +26,7 @@ FEATURES_OUTPUT = "features"
 EMBEDDING_OUTPUT = "embedding"
 """Ends of ONNX files; "features" are what the last layers of a recogniser make the logits of, (B, F)."""
 LONGEST = 300  # letters of what the runtime says
-# The runtime has a class of exception for every reason, without a common one.
-RUNTIME_ERRORS: tuple[type[Exception], ...] = (
-    *DAMAGED,
-    *(kind for kind in vars(runtime).values() if isinstance(kind, type) and issubclass(kind, Exception)),
-)
+RUNTIME_ERRORS: tuple[type[Exception], ...] = (*DAMAGED, *RUNTIME_FAILURES)  # of a network that is no usable one
 Shape = tuple[int | None, ...]  # without the batch; None for a size that is free
 
 

@@ -10,5 +10,12 @@ import os
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 import onnxruntime as ort
+from onnxruntime.capi import onnxruntime_pybind11_state as _state
 
-__all__ = ["ort"]
+_found = vars(_state).values()
+RUNTIME_FAILURES: tuple[type[Exception], ...] = tuple(
+    kind for kind in _found if isinstance(kind, type) and issubclass(kind, Exception)
+)
+"""The runtime has a class of exception for every reason, without a common one."""
+
+__all__ = ["RUNTIME_FAILURES", "ort"]
