@@ -72,7 +72,9 @@ def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
     lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
     directions = np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), HELD_OUT)), rng.uniform(0, 2 * np.pi, HELD_OUT)
     with ThreadPoolExecutor(threads) as pool:
-        held_out = _sensed(pool, mesh, look_at_origin(*directions), how.sensor, rng)
+        # Of any of its resting poses: things lie in practice, and calibration and the rate of strangers follow these.
+        shown_pose = lying[int(rng.integers(len(lying)))]
+        held_out = _sensed(pool, shown_pose, look_at_origin(*directions), how.sensor, rng)
         clean = [_clean(pool, each) for each in lying]
         sensed = [_sensed(pool, each, SENSED, how.sensor, rng) for each in lying]
         around = [_around(*both) for both in zip(clean, sensed, strict=True)]

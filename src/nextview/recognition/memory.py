@@ -34,8 +34,8 @@ class Memory:
             remembered.
         thing: Which thing each resting pose is of, ascending, (H,) int64.
         rotations: Of each resting pose, from the file's axes, (H, 3, 3) float32.
-        held_out: Embeddings of views through a sensor that are not remembered, K of each thing in its first resting
-            pose, (T, K, F): what calibration and reports are made of. Zero where nothing was seen.
+        held_out: Embeddings of views through a sensor that are not remembered, K of each thing in one of its resting
+            poses, (T, K, F): what calibration and reports are made of. Zero where nothing was seen.
         held_out_views: Elevation and azimuth of each of these, radians, (T, K, 2) float32.
         radii: Object radius of each thing, metres, (T,) float32; NaN where it is not known.
         pictures: A picture of each thing, (T, 64, 64) uint8.
