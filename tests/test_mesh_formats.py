@@ -260,3 +260,21 @@ def test_a_damaged_stl_is_refused(tmp_path, content, sentence):
     path.write_bytes(content)
     with pytest.raises(MeshError, match=f"a.stl: .*{sentence}"):
         load_mesh(path)
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply"])
+def test_a_signalling_nan_in_single_precision_is_refused_like_any_other(tmp_path, kind):
+    numbers = np.zeros(9, "<f4")
+    numbers[[3, 7]] = 1
+    numbers.view("<u4")[5] = 0x7F81_0000  # converting it sets the processor's flag of invalid operations
+    if kind == "stl":
+        data = bytes(80) + (1).to_bytes(4, "little") + bytes(12) + numbers.tobytes() + bytes(2)
+    else:
+        columns = "".join(f"property float {axis}\n" for axis in "xyz")
+        header = f"ply\nformat binary_little_endian 1.0\nelement vertex 3\n{columns}element face 1\n"
+        header += "property list uchar int vertex_indices\nend_header\n"
+        data = header.encode() + numbers.tobytes() + b"\3" + np.arange(3, dtype="<i4").tobytes()
+    path = tmp_path / f"nan.{kind}"
+    path.write_bytes(data)
+    with pytest.raises(MeshError, match="finite"):
+        load_mesh(path)

@@ -265,7 +265,8 @@ def _vertices(columns: Scalars) -> NDArray[np.float64]:
     missing = [axis for axis in "xyz" if axis not in columns]
     if missing:
         raise MeshError(f"its vertices have no {', '.join(missing)}")
-    return np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
+    with np.errstate(invalid="ignore"):  # of numbers that are none, which are refused with the mesh
+        return np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
 
 
 def _corners(element: str, lists: dict[str, Lists]) -> Corners:

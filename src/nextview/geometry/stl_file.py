@@ -44,7 +44,8 @@ def read_stl(data: bytes, max_faces: int = MAX_FACES) -> tuple[NDArray[np.float6
         raise MeshError(f"it announces {announced} faces, but holds {held}")
     check_faces(announced, max_faces)
     facets = np.frombuffer(data, FACET, announced, HEADER_BYTES)
-    vertices = facets["corners"].reshape(-1, 3).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of numbers that are none, which are refused with the mesh
+        vertices = facets["corners"].reshape(-1, 3).astype(np.float64)
     return vertices, np.arange(len(vertices)).reshape(-1, 3)
 
 
