@@ -32,7 +32,7 @@ from nextview.errors import UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, best_view
 from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, of_true_class
-from nextview.recognition.memory import TaughtRecogniser
+from nextview.things.memory import TaughtRecogniser
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -38,9 +38,9 @@ from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.recognition.memory import TaughtRecogniser
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
+from nextview.things.memory import TaughtRecogniser
 from nextview.things.registration import rotation_about_z
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings

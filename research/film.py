@@ -29,9 +29,9 @@ from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import azimuth_of, look_at_origin
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate import Discriminate
-from nextview.recognition.memory import AZIMUTHS, RINGS, Memory, open_memory
 from nextview.recognition.model_card import find_models
 from nextview.simulation.sensed_camera import SensedCamera
+from nextview.things.memory import AZIMUTHS, RINGS, Memory, open_memory
 from research.film_stage import Array, Colour, Look, Shot, Stage, circle, font, rays_of, scene, shot, tag, toned
 
 THINGS = {

@@ -12,9 +12,9 @@ from time import perf_counter
 import numpy as np
 
 import nextview
-from nextview.recognition.approximate import NearestViews
-from nextview.recognition.memory import AZIMUTHS, TaughtRecogniser, by_ring, ring_shares, similarities
 from nextview.recognition.novelty import unit
+from nextview.things.approximate import NearestViews
+from nextview.things.memory import AZIMUTHS, TaughtRecogniser, by_ring, ring_shares, similarities
 
 NOISE, VIEWS = 0.02, 100
 

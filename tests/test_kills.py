@@ -70,7 +70,7 @@ import numpy as np
 from types import SimpleNamespace
 from nextview.learning import learn as module
 from nextview.learning.learn import learn
-from nextview.recognition.memory import AZIMUTHS, RINGS, open_memory
+from nextview.things.memory import AZIMUTHS, RINGS, open_memory
 from nextview.recognition.novelty import unit
 
 

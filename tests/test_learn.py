@@ -20,13 +20,13 @@ from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.learning.learn import learn
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate import Discriminate
-from nextview.recognition.approximate import NearestViews
 from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, reorient
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.memory import AZIMUTHS, RINGS, by_ring, open_memory, similarities
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.things.approximate import NearestViews
+from nextview.things.memory import AZIMUTHS, RINGS, by_ring, open_memory, similarities
 from nextview.viewers.card import preview_card, walk_card
 from nextview.viewers.exploration import Exploration, remembered_picture, shown_objects
 

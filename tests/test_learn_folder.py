@@ -15,9 +15,9 @@ from nextview.errors import DatasetError
 from nextview.learning.learned_picture import draw_learned
 from nextview.learning.sizes import check_sizes
 from nextview.learning.things import find_things
-from nextview.recognition.memory import AZIMUTHS, RINGS
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
+from nextview.things.memory import AZIMUTHS, RINGS
 
 FEATURES = 256
 

@@ -15,10 +15,10 @@ from nextview.files import MARKER, new_folder, only_one
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning import learn as module
 from nextview.learning.learn import learn
-from nextview.recognition.memory import AZIMUTHS, RINGS, open_memory
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
 from nextview.simulation.capturing import write_capture
+from nextview.things.memory import AZIMUTHS, RINGS, open_memory
 
 
 @pytest.fixture

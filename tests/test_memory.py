@@ -13,8 +13,8 @@ import nextview
 from nextview.errors import ModelError
 from nextview.files import sha256_of
 from nextview.recognition.inference import Features
-from nextview.recognition.memory import open_memory, open_recogniser
 from nextview.recognition.model_card import find_models, read_card
+from nextview.things.memory import open_memory, open_recogniser
 
 FLOATS = ("views", "rotations", "held_out", "held_out_views", "radii", "head", "head_bias")
 ARRAYS = (*FLOATS, "thing", "pictures")
@@ -279,7 +279,7 @@ VALUES = {
 
 @pytest.mark.parametrize("how", ["dropped", *VALUES])
 def test_any_other_field_is_refused_by_name_or_the_memory_works(models, features, monkeypatch, how):
-    monkeypatch.setattr("nextview.recognition.memory.Features", lambda threads: features)
+    monkeypatch.setattr("nextview.things.memory.Features", lambda threads: features)
     card = models / "memory.json"
     original = json.loads(card.read_text())
     refused = 0

@@ -13,9 +13,9 @@ from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.recognition.memory import TaughtRecogniser
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, depth_view
+from nextview.things.memory import TaughtRecogniser
 from nextview.things.proposals import propose
 from nextview.things.registration import (
     COARSE,

@@ -18,9 +18,9 @@ from nextview.errors import DAMAGED, PredictionsError
 from nextview.files import check_new, command, unfinished
 from nextview.geometry.observation import enough_shows
 from nextview.recognition.inference import MapNetwork, Recogniser
-from nextview.recognition.memory import open_recogniser
 from nextview.recognition.model_card import BUNDLED, ModelCard
 from nextview.recognition.network_input import from_store
+from nextview.things.memory import open_recogniser
 
 BATCH = 8  # views a call of the networks
 Cards = dict[str, ModelCard]  # of map networks, by name

@@ -27,7 +27,6 @@ from nextview.learning.teaching import LEFT_OUT, Arrays, How, teach
 from nextview.learning.things import Found, Source, find_things
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import Features
-from nextview.recognition.memory import AZIMUTHS, Memory, check_features, open_memory
 from nextview.recognition.model_card import (
     FEATURES,
     MEMORY_SUFFIX,
@@ -40,6 +39,7 @@ from nextview.recognition.model_card import (
     memory_path,
     write_card,
 )
+from nextview.things.memory import AZIMUTHS, Memory, check_features, open_memory
 
 NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
 CARD, WEIGHTS, PICTURE = f"{NAME}.json", f"{NAME}{MEMORY_SUFFIX}", "learned.png"

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.recognition.belief import Calibration, SizeEvidence, log_evidence_of, of_true_class
-from nextview.recognition.memory import AZIMUTHS, by_ring, similarities
+from nextview.things.memory import AZIMUTHS, by_ring, similarities
 
 Index = NDArray[np.int64]
 Float = NDArray[np.floating]

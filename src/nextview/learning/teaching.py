@@ -18,7 +18,6 @@ from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import resting_poses, rotated
 from nextview.geometry.viewsphere import ViewSphere, angle_between, direction_of, look_at_origin
 from nextview.recognition.inference import Features
-from nextview.recognition.memory import AZIMUTHS, RINGS, joined
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import unit
 from nextview.simulation.captured import Capture, is_capture, read_capture
@@ -27,6 +26,7 @@ from nextview.simulation.captured_check import summary
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.simulation.turntable import read_turntable
+from nextview.things.memory import AZIMUTHS, RINGS, joined
 
 Arrays = dict[str, NDArray]
 HELD_OUT = 8  # views of each thing that are not remembered
@@ -56,7 +56,7 @@ class How:
 
 
 def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
-    """What is to be remembered of one thing, by the names of the fields of ``recognition.memory.Memory``.
+    """What is to be remembered of one thing, by the names of the fields of ``things.memory.Memory``.
 
     Of a mesh file or a folder of captured frames; name and seed decide all random draws. Where some of the frames were
     not used, there is a phrase about them under LEFT_OUT. MeshError, DatasetError, ObservationError: why it cannot be

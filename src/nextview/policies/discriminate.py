@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nextview.errors import OtherUseError, PolicyError
 from nextview.geometry.viewsphere import Viewpoints, azimuth_of
 from nextview.policies.base import EpisodeState, best_view, check_weight, travel_from
-from nextview.recognition.memory import AZIMUTHS, RINGS, open_memory
+from nextview.things.memory import AZIMUTHS, RINGS, open_memory
 
 Float = NDArray[np.float64]
 WEIGHT = 40.0  # of a cosine, as a log-likelihood: for one view whose noise is not known yet

@@ -21,12 +21,12 @@ from nextview.policies.registry import make_policy_anywhere, with_cards
 from nextview.recognition.belief import Stopping
 from nextview.recognition.inference import MapNetwork, Models, Recogniser, open_maps
 from nextview.recognition.map_names import SPHERE
-from nextview.recognition.memory import open_recogniser
 from nextview.recognition.model_card import DISCRIMINATE, find_models
 from nextview.recognition.own_stopping import Rule, own_stopping
 from nextview.session.limits import Limits
 from nextview.session.recognition import Recognition
 from nextview.session.session import FrameCamera, Session
+from nextview.things.memory import open_recogniser
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject

@@ -9,7 +9,7 @@ from nextview.errors import ModelError, ObservationError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import direction_of
 from nextview.recognition.belief import log_evidence_of
-from nextview.recognition.memory import TaughtRecogniser
+from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.verifier import Verified, Verifier
 from nextview.things.weighing import EvidenceWeights

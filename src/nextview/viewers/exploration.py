@@ -20,11 +20,11 @@ from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import azimuth_of, direction_of, level_pose, look_at_origin
 from nextview.policies.discriminate import Discriminate, Rivals
 from nextview.recognition.belief import FixedLength, log_evidence_of
-from nextview.recognition.memory import AZIMUTHS, RINGS, TaughtRecogniser
 from nextview.session.session import Session
 from nextview.session.system import System, load, simulated
 from nextview.session.view import View
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.things.memory import AZIMUTHS, RINGS, TaughtRecogniser
 
 Float = NDArray[np.float64]
 

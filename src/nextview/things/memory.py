@@ -1,4 +1,4 @@
-"""The memory of taught things: what each looks like from around, and how likely a view is given each of them."""
+"""The memory of taught things: what each looks like, and how likely a view is given each."""
 
 import hashlib
 from dataclasses import dataclass, fields
@@ -13,11 +13,11 @@ from safetensors.numpy import save
 from nextview.checks import check_array
 from nextview.errors import ModelError
 from nextview.files import arrays_in, checked_bytes, new_file
-from nextview.recognition.approximate import NearestViews, is_large
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Features, Recogniser
 from nextview.recognition.model_card import FEATURES, ModelCard, find_card
 from nextview.recognition.novelty import ROUNDED, Quantiles, unit
+from nextview.things.approximate import NearestViews, is_large
 
 RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the remembered views, degrees
 AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
@@ -27,15 +27,16 @@ Float = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Memory:
-    """What T things look like, each in one or more resting poses: H of these in all, sorted by class.
+    """What T things look like, each in one or more resting poses: H of these, sorted by class.
 
     Attributes:
-        views: Embedding of each remembered view, unit vectors, (H, rings, azimuths, F); zero where nothing is
-            remembered.
+        views: Embedding of each remembered view, unit vectors, (H, rings, azimuths, F); zero where
+            nothing is remembered.
         thing: Which thing each resting pose is of, ascending, (H,) int64.
         rotations: Of each resting pose, from the file's axes, (H, 3, 3) float32.
-        held_out: Embeddings of views through a sensor that are not remembered, K of each thing in one of its resting
-            poses, (T, K, F): what calibration and reports are made of. Zero where nothing was seen.
+        held_out: Embeddings of views through a sensor that are not remembered, K of each thing in
+            one of its resting poses, (T, K, F): what calibration and reports are made of. Zero
+            where nothing was seen.
         held_out_views: Elevation and azimuth of each of these, radians, (T, K, 2) float32.
         radii: Object radius of each thing, metres, (T,) float32; NaN where it is not known.
         pictures: A picture of each thing, (T, 64, 64) uint8.
@@ -58,7 +59,7 @@ class Memory:
         self._check_values()
 
     def _check_shapes(self) -> None:
-        """See that all arrays are of the right kinds of numbers, finite, and of shapes that fit together."""
+        """See that all arrays are finite numbers of the right kinds, and that their shapes fit."""
         check_array("its thing", self.thing, np.integer, (None,))
         check_array("its radii", self.radii, np.floating, (None,), finite=False)
         poses = len(self.thing)
@@ -94,7 +95,9 @@ class Memory:
 
         rotations = self.rotations.astype(np.float64)
         products = rotations @ rotations.swapaxes(1, 2)
-        turned = np.abs(products - np.eye(3)).max() < ROUNDED and (np.linalg.det(rotations) > 0).all()
+        turned = (
+            np.abs(products - np.eye(3)).max() < ROUNDED and (np.linalg.det(rotations) > 0).all()
+        )
         if not turned:
             raise ModelError("its rotations are no rotations")
 
@@ -116,7 +119,8 @@ def read_memory(path: Path, sha256: str) -> Memory:
     """Read what ``Memory.save`` wrote.
 
     Raises:
-        ModelError: the file is missing, is not that of this hash, or one of its values makes no sense.
+        ModelError: the file is missing, is not that of this hash, or one of its values makes no
+            sense.
     """
     names = [f.name for f in fields(Memory)]
     arrays = arrays_in(checked_bytes(path, sha256, "a memory"), names, f"{path}: not a memory")
@@ -133,8 +137,8 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
         model: The name of a bundled memory, or the path of a card.
 
     Raises:
-        ModelError: one of them is missing, damaged, of other features than those that the package has now, or they do
-            not fit together.
+        ModelError: one of them is missing, damaged, of other features than those that the package
+            has now, or they do not fit together.
     """
     card = find_card(model)
     if card.memory is None:
@@ -142,31 +146,52 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
 
     features = find_card(FEATURES)
     if card.memory.features_sha256 != features.sha256:
-        raise ModelError(f"{card.card_path}: was taught with other features; teach it again with nextview learn")
+        raise ModelError(
+            f"{card.card_path}: was taught with other features; teach it again with nextview learn"
+        )
     if card.input != features.input:
-        raise ModelError(f"{card.card_path}: takes other inputs than the features that it was taught with")
+        raise ModelError(
+            f"{card.card_path}: takes other inputs than the features that it was taught with"
+        )
     if card.azimuth_bins != AZIMUTHS:
         raise ModelError(f"{card.card_path}: has {card.azimuth_bins} azimuth bins, not {AZIMUTHS}")
 
     memory = read_memory(card.path, card.sha256)
     if memory.thing.tolist() != list(card.memory.poses):
-        raise ModelError(f"{card.path}: its resting poses are not those of the things on its card, {card.card_path}")
+        raise ModelError(
+            f"{card.path}: its resting poses are not those of the things on its card,"
+            f" {card.card_path}"
+        )
     if len(memory.head_bias) != len(card.classes):
-        raise ModelError(f"{card.path}: is of {len(memory.head_bias)} classes, and its card of {len(card.classes)}")
+        raise ModelError(
+            f"{card.path}: is of {len(memory.head_bias)} classes, and its card of"
+            f" {len(card.classes)}"
+        )
     return card, memory
 
 
 def check_features(card: ModelCard, memory: Memory, size: int) -> None:
-    """See that a memory holds embeddings of as many numbers as the features have; ModelError if not."""
+    """See that a memory holds embeddings of as many numbers as the features have.
+
+    Raises:
+        ModelError: it holds others.
+    """
     if memory.views.shape[-1] != size:
-        raise ModelError(f"{card.path}: its views have {memory.views.shape[-1]} features, not {size}")
+        raise ModelError(
+            f"{card.path}: its views have {memory.views.shape[-1]} features, not {size}"
+        )
 
 
 def similarities(views: Float, embeddings: Float, elevations: Float) -> NDArray[np.float32]:
-    """How alike views are to what is remembered, between two rings interpolated: cosines, (B, H, azimuths) float32.
+    """How alike views are to what is remembered, between two rings interpolated.
 
-    The memory's ``views`` are ring by ring, (rings, H * azimuths, F) float32; ``embeddings`` unit vectors, (B, F)
-    float32; ``elevations`` those from which the views were taken, radians, (B,).
+    Args:
+        views: of the memory, ring by ring, (rings, H * azimuths, F) float32.
+        embeddings: of the views, unit vectors, (B, F) float32.
+        elevations: from which the views were taken, radians, (B,).
+
+    Returns:
+        Cosines, (B, H, azimuths) float32.
     """
     shares = ring_shares(elevations)
     found = np.zeros((len(embeddings), views.shape[1]), np.float32)
@@ -185,12 +210,23 @@ def ring_shares(elevations: Float) -> NDArray[np.float32]:
 
 
 class TaughtRecogniser(Recogniser):
-    """Recognises taught things in each view by what is remembered of them; ``model`` is the path of its card."""
+    """Recognises taught things in each view by what is remembered of them."""
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:
+        """Open a memory.
+
+        Args:
+            model: The name of a bundled memory, or the path of its card.
+            threads: That the features may take; 0 for all.
+
+        Raises:
+            ModelError: see ``open_memory``.
+        """
         self.card, self.memory = open_memory(model)
-        self.classes, self.azimuth_bins = self.card.classes, self.card.azimuth_bins
+        self.classes = self.card.classes
+        self.azimuth_bins = self.card.azimuth_bins
         self.calibration = self.card.calibration
+
         self._features = Features(threads)
         check_features(self.card, self.memory, self._features.size)
         self._views = by_ring(self.memory.views)
@@ -198,18 +234,31 @@ class TaughtRecogniser(Recogniser):
 
         about = self.card.memory
         assert about is not None
-        judged = np.array([self.memory.held_out[..., 0].size])
-        usual = np.array(about.usual) if about.usual else None
-        self.novelty = Quantiles(np.array(about.novelty), judged, joint=True, usual=usual) if about.novelty else None
+        self.novelty = None
+        if about.novelty:
+            judged = np.array([self.memory.held_out[..., 0].size])
+            usual = np.array(about.usual) if about.usual else None
+            self.novelty = Quantiles(np.array(about.novelty), judged, joint=True, usual=usual)
 
     def from_inputs(self, inputs: NDArray[Any], elevations: Float | None = None) -> Evidence:
-        """Evidence by shape alone, from what the network takes and the elevations of the cameras, radians, (B,)."""
+        """Judge views by shape alone.
+
+        Args:
+            inputs: What the network takes, (B, ...).
+            elevations: Of the cameras, radians, (B,).
+
+        Returns:
+            Their evidence.
+
+        Raises:
+            ModelError: the elevations are missing.
+        """
         if elevations is None:
             raise ModelError("a memory of things needs the elevations of the views")
         return self.evidence(self._features(inputs), elevations)
 
     def evidence(self, embeddings: Float, elevations: Float) -> Evidence:
-        """Evidence of views by their embeddings, unit vectors, (B, F), and elevations, radians, (B,)."""
+        """Evidence of views by their embeddings, unit vectors, (B, F), and elevations, (B,)."""
         assert self.card.memory is not None
         if self._nearest is None:
             alike = similarities(self._views, embeddings, elevations)
@@ -225,17 +274,26 @@ class TaughtRecogniser(Recogniser):
 
 
 def by_ring(views: Float) -> NDArray[np.float32]:
-    """Remembered views, (H, rings, azimuths, F), ring by ring, (rings, H * azimuths, F) float32."""
+    """Sort remembered views, (H, rings, azimuths, F), by ring: (rings, H * azimuths, F) float32."""
     h, rings, azimuths, f = views.shape
     return np.ascontiguousarray(views.swapaxes(0, 1).reshape(rings, h * azimuths, f), np.float32)
 
 
 def joined(clean: Float, sensed: Float) -> NDArray[np.float32]:
-    """What is remembered of views, by their embeddings without and with a sensor's errors: the mean, (..., F)."""
+    """The mean of embeddings of views without and with a sensor's errors: what is remembered."""
     return unit(np.asarray(clean, np.float32) + np.asarray(sensed, np.float32))
 
 
 def open_recogniser(model: str | Path, threads: int = 0) -> Recogniser:
-    """A recogniser, or a memory of taught things, by the name of a bundled model or the path of a card."""
-    card = find_card(model)
-    return (Recogniser if card.memory is None else TaughtRecogniser)(model, threads)
+    """Open a recogniser, or a memory of taught things.
+
+    Args:
+        model: The name of a bundled model, or the path of a card.
+        threads: That the network may take; 0 for all.
+
+    Raises:
+        ModelError: it is missing or damaged.
+    """
+    if find_card(model).memory is None:
+        return Recogniser(model, threads)
+    return TaughtRecogniser(model, threads)

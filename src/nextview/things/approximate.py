@@ -8,14 +8,18 @@ from numpy.typing import NDArray
 
 from nextview.checks import extras
 
-LARGE = 20_000  # remembered views of a ring, from which looking at all of them takes more than 10 ms
-INDEX, PROBED = "PCA64,IVF256,SQ8", 16  # 64 numbers of a byte for each view; so many of 256 cells are searched
+LARGE = 20_000  # views of a ring from which looking at all of them takes more than 10 ms
+INDEX = "PCA64,IVF256,SQ8"  # 64 numbers of a byte for each view, in 256 cells
+PROBED = 16  # cells that are searched
 SAMPLE = 10_240  # views from which an index learns its cells
 NEAREST = 1000  # views of a ring that are compared exactly
 
 
 def is_large(views: NDArray[np.float32]) -> bool:
-    """Whether remembered views, (rings, N, F), are searched approximately: there are many, and faiss is installed."""
+    """Whether remembered views, (rings, N, F), are searched approximately.
+
+    They are if there are many, and faiss is installed.
+    """
     return views.shape[1] >= LARGE and find_spec("faiss") is not None
 
 
@@ -24,17 +28,30 @@ class NearestViews:
 
     def __init__(self, views: NDArray[np.float32]) -> None:
         sample = np.random.default_rng(0).permutation(views.shape[1])[:SAMPLE]
-        self._views, self._indices = views, [_index(ring, sample) for ring in views]
+        self._views = views
+        self._indices = [_index(ring, sample) for ring in views]
 
-    def similarities(self, embeddings: NDArray[np.floating], shares: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Cosines of views, (B, F), with what is remembered, (B, N) float32: the sum over rings by shares, (B, rings).
+    def similarities(
+        self, embeddings: NDArray[np.floating], shares: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Cosines of views with what is remembered, summed over rings.
 
         The nearest of each ring are compared exactly. All others count as the least alike of these.
+
+        Args:
+            embeddings: of the views, (B, F).
+            shares: how much each ring counts for each view, (B, rings).
+
+        Returns:
+            (B, N) float32.
         """
         found = np.empty((len(embeddings), self._views.shape[1]), np.float32)
-        for row, (embedding, share) in enumerate(zip(np.asarray(embeddings, np.float32), shares, strict=True)):
+        pairs = zip(np.asarray(embeddings, np.float32), shares, strict=True)
+        for row, (embedding, share) in enumerate(pairs):
             rings = np.flatnonzero(share > 0)
-            near = np.concatenate([self._indices[ring].search(embedding[None], NEAREST)[1][0] for ring in rings])
+            near = np.concatenate(
+                [self._indices[ring].search(embedding[None], NEAREST)[1][0] for ring in rings]
+            )
             near = np.unique(near[near >= 0])
             alike = sum(share[ring] * (self._views[ring, near] @ embedding) for ring in rings)
             found[row] = np.min(alike)
