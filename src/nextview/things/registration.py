@@ -341,6 +341,30 @@ def _step(
     prior: RegistrationPrior,
 ) -> Alignment:
     """One Gauss-Newton step: turn, place and, with several views, the cameras' errors."""
+    left, right = _equations(caster, alignment, views, level, prior)
+    change = np.linalg.solve(left, right[..., None])[..., 0]
+
+    turn = np.clip(change[:, TURN], -TURN_LIMIT, TURN_LIMIT)
+    moved = np.clip(change[:, 3:], -SHIFT_LIMIT, SHIFT_LIMIT)
+    cameras = alignment.cameras
+    if moved.shape[1] > 3:
+        cameras = cameras + moved[:, 3:].reshape(cameras.shape)
+    return replace(
+        alignment,
+        rotations=rotations_of(turn) @ alignment.rotations,
+        centres=alignment.centres + moved[:, :3],
+        cameras=cameras,
+    )
+
+
+def _equations(
+    caster: SurfaceCaster,
+    alignment: Alignment,
+    views: Sequence[DepthView],
+    level: Level,
+    prior: RegistrationPrior,
+) -> tuple[Float, Float]:
+    """Matrices, (H, U, U), and right-hand sides, (H, U), of a step with U unknowns."""
     errors_too = len(views) > 1  # one camera's error is the same as one of the place
     unknowns = POSE + 3 * len(views) * errors_too
     left = np.zeros((len(alignment), unknowns, unknowns))
@@ -364,19 +388,31 @@ def _step(
     weights, so_far = _priors(caster, alignment, unknowns, level, prior)
     left += weights[:, :, None] * np.eye(unknowns)
     right -= weights * so_far
-    change = np.linalg.solve(left, right[..., None])[..., 0]
+    return left, right
 
-    turn = np.clip(change[:, TURN], -TURN_LIMIT, TURN_LIMIT)
-    moved = np.clip(change[:, 3:], -SHIFT_LIMIT, SHIFT_LIMIT)
-    cameras = alignment.cameras
-    if errors_too:
-        cameras = cameras + moved[:, 3:].reshape(cameras.shape)
-    return replace(
-        alignment,
-        rotations=rotations_of(turn) @ alignment.rotations,
-        centres=alignment.centres + moved[:, :3],
-        cameras=cameras,
-    )
+
+def pose_covariances(
+    caster: SurfaceCaster,
+    alignment: Alignment,
+    views: Sequence[DepthView],
+    prior: RegistrationPrior = RegistrationPrior(),
+) -> Float:
+    """How well the views determine the poses of aligned hypotheses, the cameras being where they are.
+
+    It is the inverse of the matrix of a fine step, without what is unknown of the cameras.
+
+    Args:
+        caster: of all surfaces.
+        alignment: the hypotheses, aligned.
+        views: the views, in the order of ``alignment.cameras``.
+        prior: how far off things may be before anything was aligned.
+
+    Returns:
+        Covariances of turn, radians, about the centre of each surface, and place of that centre,
+        metres, both in the object frame, (H, 6, 6) float64.
+    """
+    left, _ = _equations(caster, alignment, views, FINE[-1], prior)
+    return np.linalg.inv(left[:, :POSE, :POSE])
 
 
 def _normal_equations(pulls: _Pulls, prior: RegistrationPrior) -> tuple[Float, Float]:

@@ -190,6 +190,14 @@ class SurfaceCaster:
             [(surface.vertices + shift, surface.faces) for surface, shift in placed]
         )
 
+    def __reduce__(self) -> tuple[type["SurfaceCaster"], tuple[tuple[Surface, ...]]]:
+        """Pickled as its surfaces: Embree's scene is built again."""
+        return SurfaceCaster, (self.surfaces,)
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "SurfaceCaster":
+        """Itself: it never changes."""
+        return self
+
     def cast(
         self, things: NDArray[np.integer], origins: Float32, directions: Float32
     ) -> tuple[Float32, Float32]:
