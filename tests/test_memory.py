@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +13,17 @@ from safetensors.numpy import load_file, save_file
 import nextview
 from nextview.errors import ModelError
 from nextview.files import sha256_of
+from nextview.geometry.mesh import load_mesh
 from nextview.recognition.inference import Features
 from nextview.recognition.model_card import find_models, read_card
 from nextview.things.memory import open_memory, open_recogniser
+from nextview.things.stored_surfaces import StoredSurfaces
+from nextview.things.surface import Surface
+from nextview.things.taught import TaughtThings
+from nextview.things.weighing import EvidenceWeights
 
-FLOATS = ("views", "rotations", "held_out", "held_out_views", "radii", "head", "head_bias")
-ARRAYS = (*FLOATS, "thing", "pictures")
+FLOATS = ("views", "rotations", "held_out", "held_out_views", "radii", "head", "head_bias", "boxes")
+ARRAYS = (*FLOATS, "thing", "pictures", "places", "faces", "counts")
 
 
 @pytest.fixture(scope="session")
@@ -92,10 +98,23 @@ OF_ONE = {
     ("thing", "beyond the last"): lambda values: values + 1,
     ("thing", "all one"): lambda values: values * 0,
     ("thing", "descending"): lambda values: values[::-1],
+    ("faces", "beyond the last"): lambda values: with_value(values, len(values)),
+    ("faces", "signed"): lambda values: values.astype(np.int32),
+    ("places", "of floats"): lambda values: values.astype(np.float32),
+    ("counts", "negative"): lambda values: values * (-1, 1),
+    ("counts", "of other things"): lambda values: values[::-1],
+    ("counts", "without faces"): lambda values: values * (1, 0),
+    ("counts", "beyond all numbers"): lambda values: values * 0 + 2**62,
+    ("boxes", "mirrored"): lambda values: -values,
+    ("boxes", "far away"): lambda values: values + 1e5,
+    ("boxes", "without extent"): lambda values: values * 0,
 }
 
 
-AXES = {"views": 4, "held_out": 3, "held_out_views": 3, "rotations": 3, "pictures": 3, "head": 2}
+AXES = {
+    "views": 4, "held_out": 3, "held_out_views": 3, "rotations": 3, "pictures": 3, "head": 2,
+    "places": 2, "faces": 2, "counts": 2, "boxes": 3,
+}  # fmt: skip
 
 
 def array_mutations():
@@ -150,6 +169,9 @@ def fewer_things(arrays):
     kept = arrays["thing"] < len(arrays["radii"])
     for name in ("views", "rotations", "thing"):
         arrays[name] = arrays[name][kept]
+    vertices, faces = arrays["counts"][:-1].sum(0)
+    arrays |= {"places": arrays["places"][:vertices], "faces": arrays["faces"][:faces]}
+    arrays |= {name: arrays[name][:-1] for name in ("counts", "boxes")}
 
 
 @pytest.mark.parametrize(
@@ -189,6 +211,7 @@ def set_at(path, value):
     return change
 
 
+VERIFIED = {"weights": {"geometry": 20.0}, "things": 3, "usual": [0.1, 0.1, 0.2], "excess": [[-0.1, 0.2]]}
 REFUSED = {
     "one class more": set_at("classes", lambda names: [*names, "mug"]),
     "one class less": set_at("classes", lambda names: names[:-1]),
@@ -230,6 +253,15 @@ REFUSED = {
     "an empty row of usual": set_at("memory/usual", [[]]),
     "ragged usual": set_at("memory/usual/0", lambda row: row[:-1]),
     "usual of one class more": set_at("memory/usual", lambda rows: [[*row, 0.0] for row in rows]),
+    "a symmetry of order one": set_at("memory/things/0/symmetries", [{"axis": [0, 0, 1], "order": 1}]),
+    "a symmetry of negative order": set_at("memory/things/0/symmetries", [{"axis": [0, 0, 1], "order": -2}]),
+    "a symmetry about no axis": set_at("memory/things/0/symmetries", [{"axis": [0, 0, 0], "order": 2}]),
+    "a symmetry about half an axis": set_at("memory/things/0/symmetries", [{"axis": [0, 1], "order": 2}]),
+    "negative weights": set_at("memory/verification", {"weights": {"geometry": -1}, "things": 3}),
+    "descending residuals": set_at("memory/verification", VERIFIED | {"excess": [[0.2, 0.1]]}),
+    "no residuals": set_at("memory/verification", VERIFIED | {"excess": [[]]}),
+    "half of the residuals": set_at("memory/verification", VERIFIED | {"excess": []}),
+    "residuals of one thing less": set_at("memory/verification", VERIFIED | {"usual": [0.1, 0.2]}),
     "an unknown field": set_at("memory/things/0/colour", "red"),
 }
 
@@ -308,3 +340,59 @@ def test_any_other_field_is_refused_by_name_or_the_memory_works(models, features
             score = recogniser.novelty.of_belief(np.zeros(3), 1)
             assert 0 <= recogniser.novelty.of_views([score]) <= 1, path
     assert refused > 20
+
+
+def meshes_by_name(scans):
+    return {path.stem: load_mesh(path, unit="cm") for path in sorted(scans.iterdir())}
+
+
+def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(sized, scans):
+    things = TaughtThings.of(open_recogniser(sized / "memory.json"))
+    meshes = meshes_by_name(scans)
+    assert things.names == tuple(meshes)
+    for surface, mesh in zip(things.verifier.caster.surfaces, meshes.values(), strict=True):
+        in_file = (mesh.vertices * mesh.radius + mesh.centre) / 100
+        step = np.ptp(in_file, axis=0).max() / 65535
+        np.testing.assert_allclose(surface.vertices, in_file, atol=step)
+        np.testing.assert_array_equal(surface.faces, mesh.faces)
+
+
+def test_things_of_unknown_size_hold_no_geometry(taught):
+    assert TaughtThings.of(open_recogniser(taught / "memory.json")) is None
+
+
+def test_weights_and_residuals_are_those_on_the_card(models):
+    card = changed_card(models, set_at("memory/verification", VERIFIED))
+    things = TaughtThings.of(open_recogniser(card))
+    assert things.verifier.weights == replace(EvidenceWeights(), geometry=20.0)
+    np.testing.assert_array_equal(things.residuals.usual, VERIFIED["usual"])
+    assert things.residuals.p_value(0.1, 0, 1) == pytest.approx(2 / 3)
+
+
+@pytest.mark.parametrize(
+    ("weights", "sentence"),
+    [({"colour": 1.0}, "colour"), ({"doubt": 2.0}, "doubt"), ({"correlation": 1.5}, "correlation")],
+)
+def test_weights_that_make_no_sense_are_refused(models, weights, sentence):
+    card = changed_card(models, set_at("memory/verification", VERIFIED | {"weights": weights}))
+    with pytest.raises(ModelError, match=rf"mine/memory\.json: .*{sentence}"):
+        TaughtThings.of(open_recogniser(card))
+
+
+def square(size, origin, name="square"):
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32) * size + origin
+    return Surface(name, corners.astype(np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+
+
+@pytest.mark.parametrize("many", [4, 70_000])
+def test_stored_surfaces_come_back_as_they_were(many):
+    rng = np.random.default_rng(3)
+    points = (rng.normal(size=(many, 3)) * 0.1 + (5, -3, 1)).astype(np.float32)
+    cloud = Surface("cloud", points, rng.integers(0, many, (9, 3)).astype(np.int32))
+    stored = StoredSurfaces.of([square(0.3, (1, 2, 3)), None, cloud])
+    assert len(stored) == 3
+    assert stored.surface(1, "nothing") is None
+    for number, surface in ((0, square(0.3, (1, 2, 3))), (2, cloud)):
+        again = stored.surface(number, surface.name)
+        np.testing.assert_allclose(again.vertices, surface.vertices, atol=np.ptp(points) / 65535)
+        np.testing.assert_array_equal(again.faces, surface.faces)

@@ -358,13 +358,14 @@ def checked_bytes(path: Path, sha256: str, what: str = "weights") -> bytes:
     return content
 
 
-def arrays_in(content: bytes, names: Sequence[str], where: str) -> dict[str, np.ndarray]:
+def arrays_in(content: bytes, names: Sequence[str], where: str, optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
     """The arrays of these names in the content of a safetensors file.
 
     Args:
         content: What the file holds.
         names: The arrays that have to be there; others are left out.
         where: How the sentence of an error begins ("a.safetensors: not a memory").
+        optional: Further arrays, which are returned if they are there.
 
     Returns:
         The arrays by name, of any shape and type: whoever asks checks these.
@@ -385,7 +386,7 @@ def arrays_in(content: bytes, names: Sequence[str], where: str) -> dict[str, np.
     for name in names:
         if name not in arrays:
             raise ModelError(f"{where} (it holds no {name})")
-    return {name: arrays[name] for name in names}
+    return {name: arrays[name] for name in (*names, *optional) if name in arrays}
 
 
 def command() -> str:

@@ -20,6 +20,10 @@ ODD_RADII = (0.001, 20.0)  # metres: a radius outside is likelier one in another
 FLAT = 1e-12  # twice the area, square object radii, below which a face counts as a line: rounding makes up to 1e-15
 
 
+Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""Rotation from the axes of a file whose y axis points up to those of a ``Mesh``, whose z axis does."""
+
+
 @dataclass(frozen=True)
 class Mesh:
     """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex at radius 1.
@@ -118,6 +122,11 @@ def mesh_warnings(mesh: Mesh) -> tuple[str, ...]:
     return tuple(doubts)
 
 
+def is_y_up(path: Path, up: str | None = None) -> bool:
+    """Whether the y axis of a mesh file points up: as ``up`` says, or as the standard of its format does."""
+    return (up or ("y" if path.suffix.lower() == ".glb" else "z")) == "y"
+
+
 def load_mesh(
     path: str | Path,
     up: str | None = None,
@@ -165,7 +174,7 @@ def load_mesh(
     except (ValueError, OverflowError) as error:  # MeshErrors, and numbers that are none or too large
         reason = str(error) if isinstance(error, MeshError) else f"{type(error).__name__}: {error}"
         raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({one_line(reason, 240)})") from None
-    if (up or ("y" if suffix == ".glb" else "z")) == "y":
+    if is_y_up(path, up):
         vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)
     mesh = make_mesh(vertices, faces, str(path), unit)
     refuse_lost_shape(vertices, mesh.radius, str(path))

@@ -23,7 +23,7 @@ from nextview.files import check_new, command, new_file, new_folder, only_one, s
 from nextview.learning.learned_picture import draw_learned
 from nextview.learning.memory_fit import VIEWS, Fit, fit_memory, size_evidence
 from nextview.learning.sizes import check_sizes
-from nextview.learning.teaching import LEFT_OUT, Arrays, How, teach
+from nextview.learning.teaching import FACES, LEFT_OUT, VERTICES, Arrays, How, teach
 from nextview.learning.things import Found, Source, find_things
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import Features
@@ -40,6 +40,8 @@ from nextview.recognition.model_card import (
     write_card,
 )
 from nextview.things.memory import AZIMUTHS, Memory, check_features, open_memory
+from nextview.things.stored_surfaces import StoredSurfaces
+from nextview.things.surface import Surface
 
 NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
 CARD, WEIGHTS, PICTURE = f"{NAME}.json", f"{NAME}{MEMORY_SUFFIX}", "learned.png"
@@ -180,6 +182,9 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
         arrays = {name: getattr(memory, name)[own] for name in ("views", "rotations")}
         arrays |= {name: getattr(memory, name)[index] for name in PER_THING}
         arrays["radii"] = arrays["radii"].reshape(1)
+        surface = memory.surfaces.surface(index, thing.name)
+        if surface is not None:
+            arrays |= {VERTICES: surface.vertices, FACES: surface.faces}
         kept.append((Source(thing.name, label, Path(thing.source)), arrays))
     return kept
 
@@ -326,7 +331,16 @@ def _fitted(taught: Sequence[Pair], label: NDArray[np.int64]) -> tuple[Memory, F
     stacked["radii"] = stacked["radii"][:, 0]
     joint = {name: np.concatenate([arrays[name] for _, arrays in taught]) for name in ("views", "rotations")}
     fit = fit_memory(joint["views"], thing, label, *(stacked[name] for name in PER_THING[:3]))
-    return Memory(thing=thing, head=fit.head, head_bias=fit.head_bias, **joint, **stacked), fit
+    surfaces = StoredSurfaces.of([_surface_of(source, arrays) for source, arrays in taught])
+    memory = Memory(thing=thing, head=fit.head, head_bias=fit.head_bias, surfaces=surfaces, **joint, **stacked)
+    return memory, fit
+
+
+def _surface_of(source: Source, arrays: Arrays) -> Surface | None:
+    """The surface of a thing; None if its size is not known."""
+    if VERTICES not in arrays:
+        return None
+    return Surface(source.name, arrays[VERTICES], arrays[FACES])
 
 
 def _card(

@@ -13,7 +13,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from nextview.errors import DatasetError, ObservationError
-from nextview.geometry.mesh import Mesh, load_mesh, mesh_warnings
+from nextview.geometry.mesh import Y_UP, Mesh, is_y_up, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import resting_poses, rotated
 from nextview.geometry.viewsphere import ViewSphere, angle_between, direction_of, look_at_origin
@@ -27,6 +27,7 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.simulation.turntable import read_turntable
 from nextview.things.memory import AZIMUTHS, RINGS, joined
+from nextview.things.surface import FINEST_ERROR, Surface
 
 Arrays = dict[str, NDArray]
 HELD_OUT = 8  # views of each thing that are not remembered
@@ -36,6 +37,8 @@ NEAR = np.radians(30)  # a captured view teaches what the thing looks like from 
 GRID = ViewSphere(RINGS, AZIMUTHS)
 SENSED = GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4, 4)  # poses of views through the sensor
 LEFT_OUT = "left_out"  # of a thing's arrays: a phrase about the frames that were not used; it is not remembered
+VERTICES, FACES = "vertices", "faces"  # of a thing's arrays: its surface, if its size is known
+COARSER = 0.002  # of the radius: a camera stands farther from a large thing, and measures it less exactly
 Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
 
 
@@ -58,7 +61,8 @@ class How:
 def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
     """What is to be remembered of one thing, by the names of the fields of ``things.memory.Memory``.
 
-    Of a mesh file or a folder of captured frames; name and seed decide all random draws. Where some of the frames were
+    And its surface, in the frame of its file, as VERTICES, (V, 3) float32, and FACES, (F, 3) int32, if its size is
+    known. Of a mesh file or a folder of captured frames; name and seed decide all random draws. Where some of the frames were
     not used, there is a phrase about them under LEFT_OUT. MeshError, DatasetError, ObservationError: why it cannot be
     looked at, in one sentence.
     """
@@ -79,15 +83,26 @@ def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
         sensed = [_sensed(pool, each, SENSED, how.sensor, rng) for each in lying]
         around = [_around(*both) for both in zip(clean, sensed, strict=True)]
         shown = np.concatenate(list(held_out))
+    to_mesh = Y_UP if is_y_up(path, how.up) else np.eye(3)
     return {
         "views": np.stack(around).astype(np.float16),
-        "rotations": rotations.astype(np.float32),
+        "rotations": (rotations @ to_mesh).astype(np.float32),
         "held_out": shown.astype(np.float16),
         "held_out_views": np.stack(directions, 1).astype(np.float32),
         "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
         "doubts": np.frombuffer("\n".join(mesh_warnings(mesh)).encode(), np.uint8),
         "pictures": _picture(SimulatedCamera(mesh, 64).observe(look_at_origin(np.radians(25), np.radians(35)))),
+        **_surface(mesh, to_mesh),
     }
+
+
+def _surface(mesh: Mesh, to_mesh: NDArray[np.float64]) -> Arrays:
+    """The surface of a mesh in the axes of its file, which ``to_mesh`` turns into its own; nothing without a unit."""
+    if mesh.metres is None:
+        return {}
+
+    surface = Surface.from_mesh(mesh, mesh.name).simplified(max(FINEST_ERROR, COARSER * mesh.metres))
+    return {VERTICES: (surface.vertices @ to_mesh).astype(np.float32), FACES: surface.faces}
 
 
 def _around(clean: Parts, sensed: Parts) -> NDArray[np.float32]:

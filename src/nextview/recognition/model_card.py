@@ -25,6 +25,8 @@ MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}  # the map networks that a
 NOWHERE = Path()
 SCHEMA = 2  # of the cards of models; those of policies have 1
 LARGEST_WEIGHT = 1e6  # of a cosine; what is fitted is below a hundred
+LARGEST_ORDER = 1000  # of a symmetry; what is found is below ten
+UNIT_LENGTH = 1e-3  # by which the axis of a symmetry may be too long: cards hold rounded numbers
 MOST_POSES = 1000  # of a thing; what is taught has a handful
 SHORT_HASH = 16  # hexadecimal digits of the SHA-256 of a memory that its file's name holds
 
@@ -37,6 +39,49 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     commands: tuple[str, ...] = ()
 
 
+class Symmetry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One symmetry of a thing: turned about an axis through its centre, it is the same.
+
+    The centre is that of the bounding box in the frame of the scan file.
+
+    Attributes:
+        axis: Unit vector in the frame of the scan file.
+        order: So many turns by equal angles make a full one, two at least; 0 for any angle.
+    """
+
+    axis: tuple[float, float, float]
+    order: Annotated[int, msgspec.Meta(ge=0, le=LARGEST_ORDER)]
+
+    def __post_init__(self) -> None:
+        if self.order == 1:
+            raise ModelError("a symmetry of the order 1 is none")
+        if abs(sum(value**2 for value in self.axis) - 1) > UNIT_LENGTH:
+            raise ModelError("the axis of a symmetry is no unit vector")
+
+
+class Verification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What was fitted to known views of things, aligned with their surfaces.
+
+    Attributes:
+        weights: Of each kind of evidence, see ``things.weighing.EvidenceWeights``, by their names.
+        things: How many things there were when these were fitted.
+        usual: Usual residual of each thing, see ``things.unknown.KnownResiduals``.
+        excess: By how much known things exceed it, ascending, after 1, 2, ... views.
+    """
+
+    weights: dict[str, Annotated[float, msgspec.Meta(ge=0, le=LARGEST_WEIGHT)]]
+    things: Annotated[int, msgspec.Meta(ge=0)]
+    usual: tuple[Annotated[float, msgspec.Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)], ...] = ()
+    excess: tuple[tuple[Annotated[float, msgspec.Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)], ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        for row in self.excess:
+            if not row or list(row) != sorted(row):
+                raise ModelError("the residuals of known things do not ascend")
+        if bool(self.usual) != bool(self.excess):
+            raise ModelError("of the residuals of known things one half is missing")
+
+
 class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One taught thing.
 
@@ -44,11 +89,13 @@ class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         name: Its name, unique among the things of a memory.
         source: The file or folder that it was taught from.
         poses: In how many resting poses it was taught.
+        symmetries: Of its surface; () for none, and where its geometry is not known.
     """
 
     name: Annotated[str, msgspec.Meta(min_length=1)]
     source: str
     poses: Annotated[int, msgspec.Meta(ge=1, le=MOST_POSES)]
+    symmetries: tuple[Symmetry, ...] = ()
 
 
 class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -62,6 +109,7 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         novelty: Quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative log-likelihood of known
             things, given the class that explains them best; () if that was not fitted.
         usual: See ``novelty.Quantiles``; () if that was not fitted.
+        verification: What was fitted to surfaces; None if nothing was.
     """
 
     things: Annotated[tuple[Thing, ...], msgspec.Meta(min_length=1)]
@@ -70,6 +118,7 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     attribution: str = ""
     novelty: tuple[tuple[float, ...], ...] = ()
     usual: tuple[tuple[float, ...], ...] = ()
+    verification: Verification | None = None
 
     def __post_init__(self) -> None:
         names = {thing.name for thing in self.things}
@@ -83,6 +132,9 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for row in self.novelty:
             if list(row) != sorted(row):
                 raise ModelError("the quantiles of the novelty do not ascend")
+
+        if self.verification is not None and len(self.verification.usual) not in (0, len(self.things)):
+            raise ModelError(f"its usual residuals are not of its {len(self.things)} things")
 
     @property
     def poses(self) -> tuple[int, ...]:

@@ -1,6 +1,7 @@
 """The memory of taught things: what each looks like, and how likely a view is given each."""
 
 import hashlib
+import logging
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -18,11 +19,13 @@ from nextview.recognition.inference import Features, Recogniser
 from nextview.recognition.model_card import FEATURES, ModelCard, find_card
 from nextview.recognition.novelty import ROUNDED, Quantiles, unit
 from nextview.things.approximate import NearestViews, is_large
+from nextview.things.stored_surfaces import StoredSurfaces
 
 RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the remembered views, degrees
 AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
 PICTURE = 64  # side of the picture of a thing, pixels
 Float = NDArray[np.floating]
+_log = logging.getLogger("nextview")
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ class Memory:
         pictures: A picture of each thing, (T, 64, 64) uint8.
         head: Weights of a linear classifier of embeddings for classes of several things, (F, C).
         head_bias: What it adds for each class, (C,).
+        surfaces: Of the things, in metres, in the frames of their scan files.
     """
 
     views: Float
@@ -53,6 +57,7 @@ class Memory:
     pictures: NDArray[np.uint8]
     head: Float
     head_bias: Float
+    surfaces: StoredSurfaces
 
     def __post_init__(self) -> None:
         self._check_shapes()
@@ -76,6 +81,8 @@ class Memory:
 
         check_array("its head_bias", self.head_bias, np.floating, (None,))
         check_array("its head", self.head, np.floating, (size, len(self.head_bias)))
+        if len(self.surfaces) != things:
+            raise ModelError(f"its surfaces are of {len(self.surfaces)} things, not {things}")
 
     def _check_values(self) -> None:
         """See that the numbers can be what they stand for."""
@@ -106,12 +113,17 @@ class Memory:
 
     def save(self, path: Path, overwrite: bool = False) -> str:
         """Write a .safetensors file, embeddings in half precision; returns its SHA-256."""
-        arrays = {f.name: np.ascontiguousarray(getattr(self, f.name)) for f in fields(self)}
+        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _OF_VIEWS}
+        arrays |= {name: getattr(self.surfaces, name) for name in _OF_SURFACES}
         arrays |= {name: arrays[name].astype(np.float16) for name in ("views", "held_out")}
         content = save(arrays)
         with new_file(path, overwrite) as part:
             part.write_bytes(content)
         return hashlib.sha256(content).hexdigest()
+
+
+_OF_SURFACES = tuple(f.name for f in fields(StoredSurfaces))
+_OF_VIEWS = tuple(f.name for f in fields(Memory) if f.name != "surfaces")
 
 
 @lru_cache(maxsize=2)
@@ -122,12 +134,24 @@ def read_memory(path: Path, sha256: str) -> Memory:
         ModelError: the file is missing, is not that of this hash, or one of its values makes no
             sense.
     """
-    names = [f.name for f in fields(Memory)]
-    arrays = arrays_in(checked_bytes(path, sha256, "a memory"), names, f"{path}: not a memory")
+    content = checked_bytes(path, sha256, "a memory")
+    where = f"{path}: not a memory"
+    arrays = arrays_in(content, _OF_VIEWS, where)
+    stored = arrays_in(content, (), where, _OF_SURFACES)
+    missing = sorted(set(_OF_SURFACES) - set(stored))
+    if missing and stored:
+        raise ModelError(f"{where} (it holds no {missing[0]})")
+
     try:
-        return Memory(**arrays)
+        if stored:
+            surfaces = StoredSurfaces(**stored)
+        else:
+            check_array("its radii", arrays["radii"], np.floating, (None,), finite=False)
+            surfaces = StoredSurfaces.of([None] * len(arrays["radii"]))
+            _log.warning("%s: holds no geometry; teach it again with nextview learn", path)
+        return Memory(**arrays, surfaces=surfaces)
     except ModelError as error:
-        raise ModelError(f"{path}: not a memory ({error})") from None
+        raise ModelError(f"{where} ({error})") from None
 
 
 def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:

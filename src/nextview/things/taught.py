@@ -1,6 +1,7 @@
 """A memory of taught things together with their surfaces: from observations to names and poses."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +10,10 @@ from nextview.errors import ModelError, ObservationError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import direction_of
 from nextview.recognition.belief import log_evidence_of
+from nextview.recognition.model_card import Verification
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
+from nextview.things.unknown import KnownResiduals
 from nextview.things.verifier import Verified, Verifier
 from nextview.things.weighing import EvidenceWeights
 
@@ -24,6 +27,9 @@ class TaughtThings:
         recogniser: what is remembered of their views.
         verifier: their surfaces.
         names: of the things, in the order of ``Verified.belief``.
+        residuals: how badly known things are explained, in the same order; None if that was not
+            fitted.
+        symmetries: of each thing, in the same order.
     """
 
     def __init__(
@@ -31,6 +37,7 @@ class TaughtThings:
         recogniser: TaughtRecogniser,
         surfaces: Sequence[Surface],
         weights: EvidenceWeights = EvidenceWeights(),
+        residuals: KnownResiduals | None = None,
     ) -> None:
         """Join a memory and the surfaces of its things, or of some of them.
 
@@ -38,6 +45,7 @@ class TaughtThings:
             recogniser: what is remembered of the things.
             surfaces: of the things that shall be recognised, by their names in the memory.
             weights: how much features, size and geometry count.
+            residuals: how badly known things are explained, in the order of the surfaces.
 
         Raises:
             ModelError: a surface of a thing that the memory does not know, or none.
@@ -57,7 +65,37 @@ class TaughtThings:
         owners = np.array([number[int(memory.thing[row])] for row in rows])
         self._rows = np.array(rows)
         self.recogniser = recogniser
+        self.residuals = residuals
+        self.symmetries = tuple(about.things[known.index(name)].symmetries for name in self.names)
         self.verifier = Verifier(surfaces, owners, memory.rotations[self._rows], weights)
+
+    @classmethod
+    def of(cls, recogniser: TaughtRecogniser) -> "TaughtThings | None":
+        """Join a memory and its own surfaces.
+
+        Args:
+            recogniser: what is remembered of the things.
+
+        Returns:
+            A recogniser of all things of known geometry; None if the memory holds none.
+
+        Raises:
+            ModelError: what was fitted to the surfaces is not what this version fits.
+        """
+        about = recogniser.card.memory
+        assert about is not None
+        stored = recogniser.memory.surfaces
+        known = [k for k in range(len(stored)) if stored.counts[k, 0]]
+        if not known:
+            return None
+
+        surfaces = [stored.surface(k, about.things[k].name) for k in known]
+        some = [surface for surface in surfaces if surface is not None]
+        if about.verification is None:
+            return cls(recogniser, some)
+        where = str(recogniser.card.card_path)
+        weights = weights_of(about.verification, where)
+        return cls(recogniser, some, weights, residuals_of(about.verification, known))
 
     def __call__(self, observations: Sequence[Observation]) -> Verified:
         """Recognise the thing that some views show.
@@ -101,3 +139,31 @@ class TaughtThings:
         total = log_evidence.sum(0)
         joint = calibration.joint(total, len(observations), classes, np.zeros(()))[self._rows]
         return self.verifier(observations, joint / joint.sum())
+
+
+def weights_of(verification: Verification, where: str) -> EvidenceWeights:
+    """The weights that a card holds; those that it does not name have their defaults.
+
+    Args:
+        verification: what the card says.
+        where: path of the card, for the sentence of an error.
+
+    Raises:
+        ModelError: it names a weight that this version does not know, or one is out of its range.
+    """
+    strange = sorted(set(verification.weights) - {field.name for field in fields(EvidenceWeights)})
+    if strange:
+        raise ModelError(f"{where}: weighs {strange[0]}, which this version does not know")
+    for share in ("correlation", "doubt"):
+        value = verification.weights.get(share, 0)
+        if value > 1:
+            raise ModelError(f"{where}: its {share} is {value:g}, and it is a share")
+    return EvidenceWeights(**verification.weights)
+
+
+def residuals_of(verification: Verification, things: Sequence[int]) -> KnownResiduals | None:
+    """The residuals that a card holds, of some of its things; None if it holds none."""
+    if not verification.usual:
+        return None
+    usual = np.array(verification.usual)[list(things)]
+    return KnownResiduals(usual, tuple(np.array(row) for row in verification.excess))

@@ -159,14 +159,24 @@ class Walk:
 
 @lru_cache(maxsize=256)
 def remembered_picture(recogniser: TaughtRecogniser, hypothesis: int, ring: int, azimuth: int) -> NDArray[np.uint8]:
-    """A thing in a pose as taught from a ring and an azimuth bin, (64, 64); without its mesh, its one picture."""
+    """Draw a thing in a resting pose, from a ring and an azimuth bin, as a (64, 64) picture.
+
+    It is drawn from the memory's own surface, or else from the mesh that it was taught from; where neither is there,
+    its one picture is taken.
+    """
     memory, about = recogniser.memory, recogniser.card.memory
     assert about is not None
     thing = int(memory.thing[hypothesis])
+    surface = memory.surfaces.surface(thing, about.things[thing].name)
     try:
-        mesh = rotated(load_mesh(about.things[thing].source), memory.rotations[hypothesis].astype(np.float64))
+        if surface is None:
+            standing = load_mesh(about.things[thing].source, up="z")  # resting poses are told from the file's own axes
+        else:
+            standing = make_mesh(surface.vertices, surface.faces, surface.name)
     except MeshError:
         return memory.pictures[thing]
+
+    mesh = rotated(standing, memory.rotations[hypothesis].astype(np.float64))
     pose = look_at_origin(np.radians(RINGS[ring]), 2 * np.pi / AZIMUTHS * azimuth)
     return SimulatedCamera(mesh, memory.pictures.shape[1]).observe(pose).picture
 

@@ -1,0 +1,124 @@
+"""Surfaces as a file of taught things holds them: places of 16 bits within the box of each thing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.checks import check_array
+from nextview.errors import ModelError
+from nextview.things.surface import Surface
+
+STEPS = 65535  # of a box along each axis: 5 micrometres for a thing of 30 cm
+SHORT = 65536  # vertices of a thing whose indices need no more than 16 bits
+LARGEST_EXTENT = 1e4  # metres, of a box and of its distance from the origin
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSurfaces:
+    """The surfaces of T things, one after the other.
+
+    Attributes:
+        places: of all vertices, in steps of their thing's box, (V, 3) uint16.
+        faces: indices among the vertices of the thing, (F, 3) uint16 or uint32.
+        counts: number of vertices and of faces of each thing, (T, 2) int64; zero and zero where
+            its geometry is not known.
+        boxes: lowest corner and extents of the box around each thing, in the frame of its scan
+            file, (T, 2, 3) float64, metres.
+    """
+
+    places: NDArray[np.uint16]
+    faces: NDArray[np.unsignedinteger]
+    counts: NDArray[np.int64]
+    boxes: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        check_array("its places", self.places, np.uint16, (None, 3), empty=True)
+        check_array("its faces", self.faces, np.unsignedinteger, (None, 3), empty=True)
+        check_array("its counts", self.counts, np.int64, (None, 2))
+        check_array("its boxes", self.boxes, np.float64, (len(self.counts), 2, 3))
+
+        if (self.counts < 0).any() or (
+            (self.counts == 0).any(1) != (self.counts == 0).all(1)
+        ).any():
+            raise ModelError("its counts are not those of surfaces")
+        totals = (len(self.places), len(self.faces))
+        if _sums(self.counts) != totals:
+            raise ModelError("its counts do not add up to its places and faces")
+
+        extents = self.boxes[:, 1]
+        if (np.abs(self.boxes) > LARGEST_EXTENT).any() or (extents < 0).any():
+            raise ModelError("its boxes are not those of things")
+        if (extents[self.counts[:, 0] > 0].max(1) == 0).any():
+            raise ModelError("its boxes hold things without extent")
+
+        limits = np.repeat(self.counts[:, 0], self.counts[:, 1])
+        if (self.faces >= limits[:, None]).any():
+            raise ModelError("its faces name vertices that are not there")
+
+    @classmethod
+    def of(cls, surfaces: Sequence[Surface | None]) -> "StoredSurfaces":
+        """Store surfaces.
+
+        Args:
+            surfaces: of each thing; None where its geometry is not known.
+
+        Returns:
+            The same, rounded to the steps of their boxes.
+        """
+        places = [np.zeros((0, 3), np.uint16)]
+        faces = [np.zeros((0, 3), np.uint32)]
+        counts = np.zeros((len(surfaces), 2), np.int64)
+        boxes = np.zeros((len(surfaces), 2, 3))
+
+        for number, surface in enumerate(surfaces):
+            if surface is None:
+                continue
+            vertices = surface.vertices.astype(np.float64)
+            low = vertices.min(0)
+            extents = vertices.max(0) - low
+            steps = np.divide(vertices - low, extents, np.zeros_like(vertices), where=extents > 0)
+            places.append(np.rint(steps * STEPS).astype(np.uint16))
+            faces.append(surface.faces.astype(np.uint32))
+            counts[number] = len(vertices), len(surface.faces)
+            boxes[number] = low, extents
+
+        short = not len(surfaces) or counts[:, 0].max() <= SHORT
+        together: NDArray[np.unsignedinteger] = np.concatenate(faces)
+        if short:
+            together = together.astype(np.uint16)
+        return cls(np.concatenate(places), together, counts, boxes)
+
+    def __len__(self) -> int:
+        """Number of things."""
+        return len(self.counts)
+
+    def surface(self, thing: int, name: str) -> Surface | None:
+        """Restore the surface of a thing.
+
+        Args:
+            thing: its number.
+            name: what it is called.
+
+        Returns:
+            Its surface; None if its geometry is not known.
+        """
+        vertices, faces = self.counts[thing].tolist()
+        if not vertices:
+            return None
+
+        vertex, face = self.counts[:thing].sum(0).tolist()
+        low, extents = self.boxes[thing]
+        shares = self.places[vertex : vertex + vertices] / STEPS
+        return Surface(
+            name,
+            (low + shares * extents).astype(np.float32),
+            self.faces[face : face + faces].astype(np.int32),
+        )
+
+
+def _sums(counts: NDArray[np.int64]) -> tuple[int, int]:
+    """Sums of counts, (T, 2), of any size: Python's integers do not overflow."""
+    vertices, faces = counts.T.tolist()
+    return sum(vertices), sum(faces)
