@@ -59,12 +59,21 @@ class How:
 
 
 def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
-    """What is to be remembered of one thing, by the names of the fields of ``things.memory.Memory``.
+    """Look at one thing, and note what is to be remembered of it.
 
-    And its surface, in the frame of its file, as VERTICES, (V, 3) float32, and FACES, (F, 3) int32, if its size is
-    known. Of a mesh file or a folder of captured frames; name and seed decide all random draws. Where some of the frames were
-    not used, there is a phrase about them under LEFT_OUT. MeshError, DatasetError, ObservationError: why it cannot be
-    looked at, in one sentence.
+    Args:
+        path: a mesh file, or a folder of captured frames.
+        name: of the thing; with the seed it decides all random draws.
+        how: how it is looked at.
+        threads: that work side by side.
+
+    Returns:
+        Arrays by the names of the fields of ``things.memory.Memory``. If its size is known, also its surface in the
+        frame of its file, metres: VERTICES, (V, 3) float32, and FACES, (F, 3) int32. Where some of the frames were not
+        used, a phrase about them under LEFT_OUT.
+
+    Raises:
+        MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
     """
     rng = np.random.default_rng([how.seed, zlib.crc32(name.encode())])
     if path.is_dir():

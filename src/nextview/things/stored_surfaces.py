@@ -1,4 +1,4 @@
-"""Surfaces as a file of taught things holds them: places of 16 bits within the box of each thing."""
+"""Surfaces as a file of taught things holds them: 16 bits a coordinate in the box of each thing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -14,7 +14,7 @@ from nextview.data.folders import list_dataset
 from nextview.data.samples import SAMPLES, sample_mesh
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, MeshError, UsageError
-from nextview.geometry.mesh import FORMATS, Mesh, load_mesh
+from nextview.geometry.mesh import FORMATS, Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import azimuth_of, direction_of, level_pose, look_at_origin
