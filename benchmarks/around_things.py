@@ -20,6 +20,7 @@ from matplotlib.patches import Polygon
 from scene_pictures import COLOURS, SIZE, picture
 
 import nextview
+from nextview.cli.ending import orderly_end
 from nextview.data.folders import list_dataset
 from nextview.data.scene_drawing import Meshes, draw_scene
 from nextview.errors import UsageError
@@ -104,4 +105,5 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("nothing was written"):
+        tyro.cli(main)

@@ -24,6 +24,7 @@ from scipy.stats import binomtest
 
 import nextview
 from nextview import Camera, Mesh, System, load_mesh
+from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import Entry, list_dataset
 from nextview.data.metrics import calibration_error
@@ -231,4 +232,5 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    with orderly_end("nothing was written"):
+        main(tyro.cli(Settings))

@@ -15,6 +15,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from nextview.cli.ending import orderly_end
 from nextview.data.folders import list_dataset
 from nextview.data.scene_drawing import Meshes, draw_scene
 from nextview.errors import UsageError
@@ -74,4 +75,5 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("nothing was written"):
+        tyro.cli(main)

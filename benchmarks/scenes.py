@@ -20,6 +20,10 @@ from dataclasses import dataclass, fields
 from itertools import pairwise, product
 from pathlib import Path
 
+from nextview.cli.ending import require
+
+require("benchmark")
+
 import matplotlib
 import numpy as np
 import pandas as pd

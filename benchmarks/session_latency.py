@@ -24,6 +24,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 import nextview
+from nextview.cli.ending import orderly_end
 from nextview.data.samples import sample_mesh
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing import Frame, ObservedObject, observed_object
@@ -139,4 +140,5 @@ def main(updates: int = 200, threads: int = 2, cpu: bool = False, seed: int = 0,
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("nothing was written"):
+        tyro.cli(main)

@@ -14,6 +14,7 @@ import trimesh
 import tyro
 
 import nextview
+from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 
 SHAPES = {
@@ -102,4 +103,5 @@ def said(result: nextview.Recognition) -> str:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("nothing was written"):
+        tyro.cli(main)

@@ -22,6 +22,7 @@ import tyro
 from numpy.typing import NDArray
 
 from nextview.benchmark.statistics import interval, resample
+from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.store import ViewStore
 from nextview.recognition.belief import log_evidence_of
@@ -150,4 +151,5 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("nothing was written"):
+        tyro.cli(main)

@@ -14,14 +14,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import ap_gym
-import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from nextview.benchmark.environments import RecogniseEnv, RecogniseVectorEnv, Split, info_of
 from nextview.data.predictions import Predictions
+from research.extras import extras
+
+with extras():
+    import ap_gym
+    import gymnasium
+    from gymnasium.vector import AutoresetMode
 
 gymnasium.register(
     "nextview/ActiveRecognise-v0",

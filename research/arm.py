@@ -25,6 +25,7 @@ from nextview.geometry.ray_caster import RayCaster, Triangles, pixel_rays
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS, Sensor
+from research.extras import extras
 
 if TYPE_CHECKING:
     from nextview.session.recognition import Recognition
@@ -80,13 +81,15 @@ SCENE = """
 def _assets() -> Path:
     spec = find_spec("gymnasium_robotics")  # to import it takes a while, and prints
     if spec is None or spec.origin is None:
-        raise ModuleNotFoundError("No module named 'gymnasium_robotics'", name="gymnasium_robotics")
+        with extras():
+            raise ModuleNotFoundError("No module named 'gymnasium_robotics'", name="gymnasium_robotics")
     return Path(spec.origin).parent / "envs/assets/kitchen_franka/franka_assets"
 
 
 def _model(vertices: Float, faces: NDArray[np.int32]) -> Any:
     """The arm with its camera, the table and the object. MuJoCo takes the object's convex hull for collisions."""
-    import mujoco
+    with extras():
+        import mujoco
 
     spec = mujoco.MjSpec.from_string(SCENE.format(assets=_assets(), clearance=CLEARANCE))
     for finger in "12":  # it holds nothing: the hand stays closed
@@ -137,8 +140,9 @@ class Arm:
         joints: Float = HOME,
         sensor: Sensor = SENSORS["stereo"],
     ) -> None:
-        import mink
-        import mujoco
+        with extras():
+            import mink
+            import mujoco
 
         cos, sin = np.cos(turn := rng.uniform(0, 2 * np.pi)), np.sin(turn)
         vertices = radius * mesh.vertices @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])

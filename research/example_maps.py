@@ -8,6 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
+from nextview.cli.ending import require
+
+require("benchmark")
+
 import matplotlib
 import numpy as np
 import tyro

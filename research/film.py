@@ -17,6 +17,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from research.extras import require
+
+require("film")
+
 import numpy as np
 import tyro
 from imageio_ffmpeg import get_ffmpeg_exe
@@ -24,6 +28,7 @@ from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
 import nextview
+from nextview.cli.ending import orderly_end
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import azimuth_of, look_at_origin
@@ -296,4 +301,5 @@ def main(folder: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path], se
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("nothing was written"):
+        tyro.cli(main)

@@ -42,7 +42,7 @@ from nextview.benchmark.replay import make_specs, replay
 from nextview.benchmark.statistics import holm, interval, mcnemar, resample
 from nextview.benchmark.true_maps import true_map, true_measure
 from nextview.cli.ending import orderly_end
-from nextview.cli.progress import follow, track
+from nextview.cli.progress import console, follow, track
 from nextview.data import predicting
 from nextview.data.measures import measure
 from nextview.data.metrics import ratio
@@ -321,6 +321,7 @@ def main(
         part.write_text(text, encoding="utf-8")
     to_png(drawn, out / "measures.png")
     print(text, end="")
+    console.print(f"{out}: measures.md, table.csv, table.tex, measures.csv and the figure measures.png are written")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import tyro
 from PIL import Image
 
 import nextview
+from nextview.cli.ending import orderly_end
 from nextview.sensing import Frame, ObservedObject
 
 INTRINSICS = np.array([[618.017, 0, 312.377], [0, 618.003, 232.375], [0, 0, 1.0]])
@@ -48,4 +49,5 @@ def main(folder: tyro.conf.Positional[Path], scans: tyro.conf.Positional[Path]) 
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("nothing was written"):
+        tyro.cli(main)

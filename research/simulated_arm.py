@@ -21,6 +21,7 @@ import numpy as np
 import tyro
 
 import nextview
+from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
 from nextview.geometry.viewsphere import Viewpoints
@@ -161,4 +162,5 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    with orderly_end("nothing was written"):
+        main(tyro.cli(Settings))

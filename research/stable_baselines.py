@@ -8,13 +8,16 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
-from torch import nn
 
 from nextview.benchmark.environments import TaskVectorEnv
 from nextview.errors import ModelError
+from research.extras import extras
+
+with extras():
+    from stable_baselines3 import DQN, PPO
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecEnv
+    from torch import nn
 
 Layers = Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
 """Weights (in, out) and biases (out,) of one perceptron, ReLU between them."""

@@ -18,6 +18,10 @@ from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 
+from nextview.cli.ending import require
+
+require("train")
+
 import numpy as np
 import onnx
 import torch
@@ -27,6 +31,7 @@ from onnx import TensorProto, compose, helper, numpy_helper, utils
 from torch import nn
 from torch.nn import functional as F
 
+from nextview.cli.ending import orderly_end
 from nextview.data.folders import list_dataset
 from nextview.files import sha256_of
 from nextview.geometry.mesh import load_mesh, make_mesh
@@ -182,4 +187,5 @@ def main(dataset: Path, checkpoint: Path, out: Path, things: int = 600, steps: i
 
 
 if __name__ == "__main__":
-    tyro.cli(main, config=(tyro.conf.PositionalRequiredArgs,))
+    with orderly_end("nothing was written"):
+        tyro.cli(main, config=(tyro.conf.PositionalRequiredArgs,))

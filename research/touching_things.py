@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 
 import nextview
+from nextview.cli.ending import orderly_end
 from nextview.simulation.robot_camera import Named, RobotCamera
 from nextview.simulation.scene import build_scene, cached_mesh, footprint, mesh_hash, place, separation
 from nextview.simulation.scene_layout import Placement, SceneLayout
@@ -56,4 +57,5 @@ def main(scans: tyro.conf.Positional[Path], scenes: int = 30, named: Named = "po
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("nothing was written"):
+        tyro.cli(main)

@@ -14,6 +14,10 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from research.extras import require
+
+require("rl")
+
 import numpy as np
 import torch
 import tyro

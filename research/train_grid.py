@@ -12,6 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from nextview.cli.ending import require
+
+require("train")
+require("benchmark")
+
 import numpy as np
 import torch
 import tyro

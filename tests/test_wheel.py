@@ -9,14 +9,13 @@ import re
 import shutil
 import subprocess
 import sys
-import sysconfig
 import tomllib
-import venv
 import zipfile
-from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from importlib.metadata import Distribution, PackageNotFoundError
 from pathlib import Path
 
 import pytest
+from linked_environment import asked_for, empty_environment, link
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -62,50 +61,6 @@ def wheel(tmp_path_factory):
     run(*pip, "wheel", "--quiet", "--no-deps", "--no-index", "--no-build-isolation", "-w", folder / "dist", folder)
     (built,) = (folder / "dist").glob("*.whl")
     return built
-
-
-def environment(folder):
-    """An environment of its own without anything; its Python and where its packages go."""
-    venv.create(folder, with_pip=False)
-    base = {"base": str(folder), "platbase": str(folder)}
-    python = Path(sysconfig.get_path("scripts", "venv", base)) / "python"
-    return python, Path(sysconfig.get_path("purelib", "venv", base))
-
-
-def asked_for(requirements, found=None):
-    """The installed distributions that requirements need, by name, theirs included.
-
-    Raises:
-        PackageNotFoundError: one is not installed.
-    """
-    found = {} if found is None else found
-    for text, extra in requirements:
-        needed = Requirement(text)
-        if needed.marker and not needed.marker.evaluate({"extra": extra}):
-            continue
-        installed = distribution(needed.name)
-        for wanted in ("", *needed.extras):
-            if (needed.name.lower(), wanted) not in found:
-                found[needed.name.lower(), wanted] = installed
-                asked_for([(each, wanted) for each in installed.requires or ()], found)
-    return found
-
-
-def link(installed, packages):
-    """What a distribution has at the top of its packages' folder, linked into another one."""
-    home = Path(installed.locate_file(""))
-    for name in {file.parts[0] for file in installed.files or () if file.parts[0] not in ("..", "__pycache__")}:
-        place = packages / name
-        if place.is_dir() and not place.is_symlink():
-            for inner in (home / name).iterdir():
-                if not (place / inner.name).exists():
-                    (place / inner.name).symlink_to(inner)
-        elif not place.exists() and (home / name).exists():
-            if (home / name).is_dir() and not (home / name / "__init__.py").exists() and "-" not in name:
-                place.mkdir()  # several distributions may share a namespace
-                link(installed, packages)
-            else:
-                place.symlink_to(home / name)
 
 
 HOLES = {
@@ -158,7 +113,7 @@ def test_every_extra_has_an_example():
 
 @pytest.mark.parametrize("extra", EXAMPLES if os.environ.get("NEXTVIEW_WHEELS") == "all" else QUICK)
 def test_it_runs_with_what_it_asks_for(wheel, extra, tmp_path):
-    python, packages = environment(tmp_path / "venv")
+    python, packages = empty_environment(tmp_path / "venv")
     zipfile.ZipFile(wheel).extractall(packages)
     (own,) = packages.glob("nextview-*.dist-info")
     try:

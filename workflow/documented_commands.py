@@ -2,14 +2,20 @@
 
     python workflow/documented_commands.py [PAGE ...] [--only-list]
 
-Takes README.md, docs/*.md and research/README.md apart into commands and Python blocks, and runs them page by page, in
-the order of the page, each page in a folder of its own with what its commands need: a few box meshes under the names of
-ModelNet10, a store of their views and predictions. ``SMALL`` makes a command quick; ``NOT_RUN`` says what is not run,
-and why. What fails is printed with the end of its output, and the exit status is 1.
+Takes README.md, docs/*.md, research/README.md and what stands above the code of examples/*.py apart into commands and
+Python blocks, and runs them page by page, in the order of the page, each page in a folder of its own with what its
+commands need: a few box meshes under the names of ModelNet10, a store of their views and predictions. ``SMALL`` makes a
+command quick; ``NOT_RUN`` says what is not run, and why. What fails is printed with the end of its output, and the exit
+status is 1.
+
+Each command runs where nothing is installed but what a reader of the page has: the base installation, and the extras
+that ``NEEDS`` names for it, which the page has to name, too. Such an environment is linked from that of this script.
 """
 
 from __future__ import annotations
 
+import ast
+import os
 import re
 import shlex
 import shutil
@@ -18,7 +24,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +35,12 @@ import tyro
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
 
-PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")), "research/README.md")
+PAGES = (
+    "README.md",
+    *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")),
+    "research/README.md",
+    *sorted(f"examples/{path.name}" for path in (ROOT / "examples").glob("*.py")),
+)
 PROGRAMS = (
     "nextview ",
     "python",
@@ -65,6 +77,16 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"SceneLayout\.load": "names one of the drawn scenes; tests/test_scenes.py looks into one of its own",
     r"nextview_ros": "takes messages of ROS 2; tests/test_ros2.py has recorded ones",
     r"agents/(ppo|mvselect)\.json .*agents/": "needs two agents of a million steps each",
+}
+NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
+    r"nextview (train|export) ": "nextview[train]",
+    r"nextview (benchmark|evaluate|report) ": "nextview[benchmark]",
+    r"benchmarks/(ablations|things|views)\.py|research\.(measure_study|example_maps)": "nextview[benchmark]",
+    r"benchmarks/ablations\.py": "nextview[train]",
+    r"--record|viewers\.recording": "nextview[record]",
+    r"\b(volumetric|coverage)\b": "research",
+    r"research\.train_agent": "research[rl]",
+    r"research\.arm|examples/panda": "research[arm]",
 }
 SMALL = {  # options that make a command quick
     "nextview render": "--workers 1",
@@ -114,6 +136,11 @@ class Step:
     python: bool = False
 
     @property
+    def needs(self) -> frozenset[str]:
+        """What has to be installed besides the base installation, as pip is told."""
+        return frozenset(wanted for pattern, wanted in NEEDS.items() if re.search(pattern, self.text))
+
+    @property
     def why_not(self) -> str | None:
         """Why it is not run; None if it is."""
         return next((why for pattern, why in NOT_RUN.items() if re.search(pattern, self.text)), None)
@@ -136,7 +163,16 @@ class Step:
 
 def steps_of(page: str) -> Iterator[Step]:
     """The commands and Python blocks of a page, in order; blocks of doctest are run by the tests."""
-    lines = (ROOT / page).read_text(encoding="utf-8").splitlines()
+    text = (ROOT / page).read_text(encoding="utf-8")
+    if page.endswith(".py"):
+        # What may be given or not stands in brackets there.
+        about = re.sub(r"\[(--[^\]]+)\]", r"\1", ast.get_docstring(ast.parse(text), clean=False) or "")
+        lines = about.splitlines()
+        for number in range(1, 1 + len(lines)):
+            yield from _commands(page, number, lines)
+        return
+
+    lines = text.splitlines()
     block: list[str] = []
     begun, kind = 0, None
     for number, line in enumerate(lines, 1):
@@ -244,7 +280,11 @@ for path in BUNDLED.glob("recogniser-modelnet10*"):
     shutil.copy(path, Path(f"{sys.argv[1]}{path.name.removeprefix('recogniser-modelnet10')}"))
 """,
     "stand_ins.py": """
+import sys
+
 import numpy as np
+
+sys.path.insert(0, "examples")
 from arm_over_table import Arm
 from simulated_sensor import INTRINSICS as intrinsics
 
@@ -267,46 +307,86 @@ STORES = (  # made once, for all pages
 )
 
 
-def run(command: str, folder: Path) -> tuple[int, str, float]:
-    """Exit status, output and seconds of a command of a shell, with the programs of this environment."""
-    begun = time.monotonic()
-    bin_folder = Path(sys.executable).parent
-    setting = f"export PATH={shlex.quote(str(bin_folder))}:$PATH PYTHONPATH=.:examples:$PYTHONPATH; set -e; "
-    try:
-        done = subprocess.run(
-            ["bash", "-c", setting + command], cwd=folder, capture_output=True, text=True, timeout=LIMIT
-        )
-    except subprocess.TimeoutExpired:
-        return 124, f"took longer than {LIMIT} s", time.monotonic() - begun
-    return done.returncode, done.stdout + done.stderr, time.monotonic() - begun
+@dataclass
+class Environments:
+    """Environments with nothing but what is asked for, each made when it is first needed.
+
+    Attributes:
+        folder: in which they lie.
+    """
+
+    folder: Path
+    _made: dict[frozenset[str], Path] = field(default_factory=dict)
+
+    def programs(self, needs: frozenset[str]) -> Path:
+        """The folder of the programs of one of them: Python, nextview.
+
+        Args:
+            needs: what is installed besides the base installation, as pip is told: "nextview[train]", "research".
+        """
+        from linked_environment import installation
+
+        if needs not in self._made:
+            extras = {text.partition("[")[2].rstrip("]") for text in needs if text.startswith("nextview[")}
+            research = [text.partition("[")[2].rstrip("]") for text in needs if text.startswith("research")]
+            wanted = set(filter(None, research)) if research else None
+            try:
+                python = installation(self.folder / str(len(self._made)), extras, wanted)
+            except PackageNotFoundError as missing:
+                raise SystemExit(f"{', '.join(sorted(needs))}: not installed here, {missing.name} is missing") from None
+            self._made[needs] = python.parent
+        return self._made[needs]
+
+    def run(self, command: str, folder: Path, needs: frozenset[str] = frozenset()) -> tuple[int, str, float]:
+        """Exit status, output and seconds of a command of a shell in a folder."""
+        begun = time.monotonic()
+        setting = f"export PATH={shlex.quote(str(self.programs(needs)))}:$PATH; set -e; "
+        surroundings = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        shell = ["bash", "-c", setting + command]
+        try:
+            done = subprocess.run(shell, cwd=folder, env=surroundings, capture_output=True, text=True, timeout=LIMIT)
+        except subprocess.TimeoutExpired:
+            return 124, f"took longer than {LIMIT} s", time.monotonic() - begun
+        return done.returncode, done.stdout + done.stderr, time.monotonic() - begun
 
 
-def run_page(page: str, folder: Path, beside: Path | None = None) -> list[str]:
+def run_page(page: str, environments: Environments, folder: Path, beside: Path | None = None) -> list[str]:
     """Run what a page shows; returns what failed, a line each.
 
     Args:
         page: of the repository.
+        environments: those of its commands.
         folder: in which the commands run.
         beside: in which the Python blocks run, if not there.
     """
     failed = []
     if page in PREPARED:
-        status, said, _ = run(PREPARED[page], folder)
+        status, said, _ = environments.run(PREPARED[page], folder)
         if status != 0:
             raise SystemExit(f"{page}: {PREPARED[page]}\n{said}")
     python: list[str] = [BEFORE[page]] if page in BEFORE else []
+    needs_of_python: frozenset[str] = frozenset()
     for step in steps_of(page):
         where = f"{step.page}:{step.line}"
         if step.why_not is not None:
             print(f"  not run  {where}  {step.text}  ({step.why_not})", flush=True)
             continue
+
         command = step.command
+        needs = step.needs
+        place = folder
         if step.python:
+            place = beside or folder
             python.append(step.text)
-            ((beside or folder) / "page_block.py").write_text("\n\n".join(python) + "\n", encoding="utf-8")
+            needs_of_python |= needs
+            needs = needs_of_python
+            (place / "page_block.py").write_text("\n\n".join(python) + "\n", encoding="utf-8")
             command = "python page_block.py"
-        status, said, seconds = run(command, (beside or folder) if step.python else folder)
-        print(f"{'ok' if status == 0 else 'FAILED':>9}  {where}  {seconds:.0f} s  {command}", flush=True)
+
+        status, said, seconds = environments.run(command, place, needs)
+        ended = "ok" if status == 0 else "FAILED"
+        installed = ", ".join(sorted(needs)) or "base"
+        print(f"{ended:>9}  {where}  {seconds:.0f} s  ({installed})  {command}", flush=True)
         if status != 0:
             print("\n".join(said.splitlines()[-12:]), flush=True)
             failed.append(f"{where}  {step.text.splitlines()[0]}")
@@ -325,15 +405,18 @@ def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), only_list: bool = Fa
         for step in (step for page in chosen for step in steps_of(page)):
             print(f"{step.page}:{step.line}  {step.why_not or step.command}")
         return
+
     failed = []
     with tempfile.TemporaryDirectory(prefix="documented-") as place:
+        environments = Environments(Path(place) / "environments")
         inputs = Path(place) / "inputs"
         inputs.mkdir()
         make_inputs(inputs)
         for command in STORES:
-            status, said, _ = run(command, inputs)
+            status, said, _ = environments.run(command, inputs)
             if status != 0:
                 raise SystemExit(f"{command}\n{said}")
+
         for page in chosen:
             folder = Path(place) / page.replace("/", "_")
             shutil.copytree(inputs, folder)
@@ -341,7 +424,7 @@ def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), only_list: bool = Fa
             beside = Path(place) / "beside" if page in BESIDE else None
             if beside is not None:
                 shutil.copytree(inputs, beside)
-            failed += run_page(page, folder, beside)
+            failed += run_page(page, environments, folder, beside)
             shutil.rmtree(folder)
     if failed:
         raise SystemExit("\n".join([f"{len(failed)} commands failed:", *failed]))

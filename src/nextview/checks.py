@@ -5,7 +5,7 @@ import os
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import cache
@@ -25,22 +25,39 @@ EXTRAS = {  # packages by the optional part of the installation that brings them
     "large": ("faiss",),
     "record": ("rerun",),
     "envs": ("gymnasium",),
-    "train": ("lightning", "onnx", "onnxscript", "torch", "torchmetrics"),
+    "train": ("lightning", "numcodecs", "onnx", "onnxscript", "torch", "torchmetrics"),
 }
 TRACEBACK = "NEXTVIEW_TRACEBACK"  # an environment variable: set, the whole traceback of a plugin's error is printed too
 _NOT_PLUGINS = (f"{Path(__file__).parent}{os.sep}", "<frozen ", *map(sysconfig.get_path, ("stdlib", "purelib")))
 
 
-def missing_extra(error: ModuleNotFoundError) -> str | None:
-    """What to install; None where the module belongs to no optional part."""
+def needs_package(package: str, extra: str, project: str = "nextview") -> str:
+    """What to say of a missing package: the end of a sentence that begins with what needs it."""
+    return f"needs the package {package}: pip install '{project}[{extra}]'"
+
+
+def missing_extra(
+    error: ModuleNotFoundError, packages: Mapping[str, tuple[str, ...]] = EXTRAS, project: str = "nextview"
+) -> str | None:
+    """What to install, a sentence; None where the module belongs to no optional part.
+
+    Args:
+        error: of an import.
+        packages: those of each optional part.
+        project: whose parts they are, as pip is told.
+    """
     package = (error.name or "").partition(".")[0]
-    extra = next((extra for extra, packages in EXTRAS.items() if package in packages), None)
-    return None if extra is None else f"this needs the package {package}: pip install 'nextview[{extra}]'"
+    extra = next((extra for extra, of_extra in packages.items() if package in of_extra), None)
+    return None if extra is None else f"this {needs_package(package, extra, project)}"
 
 
 @contextmanager
-def extras() -> Iterator[None]:
+def extras(packages: Mapping[str, tuple[str, ...]] = EXTRAS, project: str = "nextview") -> Iterator[None]:
     """Stands around imports from optional parts of the installation.
+
+    Args:
+        packages: those of each optional part.
+        project: whose parts they are, as pip is told.
 
     Raises:
         MissingExtraError: such a part is not installed; the sentence says how to install it.
@@ -48,7 +65,7 @@ def extras() -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        sentence = missing_extra(error)
+        sentence = missing_extra(error, packages, project)
         if sentence is None:
             raise
         raise MissingExtraError(sentence) from error

@@ -4,12 +4,12 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Any
 
-from nextview.checks import EXTRAS, missing_extra
+from nextview.checks import EXTRAS, missing_extra, needs_package
 from nextview.errors import NextviewError
 
 
@@ -61,9 +61,23 @@ def _end(sentence: str, status: int) -> Any:
     sys.exit(status)
 
 
-def require(extra: str) -> None:
-    """End a script, before its imports fail, with the sentence that says what to install."""
-    for package in EXTRAS[extra]:
-        if find_spec(package) is None:
-            print(f"{sys.argv[0]} needs the package {package}: pip install 'nextview[{extra}]'", file=sys.stderr)
-            sys.exit(2)
+def require(extra: str, packages: Mapping[str, tuple[str, ...]] = EXTRAS, project: str = "nextview") -> None:
+    """End a script, before its imports fail, with the sentence that says what to install.
+
+    With --help it goes on: stand-ins are imported for what is missing, and its help is shown.
+
+    Args:
+        extra: the optional part of the installation that the script needs.
+        packages: those of each optional part.
+        project: whose parts they are, as pip is told.
+    """
+    missing = [package for package in packages[extra] if find_spec(package) is None]
+    if not missing:
+        return
+
+    print(f"{sys.argv[0]} {needs_package(missing[0], extra, project)}", file=sys.stderr)
+    if not {"-h", "--help"} & set(sys.argv[1:]):
+        sys.exit(2)
+    from nextview.cli.stand_ins import import_stand_ins
+
+    import_stand_ins(missing)

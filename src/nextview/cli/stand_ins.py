@@ -7,7 +7,7 @@ subclassed and annotated with. The process ends once the help is shown: nothing 
 
 import sys
 from abc import ABCMeta
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -46,11 +46,10 @@ def _stand_in(name: str) -> type:
 
 
 class _Finder(MetaPathFinder, Loader):
-    """Finds the packages of the extras; it stands behind all others, so that what is installed is taken."""
+    """Finds packages that are missing; it stands behind all others, so that what is installed is taken."""
 
-    def __init__(self) -> None:
-        named = {package for packages in EXTRAS.values() for package in packages}
-        self.missing = {package for package in named if find_spec(package) is None}
+    def __init__(self, missing: Iterable[str]) -> None:
+        self.missing = frozenset(missing)
 
     def find_spec(self, fullname: str, path: Any, target: Any = None) -> ModuleSpec | None:
         """A spec for a package that is missing, and for all that is below it."""
@@ -69,10 +68,17 @@ class _Finder(MetaPathFinder, Loader):
 
 @contextmanager
 def stand_ins() -> Iterator[None]:
-    """Import with stand-ins for what is missing; only for a process that ends afterwards."""
-    finder = _Finder()
-    sys.meta_path.append(finder)
+    """Import with stand-ins for what is missing of all extras; only for a process that ends afterwards."""
+    named = {package for packages in EXTRAS.values() for package in packages}
+    finder = import_stand_ins(package for package in named if find_spec(package) is None)
     try:
         yield
     finally:
         sys.meta_path.remove(finder)
+
+
+def import_stand_ins(missing: Iterable[str]) -> MetaPathFinder:
+    """From now on, import stand-ins for packages that are missing; only for a process that ends with its help."""
+    finder = _Finder(missing)
+    sys.meta_path.append(finder)
+    return finder
