@@ -89,11 +89,39 @@ def test_a_command_that_fails_is_told(tmp_path, monkeypatch, capsys):
         "```sh\nnextview list models   # fine\nnextview list nonsense\n```\n\n```python\nprint(1 / 0)\n```\n"
     )
     monkeypatch.setattr(documented_commands, "ROOT", tmp_path)
-    failed = documented_commands.run_page("page.md", tmp_path)
+    environments = documented_commands.Environments(tmp_path / "environments")
+    failed = documented_commands.run_page("page.md", environments, tmp_path)
     assert [line.split()[0] for line in failed] == ["page.md:3", "page.md:7"]
     shown = capsys.readouterr().out
     assert "ZeroDivisionError" in shown
     assert shown.count("FAILED") == 2
+
+
+def test_each_page_names_what_its_commands_need():
+    needed = set()
+    for page in documented_commands.PAGES:
+        text = (ROOT / page).read_text()
+        for step in documented_commands.steps_of(page):
+            for wanted in step.needs if step.why_not is None else ():
+                project, _, extra = wanted.rstrip("]").partition("[")
+                name = r"(nextview|\.)" if project == "nextview" else r"\./research"
+                said = re.search(name + (rf"\[[\w,-]*\b{extra}\b" if extra else ""), text)
+                assert said, f"{page}:{step.line} needs {wanted}, which the page does not name"
+                needed.add(wanted)
+    assert needed == set(documented_commands.NEEDS.values())
+
+
+def test_a_command_has_nothing_but_what_it_needs(tmp_path):
+    environments = documented_commands.Environments(tmp_path / "environments")
+    asked = "python -c 'import nextview.learning.export'"
+    status, said, _ = environments.run(asked, tmp_path)
+    assert status == 1
+    assert "pip install 'nextview[train]'" in said
+    status, said, _ = environments.run("nextview --version && python -c 'import pandas'", tmp_path)
+    assert said.startswith("nextview 0")
+    assert "No module named 'pandas'" in said
+    status, said, _ = environments.run("python -c 'import pandas'", tmp_path, frozenset(["nextview[benchmark]"]))
+    assert (status, said) == (0, "")
 
 
 @pytest.mark.long

@@ -84,7 +84,7 @@ NEEDS = {  # what a command or a Python block needs besides the base installatio
     r"benchmarks/(ablations|things|views)\.py|research\.(measure_study|example_maps)": "nextview[benchmark]",
     r"benchmarks/ablations\.py": "nextview[train]",
     r"--record|viewers\.recording": "nextview[record]",
-    r"\b(volumetric|coverage)\b": "research",
+    r"(?<![.:])\b(volumetric|coverage)\b": "research",  # by their short names
     r"research\.train_agent": "research[rl]",
     r"research\.arm|examples/panda": "research[arm]",
 }

@@ -25,7 +25,7 @@ EXTRAS = {  # packages by the optional part of the installation that brings them
     "large": ("faiss",),
     "record": ("rerun",),
     "envs": ("gymnasium",),
-    "train": ("lightning", "numcodecs", "onnx", "onnxscript", "torch", "torchmetrics"),
+    "train": ("lightning", "onnx", "onnxscript", "torch", "torchmetrics"),
 }
 TRACEBACK = "NEXTVIEW_TRACEBACK"  # an environment variable: set, the whole traceback of a plugin's error is printed too
 _NOT_PLUGINS = (f"{Path(__file__).parent}{os.sep}", "<frozen ", *map(sysconfig.get_path, ("stdlib", "purelib")))

@@ -8,18 +8,15 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numcodecs import Blosc
 from numpy.typing import NDArray
 
-from nextview.checks import extras
 from nextview.data.pool import WorkerDied, each
 from nextview.data.progress import Track, silently
 from nextview.data.store import ViewStore
 from nextview.errors import DAMAGED, DatasetError
 from nextview.files import new_folder, only_one
 from nextview.recognition.network_input import CHANNELS_OF, InputKind, InputSpec, from_store
-
-with extras():
-    from numcodecs import Blosc
 
 PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)  # views are mostly background and flat faces: a sixth is left, or less
 AGAIN = "delete it, and it is made again"

@@ -1,0 +1,219 @@
+"""What is imported is a dependency, or belongs to an extra that an error names; help needs none."""
+
+import ast
+import subprocess
+import sys
+import tomllib
+from functools import cache
+from importlib.metadata import PackageNotFoundError, packages_distributions
+from pathlib import Path
+
+import pytest
+from linked_environment import ROOT, asked_for, installation
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from nextview.checks import EXTRAS
+from research.extras import EXTRAS as EXTRAS_OF_RESEARCH
+
+SOURCES = sorted((ROOT / "src").rglob("*.py"))
+SCRIPTS = [
+    path
+    for folder in ("benchmarks", "examples", "research", "workflow")
+    for path in sorted((ROOT / folder).glob("*.py"))
+    if '__name__ == "__main__"' in path.read_text()
+]
+
+
+def project(folder: str) -> dict:
+    return tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
+
+
+def names(requirements) -> set[str]:
+    return {canonicalize_name(Requirement(text).name) for text in requirements}
+
+
+def imported(tree: ast.AST, in_extras: bool = False):
+    """The packages that code imports, not for types alone, and whether that stands in ``with extras()``."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name.partition(".")[0], in_extras) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield node.module.partition(".")[0], in_extras
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            yield from imported(ast.Module(node.orelse, []), in_extras)
+        else:
+            here = isinstance(node, ast.With) and any(ast.unparse(i.context_expr) == "extras()" for i in node.items)
+            yield from imported(node, in_extras or here)
+
+
+@cache
+def brought_by() -> dict[str, set[str]]:
+    """The distributions that bring each package which is installed here."""
+    return {package: set(map(canonicalize_name, names)) for package, names in packages_distributions().items()}
+
+
+def faults(code: str) -> list[str]:
+    """What is wrong with the imports of some code, a phrase each."""
+    table = project(".")
+    base = names(table["dependencies"])
+    by_extra = {extra: names(asked) for extra, asked in table["optional-dependencies"].items()}
+    found = []
+    for package, in_extras in sorted(set(imported(ast.parse(code)))):
+        if package in sys.stdlib_module_names or package in ("nextview", "nextview_command"):
+            continue
+        distributions = brought_by().get(package, set())
+        if distributions & base:
+            continue
+        extras = [extra for extra, packages in EXTRAS.items() if package in packages]
+        if not any(distributions & by_extra[extra] for extra in extras):
+            found.append(f"{package}: neither a dependency nor of an extra in checks.EXTRAS")
+        elif not in_extras:
+            found.append(f"{package}: imported outside of extras()")
+    return found
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT / "src")))
+def test_what_is_imported_is_asked_for(path):
+    assert faults(path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "wrong"),
+    [
+        ("import numpy\nfrom scipy.optimize import minimize\nimport os.path", []),
+        ("def f():\n    with extras():\n        import torch", []),
+        ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch", []),
+        ("import torch", ["torch: imported outside of extras()"]),
+        ("class A:\n    def f(self):\n        from faiss import Index", ["faiss: imported outside of extras()"]),
+        ("try:\n    import hypothesis\nexcept ImportError:\n    pass", ["hypothesis: neither"]),
+        ("with extras():\n    import pytest", ["pytest: neither"]),
+        ("import not_a_package_of_anybody", ["not_a_package_of_anybody: neither"]),
+    ],
+)
+def test_a_wrong_import_is_found(code, wrong):
+    found = faults(code)
+    assert len(found) == len(wrong)
+    assert all(phrase.startswith(begin) for phrase, begin in zip(found, wrong, strict=True))
+
+
+@pytest.mark.parametrize("folder", [".", "research"])
+def test_an_extra_brings_what_its_error_speaks_of(folder):
+    optional = project(folder)["optional-dependencies"]
+    of_nextview = project(".")["optional-dependencies"]
+    for extra, packages in (EXTRAS if folder == "." else EXTRAS_OF_RESEARCH).items():
+        texts = list(optional[extra])
+        for needed in map(Requirement, optional[extra]):
+            if needed.name == "nextview":
+                texts += [text for own in needed.extras for text in of_nextview[own]]
+        try:
+            brought = {canonicalize_name(name) for name, _ in asked_for([(text, "") for text in texts])}
+        except PackageNotFoundError:
+            continue  # the extra is not installed here
+        for package in packages:
+            assert brought_by()[package] & brought, (extra, package)
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory) -> Path:
+    """The Python of an installation without any extra."""
+    return installation(tmp_path_factory.mktemp("base") / "venv")
+
+
+def in_base(base: Path, code: str, *arguments: str) -> str:
+    done = subprocess.run([str(base), "-c", code, *arguments], cwd=ROOT, env={}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+IMPORT_ALL = """
+import pkgutil, sys
+from importlib import import_module
+import nextview
+
+for module in pkgutil.walk_packages(nextview.__path__, "nextview."):
+    if module.name == "nextview.__main__":
+        continue
+    try:
+        import_module(module.name)
+    except nextview.MissingExtraError as error:
+        print(module.name, error)
+print("torch" in sys.modules)
+"""
+
+
+def test_every_module_imports_in_the_base_installation_or_names_its_extra(base):
+    *missing, torch_is_there = in_base(base, IMPORT_ALL).splitlines()
+    assert torch_is_there == "False"
+    assert any(line.startswith("nextview.learning.export ") for line in missing)
+    for line in missing:
+        named = [extra for extra in EXTRAS if line.endswith(f": pip install 'nextview[{extra}]'")]
+        assert len(named) == 1, line
+
+
+RUN_EACH = """
+import os, runpy, sys, tempfile
+import matplotlib.figure, scipy.optimize, scipy.stats, trimesh, tyro  # once, before each is run in a process of its own
+import nextview
+
+options, scripts = sys.argv[1], sys.argv[2:]
+sys.path.insert(0, os.getcwd())
+for script in scripts:
+    with tempfile.TemporaryFile("w+") as said:
+        child = os.fork()
+        if child == 0:
+            os.dup2(said.fileno(), 1)
+            os.dup2(said.fileno(), 2)
+            sys.argv = [script, *options.split()]
+            sys.path.insert(0, os.path.dirname(script))
+            status = 0
+            try:
+                runpy.run_path(script, run_name="__main__")
+            except SystemExit as ended:
+                status = ended.code or 0
+            except BaseException:
+                import traceback
+                traceback.print_exc()
+                status = 1
+            sys.stdout.flush()
+            os._exit(status if isinstance(status, int) else 1)
+        _, ended = os.waitpid(child, 0)
+        said.seek(0)
+        print(script, os.waitstatus_to_exitcode(ended), repr(said.read()), flush=True)
+"""
+
+
+def runs(base: Path, options: str, scripts: list[str]) -> dict[str, tuple[int, str]]:
+    """Exit status and output of scripts, by their names."""
+    lines = in_base(base, RUN_EACH, options, *scripts).splitlines()
+    ended = {line.split(" ", 2)[0]: line.split(" ", 2)[1:] for line in lines}
+    return {name: (int(status), ast.literal_eval(said)) for name, (status, said) in ended.items()}
+
+
+def test_the_help_of_every_script_shows_in_the_base_installation(base):
+    scripts = [str(path.relative_to(ROOT)) for path in SCRIPTS]
+    ended = runs(base, "--help", scripts)
+    assert ended.keys() == set(scripts)
+    for name, (status, said) in ended.items():
+        assert status == 0, (name, said)
+        assert "usage: " in said, name
+    assert "pip install 'nextview[benchmark]'" in ended["benchmarks/scenes.py"][1]
+    assert "pip install './research[film]'" in ended["research/film.py"][1]
+
+
+def test_a_script_without_its_extra_says_what_to_install(base):
+    needing = {
+        "benchmarks/ablations.py": "nextview[train]",
+        "benchmarks/scenes.py": "nextview[benchmark]",
+        "research/example_maps.py": "nextview[benchmark]",
+        "research/film.py": "./research[film]",
+        "research/growth.py": "nextview[large]",
+        "research/measure_study.py": "nextview[benchmark]",
+        "research/thing_features.py": "nextview[train]",
+        "research/train_agent.py": "./research[rl]",
+        "research/train_grid.py": "nextview[train]",
+    }
+    for name, (status, said) in runs(base, "", list(needing)).items():
+        assert status == 2, (name, said)
+        assert said.endswith(f": pip install '{needing[name]}'\n")
+        assert said.count("\n") == 1
