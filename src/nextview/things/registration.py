@@ -397,7 +397,7 @@ def pose_covariances(
     views: Sequence[DepthView],
     prior: RegistrationPrior = RegistrationPrior(),
 ) -> Float:
-    """How well the views determine the poses of aligned hypotheses, the cameras being where they are.
+    """How well the views determine the poses of aligned hypotheses, given the cameras.
 
     It is the inverse of the matrix of a fine step, without what is unknown of the cameras.
 
