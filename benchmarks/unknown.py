@@ -26,7 +26,7 @@ from nextview.cli.ending import orderly_end
 from nextview.cli.progress import track
 from nextview.data.store import ViewStore
 from nextview.recognition.belief import log_evidence_of
-from nextview.recognition.inference import Features, Recogniser
+from nextview.recognition.inference import Features, NetworkRecogniser
 from nextview.recognition.model_card import RECOGNISER
 from nextview.recognition.network_input import from_store
 
@@ -54,7 +54,7 @@ class Judged:
         return self.scores[:, : runs * n_views].reshape(len(self.scores), runs, n_views).mean(2)
 
 
-def judge(store: Path, split: str | None, objects: int | None, recogniser: Recogniser, seed: int) -> Judged:
+def judge(store: Path, split: str | None, objects: int | None, recogniser: NetworkRecogniser, seed: int) -> Judged:
     views, rng = ViewStore.open(store), np.random.default_rng(seed)
     chosen = np.flatnonzero(views.done & ((views.splits == split) if split else True))
     chosen = np.sort(rng.permutation(chosen)[:objects])
@@ -101,7 +101,7 @@ def main(
     seed: int = 0,
 ) -> None:
     """Print the tables, for a store of known objects, and one of objects of no known class."""
-    network = Recogniser(recogniser)
+    network = NetworkRecogniser(recogniser)
     if network.novelty is None:
         raise SystemExit(f"{recogniser} cannot tell unknown objects; nextview fit unknown teaches it")
     ours, others = judge(known, split, None, network, seed), judge(unknown, None, objects, network, seed)

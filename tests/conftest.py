@@ -18,7 +18,7 @@ from hypothesis import settings
 from nextview.data.samples import sample_mesh
 from nextview.learning.learn import learn
 from nextview.recognition.belief import Calibration
-from nextview.recognition.inference import MapNetwork, Models, Recogniser
+from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
 
 LONG = ("test_workflow.py", "test_training.py")
 """Files that take longest: begun first, no process is left alone with one at the end."""
@@ -105,7 +105,7 @@ def models(shared) -> Path:
 @pytest.fixture(scope="session")
 def tiny(models):
     """They, opened, with a calibration of several views: by no views at all one cannot divide."""
-    recogniser = Recogniser(models / "tiny.json")
+    recogniser = NetworkRecogniser(models / "tiny.json")
     recogniser.calibration = Calibration(0.8, 1.0, bin_correlation=1.5)
     return Models(recogniser, {"lem": MapNetwork(models / "tiny-lem.json")})
 

@@ -26,7 +26,7 @@ from nextview.policies.baselines import Random
 from nextview.policies.learned_tables import ClassTable, cells_from, cells_to
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import PLAIN_SUM, Calibration
-from nextview.recognition.inference import Recogniser
+from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import values_of
 from research.fit_policies import fit_class_table, fit_policies, fit_ring, fit_sequence, fitting_set
@@ -233,7 +233,7 @@ def test_a_calibration_goes_into_the_card_and_is_used(training_predictions, monk
     after = json.loads(card.read_text())
     assert {name: after[name] for name in before} == before | {"schema": 2}  # written anew
     assert after["training"]["commands"] == ["nextview fit calibration 'a b'"]
-    assert Recogniser(card).calibration == fitted.calibration
+    assert NetworkRecogniser(card).calibration == fitted.calibration
     assert fitted.after < fitted.before
     assert "45 objects" in after["fitted_to"]["calibration"]
     assert [p.name for p in card.parent.iterdir() if p.name.startswith(".")] == []  # no lock, no part is left
@@ -363,10 +363,10 @@ def test_what_is_fitted_finds_the_strange_and_keeps_the_rate_that_was_asked_for(
 def test_a_recogniser_learns_to_notice_unknown_objects(furniture, models, tmp_path):
     card = Path(shutil.copy(models / "tiny.json", tmp_path))
     shutil.copy(models / "tiny.onnx", tmp_path)
-    assert Recogniser(card).novelty is None
+    assert NetworkRecogniser(card).novelty is None
     fitted = fit_unknown(furniture, card, workers=0)
     assert (fitted.objects, fitted.held_out) == (6, 6)
-    taught, about = Recogniser(card), read_card(card).fitted_to["novelty"]
+    taught, about = NetworkRecogniser(card), read_card(card).fitted_to["novelty"]
     assert "calibrated on 6 others" in about
     views = [SimulatedCamera(sample_mesh("chair")).observe(pose) for pose in SPHERE.poses[:3]]
     evidence = taught(views)

@@ -16,7 +16,8 @@ from nextview.files import sha256_of
 from nextview.geometry.mesh import load_mesh
 from nextview.recognition.inference import Features
 from nextview.recognition.model_card import find_models, read_card
-from nextview.things.memory import open_memory, open_recogniser
+from nextview.things.memory import open_memory
+from nextview.things.recogniser import open_recogniser
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings

@@ -11,7 +11,7 @@ from nextview.errors import ModelError
 from nextview.files import sha256_of
 from nextview.geometry.observation import Observation, pinhole
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.recognition.inference import MapNetwork, Recogniser
+from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import bundled_cards, find_card, read_card, write_card
 
 CLASSES = [f"class{k}" for k in range(10)]
@@ -43,7 +43,7 @@ def test_a_card_of_other_classes_or_inputs_than_its_network_is_refused_when_that
         before = card.read_text()
         change_card(card, **values)
         with pytest.raises(ModelError, match=sentence):
-            Recogniser(card)
+            NetworkRecogniser(card)
         card.write_text(before)
     lem = make_map_network(tmp_path)
     change_card(lem, good="valley")
@@ -110,14 +110,14 @@ def test_a_file_that_is_not_what_its_card_promises(tmp_path, monkeypatch, change
     for folder in (tmp_path, tmp_path / "models"):
         (folder / "weights.bin").write_bytes(np.ones(12, np.float32).tobytes())
     card = make_recogniser(tmp_path / "models", ["a", "b", "c"])
-    assert Recogniser(card, 1)([SEEN, SEEN]).logits.shape == (2, 3)
+    assert NetworkRecogniser(card, 1)([SEEN, SEEN]).logits.shape == (2, 3)
     file = card.with_suffix(".onnx")
     model = onnx.load(file)
     change(model)
     file.write_bytes(model.SerializeToString())
     with pytest.raises(ModelError, match="the SHA-256 differs"):
-        Recogniser(card, 1)
+        NetworkRecogniser(card, 1)
     change_card(card, sha256=sha256_of(file))
     with pytest.raises(ModelError, match=f"tiny.onnx: {sentence}") as refused:
-        Recogniser(card, 1)([SEEN, SEEN])
+        NetworkRecogniser(card, 1)([SEEN, SEEN])
     assert "\n" not in str(refused.value)

@@ -23,7 +23,7 @@ from nextview.errors import DatasetError, PredictionsError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration, RiskBounds
-from nextview.recognition.inference import MapNetwork, Recogniser
+from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.recognition.network_input import InputSpec, from_store
 
@@ -114,7 +114,7 @@ def test_predictions_are_what_the_networks_say_of_each_look(views, models, predi
     assert found.valley_classes == {"lem": ("table",)}
     i, v = 3, 17
     observation = Observation(store.depth(i)[v], store.sphere.poses[v], store.intrinsics)
-    evidence = Recogniser(models / "tiny.json")([observation])
+    evidence = NetworkRecogniser(models / "tiny.json")([observation])
     np.testing.assert_allclose(found.logits[i, v], evidence.logits[0], atol=1e-5)
     np.testing.assert_allclose(found.azimuth_bins[i, v], evidence.azimuth_bins[0], atol=1e-5)
     # Here the points come from the stored depth, which is rounded; those in the store are from the depth as rendered.
@@ -124,7 +124,7 @@ def test_predictions_are_what_the_networks_say_of_each_look(views, models, predi
 
 def test_logits_of_ones_own_make_the_predictions_that_the_networks_make(views, models, predictions):
     made, store = Predictions.load(predictions).by_shape(), ViewStore.open(views)
-    recogniser = Recogniser(models / "tiny.json")
+    recogniser = NetworkRecogniser(models / "tiny.json")
     logits = np.stack([recogniser.from_inputs(from_store(SPEC, store, i)).logits for i in range(18)])
     own = Predictions.from_logits(views, logits, made.classes)
     np.testing.assert_allclose(own.logits, made.logits, atol=1e-5)

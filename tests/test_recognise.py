@@ -20,7 +20,7 @@ from nextview import ViewSphere
 from nextview.cli.main import main
 from nextview.errors import ModelError, UsageError
 from nextview.policies.policy_card import bundled_policies
-from nextview.recognition.inference import MapNetwork, Recogniser
+from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import BUNDLED, RECOGNISER, bundled_cards
 from nextview.session import fonts
 from nextview.session.style import PlainFigure
@@ -132,7 +132,7 @@ def test_bundled_models_are_what_their_cards_say():
 
 def test_wrong_models_are_refused():
     with pytest.raises(ModelError, match="not a recogniser"):
-        Recogniser("lem-modelnet10")
+        NetworkRecogniser("lem-modelnet10")
     with pytest.raises(ModelError, match="not a map network"):
         MapNetwork(RECOGNISER)
 

@@ -17,7 +17,7 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import Calibration, Stopping
-from nextview.recognition.inference import MapNetwork, Models, Recogniser
+from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
 from nextview.recognition.own_stopping import own_stopping
 from nextview.session.episode import Episodes, run_episodes
 from nextview.session.session import Session
@@ -217,7 +217,7 @@ class ToItsBack:
 def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(furniture, models, predictions):
     p = Predictions.load(predictions).of_split("test")
     specs = make_specs(p, runs=2, seed=0)
-    networks = Models(Recogniser(models / "tiny.json", 1), {"lem": MapNetwork(models / "tiny-lem.json", 1)})
+    networks = Models(NetworkRecogniser(models / "tiny.json", 1), {"lem": MapNetwork(models / "tiny-lem.json", 1)})
     # A threshold that some reach: the middle of all confidences after two views.
     threshold = float(np.median(replay("lem", specs, 2, 0).confidences[:, 1]))
     for name in ("lem", "lem-peak", "unidirectional", "test_replay:ToItsBack"):

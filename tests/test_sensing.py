@@ -15,7 +15,7 @@ from nextview import Observation, SimulatedCamera
 from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.recognition.inference import Recogniser
+from nextview.recognition.inference import NetworkRecogniser
 from nextview.sensing import Box, Frame, ObjectFrame, ObservedObject, check_observation, check_views
 from nextview.sensing.facets import fit_facets, look_again, virtual_pose
 from nextview.sensing.plausibility import check_frame, refuse_far
@@ -483,7 +483,7 @@ def kinect(number: int) -> Frame:
 @real
 def test_a_real_chair_is_a_chair():
     """Single frames in which at least half of the chair's box is in the picture."""
-    recogniser = Recogniser()
+    recogniser = NetworkRecogniser()
     grid = np.stack(np.meshgrid(*(np.linspace(*ends, 8) for ends in zip(CHAIR.low, CHAIR.high, strict=True))), -1)
     answers = []
     for number in range(0, 1000, 20):

@@ -18,7 +18,7 @@ from nextview.errors import DatasetError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.card_fits import ANY_SIZE, RADII, densities, fit_weight
-from nextview.recognition.inference import Recogniser
+from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.simulation.simulated import SimulatedCamera
 
@@ -103,7 +103,7 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     list(predict(Path(views), tmp_path / "new.npz", read_card(Path(card)), {}, "test", workers=1))
     np.testing.assert_allclose(Predictions.load(tmp_path / "new.npz").logits, known.logits, atol=1e-5)
 
-    recogniser = Recogniser(card)
+    recogniser = NetworkRecogniser(card)
     path = shop / "meshes/small/test/small_7.off"
     n_views = [SimulatedCamera(load_mesh(path, unit=unit), 32).observe(SPHERE.poses[9]) for unit in ("cm", None)]
     assert [observation.radius for observation in n_views] == [pytest.approx(radii["small_7"]), None]

@@ -28,7 +28,7 @@ from nextview.learning.map_training import Windows, train_map
 from nextview.learning.recipes import THESIS_MAP, THESIS_RECOGNISER, Hardware, MapRecipe, RecogniserRecipe
 from nextview.learning.recogniser_training import Source, Views, train_recogniser
 from nextview.learning.runs import fit, load_run, read_run, start_from
-from nextview.recognition.inference import MapNetwork, Recogniser
+from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.recognition.network_input import InputSpec, from_store
 from nextview.simulation.simulated import SimulatedCamera
@@ -321,7 +321,7 @@ def test_trained_models_have_cards_and_run(trained, views):
     assert card.held_out == tuple(sorted(run.held_out))
     store = ViewStore.open(views)
     assert set(card.held_out) < {n for n, split in zip(store.names, store.splits, strict=True) if split == "train"}
-    evidence = Recogniser(trained / "models/tiny.json").from_inputs(np.zeros((3, 4, 32, 32), np.uint8))
+    evidence = NetworkRecogniser(trained / "models/tiny.json").from_inputs(np.zeros((3, 4, 32, 32), np.uint8))
     assert evidence.logits.shape == (3, 3)
     assert np.exp(evidence.azimuth_bins).sum(2) == pytest.approx(np.ones((3, 3)), abs=1e-4)
     lem = MapNetwork(trained / "models/tiny-lem.json").from_inputs(np.zeros((2, 4, 32, 32), np.uint8))
@@ -343,7 +343,7 @@ def test_several_runs_are_averaged(trained, views, tmp_path):
     networks = [run_network(folder, SMALL, ViewStore.open(views)) for folder in (run, tmp_path / "on")]
     with torch.no_grad():
         outputs = [network(torch.from_numpy(x).float() / 255) for network in networks]
-    both = Recogniser(tmp_path / "both.json")
+    both = NetworkRecogniser(tmp_path / "both.json")
     assert both.from_inputs(x).logits == pytest.approx(sum(o[0] for o in outputs).numpy() / 2, abs=2e-2)
     assert both.card.network == "ResNet-18 + ResNet-18"
     assert [recipe["ensemble_seed"] for recipe in both.card.training.recipes] == [0, 1]

@@ -27,7 +27,7 @@ from nextview.policies.gain import INPUTS, VISIBILITY, Frame, features, maps_of,
 from nextview.policies.learned_tables import cells_from
 from nextview.recognition.belief import Calibration, FixedLength, Stopping
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.inference import Models, Recogniser, open_maps
+from nextview.recognition.inference import Models, NetworkRecogniser, open_maps
 from nextview.recognition.map_names import in_order
 from nextview.recognition.model_card import find_models
 from nextview.session.episode import Episodes
@@ -366,7 +366,7 @@ class RecogniseMeshEnv(TaskEnv):
     ) -> None:
         whole(size, "the side of an image", 1)
         given, found, sphere = Rules(**rules), find_models(models), ViewSphere.named(viewpoints)
-        self._models = Models(Recogniser(found.recogniser), open_maps(found.maps, given.maps))
+        self._models = Models(NetworkRecogniser(found.recogniser), open_maps(found.maps, given.maps))
         classes, calibration = self._models.classes, self._models.recogniser.calibration
         objects: list[tuple[str, Callable[[], Mesh]]] = [(name, partial(sample_mesh, name)) for name in SAMPLES]
         if meshes is not None:

@@ -17,10 +17,10 @@ from nextview.data.store import ViewStore, writing
 from nextview.errors import DAMAGED, PredictionsError
 from nextview.files import check_new, command, unfinished
 from nextview.geometry.observation import enough_shows
-from nextview.recognition.inference import MapNetwork, Recogniser
+from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import BUNDLED, ModelCard
 from nextview.recognition.network_input import from_store
-from nextview.things.memory import open_recogniser
+from nextview.things.recogniser import open_recogniser
 
 BATCH = 8  # views a call of the networks
 Cards = dict[str, ModelCard]  # of map networks, by name
@@ -86,7 +86,7 @@ def _card_file(card: ModelCard) -> Path:
 
 
 @lru_cache(maxsize=1)
-def _open(store: Path, recogniser: Path, maps: Files) -> tuple[ViewStore, Recogniser, dict[str, MapNetwork]]:
+def _open(store: Path, recogniser: Path, maps: Files) -> tuple[ViewStore, NetworkRecogniser, dict[str, MapNetwork]]:
     """Each process has its own store and networks, and one thread: objects are what runs side by side."""
     networks = {name: MapNetwork(card, threads=1) for name, card in maps}
     return ViewStore.open(store), open_recogniser(recogniser, threads=1), networks

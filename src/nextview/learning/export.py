@@ -26,7 +26,7 @@ from nextview.learning.inputs import load_inputs
 from nextview.learning.map_training import target_of
 from nextview.learning.recipes import MapRecipe, RecogniserRecipe
 from nextview.learning.runs import load_run, read_recipe, read_run
-from nextview.recognition.inference import BINS_OUTPUT, FEATURES_OUTPUT, MapNetwork, Recogniser
+from nextview.recognition.inference import BINS_OUTPUT, FEATURES_OUTPUT, MapNetwork, NetworkRecogniser
 from nextview.recognition.map_names import CONFIDENCE, Good, map_name
 from nextview.recognition.model_card import ModelCard, Training, write_card
 from nextview.recognition.network_input import InputSpec, from_store
@@ -150,7 +150,7 @@ class _Candidate:
     def answers(self, card: Path) -> Callable[[NDArray], NDArray[np.float32]]:
         """From views to what the file says of them."""
         if self.card.is_recogniser:
-            recogniser = Recogniser(card)
+            recogniser = NetworkRecogniser(card)
             return lambda seen: recogniser.from_inputs(seen).logits
         network = MapNetwork(card)
         return lambda seen: network.from_inputs(seen)[self.card.kind]

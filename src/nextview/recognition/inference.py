@@ -18,6 +18,7 @@ from nextview.recognition.map_names import SPHERE, maps_among
 from nextview.recognition.model_card import FEATURES, RECOGNISER, ModelCard, find_card
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, novelty_path, read_novelty
+from nextview.recognition.protocol import Recogniser
 from nextview.recognition.runtime import RUNTIME_FAILURES, ort
 
 INPUT = "input"
@@ -108,7 +109,7 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
     return session
 
 
-class Recogniser:
+class NetworkRecogniser:
     """Classifies the object in each view, by its shape and, where the camera knows it, by its size.
 
     ``model`` is the name of a bundled model, or the path of a card, ``threads`` those of ONNX Runtime, 0 for one on
@@ -125,6 +126,11 @@ class Recogniser:
         self._known: Features | None = None
         self._threads, sha256 = threads, self.card.novelty_sha256
         self.novelty: Quantiles | None = read_novelty(novelty_path(self.card.path), sha256) if sha256 else None
+
+    @property
+    def name(self) -> str:
+        """What its card calls it."""
+        return self.card.name
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
         """Evidence of B views from one camera; views in which nothing is seen are marked, see ``Evidence.seen``."""
@@ -180,7 +186,8 @@ class Features:
 class MapNetwork:
     """Predicts the local map around each view from the geometry seen, or from its partial cloud, as its card says.
 
-    ``rings`` is how many rings of views the map has, None if its file leaves that open. Arguments as of ``Recogniser``.
+    ``rings`` is how many rings of views the map has, None if its file leaves that open. Arguments as of
+    ``NetworkRecogniser``.
     """
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:

@@ -1,6 +1,6 @@
 """The loop: observe, believe, stop or choose, move. One for a robot and for a hundred thousand replays."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from nextview.geometry.viewsphere import SNAP, Viewpoints, angle_between, azimut
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.off_grid import OffGrid
 from nextview.recognition.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
+from nextview.recognition.protocol import JointBelief
 from nextview.sensing.expected_visibility import SeenScene, expected_visibility
 
 Float = NDArray[np.float64]
@@ -33,6 +34,9 @@ class Step:
     total: Float  # sum of the log-evidence in it and before, (A, D), see ``belief.log_evidence_of``
     seen: Float  # views so far in which anything was seen, each by its weight, (A,), see ``Calibration.weights``
     state: EpisodeState | None = None  # what the policy was shown of the episodes that go on; None where all ended
+    # what all views so far say together, of each of the A episodes, None before anything is seen; () where views are
+    # judged one by one
+    joint: tuple[JointBelief | None, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,7 @@ class Taken:
 
 Visible = Callable[[EpisodeState], Float]  # expected share of the object that shows from each view, (B, V)
 Constrain = Callable[[EpisodeState], EpisodeState]  # with where robots can go, and what it costs
+Together = Callable[[Sequence[Observation], Float, int], JointBelief]  # see ``protocol.JudgesTogether.together``
 
 
 def unconstrained(state: EpisodeState) -> EpisodeState:
@@ -81,9 +86,10 @@ class Episodes:
         calibration: Calibration = PLAIN_SUM,  # how far to trust the sum of the logits; fully by default
         # for policies that need it; by default from the scenes in the observations, see ``SeenScene``
         visibility: Visible | None = None,
+        together: Together | None = None,  # judges all views of an episode; by default their evidence is added up
     ) -> None:
         self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
-        self.calibration, self.visibility = calibration, visibility
+        self.calibration, self.visibility, self.together = calibration, visibility, together
         self.running = np.arange(len(starts))
         self.current = np.array(starts, np.int64)
         if ((self.current < 0) | (self.current >= len(sphere))).any():
@@ -130,9 +136,17 @@ class Episodes:
             step = replace(step, state=state)
         return replace(taken, step=replace(step, enough=enough, stopped=step.next_views < 0))
 
-    def take(self, evidence: Evidence, directions: Float | None = None) -> None:
-        """Take in a view after which it is known that the episodes went on: neither stop nor choose."""
-        self.keep(self._taken(evidence, directions))
+    def take(
+        self,
+        evidence: Evidence,
+        directions: Float | None = None,
+        joint: tuple[JointBelief | None, ...] | None = None,
+    ) -> None:
+        """Take in a view after which it is known that the episodes went on: neither stop nor choose.
+
+        ``joint`` is what all views said together after it, where that is known: they are not judged once more.
+        """
+        self.keep(self._taken(evidence, directions, joint))
 
     def keep(self, taken: Taken) -> None:
         """Take in what ``next_step`` made."""
@@ -186,7 +200,12 @@ class Episodes:
         )
         return replace(state, visibility=self._visibility(step, state)) if "visibility" in needs else state
 
-    def _taken(self, evidence: Evidence, directions: Float | None) -> Taken:
+    def _taken(
+        self,
+        evidence: Evidence,
+        directions: Float | None,
+        joint: tuple[JointBelief | None, ...] | None = None,
+    ) -> Taken:
         """The next step, as if no episode ended and none moved on. Nothing is changed yet."""
         now = self.running
         if len(evidence.logits) != len(now):
@@ -215,7 +234,32 @@ class Episodes:
         belief = self.calibration.belief(total, np.maximum(counted, 1), evidence.logits.shape[1])
         no, nowhere = np.zeros(len(now), bool), np.full(len(now), -1)
         step = Step(now, views, evidence, belief, no, no, nowhere, total, counted)
+        if self.together is not None:
+            step = self._judged(step, seen, joint or (None,) * len(now))
         return Taken(step, seen, visited, azimuth, places)
+
+    def _judged(self, step: Step, seen: NDArray[np.bool_], known: tuple[JointBelief | None, ...]) -> Step:
+        """The step with what all views so far say together, and the belief that follows.
+
+        ``seen`` says in which episodes anything is seen in this view, (A,), and ``known`` what is known already. Before
+        anything is seen the belief stays as it is.
+        """
+        assert self.together is not None
+        before: dict[int, JointBelief | None] = {}
+        if self.steps and self.steps[-1].joint:
+            before = dict(zip(self.steps[-1].episodes.tolist(), self.steps[-1].joint, strict=True))
+        taken = self._observations(step, step.episodes, counted=True) if seen.any() else []
+
+        joint, belief = list(known), step.belief.copy()
+        for row, episode in enumerate(step.episodes.tolist()):
+            if joint[row] is None and seen[row]:
+                joint[row] = self.together(taken[row], step.total[row], int(step.seen[row]))
+            elif joint[row] is None:
+                joint[row] = before.get(episode)
+            found = joint[row]
+            if found is not None:
+                belief[row] = found.belief
+        return replace(step, belief=belief, joint=tuple(joint))
 
     def _visibility(self, last: Step, state: EpisodeState) -> Float:
         """What is expected to show from each view in the episodes of a state."""
@@ -239,15 +283,20 @@ class Episodes:
         self._scenes[episode] = scenes, seen
         return seen
 
-    def _observations(self, last: Step, episodes: NDArray[np.int64]) -> list[list[Observation]]:
-        """All that was seen so far in some episodes, the last step included."""
+    def _observations(self, last: Step, episodes: NDArray[np.int64], counted: bool = False) -> list[list[Observation]]:
+        """All views so far of some episodes, the last step included; ``counted``: those that are evidence."""
         found: dict[int, list[Observation]] = {int(episode): [] for episode in episodes}
         for step in (*self.steps, last):
-            if step.evidence.observations is None:
-                raise UsageError("this policy needs the depth that was seen, and only evidence is given")
-            for episode, seen in zip(step.episodes, step.evidence.observations, strict=True):
-                if int(episode) in found:
-                    found[int(episode)].append(seen)
+            evidence = step.evidence
+            if evidence.observations is None:
+                who = "this recogniser" if counted else "this policy"
+                raise UsageError(f"{who} needs the depth that was seen, and only evidence is given")
+            counts = np.ones(len(step.episodes), bool)
+            if counted and evidence.seen is not None:
+                counts = evidence.seen
+            for episode, view, is_evidence in zip(step.episodes, evidence.observations, counts, strict=True):
+                if is_evidence and int(episode) in found:
+                    found[int(episode)].append(view)
         return list(found.values())
 
     def _move(self, state: EpisodeState, constrain: Constrain) -> tuple[EpisodeState, NDArray[np.int64]]:

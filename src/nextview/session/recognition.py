@@ -1,12 +1,18 @@
 """How an episode ended: the answer, how sure it is, and its picture."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.recognition.belief import Stopping
 from nextview.recognition.novelty import Quantiles, values_of
+from nextview.recognition.poses import PoseCandidate, PoseUncertainty, place_in_words, uncertainty_of
+from nextview.recognition.protocol import JointBelief
+from nextview.session.pose_frame import PoseFrame, PoseFrameName
 from nextview.session.view import View
 
 if TYPE_CHECKING:
@@ -33,6 +39,7 @@ class Recognition:
     score: Quantiles | None = None  # gives the novelty of views; None if the recogniser has none
     unknown_rate: float = 0.0  # share of objects of known classes that may be called unknown; 0: none
     impossible: tuple[str, ...] = ()  # classes whose objects have not such a size
+    poses_in: PoseFrame = field(default_factory=PoseFrame, repr=False)  # the frame in which poses are given
 
     @property
     def seen(self) -> bool:
@@ -43,8 +50,11 @@ class Recognition:
     def novelty(self) -> float | None:
         """Share of known objects that are at least as novel (a p-value); None if the recogniser has no score.
 
-        It holds for objects seen as the known ones were; what is hidden of one is allowed for, see ``values_of``.
+        It holds for objects seen as the known ones were; what is hidden of one is allowed for, see ``values_of``. Of
+        things that are known by their geometry it says how badly the likeliest one explains the depth.
         """
+        if self._explained is not None:
+            return self._explained
         if self.score is None or not self.seen:
             return None
         views = [view.score for view in self.views if view.score is not None]
@@ -55,7 +65,10 @@ class Recognition:
         """Whether the object is called one of no known class: too novel, or of another size than the class believed."""
         if not self.unknown_rate or not self.seen:
             return False
-        return (self.novelty is not None and self.novelty < self.unknown_rate) or self.most_like in self.impossible
+        if self.novelty is not None and self.novelty < self.unknown_rate:
+            return True
+        # A thing that explains the depth has the right size, even where half of it is hidden.
+        return self._explained is None and self.most_like in self.impossible
 
     @property
     def none_of_them(self) -> str:
@@ -66,6 +79,8 @@ class Recognition:
     @property
     def why_unknown(self) -> str:
         """What an object is called unknown for, in words."""
+        if self._explained is not None:
+            return f"{100 * self._explained:.2g} % of taught things are explained as badly by their scans"
         if self.most_like in self.impossible:
             return f"a radius of {self.radius:.2g} m is that of no {self.most_like}"
         return f"{100 * (self.novelty or 0):.2g} % of known objects are as novel"
@@ -96,6 +111,83 @@ class Recognition:
         return self.views[-1].observation.radius if self.views else None
 
     @property
+    def pose(self) -> NDArray[np.float64] | None:
+        """Where the object is: from the frame of its scan file (origin and axes) into ``pose_frame``, (4, 4), metres.
+
+        A point p of the scan, in metres, is at ``(pose @ [*p, 1])[:3]``. None where there is no answer, or its geometry
+        is not known: see ``why_no_pose``.
+        """
+        found = self._candidates_of_answer
+        return found[0].pose if found else None
+
+    @property
+    def pose_frame(self) -> PoseFrameName:
+        """The frame in which poses are given.
+
+        "world" is the robot's: that in which the frames' camera poses are. "camera" is that of the camera (OpenCV
+        axes), of a single frame without a pose. "object" is the object frame in metres, where a camera gives
+        observations, as simulated ones do.
+        """
+        return self.poses_in.name
+
+    @property
+    def pose_candidates(self) -> tuple[PoseCandidate, ...]:
+        """The poses that the object may have, the likeliest first, in ``pose_frame``; their probabilities sum to 1.
+
+        There are several where a thing looks alike from several sides, or two things look alike: each says of which
+        thing it is. None are known where ``pose`` is None because the geometry is not known.
+        """
+        joint = self._joint
+        if joint is None:
+            return ()
+        return tuple(candidate.moved(self.poses_in.from_object) for candidate in joint.poses)
+
+    @property
+    def pose_uncertainty(self) -> PoseUncertainty | None:
+        """How far off ``pose`` may be, degrees and millimetres: standard deviations; None where there is none.
+
+        It comes from how well the depth determines the pose, from how likely the other candidates of the same thing
+        are, and in the world from how far off cameras usually are.
+        """
+        found = self._candidates_of_answer
+        joint = self._joint
+        if not found or joint is None:
+            return None
+        camera = joint.camera_error if self.pose_frame == "world" else 0.0
+        return uncertainty_of([one for one in found if one.thing == found[0].thing], camera)
+
+    @property
+    def symmetry(self) -> Any:
+        """Turns after which the thing that was named looks the same; None where they are not known."""
+        found = self._candidates_of_answer
+        return found[0].symmetry if found else None
+
+    @property
+    def why_no_pose(self) -> str:
+        """Why there is no pose though all views were judged together, in words; "" if there is one."""
+        joint = self._joint
+        return joint.why_no_pose if joint is not None and self.pose is None else ""
+
+    @property
+    def _joint(self) -> JointBelief | None:
+        """What all views say together; None where views are judged one by one, or nothing is seen."""
+        return self.views[-1].joint if self.views else None
+
+    @property
+    def _explained(self) -> float | None:
+        """Share of known things that are explained as badly by their geometry; None where that is not known."""
+        joint = self._joint
+        return None if joint is None else joint.p_value
+
+    @property
+    def _candidates_of_answer(self) -> list[PoseCandidate]:
+        """Poses of things of the class that is the answer, the likeliest first; none for an unknown object."""
+        if self.answer is None:
+            return []
+        label = self.classes.index(self.answer)
+        return [candidate for candidate in self.pose_candidates if candidate.label == label]
+
+    @property
     def travel(self) -> float:
         """Of the whole episode, grid cells."""
         return self.views[-1].travel if self.views else 0.0
@@ -114,7 +206,15 @@ class Recognition:
                 sure += f": {self.why_stranded}"
         names = dict.fromkeys(warning.name for view in self.views for warning in view.warnings)
         warnings = f", warnings: {', '.join(names)}" if names else ""
-        return f"{self.answer} (belief {self.confidence:.3f}, {views}, {sure}{warnings})"
+        return f"{self.answer} (belief {self.confidence:.3f}, {views}, {sure}{self._place_in_words}{warnings})"
+
+    @property
+    def _place_in_words(self) -> str:
+        """``, at (0.412, -0.103, 0.050) m in the world, ± 1.2°, 0.8 mm``: the thing's centre; "" without a pose."""
+        if self.pose is None:
+            return ""
+        place = place_in_words(self._candidates_of_answer[0].place)
+        return f", at {place} in {self.poses_in}, {self.pose_uncertainty}"
 
     def plot(self, path: str | Path | None = None, title: str = "") -> "Figure":
         """Draw the episode: images, what the policy valued the views at, beliefs and the path on the sphere.

@@ -20,13 +20,15 @@ from nextview.geometry.viewsphere import Viewpoints, angle_between, azimuth_of, 
 from nextview.policies.base import EpisodeState, Policy, ValuesViews
 from nextview.policies.off_grid import anywhere
 from nextview.recognition.belief import MUCH, Stopping, log_evidence_of
-from nextview.recognition.inference import Models
+from nextview.recognition.inference import Models, NetworkRecogniser
 from nextview.recognition.map_names import maps_among
 from nextview.recognition.novelty import Novelty, ViewScore, values_of
+from nextview.recognition.protocol import JudgesTogether
 from nextview.sensing.frame import Frame
 from nextview.sensing.plausibility import ViewWarning, check_observation, check_views
 from nextview.session.episode import Episodes, Step
 from nextview.session.limits import Limits, in_words
+from nextview.session.pose_frame import PoseFrame
 from nextview.session.reach import Reach, Reachable, TravelCost, as_reachable, as_travel_cost
 from nextview.session.recognition import SUSPICIOUS, Recognition
 from nextview.session.repeated import REPEATED, after_repeated, is_repeated
@@ -150,8 +152,16 @@ class Session:
         vars(self).update(state, _lock=RLock())
 
     def _begin(self, start: int) -> Episodes:
-        calibration = self.models.recogniser.calibration
-        return Episodes(self.sphere, self._chooser, np.array([start]), self.stopping, self._rng, calibration)
+        recogniser = self.models.recogniser
+        return Episodes(
+            self.sphere,
+            self._chooser,
+            np.array([start]),
+            self.stopping,
+            self._rng,
+            recogniser.calibration,
+            together=recogniser.together if isinstance(recogniser, JudgesTogether) else None,
+        )
 
     # Where to look
 
@@ -371,7 +381,9 @@ class Session:
         """See ``ObservedObject.reconsider``: where the last view is suspiciously novel."""
         recogniser = self.models.recogniser
         score = recogniser.novelty
-        if not self.unknown or not isinstance(score, Novelty) or not object.other_joins():
+        if not self.unknown or not isinstance(score, Novelty) or not isinstance(recogniser, NetworkRecogniser):
+            return
+        if not object.other_joins():
             return
 
         def novelty(seen: Sequence[Observation]) -> float:
@@ -412,7 +424,8 @@ class Session:
         if changed != [last]:
             episodes = self._begin(self.view)
             for k, step in enumerate(self._episodes.steps):
-                episodes.take(evidence.get(k, step.evidence), directions[k][None])
+                # What all views said together then is not asked again: it takes time.
+                episodes.take(evidence.get(k, step.evidence), directions[k][None], step.joint)
         reach, doubtful = self._reach, bool(warnings) or self._contradicted(last + 1)
         taken = episodes.next_step(
             evidence[last],
@@ -458,6 +471,7 @@ class Session:
             direction=direction,
             azimuth_bins=None if bins is None else bins[0],
             score=self._score(step, observation),
+            joint=step.joint[0] if step.joint else None,
         )
 
     def _score(self, step: Step, observation: Observation) -> ViewScore | None:
@@ -478,8 +492,13 @@ class Session:
 
     def _suspicious(self, steps: Sequence[Step], observations: Sequence[Observation]) -> bool:
         """Whether an object is too novel for a confident answer by some steps, as their views are seen by now."""
+        if not self.unknown:
+            return False
+        joint = steps[-1].joint[0] if steps[-1].joint else None
+        if joint is not None and joint.p_value is not None:
+            return joint.p_value < SUSPICIOUS * self.unknown
         score = self.models.recogniser.novelty
-        if score is None or not self.unknown:
+        if score is None:
             return False
         found = [self._score(step, seen) for step, seen in zip(steps, observations, strict=True)]
         return score.of_views(values_of([s for s in found if s is not None])) < SUSPICIOUS * self.unknown
@@ -543,6 +562,7 @@ class Session:
                 score=self.models.recogniser.novelty,
                 unknown_rate=self.unknown,
                 impossible=self._impossible(),
+                poses_in=PoseFrame.of(self.object),
             )
             return replace(result, confident=enough and not result.unknown)
 

@@ -19,14 +19,16 @@ from nextview.policies.base import Policy
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.registry import make_policy_anywhere, with_cards
 from nextview.recognition.belief import Stopping
-from nextview.recognition.inference import MapNetwork, Models, Recogniser, open_maps
+from nextview.recognition.inference import MapNetwork, Models, open_maps
 from nextview.recognition.map_names import SPHERE
 from nextview.recognition.model_card import DISCRIMINATE, find_models
+from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.own_stopping import Rule, own_stopping
+from nextview.recognition.protocol import Recogniser, tells_unknown
 from nextview.session.limits import Limits
 from nextview.session.recognition import Recognition
 from nextview.session.session import FrameCamera, Session
-from nextview.things.memory import open_recogniser
+from nextview.things.recogniser import open_recogniser
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
@@ -149,7 +151,7 @@ class System:
         return self.session_with(what, start, seed).run(what)
 
     def __repr__(self) -> str:
-        name, views = self.models.recogniser.card.name, len(self.sphere)
+        name, views = self.models.recogniser.name, len(self.sphere)
         return f"System({name}, policy {self.policy_name}, {views} viewpoints, {self.stopping})"
 
     def __reduce__(self) -> "tuple[Callable[[], System], tuple[()]]":
@@ -177,6 +179,7 @@ def load(
     threads: int = 0,
     unknown: float | None = None,
     stopping: Stopping | Rule | str | None = None,
+    recogniser: Any = None,
 ) -> System:
     """Open models, and what belongs to them.
 
@@ -196,6 +199,8 @@ def load(
             By default 0.02, where the recogniser has a novelty score.
         stopping: a rule of your own: "MODULE:NAME" or a function, which is asked with what is believed and the
             threshold, see ``recognition.own_stopping``; or a ``Stopping``, instead of threshold, risk and views.
+        recogniser: one of your own instead of that of the models: an object or "MODULE:NAME", see
+            ``recognition.own_recogniser``. It is pickled with the system.
 
     Raises:
         ModelError: there are no such models, one cannot be used, or the recogniser has no novelty score.
@@ -204,7 +209,41 @@ def load(
         UsageError: a threshold, a rate or a number of views makes no sense.
     """
     given = locals() | {"models": str(models)}
-    for value, what in ((models, "models are"), (DEFAULT if policy is None else policy, "a policy is")):
+    _check_options(models, policy, threads, risk, unknown)
+    Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
+
+    found = find_models(models)
+    sphere = viewpoints_of(viewpoints)
+    if recogniser is None:
+        knows: Recogniser = open_recogniser(found.recogniser, threads)
+        policies = found.policies
+    else:
+        knows = own_recogniser(recogniser)
+        # The policy of a memory belongs to its things.
+        policies = {name: card for name, card in found.policies.items() if name != DISCRIMINATE}
+
+    share = _unknown_share(unknown, knows, str(found.recogniser) if recogniser is None else knows.name)
+    if not share:
+        knows.novelty = None  # it takes time
+    if policy is None:
+        name, made = _default_policy(policies, sphere, knows)
+    else:
+        name = str(policy)
+        made = make_policy_anywhere(with_cards(name, policies), sphere, (), knows.classes, found.maps)
+
+    opened = Models(knows, open_maps(found.maps, made.needs, threads))
+    if name in opened.maps:  # a map's own policy goes to the valley for some classes, which the map's card names
+        made = make_policy_anywhere(name, sphere, opened.valley_classes(name), knows.classes, found.maps)
+    if isinstance(made, MapPeak | SpherePeak):
+        made = replace(made, sphere=_grid_of(opened.maps[made.map_name.removesuffix(SPHERE)], made.sphere))
+    rule = _rule(stopping, Stopping.of(knows.calibration, threshold, risk, max_views), risk)
+    return System(opened, made, name, sphere, rule, share, given)
+
+
+def _check_options(models: Any, policy: Any, threads: int, risk: float | None, unknown: float | None) -> None:
+    """Refuse arguments of ``load`` that make no sense, before anything is opened; UsageError."""
+    named = {"models are": models, "a policy is": DEFAULT if policy is None else policy}
+    for what, value in named.items():
         if not isinstance(value, str | Path):
             raise UsageError(f"{what} given by name or path, not {one_line(repr(value))}")
     whole(threads, "the number of threads", 0, MOST_THREADS)
@@ -212,27 +251,16 @@ def load(
         number(risk, "the risk")
     if unknown is not None and number(unknown, "the share of known objects called unknown", 0) >= 1:
         raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
-    Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
-    found = find_models(models)
-    sphere = viewpoints_of(viewpoints)
-    recogniser = open_recogniser(found.recogniser, threads)
-    if unknown and recogniser.novelty is None:
-        raise ModelError(f"{found.recogniser}: cannot tell unknown objects; nextview fit unknown teaches it")
-    if unknown is None:
-        unknown = 0.0 if recogniser.novelty is None else UNKNOWN
-    if not unknown:
-        recogniser.novelty = None  # it takes time
-    if policy is None:
-        policy, made = _default_policy(found.policies, sphere, recogniser)
-    else:
-        made = make_policy_anywhere(with_cards(str(policy), found.policies), sphere, (), recogniser.classes, found.maps)
-    opened = Models(recogniser, open_maps(found.maps, made.needs, threads))
-    if policy in opened.maps:  # a map's own policy goes to the valley for some classes, which the map's card names
-        made = make_policy_anywhere(policy, sphere, opened.valley_classes(policy), recogniser.classes, found.maps)
-    if isinstance(made, MapPeak | SpherePeak):
-        made = replace(made, sphere=_grid_of(opened.maps[made.map_name.removesuffix(SPHERE)], made.sphere))
-    rule = _rule(stopping, Stopping.of(recogniser.calibration, threshold, risk, max_views), risk)
-    return System(opened, made, policy, sphere, rule, unknown, given)
+
+
+def _unknown_share(asked: float | None, recogniser: Recogniser, called: str) -> float:
+    """Share of known objects that may be called unknown; ModelError where the recogniser cannot tell."""
+    can_tell = tells_unknown(recogniser)
+    if asked and not can_tell:
+        raise ModelError(f"{called}: cannot tell unknown objects; nextview fit unknown teaches it")
+    if asked is None:
+        return UNKNOWN if can_tell else 0.0
+    return asked
 
 
 def _rule(given: Stopping | Rule | str | None, usual: Stopping, risk: float | None) -> Stopping:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, elevation_of
 from nextview.recognition.novelty import ViewScore, values_of
+from nextview.recognition.protocol import JointBelief
 from nextview.sensing.plausibility import ViewWarning
 
 
@@ -17,7 +18,8 @@ class View:
 
     index: int  # candidate viewpoint that it was taken from, or the nearest one to where the camera stood
     observation: Observation = field(repr=False)
-    # belief by this view alone, (classes,); even if nothing is seen in it
+    # belief by this view alone, (classes,), by features where the geometry of all views is judged together; even if
+    # nothing is seen in it
     alone: NDArray[np.float64] = field(repr=False)
     belief: NDArray[np.float64] = field(repr=False)  # fused over all views so far, (classes,)
     maps: dict[str, NDArray[np.floating]] = field(repr=False)  # predicted local maps by name, each (rings, 3)
@@ -35,6 +37,9 @@ class View:
     score: ViewScore | None = field(default=None, repr=False)
     warnings: tuple[ViewWarning, ...] = ()  # what is likely to be wrong with the view; usually nothing
     degrees_off: float = 0.0  # between the view that was asked for and where the camera stood; 0 for a first frame
+    # What all views up to this one say together, its poses in the object frame as it was known then; None where the
+    # recogniser judges views one by one, or nothing was seen.
+    joint: JointBelief | None = field(default=None, repr=False)
 
     @property
     def novelty(self) -> float | None:

@@ -15,7 +15,7 @@ from nextview.checks import check_array
 from nextview.errors import ModelError
 from nextview.files import arrays_in, checked_bytes, new_file
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.inference import Features, Recogniser
+from nextview.recognition.inference import Features, NetworkRecogniser
 from nextview.recognition.model_card import FEATURES, ModelCard, find_card
 from nextview.recognition.novelty import ROUNDED, Quantiles, unit
 from nextview.things.approximate import NearestViews, is_large
@@ -233,7 +233,7 @@ def ring_shares(elevations: Float) -> NDArray[np.float32]:
     return np.where(shares > 1e-6, shares, 0).astype(np.float32)
 
 
-class TaughtRecogniser(Recogniser):
+class TaughtRecogniser(NetworkRecogniser):
     """Recognises taught things in each view by what is remembered of them."""
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:
@@ -306,18 +306,3 @@ def by_ring(views: Float) -> NDArray[np.float32]:
 def joined(clean: Float, sensed: Float) -> NDArray[np.float32]:
     """The mean of embeddings of views without and with a sensor's errors: what is remembered."""
     return unit(np.asarray(clean, np.float32) + np.asarray(sensed, np.float32))
-
-
-def open_recogniser(model: str | Path, threads: int = 0) -> Recogniser:
-    """Open a recogniser, or a memory of taught things.
-
-    Args:
-        model: The name of a bundled model, or the path of a card.
-        threads: That the network may take; 0 for all.
-
-    Raises:
-        ModelError: it is missing or damaged.
-    """
-    if find_card(model).memory is None:
-        return Recogniser(model, threads)
-    return TaughtRecogniser(model, threads)

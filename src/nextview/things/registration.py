@@ -399,7 +399,9 @@ def pose_covariances(
 ) -> Float:
     """How well the views determine the poses of aligned hypotheses, given the cameras.
 
-    It is the inverse of the matrix of a fine step, without what is unknown of the cameras.
+    It is the inverse of the matrix of a fine step, without what is unknown of the cameras. Where a
+    hypothesis lies right its outline draws it nowhere, but would if it were displaced: so the
+    outline is added.
 
     Args:
         caster: of all surfaces.
@@ -412,7 +414,42 @@ def pose_covariances(
         metres, both in the object frame, (H, 6, 6) float64.
     """
     left, _ = _equations(caster, alignment, views, FINE[-1], prior)
-    return np.linalg.inv(left[:, :POSE, :POSE])
+    information = left[:, :POSE, :POSE]
+    for number, view in enumerate(views):
+        rendered = render(caster, alignment, view, number)
+        centres = alignment.centres + alignment.cameras[:, number]
+        information = information + _normal_equations(_outline(view, rendered, centres), prior)[0]
+    return np.asarray(np.linalg.inv(information), np.float64)
+
+
+def _outline(view: DepthView, rendered: Rendered, centres: Float) -> _Pulls:
+    """What holds hypotheses that lie right, with these centres, (H, 3), at the thing's outline.
+
+    These are the pixels of the thing next to others where something farther, or nothing, shows:
+    the thing ends there, and is not hidden.
+    """
+    thing = (view.kind == THING).reshape(view.shape)
+    depth = np.where(view.kind == NOT_MEASURED, 0, view.depth).reshape(view.shape)
+    own = np.where(thing, view.depth.reshape(view.shape), 0)
+    inwards = np.zeros((*view.shape, 2), np.float32)
+    for axis in (0, 1):
+        for step in (-1, 1):
+            beside = np.roll(depth, -step, axis)
+            ends = thing & ~np.roll(thing, -step, axis) & (beside > own + HIDING)
+            inwards[..., 1 - axis] -= step * ends
+
+    length = np.linalg.norm(inwards, axis=2).ravel()
+    rim = (length > 0) & np.isfinite(rendered.depth)
+    in_image = inwards.reshape(-1, 2) / np.maximum(length, 1)[:, None]
+    aside = in_image @ view.camera_axes[:, :2].T.astype(np.float32)
+
+    shown = np.where(rim, rendered.depth, 0)
+    points = view.origin.astype(np.float32) + view.rays * shown[..., None]
+    arms = points - centres.astype(np.float32)[:, None]
+    deviation = OUTLINE_PIXELS * view.pitch * shown
+    weights = rim / (SURFACE_ERROR**2 + deviation**2)
+    directions = np.broadcast_to(aside, arms.shape)
+    return _Pulls(arms, directions, np.zeros_like(shown), weights.astype(np.float32))
 
 
 def _normal_equations(pulls: _Pulls, prior: RegistrationPrior) -> tuple[Float, Float]:

@@ -30,6 +30,7 @@ class TaughtThings:
         residuals: how badly known things are explained, in the same order; None if that was not
             fitted.
         symmetries: of each thing, in the same order.
+        rows: hypotheses of the memory that are of these things, (R,) int64.
     """
 
     def __init__(
@@ -63,11 +64,11 @@ class TaughtThings:
         number = {known.index(name): k for k, name in enumerate(self.names)}
         rows = [row for row, thing in enumerate(memory.thing.tolist()) if thing in number]
         owners = np.array([number[int(memory.thing[row])] for row in rows])
-        self._rows = np.array(rows)
+        self.rows = np.array(rows)
         self.recogniser = recogniser
         self.residuals = residuals
         self.symmetries = tuple(about.things[known.index(name)].symmetries for name in self.names)
-        self.verifier = Verifier(surfaces, owners, memory.rotations[self._rows], weights)
+        self.verifier = Verifier(surfaces, owners, memory.rotations[self.rows], weights)
 
     @classmethod
     def of(cls, recogniser: TaughtRecogniser) -> "TaughtThings | None":
@@ -137,8 +138,22 @@ class TaughtThings:
         calibration = self.recogniser.calibration
         classes = len(self.recogniser.classes)
         total = log_evidence.sum(0)
-        joint = calibration.joint(total, len(observations), classes, np.zeros(()))[self._rows]
-        return self.verifier(observations, joint / joint.sum())
+        joint = calibration.joint(total, len(observations), classes, np.zeros(()))
+        return self.judge(observations, joint)
+
+    def judge(self, observations: Sequence[Observation], joint: Float) -> Verified:
+        """Recognise the thing that some views show, of which the features are summed up.
+
+        Args:
+            observations: views that show one thing, all in one object frame.
+            joint: belief in each hypothesis of the memory and azimuth bin by features and size,
+                (H, bins), see ``Calibration.joint``, for an azimuth of zero.
+
+        Returns:
+            The belief in each thing, and the poses.
+        """
+        known = joint[self.rows]
+        return self.verifier(observations, known / known.sum())
 
 
 def weights_of(verification: Verification, where: str) -> EvidenceWeights:

@@ -1,0 +1,100 @@
+"""What a recogniser is: observations in, what is believed of each class out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.geometry.observation import Observation
+from nextview.recognition.belief import Calibration
+from nextview.recognition.evidence import Evidence
+from nextview.recognition.novelty import Quantiles
+from nextview.recognition.poses import PoseCandidate
+
+Float = NDArray[np.float64]
+
+
+@runtime_checkable
+class Recogniser(Protocol):
+    """Says of single views which class they speak for. What it says of several can be summed.
+
+    The ONNX recogniser, the memory of taught things, and ``own_recogniser.OwnRecogniser`` around an
+    object of yours are of this kind.
+
+    Attributes:
+        name: what to call it in messages.
+        classes: names of the classes, unique.
+        azimuth_bins: how many azimuths it tells apart; 0 if it tells none.
+        calibration: how far the sum of what it says is to be trusted.
+        novelty: how novel objects of known classes are to it; None if it does not tell.
+    """
+
+    classes: tuple[str, ...]
+    azimuth_bins: int
+    calibration: Calibration
+    novelty: Quantiles | None
+
+    @property
+    def name(self) -> str:
+        """What to call it in messages."""
+
+    def __call__(self, observations: Sequence[Observation]) -> Evidence:
+        """What each of B views speaks for.
+
+        Args:
+            observations: the views; they need not be of one object.
+
+        Returns:
+            Logits of the classes, (B, classes), and what else it knows.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class JointBelief:
+    """What all views of one object say together.
+
+    Attributes:
+        belief: in each class, (classes,) float64, sums to 1.
+        poses: that the object may have, the likeliest first, in the object frame; () if none is
+            known.
+        camera_error: by how much errors of the cameras' places displace these poses, millimetres,
+            one standard deviation.
+        p_value: share of known objects that are explained as badly as this one, 0 to 1; None if
+            that is not known.
+        why_no_pose: why there is no pose, in words; "" if there is one, or none was to be expected.
+    """
+
+    belief: Float
+    poses: tuple[PoseCandidate, ...] = ()
+    camera_error: float = 0.0
+    p_value: float | None = None
+    why_no_pose: str = ""
+
+
+@runtime_checkable
+class JudgesTogether(Protocol):
+    """A recogniser that judges all views of an object together, where a sum would not do.
+
+    Policies still see what it says of single views.
+    """
+
+    def together(
+        self, observations: Sequence[Observation], total: NDArray[np.floating], counted: int
+    ) -> JointBelief:
+        """What is believed of an object.
+
+        Args:
+            observations: all views so far in which anything was seen, in one object frame; at
+                least one.
+            total: sum of the log-evidence of these views, (D,), see ``belief.log_evidence_of``.
+            counted: number of these views.
+        """
+
+
+def tells_unknown(recogniser: Recogniser) -> bool:
+    """Whether a recogniser may say that an object is of none of its classes."""
+    return recogniser.novelty is not None or isinstance(recogniser, JudgesTogether)

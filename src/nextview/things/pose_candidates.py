@@ -1,0 +1,96 @@
+"""What was found of poses, as a result gives it: each pose once, with how sure it is."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.geometry.observation import Observation
+from nextview.recognition.poses import PoseCandidate, distinct
+from nextview.things.depth_view import depth_view
+from nextview.things.registration import Alignment, pose_covariances
+from nextview.things.taught import TaughtThings
+from nextview.things.verifier import FINE_SIDE, Verified, Verifier
+
+Float = NDArray[np.float64]
+
+LEAST_PROBABILITY = 0.01  # of a pose that is named beside the likeliest one
+
+
+def candidates_of(
+    things: TaughtThings,
+    found: Verified,
+    observations: Sequence[Observation],
+    labels: NDArray[np.integer],
+) -> tuple[PoseCandidate, ...]:
+    """The poses that a thing may have, the likeliest first, in the object frame.
+
+    Args:
+        things: what found them.
+        found: what they found.
+        observations: the views that they were asked with.
+        labels: class of each of the things, (T,).
+
+    Returns:
+        Different poses, of one or several things.
+    """
+    candidates = []
+    for thing, pose, probability in zip(
+        found.things, found.poses, found.probabilities, strict=True
+    ):
+        surface = things.verifier.caster.surfaces[thing]
+        candidate = PoseCandidate(
+            thing=surface.name,
+            label=int(labels[thing]),
+            pose=pose,
+            probability=float(probability),
+            centre=surface.centre.astype(np.float64),
+            vertices=surface.vertices,
+            faces=surface.faces,
+            symmetry=things.symmetries[thing],
+        )
+        candidates.append(candidate)
+
+    rows = [
+        row
+        for row in distinct(candidates)
+        if row == 0 or candidates[row].probability > LEAST_PROBABILITY
+    ]
+    total = sum(candidates[row].probability for row in rows)
+    deviations = _deviations(things.verifier, found, observations, np.array(rows))
+    kept = []
+    for row, (degrees, millimetres) in zip(rows, deviations, strict=True):
+        share = candidates[row].probability / total
+        candidate = replace(
+            candidates[row], probability=share, degrees=degrees, millimetres=millimetres
+        )
+        kept.append(candidate)
+    return tuple(kept)
+
+
+def _deviations(
+    verifier: Verifier,
+    found: Verified,
+    observations: Sequence[Observation],
+    rows: NDArray[np.int64],
+) -> list[tuple[float, float]]:
+    """Standard deviations of turn, degrees, and place, millimetres, of some hypotheses."""
+    things = found.things[rows]
+    rotations = found.poses[rows, :3, :3]
+    own_centres = verifier.caster.centres[things].astype(np.float64)
+    centres = np.einsum("hij,hj->hi", rotations, own_centres) + found.poses[rows, :3, 3]
+    alignment = Alignment(
+        things=things,
+        ups=verifier.rotations[found.resting[rows], 2],
+        rotations=rotations,
+        centres=centres,
+        cameras=found.cameras[rows],
+    )
+
+    views = [depth_view(observation, FINE_SIDE) for observation in observations]
+    shown = [view for view in views if view is not None]
+    covariances = pose_covariances(verifier.caster, alignment, shown, verifier.prior)
+    turns = np.degrees(np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2)))
+    places = 1000 * np.sqrt(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))
+    return list(zip(turns.tolist(), places.tolist(), strict=True))

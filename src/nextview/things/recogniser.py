@@ -1,0 +1,157 @@
+"""Taught things as a recogniser: by features alone, or verified by their geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import ModelError, ObservationError
+from nextview.geometry.observation import Observation
+from nextview.recognition.inference import NetworkRecogniser
+from nextview.recognition.model_card import find_card
+from nextview.recognition.protocol import JointBelief
+from nextview.things.memory import TaughtRecogniser, open_memory
+from nextview.things.pose_candidates import candidates_of
+from nextview.things.taught import TaughtThings
+from nextview.things.verifier import Verified
+
+Float = NDArray[np.float64]
+
+NO_SCALE = "the scale of what is seen is not known in metres"
+AXES = 3  # along each of which a camera's place errs
+
+
+class VerifiedRecogniser(TaughtRecogniser):
+    """Recognises taught things by all that was seen: features and size propose, geometry decides.
+
+    What it says of single views, which policies see, is what the memory's features and sizes say.
+    """
+
+    def __init__(self, model: str | Path, threads: int = 0) -> None:
+        """Open a memory that holds surfaces.
+
+        Args:
+            model: name of a bundled memory, or the path of its card.
+            threads: of ONNX Runtime, 0 for one on each core.
+
+        Raises:
+            ModelError: see ``open_memory``, or the memory knows no geometry.
+        """
+        super().__init__(model, threads)
+        assert len(self.things.names)  # made now: what is wrong with it is said when it is opened
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is made of the memory, and leads back to it."""
+        return {name: value for name, value in vars(self).items() if name != "things"}
+
+    @cached_property
+    def things(self) -> TaughtThings:
+        """The things whose geometry is known, ready to be compared with what is seen."""
+        found = TaughtThings.of(self)
+        if found is None:
+            raise ModelError(f"{self.card.card_path}: knows no geometry of its things")
+        return found
+
+    @cached_property
+    def labels(self) -> NDArray[np.int64]:
+        """Class of each thing whose geometry is known, (T,) int64."""
+        of_hypotheses = np.array(self.calibration.hypotheses)[self.things.rows]
+        labels = np.zeros(len(self.things.names), np.int64)
+        labels[self.things.verifier.owners] = of_hypotheses
+        return labels
+
+    def together(
+        self, observations: Sequence[Observation], total: NDArray[np.floating], counted: int
+    ) -> JointBelief:
+        """What is believed of an object by all views of it.
+
+        Args:
+            observations: the views, in one object frame; something is seen in each.
+            total: sum of their log-evidence, (D,).
+            counted: how many they are.
+
+        Returns:
+            The belief in each class and the poses. By features alone, with the reason why, where
+            the scale is not known, or all that is likely has no known geometry.
+        """
+        classes = len(self.classes)
+        alone = self.calibration.belief(total, counted, classes)
+        if any(observation.radius is None for observation in observations):
+            return JointBelief(alone, why_no_pose=NO_SCALE)
+
+        joint = self.calibration.joint(total, counted, classes, np.zeros(()))
+        of_hypotheses = joint.sum(1)
+        share = float(of_hypotheses[self.things.rows].sum())
+        if share <= 0:
+            return JointBelief(alone, why_no_pose=self._no_geometry(alone))
+        try:
+            found = self.things.judge(observations, joint)
+        except ObservationError as error:
+            return JointBelief(alone, why_no_pose=str(error))
+        return self._believed(observations, found, of_hypotheses, share)
+
+    def _believed(
+        self,
+        observations: Sequence[Observation],
+        found: Verified,
+        of_hypotheses: Float,
+        share: float,
+    ) -> JointBelief:
+        """The belief in classes that follows from that in things.
+
+        Geometry decides among the things whose surfaces are known. What features and size believe
+        of all others stays.
+        """
+        others = of_hypotheses.copy()
+        others[self.things.rows] = 0
+        belief = np.zeros(len(self.classes))
+        np.add.at(belief, list(self.calibration.hypotheses), others)
+        np.add.at(belief, self.labels, share * found.belief)
+        belief /= belief.sum()
+
+        best = int(belief.argmax())
+        if best not in self.labels:
+            return JointBelief(belief, why_no_pose=self._no_geometry(belief))
+        poses = candidates_of(self.things, found, observations, self.labels)
+        return JointBelief(belief, poses, self._camera_error(observations), self._p_value(found))
+
+    def _no_geometry(self, belief: Float) -> str:
+        """Why there is no pose of the class believed most, in words."""
+        return f"the geometry of {self.classes[int(belief.argmax())]} is not known in metres"
+
+    def _p_value(self, found: Verified) -> float | None:
+        """Share of known things that are explained as badly by the likeliest hypothesis."""
+        residuals = self.things.residuals
+        if residuals is None:
+            return None
+        return residuals.p_value(found.residual, int(found.things[0]), found.mean.shape[1])
+
+    def _camera_error(self, observations: Sequence[Observation]) -> float:
+        """By how much errors of the cameras' places displace a pose, millimetres."""
+        if all(observation.exact for observation in observations):
+            return 0.0
+        one = 1000 * np.sqrt(AXES) * self.things.verifier.prior.camera
+        return float(one / np.sqrt(len(observations)))
+
+
+def open_recogniser(model: str | Path, threads: int = 0) -> NetworkRecogniser:
+    """Open a recogniser, or a memory of taught things.
+
+    Args:
+        model: The name of a bundled model, or the path of a card.
+        threads: That the network may take; 0 for all.
+
+    Raises:
+        ModelError: it is missing or damaged.
+    """
+    if find_card(model).memory is None:
+        return NetworkRecogniser(model, threads)
+    _, memory = open_memory(model)
+    if memory.surfaces.counts.any():
+        return VerifiedRecogniser(model, threads)
+    return TaughtRecogniser(model, threads)

@@ -1,0 +1,174 @@
+"""A recogniser of a user's own: by views or by all views together, and what is refused at the door."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+import nextview
+from nextview.data.samples import sample_mesh
+from nextview.errors import ModelError, UsageError
+from nextview.policies.base import Evidence
+from nextview.recognition.own_recogniser import own_recogniser
+from nextview.recognition.poses import PoseCandidate
+from nextview.recognition.protocol import JointBelief
+
+NAMES = ("chair", "monitor", "table")
+
+
+class NearestPoints:
+    """A geometric matcher: how near all seen points are to those of each mesh, turned by steps."""
+
+    classes = NAMES
+
+    def __init__(self):
+        self.trees = [cKDTree(sample_points(name)) for name in NAMES]
+
+    def distance(self, observations, tree) -> float:
+        points = np.concatenate([seen.points[::8] for seen in observations])
+        angles = np.arange(12) * np.pi / 6
+        turned = [points @ turn(angle).T for angle in angles]
+        return min(tree.query(each)[0].mean() for each in turned)
+
+    def belief(self, observations):
+        far = np.array([self.distance(observations, tree) for tree in self.trees])
+        likelihood = np.exp(-far / 0.02)
+        return likelihood / likelihood.sum()
+
+
+def turn(angle: float) -> np.ndarray:
+    return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+
+
+def sample_points(name: str) -> np.ndarray:
+    camera = nextview.SimulatedCamera(sample_mesh(name), 96)
+    return np.concatenate([camera.observe(pose).points for pose in nextview.ViewSphere.named("12").poses])
+
+
+class Filled:
+    """By how much of the picture is filled: adds up over views."""
+
+    classes = ("much", "little")
+
+    def __call__(self, observations):
+        filled = np.array([seen.visible / seen.depth.size for seen in observations])
+        return np.stack([filled, 0.3 - filled], 1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_geometric_matcher_of_ones_own_judges_all_views(name):
+    system = nextview.load(recogniser=NearestPoints(), threads=1, threshold=0.9, max_views=3)
+    assert system.classes == NAMES
+    assert "NearestPoints" in repr(system)
+    result = system.recognise(sample_mesh(name), seed=4)
+    assert result.answer == name
+    seen = [view.observation for view in result.views]
+    np.testing.assert_allclose(result.views[-1].belief, NearestPoints().belief(seen))
+    assert (result.pose, result.why_no_pose) == (None, "")
+
+
+def test_what_views_speak_for_adds_up():
+    system = nextview.load(recogniser=Filled(), threads=1, threshold=1.0, max_views=2)
+    result = system.recognise(sample_mesh("table"), seed=0)
+    logits = Filled()([view.observation for view in result.views]).sum(0)
+    np.testing.assert_allclose(result.views[-1].belief, np.exp(logits) / np.exp(logits).sum())
+
+
+def test_poses_of_ones_own_arrive_in_the_result():
+    pose = np.eye(4)
+    pose[:3, 3] = (0.1, 0.2, 0.3)
+
+    class Posed(NearestPoints):
+        def belief(self, observations):
+            found = super().belief(observations)
+            best = int(found.argmax())
+            candidate = PoseCandidate(NAMES[best], best, pose, 1.0, degrees=3.0, millimetres=4.0)
+            return JointBelief(found, (candidate,), p_value=0.5)
+
+    result = nextview.load(recogniser=Posed(), threads=1).recognise(sample_mesh("chair"), seed=1)
+    np.testing.assert_array_equal(result.pose, pose)
+    assert (result.pose_uncertainty.degrees, result.novelty) == (3.0, 0.5)
+
+
+class Fails(Filled):
+    def __call__(self, observations):
+        return 1 / 0
+
+
+def says(value, **more):
+    return type("Says", (), {"classes": ("a", "b"), "__call__": lambda self, seen: value, **more})()
+
+
+def believes(value):
+    return type("Believes", (), {"classes": ("a", "b"), "belief": lambda self, seen: value})()
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        (Fails(), "recogniser Fails raised ZeroDivisionError: .*test_own_recogniser.py"),
+        (says(np.zeros((1, 3))), r"gives logits of \(1, 2\) numbers, not float64 of the shape \(1, 3\)"),
+        (says(np.zeros(2)), r"of the shape \(2,\)"),
+        (says([["a", "b"]]), r"gives logits of \(1, 2\) numbers"),
+        (says([[1], [1, 2]]), r"gives logits of \(1, 2\) numbers"),
+        (says(np.array([[0, np.nan]])), "gives logits that are not finite"),
+        (says(Evidence(np.zeros((1, 2)))), None),
+        (says(Evidence(np.zeros((1, 2))), azimuth_bins=8), r"gives azimuth bins of \(1, 2, 8\)"),
+        (believes([0.5, 0.6]), "probabilities of the classes, which sum to 1, not to 1.1"),
+        (believes([-0.5, 1.5]), "probabilities of the classes"),
+        (believes([1.0]), r"gives a belief of \(2,\) numbers"),
+        (believes(None), r"gives a belief of \(2,\) numbers"),
+        (believes(JointBelief(np.array([0.5, 0.5]), p_value=2.0)), "a p-value is 0 to 1"),
+        (believes(JointBelief(np.array([0.5, 0.5]), ("here",))), "a pose is a PoseCandidate, not a str"),
+        (
+            believes(JointBelief(np.array([0.5, 0.5]), (PoseCandidate("a", 0, 2 * np.eye(4), 1.0),))),
+            "not a rigid motion",
+        ),
+        (believes(JointBelief(np.array([0.5, 0.5]), (PoseCandidate("a", 5, np.eye(4), 1.0),))), "of class 5"),
+    ],
+)
+def test_what_it_says_is_checked(given, sentence):
+    system = nextview.load(recogniser=given, threads=1)
+    if sentence is None:
+        assert system.recognise(sample_mesh("chair")).seen
+        return
+    with pytest.raises(ModelError, match=sentence):
+        system.recognise(sample_mesh("chair"))
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "sentence"),
+    [
+        (object(), ModelError, "can be called with observations, or has a method belief"),
+        (SimpleNamespace(belief=print), ModelError, "has no classes .AttributeError"),
+        (SimpleNamespace(belief=print, classes="chair"), ModelError, "are a tuple of names, not 'chair'"),
+        (SimpleNamespace(belief=print, classes=()), ModelError, "are a tuple of names"),
+        (SimpleNamespace(belief=print, classes=("a", 2)), ModelError, "are a tuple of names"),
+        (SimpleNamespace(belief=print, classes=("a", "a")), ModelError, "have the same name"),
+        (SimpleNamespace(belief=print, classes=("a",), calibration=2), ModelError, "calibration of recogniser"),
+        (SimpleNamespace(belief=print, classes=("a",), azimuth_bins=-1), UsageError, "number of azimuth bins"),
+        (Filled, ModelError, "not the class Filled: call it first"),
+        ("here", UsageError, "is named MODULE:NAME"),
+        ("nowhere_at_all:Thing", UsageError, "cannot be made .ModuleNotFoundError"),
+    ],
+)
+def test_what_is_no_recogniser_is_refused_at_the_door(given, error, sentence):
+    with pytest.raises(error, match=sentence):
+        nextview.load(recogniser=given, threads=1)
+
+
+def test_it_is_named_as_module_and_name_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    call = "def __call__(self, seen): return [[1, 0]] * len(seen)"
+    code = f"class Thing:\n    classes = ('a', 'b')\n    {call}\n"
+    (tmp_path / "recogniser_of_mine.py").write_text(code)
+    system = nextview.load(recogniser="recogniser_of_mine:Thing", threads=1)
+    assert system.recognise(sample_mesh("chair")).answer == "a"
+    with pytest.raises(ModelError, match="cannot tell unknown objects"):
+        nextview.load(recogniser="recogniser_of_mine:Thing", unknown=0.1)
+
+
+def test_the_packages_own_kinds_are_taken_as_they_are():
+    recogniser = nextview.load(threads=1).models.recogniser
+    assert own_recogniser(recogniser) is recogniser

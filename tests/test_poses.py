@@ -1,0 +1,273 @@
+"""Taught things through the front door: named by their geometry, with poses where a robot needs them."""
+
+import pickle
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from pipeline import INTRINSICS, TABLE, box, cast, pose_at
+from scipy.spatial.transform import Rotation
+from test_household import bottle, mug
+
+import nextview
+from nextview.geometry.mesh import load_mesh, make_mesh
+from nextview.geometry.resting import rotated
+from nextview.learning.learn import learn
+from nextview.recognition.belief import FixedLength
+from nextview.recognition.poses import PoseCandidate, uncertainty_of
+from nextview.sensing import Frame
+from nextview.things.memory import TaughtRecogniser
+from nextview.things.recogniser import VerifiedRecogniser
+from nextview.things.taught import TaughtThings
+from nextview.things.unknown import KnownResiduals
+
+ORIGIN = np.array([0.3, -0.1, 0.2])  # of the scans, far from the things
+SPOT = np.array([0.4, -0.25, 0.0])  # on the table
+
+
+def l_block() -> trimesh.Trimesh:
+    parts = [box((0.16, 0.04, 0.04)), box((0.04, 0.08, 0.04), (-0.06, 0.06, 0))]
+    return trimesh.util.concatenate(parts)
+
+
+THINGS = {"block": l_block, "bottle": bottle, "carton": lambda: box((0.1, 0.06, 0.16)), "mug": mug}
+
+
+@pytest.fixture(scope="session")
+def metric_scans(shared):
+    """Scans of four things in metres, each with its origin elsewhere."""
+
+    def make(folder):
+        for name, thing in THINGS.items():
+            thing().apply_translation(ORIGIN).export(folder / f"{name}.ply")
+
+    return shared("metric_scans", make)
+
+
+@pytest.fixture(scope="session")
+def known(shared, metric_scans):
+    """The models that know them."""
+
+    def make(folder):
+        learn(metric_scans, folder / "mine", unit="m", upright=True, workers=0)
+
+    return shared("known", make) / "mine"
+
+
+@pytest.fixture(scope="module")
+def meshes(metric_scans):
+    return {name: load_mesh(metric_scans / f"{name}.ply", unit="m") for name in THINGS}
+
+
+def session_of(system, views: int, start: int = 0, **more) -> nextview.Session:
+    """A session that does not stop before so many views."""
+    return replace(system, stopping=FixedLength(max_views=views)).session(start=start, **more)
+
+
+@pytest.fixture(scope="module")
+def system(known):
+    return nextview.load(models=known, threads=1)
+
+
+def recogniser_of(known) -> VerifiedRecogniser:
+    return VerifiedRecogniser(known / "memory.json", 1)
+
+
+def placed(name: str, yaw: float, at=SPOT) -> np.ndarray:
+    """Pose in the world, (4, 4), of a scan that stands on the table, turned by ``yaw``."""
+    scan = THINGS[name]().apply_translation(ORIGIN)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0, 0, yaw]).as_matrix()
+    middle = np.array([*scan.bounds.mean(0)[:2], scan.bounds[0, 2]])
+    pose[:3, 3] = at - pose[:3, :3] @ middle
+    return pose
+
+
+def frame_of(name: str, pose: np.ndarray, camera: np.ndarray, seed=0, sigma=0.001, posed=True) -> Frame:
+    """A noisy depth frame of a scan on the table."""
+    scan = THINGS[name]().apply_translation(ORIGIN).apply_transform(pose)
+    depth, _ = cast([scan, TABLE], camera)
+    noise = sigma * depth**2 * np.random.default_rng(seed).normal(size=depth.shape)
+    measured = np.where(depth > 0, depth + noise, 0).astype(np.float32)
+    return Frame(measured, INTRINSICS, camera if posed else None, pixel_centre=0.5)
+
+
+def off_by(found: np.ndarray, true: np.ndarray, name: str) -> tuple[float, float]:
+    """Degrees, and millimetres at the middle of the thing, between two poses."""
+    turn = Rotation.from_matrix(found[:3, :3] @ true[:3, :3].T).magnitude()
+    middle = np.append(THINGS[name]().bounds.mean(0) + ORIGIN, 1)
+    return float(np.degrees(turn)), float(1000 * np.linalg.norm(((found - true) @ middle)[:3]))
+
+
+@pytest.mark.parametrize("name", ["block", "mug"])
+def test_a_pose_is_where_the_thing_is_in_the_world(system, name):
+    true = placed(name, 0.7)
+    session = session_of(system, 2, distance=0.5)
+    for seed, (up, around) in enumerate([(35, 20), (40, 100)]):
+        session.update(frame_of(name, true, pose_at(up, around, 0.5, np.add(SPOT, (0, 0, 0.03))), seed))
+        result = session.result
+        assert (result.answer, result.pose_frame) == (name, "world")
+        turn, moved = off_by(result.pose, true, name)
+        assert turn < 2
+        assert moved < 2.5
+    assert 0.1 < result.pose_uncertainty.degrees < 5
+    # Two cameras are each taken to be off by millimetres.
+    assert 1 < result.pose_uncertainty.millimetres < 10
+    assert result.pose_candidates[0].probability > 0.9
+    assert "in the world, ±" in repr(result)
+
+
+def test_a_frame_without_a_pose_gives_it_in_the_cameras_frame(system):
+    true = placed("mug", 0.2)
+    camera = pose_at(40, 60, 0.5, np.add(SPOT, (0, 0, 0.05)))
+    session = system.session(object=nextview.sensing.ObservedObject(up=None))
+    session.update(frame_of("mug", true, camera, posed=False))
+    result = session.result
+    assert (result.answer, result.pose_frame) == ("mug", "camera")
+    turn, moved = off_by(result.pose, np.linalg.inv(camera) @ true, "mug")
+    assert turn < 2
+    assert moved < 2
+    assert result.pose_uncertainty.millimetres < 2  # nothing is said of where the camera stands
+
+
+@pytest.mark.parametrize("name", list(THINGS))
+def test_simulated_cameras_give_it_in_the_object_frame(system, meshes, name):
+    mesh = meshes[name]
+    turn = Rotation.from_rotvec([0, 0, 0.9]).as_matrix()
+    turned = rotated(mesh, turn)
+    true = np.eye(4)
+    true[:3, :3] = turn
+    true[:3, 3] = -(turn @ mesh.centre + turned.centre)
+    result = system.recognise(turned, seed=2)
+    assert (result.answer, result.pose_frame) == (name, "object")
+    degrees, millimetres = off_by(result.pose, true, name)
+    assert millimetres < 2
+    np.testing.assert_allclose(sum(each.probability for each in result.pose_candidates), 1)
+    if name in ("block", "mug"):
+        assert degrees < 2
+    else:  # a carton has two azimuths, a bottle any
+        assert len(result.pose_candidates) > 1
+        assert result.pose_uncertainty.degrees > 60
+
+
+def test_the_last_view_changes_nothing_where_nothing_is_seen(system, meshes):
+    session = session_of(system, 3, start=3)
+    camera = nextview.SimulatedCamera(meshes["mug"])
+    seen = camera.observe(system.sphere.poses[3])
+    first = session.update(seen)
+    empty = replace(seen, depth=np.zeros_like(seen.depth), pose=system.sphere.poses[9])
+    second = session.update(empty)
+    assert second.joint is first.joint
+    np.testing.assert_array_equal(first.belief, second.belief)
+    third = session.update(camera.observe(system.sphere.poses[12]))
+    assert third.joint is not first.joint
+    assert session.result.answer == "mug"
+
+
+def test_views_are_judged_together_once_an_update(known, monkeypatch):
+    recogniser = recogniser_of(known)
+    asked = []
+    judge = type(recogniser.things).judge
+
+    def counted(self, observations, joint):
+        asked.append(len(observations))
+        return judge(self, observations, joint)
+
+    monkeypatch.setattr(type(recogniser.things), "judge", counted)
+    system = nextview.load(models=known, threads=1, recogniser=recogniser)
+    session = session_of(system, 3, distance=0.5)
+    true = placed("block", 0.1)
+    for around in (20, 80, 140):  # the object frame gets better by each
+        session.update(frame_of("block", true, pose_at(35, around, 0.5, SPOT), around))
+    assert session.object.revision > 0
+    assert asked == [1, 2, 3]
+
+
+def test_without_a_scale_features_answer_and_it_says_so(system, known, meshes):
+    mug_of_no_size = replace(meshes["mug"], unit=None)
+    result = system.recognise(mug_of_no_size, seed=2)
+    assert result.pose is None
+    assert result.pose_candidates == ()
+    assert "not known in metres" in result.why_no_pose
+    plain = nextview.load(models=known, recogniser=TaughtRecogniser(known / "memory.json", 1))
+    np.testing.assert_array_equal(plain.recognise(mug_of_no_size, seed=2).views[0].belief, result.views[0].belief)
+
+
+def test_what_has_no_geometry_is_known_by_features_alone(known, meshes):
+    recogniser = recogniser_of(known)
+    surfaces = [each for each in recogniser.things.verifier.caster.surfaces if each.name != "mug"]
+    recogniser.things = TaughtThings(recogniser, surfaces)
+    system = nextview.load(models=known, threads=1, recogniser=recogniser)
+    result = system.recognise(meshes["mug"], seed=2)
+    assert result.answer == "mug"
+    assert result.pose is None
+    assert "the geometry of mug is not known" in result.why_no_pose
+    assert system.recognise(meshes["block"], seed=2).pose is not None
+
+
+def test_what_no_scan_explains_is_unknown_with_a_p_value(known, meshes):
+    usual = KnownResiduals(np.full(len(meshes), 0.1), (np.linspace(-0.1, 0.1, 99),))
+    recogniser = recogniser_of(known)
+    recogniser.things.residuals = usual
+    system = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0.02)
+    stranger = trimesh.util.concatenate([box((0.1, 0.1, 0.02)), box((0.02, 0.02, 0.12), (0, 0, 0.05))])
+    result = system.recognise(make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1)
+    assert result.unknown
+    assert (result.answer, result.pose, result.novelty) == (None, None, pytest.approx(0.01))
+    assert "1 % of taught things are explained as badly by their scans" in repr(result)
+    taught = system.recognise(meshes["mug"], seed=1)
+    assert (taught.answer, taught.unknown) == ("mug", False)
+    assert taught.novelty > 0.5
+    never = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0)
+    assert not never.recognise(make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1).unknown
+
+
+@pytest.mark.parametrize("again", [deepcopy, lambda session: pickle.loads(pickle.dumps(session))])
+def test_a_copy_of_a_session_with_geometry_goes_on_alike(system, meshes, again):
+    session = session_of(system, 2, start=5)
+    camera = nextview.SimulatedCamera(meshes["block"])
+    session.update(camera.observe(session.pose))
+    other = again(session)
+    assert len(other.views) == 1
+    assert repr(other.run(camera)) == repr(session.run(camera))
+
+
+def candidate(turn=(0, 0, 0), at=(0, 0, 0), probability=1.0, symmetry=None, degrees=0.0, millimetres=0.0):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(np.radians(turn)).as_matrix()
+    pose[:3, 3] = at
+    return PoseCandidate("thing", 0, pose, probability, degrees, millimetres, symmetry=symmetry)
+
+
+class About:
+    """A symmetry about an axis."""
+
+    def __init__(self, axis, order):
+        self.axis, self.order = axis, order
+
+
+def test_the_uncertainty_is_the_root_mean_square_of_all_candidates():
+    both = [candidate(probability=0.75, degrees=1.0, millimetres=2.0), candidate((0, 0, 90), (0.01, 0, 0), 0.25)]
+    found = uncertainty_of(both, camera=3.0)
+    assert found.degrees == pytest.approx(np.sqrt(0.75 * 1 + 0.25 * 90**2))
+    assert found.millimetres == pytest.approx(np.sqrt(0.75 * 4 + 0.25 * 100 + 9))
+
+
+@pytest.mark.parametrize(
+    ("symmetry", "turn", "left"),
+    [
+        (None, (0, 0, 170), 170),
+        ((), (0, 0, 170), 170),
+        ((About((0, 0, 1), 2),), (0, 0, 170), 10),
+        ((About((0, 0, 1), 4),), (0, 0, 100), 10),
+        ((About((0, 0, 1), 0),), (0, 0, 123), 0),
+        ((About((0, 0, 1), 0),), (0, 20, 0), 20),
+        ((About((0, 0, 1), 0), About((1, 0, 0), 2)), (180, 0, 0), 0),
+        ((About((0, 0, 1), 0), About((1, 0, 0), 2)), (0, 175, 0), 5),
+    ],
+)
+def test_turns_that_change_nothing_are_no_uncertainty(symmetry, turn, left):
+    both = [candidate(probability=0.0, symmetry=symmetry), candidate(turn, probability=1.0, symmetry=symmetry)]
+    assert uncertainty_of(both).degrees == pytest.approx(left, abs=1e-5)
