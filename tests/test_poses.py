@@ -208,7 +208,7 @@ def test_what_has_no_geometry_is_known_by_features_alone(known, meshes):
 
 
 def test_what_no_scan_explains_is_unknown_with_a_p_value(known, meshes):
-    usual = KnownResiduals(np.full(len(meshes), 0.1), (np.linspace(-0.1, 0.1, 99),))
+    usual = KnownResiduals(np.full(len(meshes), 0.3), (np.linspace(-0.3, 0.3, 99),))
     recogniser = recogniser_of(known)
     recogniser.things.residuals = usual
     system = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0.02)
