@@ -30,6 +30,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -105,7 +106,7 @@ def _tube(centres: Float, radius: float) -> trimesh.Trimesh:
     parts = [trimesh.creation.icosphere(subdivisions=2, radius=radius) for _ in centres]
     for ball, centre in zip(parts, centres, strict=True):
         ball.apply_translation(centre)
-    for begin, end in zip(centres[:-1], centres[1:], strict=True):
+    for begin, end in pairwise(centres):
         rod = trimesh.creation.cylinder(radius=radius, segment=[begin, end], sections=16)
         parts.append(rod)
     return trimesh.util.concatenate(parts)
@@ -306,9 +307,7 @@ def make_pairs(scans: list[Path], models: list[Path], count: int, seed: int) -> 
     return made
 
 
-def _changed(
-    body: trimesh.Trimesh, change: str, rng: np.random.Generator
-) -> tuple[Pair, float] | None:
+def _changed(body: trimesh.Trimesh, change: str, rng: np.random.Generator) -> tuple[Pair, float] | None:
     """A pair of a body that differs in the wanted share of the views; None if no place was found."""
     for _ in range(PLACES_TRIED):
         place = place_on_side(body, rng)

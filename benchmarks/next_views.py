@@ -48,17 +48,17 @@ from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
-from nextview.geometry.viewsphere import ViewSphere, azimuth_of, direction_of
+from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, Policy, best_view
 from nextview.policies.baselines import Furthest, RandomAll, Spread
 from nextview.policies.discriminate import Discriminate
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.memory import TaughtRecogniser
 from nextview.simulation.scene import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.things.expected_views import Hypotheses, Outlook
+from nextview.things.memory import TaughtRecogniser
 from nextview.things.registration import rotation_about_z
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
@@ -92,9 +92,7 @@ class Setting:
 class Episode:
     """A thing that can be looked at from all viewpoints. What was computed once is kept."""
 
-    def __init__(
-        self, things: TaughtThings, mesh: Mesh, thing: int, draw: int, setting: Setting
-    ) -> None:
+    def __init__(self, things: TaughtThings, mesh: Mesh, thing: int, draw: int, setting: Setting) -> None:
         """Place the thing, its camera and what stands around it."""
         self.things = things
         self.thing = thing
@@ -255,9 +253,7 @@ def run(episode: Episode, policy: Policy, count: int, rng: np.random.Generator) 
         made.views.append(view)
 
 
-def policies_of(
-    names: tuple[str, ...], things: TaughtThings
-) -> dict[str, Callable[[Episode], Policy]]:
+def policies_of(names: tuple[str, ...], things: TaughtThings) -> dict[str, Callable[[Episode], Policy]]:
     """Policies by name, each made for an episode."""
     card = things.recogniser.card.card_path
     picture = Discriminate.from_card(card, SPHERE) if "picture" in names else None
@@ -316,12 +312,7 @@ class Results:
         for policy in policies:
             rows: dict[str, list[NDArray]] = {}
             for name in names:
-                runs = [
-                    each
-                    for episode in episodes
-                    if episode["thing"] == name
-                    for each in episode["runs"][policy]
-                ]
+                runs = [each for episode in episodes if episode["thing"] == name for each in episode["runs"][policy]]
                 for key, value in _means(runs).items():
                     rows.setdefault(key, []).append(value)
                 decision[policy] += [x for each in runs for x in each["decision"]]
@@ -409,9 +400,7 @@ def load_things(models: str, scans: Path) -> tuple[TaughtThings, list[Mesh]]:
     if missing:
         raise UsageError(f"{scans}: holds no scan of {missing[0]}")
     meshes = [load_mesh(files[name], unit="m") for name in track(names, "scans")]
-    surfaces = [
-        Surface.from_mesh(mesh, name).simplified() for mesh, name in zip(meshes, names, strict=True)
-    ]
+    surfaces = [Surface.from_mesh(mesh, name).simplified() for mesh, name in zip(meshes, names, strict=True)]
     return TaughtThings(recogniser, surfaces), meshes
 
 

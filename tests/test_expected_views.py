@@ -6,21 +6,30 @@ import numpy as np
 import pytest
 import trimesh
 
+from nextview.errors import PolicyError
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.observation import SceneView
 from nextview.geometry.viewsphere import ViewSphere, angle_between, look_at_origin
+from nextview.policies.base import EpisodeState
+from nextview.policies.discriminate_geometry import DiscriminateGeometry
+from nextview.recognition.evidence import Evidence
+from nextview.simulation.sensed_camera import SensedCamera
+from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import depth_view
 from nextview.things.expected_views import (
     ExpectedSensor,
     ExpectedViews,
     Hypotheses,
+    Outlook,
     Surroundings,
     expected_views,
 )
-from nextview.things.registration import render, rotation_about_z, start
+from nextview.things.registration import RegistrationPrior, render, rotation_about_z, start
 from nextview.things.surface import Surface, SurfaceCaster
-from nextview.things.verification import likelihood
+from nextview.things.verification import PixelModel, likelihood
+from nextview.things.verifier import Verifier
+from nextview.things.weighing import EvidenceWeights
 
 SPHERE = ViewSphere.named("40")
 AWAY = 0.45  # metres from the centre
@@ -178,8 +187,6 @@ def test_what_is_expected_is_what_the_verifier_says(shown, side):
     pose[:3, 3] *= found.radius
     sensor = ExpectedSensor(view.pitch, SENSOR.noise)
     floor = Surroundings(np.zeros((0, 3)), -0.05, 10.0)
-    from nextview.things.weighing import EvidenceWeights
-
     plain = EvidenceWeights(geometry=1.0, correlation=0.0)
     expected_ratio = expected_views(caster, hypotheses, pose[None], sensor, floor, 1, plain)
     divergence = expected_ratio.divergence[0, 0, 1]
@@ -189,6 +196,104 @@ def test_what_is_expected_is_what_the_verifier_says(shown, side):
     else:
         assert abs(ratio) < 0.15
         assert divergence < 0.15
+
+
+def settled(belief, visited, reachable=None, travel=None, **policy) -> tuple[int, np.ndarray]:
+    """Where the policy goes from some views, a box or the same with a knob, and its values."""
+    caster = surfaces_of(box_mesh(BODY), box_mesh(BODY, KNOB))
+    outlook = Outlook(
+        caster=caster,
+        hypotheses=hypotheses_of((0, 1), belief),
+        sensor=SENSOR,
+        surroundings=Surroundings.nothing(),
+        distance=AWAY,
+        taken=len(visited),
+        weights=EvidenceWeights(),
+        pixels=PixelModel(),
+        prior=RegistrationPrior(),
+    )
+    been = np.isin(np.arange(len(SPHERE)), visited)[None]
+    state = EpisodeState(
+        current=np.array(visited[-1:]),
+        visited=been,
+        belief=np.array([belief]),
+        evidence=Evidence(np.zeros((1, 2))),
+        step=len(visited),
+        reachable=reachable,
+        travel=travel,
+        outlook=[outlook],
+    )
+    chooses = DiscriminateGeometry(SPHERE, **policy)
+    values = chooses.view_values(state)[0]
+    return int(chooses.next_views(state, np.random.default_rng(0))[0]), values
+
+
+def test_the_policy_goes_where_the_knob_shows_and_can_be_reached():
+    from_behind = 4  # on the ring of elevation 0, at an azimuth of 180 degrees
+    chosen, values = settled((0.5, 0.5), [from_behind])
+    assert SPHERE.directions[chosen, 0] > 0.5
+    assert np.isnan(values[from_behind])
+
+    reachable = (SPHERE.directions[:, 0] < 0.3)[None]
+    chosen, values = settled((0.5, 0.5), [from_behind], reachable)
+    assert reachable[0, chosen]
+    assert (np.isnan(values) == ~(reachable[0] & (np.arange(40) != from_behind))).all()
+
+
+@pytest.mark.parametrize("near", [1, 7])
+def test_among_views_that_are_worth_the_same_the_nearer_one_is_taken(near, monkeypatch):
+    def the_same(outlook, cameras):
+        divergence = np.tile(5.0 * (1 - np.eye(2)), (len(cameras), 1, 1))
+        return ExpectedViews(outlook.hypotheses, divergence, divergence)
+
+    monkeypatch.setattr(Outlook, "expect", the_same)
+    travel = np.where(np.arange(40) == near, 1.0, 9.0)[None]
+    assert settled((0.5, 0.5), [4], travel=travel)[0] == near
+
+
+def test_where_nothing_is_left_to_tell_the_belief_is_tested_from_afar():
+    chosen, _ = settled((1.0, 0.0), [0])
+    assert SPHERE.arc[0, chosen] == SPHERE.arc[0].max()
+    _, values = settled((0.5, 0.5), [4], travel=np.full((1, 40), 3.0), travel_weight=0.1)
+    _, free = settled((0.5, 0.5), [4], travel=np.full((1, 40), 3.0))
+    np.testing.assert_allclose(values[0], free[0] - 0.3)
+
+
+def test_a_policy_without_known_geometry_says_so():
+    state = EpisodeState(
+        current=np.zeros(1, np.int64),
+        visited=np.zeros((1, 40), bool),
+        belief=np.ones((1, 1)),
+        evidence=Evidence(np.zeros((1, 1))),
+        step=1,
+    )
+    with pytest.raises(PolicyError, match="needs things of known geometry"):
+        DiscriminateGeometry(SPHERE).view_values(state)
+    with pytest.raises(PolicyError, match="travel weight"):
+        DiscriminateGeometry(SPHERE, travel_weight=-1.0)
+
+
+def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
+    meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
+    verifier = Verifier([Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)], [0, 1], [np.eye(3)] * 2)
+    sensor = replace(SENSORS["none"], radius=meshes[1].metres, distance=AWAY)
+    block = trimesh.creation.box((0.2, 1.0, 1.5))
+    block.apply_translation((1.8, 0.0, 0.0))  # object radii
+    obstacle = Mesh(np.asarray(block.vertices), block.faces.astype(np.int32), np.zeros(3), 1.0)
+    camera = SensedCamera(meshes[1], sensor, np.random.default_rng(0), around=obstacle)
+    observations = [camera.observe(SPHERE.poses[view]) for view in (12, 18)]
+    found = verifier(observations, np.full((2, 16), 1 / 32))
+    outlook = Outlook.of(verifier, found, observations)
+    assert outlook.taken == 2
+    assert outlook.distance == pytest.approx(AWAY, rel=1e-3)
+    assert outlook.sensor.pitch == pytest.approx(1 / observations[0].scene.intrinsics[0, 0])
+    assert outlook.hypotheses.belief.sum() == pytest.approx(1)
+    around = outlook.surroundings
+    metres = meshes[1].metres
+    assert around.floor == pytest.approx(-0.05, abs=0.003)
+    assert around.reach == pytest.approx(1.5 * metres, rel=0.1)  # radius of the table
+    assert len(around.obstacles) > 20
+    assert around.obstacles[:, 0].min() > 1.6 * metres
 
 
 def test_words_name_the_rivals_and_how_much_is_settled():

@@ -188,7 +188,7 @@ def _beside(observation: Observation) -> Float:
     scene = observation.scene
     if scene is None or observation.radius is None:
         return np.zeros((0, 3))
-    every = max(1, len(scene.depth) // OBSTACLE_ROWS)
+    every = max(1, scene.depth.shape[0] // OBSTACLE_ROWS)
     depth = scene.depth[::every, ::every].astype(np.float64) * observation.radius
     target = scene.target[::every, ::every]
     rows, columns = np.nonzero((depth > 0) & np.isfinite(depth) & ~target)
@@ -225,14 +225,16 @@ class ExpectedViews:
             goal: "thing" values what is told of which thing it is; "pose" what is told of thing and
                 pose.
         """
-        gains = np.stack([self.gain(row, goal) for row in range(len(self.hypotheses.belief))], 1)
-        return np.maximum(gains @ self.hypotheses.belief, 0)
+        belief = self.hypotheses.belief
+        possible = np.flatnonzero(belief)
+        gains = np.stack([self.gain(int(row), goal) for row in possible], 1)
+        return np.maximum(gains @ belief[possible], 0)
 
     def gain(self, truth: int, goal: Goal = "thing") -> Float:
         """Gain of the log-belief in the right answer with each view, (V,) float64.
 
         Args:
-            truth: which hypothesis is true.
+            truth: which hypothesis is true; the belief in it is not zero.
             goal: whether the answer is a thing, or a thing and its pose.
         """
         belief = self.hypotheses.belief
@@ -246,7 +248,7 @@ class ExpectedViews:
         """Entropy of the present belief, nats: the most that a view can tell."""
         belief = self.hypotheses.belief
         if goal == "thing":
-            belief = np.bincount(self.hypotheses.things, belief)
+            belief = np.bincount(self.hypotheses.things, belief).astype(np.float64)
         some = belief[belief > 0]
         return float(-(some * np.log(some)).sum())
 
@@ -350,9 +352,9 @@ class Outlook:
     surroundings: Surroundings
     distance: float
     taken: int
-    weights: EvidenceWeights = EvidenceWeights()
-    pixels: PixelModel = PixelModel()
-    prior: RegistrationPrior = RegistrationPrior()
+    weights: EvidenceWeights
+    pixels: PixelModel
+    prior: RegistrationPrior
 
     @classmethod
     def of(
@@ -466,8 +468,8 @@ def _rendered(
     in_camera = np.ones((views, side, side, 3))
     in_camera[..., 0] = x[:, None, :]
     in_camera[..., 1] = y[:, :, None]
-    rays = in_camera.reshape(views, -1, 3) @ cameras[:, :3, :3].swapaxes(1, 2)
-    rays = rays.astype(np.float32)
+    turned = in_camera.reshape(views, -1, 3) @ cameras[:, :3, :3].swapaxes(1, 2)
+    rays = turned.astype(np.float32)
 
     # Rows of the call: all hypotheses of the first camera, then of the second.
     from_place = origins[:, None] - places
@@ -486,9 +488,7 @@ def _rendered(
     before = _obstacle_depth(scene.obstacles, cameras, x, y, step)
     hidden = np.isfinite(depth) & (depth > before[:, None])
     behind = np.isfinite(before) | _support_shows(scene, origins, rays)
-    centre = np.mean(
-        np.einsum("hij,hj->hi", turns, caster.centres[things]) + places, axis=0
-    )
+    centre = np.mean(np.einsum("hij,hj->hi", turns, caster.centres[things]) + places, axis=0)
     return _Images(
         rays=rays,
         lengths=lengths.astype(np.float32),
@@ -507,7 +507,7 @@ def _rendered(
 def _windows(
     caster: SurfaceCaster, hypotheses: Hypotheses, cameras: Float, side: int
 ) -> tuple[Float, Float, Float]:
-    """Tangents of the columns and the rows, (V, side) each, that cover all hypotheses, and steps."""
+    """Tangents of columns and rows, (V, side) each, that cover all hypotheses, and the steps."""
     boxes = []
     for thing, pose in zip(hypotheses.things, hypotheses.poses, strict=True):
         vertices = caster.surfaces[thing].vertices
@@ -527,9 +527,7 @@ def _windows(
     return x, y, step[:, ::-1]
 
 
-def _obstacle_depth(
-    obstacles: Float, cameras: Float, x: Float, y: Float, step: Float
-) -> Float32:
+def _obstacle_depth(obstacles: Float, cameras: Float, x: Float, y: Float, step: Float) -> Float32:
     """Depth of the nearest obstacle at each pixel, (V, P) float32; infinity where there is none."""
     views, side = x.shape
     depth = np.full((views, side, side), np.inf, np.float32)
@@ -597,8 +595,8 @@ def _fitted(images: _Images, sensor: ExpectedSensor, prior: RegistrationPrior) -
         return gap
 
     # A symmetric Jacobian: the surface halfway between the two.
-    normals = [images.normals[..., k] for k in range(3)]
-    normals = [axis[:, first] + axis[:, second] for axis in normals]
+    axes = [images.normals[..., k] for k in range(3)]
+    normals = [axis[:, first] + axis[:, second] for axis in axes]
     scale = both / np.sqrt(normals[0] ** 2 + normals[1] ** 2 + normals[2] ** 2 + 1e-12)
     normals = [axis * scale for axis in normals]
     middle = a - gap / 2
@@ -611,9 +609,8 @@ def _fitted(images: _Images, sensor: ExpectedSensor, prior: RegistrationPrior) -
         arms[0] * normals[1] - arms[1] * normals[0],
         *normals,
     ]
-    along = sum(normals[k] * rays[k][:, None] for k in range(3))
     steepest = -LOWEST_COSINE * images.lengths[:, None]
-    along = np.minimum(along, steepest)
+    along = np.minimum(sum(normals[k] * rays[k][:, None] for k in range(3)), steepest)
 
     some = slice(None, None, FITTED_EVERY)
     distance = (gap * along)[..., some]
@@ -673,7 +670,8 @@ class _Judged:
         deviation: standard deviation of the depth there, metres.
         hole: log-likelihood of a hole there.
         missing: log-likelihood of a pixel of the thing that shows nothing of another hypothesis.
-        apart: how surely a pixel beside a hypothesis is beside it when that is aligned anew, 0 to 1.
+        apart: how surely a pixel beside a hypothesis is beside it after it is aligned anew, 0 to
+            1.
         behind: whether something is measured where a hypothesis does not show, (V, 1, P).
         area: pixels of the camera in one of these, (V, 1).
         enough: pixels of the camera from which on a view counts in full.
@@ -781,16 +779,16 @@ def _rings(shows: NDArray[np.bool_], side: int) -> tuple[Float32, Float32]:
     inner = image
     outer = image
     for _ in range(2):
-        inner = inner & _neighbours(inner, False).all(0)
-        outer = outer | _neighbours(outer, False).any(0)
+        inner = inner & _neighbours(inner).all(0)
+        outer = outer | _neighbours(outer).any(0)
         within += inner
         beside += ~outer
     return within.reshape(shows.shape), beside.reshape(shows.shape)
 
 
-def _neighbours(image: NDArray[np.bool_], outside: bool) -> NDArray[np.bool_]:
+def _neighbours(image: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The four neighbours of each pixel of images, (4, V, H, rows, columns)."""
-    padded = np.pad(image, ((0, 0), (0, 0), (1, 1), (1, 1)), constant_values=outside)
+    padded = np.pad(image, ((0, 0), (0, 0), (1, 1), (1, 1)))
     up = padded[..., :-2, 1:-1]
     down = padded[..., 2:, 1:-1]
     left = padded[..., 1:-1, :-2]

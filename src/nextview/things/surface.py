@@ -183,7 +183,7 @@ def _near_enough(surface: Surface, simplified: Surface, error: float) -> bool:
         return True
     nearby = simplified.sample(NEARBY_SAMPLES, rng)
     spacing = float(np.sqrt(simplified.area / NEARBY_SAMPLES))
-    beside = cKDTree(nearby).query(points[far])[0]
+    beside = np.asarray(cKDTree(nearby).query(points[far])[0])
     return bool(beside.max() <= LARGEST_ERROR * error + spacing)
 
 
