@@ -1,11 +1,13 @@
 """Taught things recognised by features alone and verified by their geometry, at true size.
 
-    python benchmarks/verified_things.py SCANS [--models ycb] [--draws 0 1] [--every 3] [--half]
-    [--fit]
+    python benchmarks/verified_things.py SCANS [--models ycb] [--draws 0 1] [--every 3] [--resting]
+    [--clutter 5] [--known even] [--fit]
 
 SCANS holds the scans of the things that the memory knows, in metres, by their names. Each draw
 shows every thing once, with an azimuth, views and errors of the sensor of its own. The camera
-stands five object radii away, between 25 cm from the surface and 45 cm from the centre.
+stands five object radii away, between 25 cm from the surface and 45 cm from the centre. Things
+stand as they were scanned, or with ``--resting`` in any pose that they can rest in; with
+``--clutter`` so many boxes stand around each, which hide parts of it.
 
 Prints after 1, 2, 3 and 5 random views: the share that is named right by features and size, and
 with the geometry; the expected calibration error (ten bins) and the share that is wrong with a
@@ -16,8 +18,8 @@ the definitions of the BOP toolkit), and the share in the right resting pose, or
 same; and the milliseconds that the verification takes, without the features.
 
 With ``--fit`` the weights that the draws call for are printed, with the loss that they are chosen
-by. With ``--half`` every other thing is taught and all are shown: the first half of the draws says
-which residuals are usual, the others are judged by a p-value of 0.02.
+by. With ``--known even`` or ``odd`` every other thing is taught and all are shown: the first half of
+the draws says which residuals are usual, the others are judged by a p-value of 0.02.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -39,6 +42,7 @@ from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere
+from nextview.simulation.scene import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.things.memory import TaughtRecogniser
@@ -58,7 +62,8 @@ RADII_AWAY = 5.0
 CONFIDENT = 0.97
 REJECTED = 0.02  # p-value below which a thing is called unknown
 POINTS = 1000  # of a surface, for symmetries and ADD-S
-SYMMETRIC = 0.015  # mean distance to a turned copy, diameters, below which a thing is symmetric
+SYMMETRIC = 0.1  # largest distance to a turned copy, diameters, of a symmetric thing, as in BOP
+UPRIGHT = 20.0  # degrees that the vertical of a thing in the right resting pose may be off
 COLUMNS = (
     "views",
     "features",
@@ -73,6 +78,23 @@ COLUMNS = (
     "ms of CPU: median, worst",
 )
 ORDERS = (1, 2, 3, 4, 5, 6, 7, 8)  # of symmetries about the vertical
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How things are shown.
+
+    Attributes:
+        sensor: what the views are taken with.
+        views: how many views are taken.
+        resting: whether they rest in any pose that they can, and not only as they were scanned.
+        clutter: how many boxes stand around a thing.
+    """
+
+    sensor: str
+    views: int
+    resting: bool
+    clutter: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +129,8 @@ class Outcome:
         seconds: of CPU that the verification took.
         residual: how badly the likeliest hypothesis explains the views.
         named: the thing that it is of.
-        azimuth: error, degrees; None for a thing with every symmetry, too.
+        azimuth: error, degrees; None for a thing with every symmetry, and in another resting pose
+            that looks the same, too.
         place: error of the centre in the last camera's frame, metres.
         place_in_world: the same in the robot's world, in which the cameras' places have errors.
         add_s: mean distance of the surface's points, diameters.
@@ -165,6 +188,11 @@ class Taught:
         orders = [symmetry_order(*both) for both in zip(whole, points, strict=True)]
         return cls(recogniser, names, meshes, surfaces, points, orders)
 
+    def resting_poses(self, thing: int) -> Float:
+        """How the thing of this number can rest, rotations from the scan's axes, (N, 3, 3)."""
+        memory = self.recogniser.memory
+        return memory.rotations[memory.thing == thing].astype(np.float64)
+
     def things(self, some: NDArray[np.int64]) -> TaughtThings:
         """A recogniser of some of the things."""
         return TaughtThings(self.recogniser, [self.surfaces[k] for k in some])
@@ -174,28 +202,35 @@ def symmetry_order(surface: Surface, points: Float) -> int:
     """How many azimuths a thing looks the same from; 0 if all of them."""
     centred = points - surface.centre
     tree = cKDTree(centred)
+    apart = tree.query(centred, k=2)[0][:, 1].mean() / 2  # of the points themselves
     same = []
     for order in ORDERS:
         turn = rotation_about_z(np.array([2 * np.pi / order]))[0]
-        distance = tree.query(centred @ turn.T)[0].mean() - tree.query(centred, k=2)[0][:, 1].mean() / 2
+        distance = np.quantile(tree.query(centred @ turn.T)[0], 0.99) - apart
         same.append(distance < SYMMETRIC * surface.diameter)
     if same[ORDERS.index(5)] and same[ORDERS.index(7)]:
         return 0
     return max(order for order, alike in zip(ORDERS, same, strict=True) if alike or order == 1)
 
 
-def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, sensor_name: str, most: int) -> Episode:
+def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: Setting) -> Episode:
     """Look at a thing from random viewpoints through a sensor, at its true size."""
     rng = np.random.default_rng([thing, draw])
     turn = rotation_about_z(rng.uniform(0, 2 * np.pi, 1))[0]
     mesh = taught.meshes[thing]
+    if setting.resting:
+        poses = np.random.default_rng([thing, draw, 1])
+        turn = turn @ poses.choice(taught.resting_poses(thing))
     standing = rotated(mesh, turn)
     radius = standing.metres
     assert radius is not None
 
     distance = max(NEAREST + radius, min(USUAL, RADII_AWAY * radius))
-    sensor = replace(sensor_named(sensor_name), radius=radius, distance=distance)
-    camera = SensedCamera(standing, sensor, np.random.default_rng([thing, draw, 7]))
+    sensor = replace(sensor_named(setting.sensor), radius=radius, distance=distance)
+    around = None
+    if setting.clutter:
+        around = boxes_around(standing.vertices, setting.clutter, np.random.default_rng([thing, draw, 2]))
+    camera = SensedCamera(standing, sensor, np.random.default_rng([thing, draw, 7]), around=around)
     observations = []
     cameras = []
     for view in rng.permutation(len(SPHERE)):
@@ -203,7 +238,7 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, sensor_na
         if observation.seen and observation.scene is not None:
             observations.append(observation)
             cameras.append(camera.true_pose)
-        if len(observations) == most:
+        if len(observations) == setting.views:
             break
 
     in_truth = np.eye(4)
@@ -272,12 +307,13 @@ def pose_errors(
     order = taught.orders[episode.thing]
     step = 360 / order if order else 0
     up = pose[2, :3] @ episode.true_pose[2, :3]
+    same_pose = up > np.cos(np.radians(UPRIGHT))
     return {
-        "azimuth": abs((azimuth + step / 2) % step - step / 2) if order else None,
+        "azimuth": abs((azimuth + step / 2) % step - step / 2) if order and same_pose else None,
         "place": float(np.linalg.norm((in_camera - true_in_camera) @ centre)),
         "place_in_world": float(np.linalg.norm((pose - episode.true_pose) @ centre)),
         "add_s": float(add_s),
-        "resting": bool(up > np.cos(np.radians(20)) or add_s < 0.1),
+        "resting": bool(same_pose or add_s < 0.1),
     }
 
 
@@ -362,7 +398,9 @@ def main(
     views: tuple[int, ...] = (1, 2, 3, 5),
     sensor: str = "wrist",
     every: int = 1,
-    half: bool = False,
+    known: Literal["all", "even", "odd"] = "all",
+    resting: bool = False,
+    clutter: int = 0,
     fit: bool = False,
 ) -> None:
     """Show the things, recognise them, and print the tables.
@@ -374,25 +412,28 @@ def main(
         views: after how many views things are judged.
         sensor: what the views are taken with.
         every: show every so many things only.
-        half: teach every other thing, and show all.
+        known: which of the things are taught; all are shown.
+        resting: show things in any pose that they can rest in.
+        clutter: number of boxes around each thing.
         fit: print the weights that the draws call for.
     """
     taught = Taught.load(models, scans)
+    setting = Setting(sensor, max(views), resting, clutter)
     everything = np.arange(len(taught.names))
-    known = everything[::2] if half else everything
-    things = taught.things(known)
+    some = {"all": everything, "even": everything[::2], "odd": everything[1::2]}[known]
+    things = taught.things(some)
 
     outcomes: list[list[Outcome]] = []
     for draw in draws:
         here: list[Outcome] = []
         for thing in track(everything[draw % every :: every], f"draw {draw}"):
-            episode = shown(taught, things, int(thing), draw, sensor, max(views))
+            episode = shown(taught, things, int(thing), draw, setting)
             counts = [k for k in views if k <= len(episode.observations)]
-            here += [judged(things, taught, known, episode, k) for k in counts]
+            here += [judged(things, taught, some, episode, k) for k in counts]
         outcomes.append(here)
 
-    if half:
-        print(*unknown_table(outcomes, known, views), sep="\n")
+    if known != "all":
+        print(*unknown_table(outcomes, some, views), sep="\n")
         return
     together = [outcome for draw in outcomes for outcome in draw]
     print(*table(together, views), "", *mistakes(taught, together, views), sep="\n")

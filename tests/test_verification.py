@@ -14,14 +14,17 @@ from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, depth_view
+from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, MetricImage, depth_view
+from nextview.things.ground import levelling
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.proposals import propose
 from nextview.things.registration import (
     COARSE,
     FINE,
+    FIRST,
     align,
     centred,
+    different_poses,
     render,
     rotation_about_z,
     start,
@@ -107,7 +110,7 @@ def aligned(mesh: Mesh, observations, yaws) -> tuple[SurfaceCaster, np.ndarray, 
     coarse = [depth_view(each, 24) for each in observations]
     fine = [depth_view(each, SIDE) for each in observations]
     found = start(np.zeros(len(yaws), int), rotation_about_z(yaws), len(observations))
-    found = align(caster, centred(caster, found, coarse), coarse, COARSE)
+    found = align(caster, centred(caster, found, coarse), coarse, (*FIRST, *COARSE))
     found = align(caster, found, fine, FINE)
     judged = [likelihood(view, render(caster, found, view, k)).mean for k, view in enumerate(fine)]
     return found, found.poses(caster), np.sum(judged, 0)
@@ -170,9 +173,95 @@ def test_a_missing_handle_lowers_the_likelihood():
         observation = views_of(cup(handle), directions=((30.0, 60.0),))[0]
         view = depth_view(observation, SIDE)
         found = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
-        found = align(caster, centred(caster, found, [view]), [view], (*COARSE, *FINE))
+        found = align(caster, centred(caster, found, [view]), [view], (*FIRST, *COARSE, *FINE))
         with_it, without = likelihood(view, render(caster, found, view, 0)).mean
         assert (with_it > without + 0.1) == handle
+
+
+@pytest.mark.parametrize("times", [0.2, 8.0])  # a die, and a cupboard
+def test_small_and_large_things_are_aligned_as_well(times):
+    mesh = l_block()
+    scaled = make_mesh(times * (mesh.vertices * mesh.radius + mesh.centre), mesh.faces, unit="m")
+    _, poses, likely = aligned(scaled, views_of(scaled, 2.0)[:2], np.arange(8) * np.pi / 4)
+    turn, moved = off_by(poses[likely.argmax()], true_pose(scaled, 2.0), scaled.centre)
+    assert turn < 1
+    assert moved < max(1, times)
+
+
+def standing_view(mesh: Mesh, lean: np.ndarray, noise: float = 0.0) -> Observation:
+    """A view of a turned thing on a table that leans as it does; noise as inverse depth, 1/m."""
+    shown = rotated(mesh, lean)
+    observation = SimulatedCamera(shown).observe(look_at_origin(np.radians(35.0), 0.4))
+    rows, columns = np.indices(observation.depth.shape)
+    k = observation.intrinsics
+    x, y = (columns + 0.5 - k[0, 2]) / k[0, 0], (rows + 0.5 - k[1, 2]) / k[1, 1]
+    rays = np.stack([x, y, np.ones(x.shape)], -1) @ observation.pose[:3, :3].T
+    bottom = mesh.vertices[:, 2].min() - shown.centre @ lean[:, 2] / shown.radius
+    up = lean[:, 2]
+    table = (bottom - observation.pose[:3, 3] @ up) / (rays @ up)
+    target = observation.depth > 0
+    depth = np.where(target, observation.depth, table)
+    q = 1 / depth + noise * observation.radius * np.random.default_rng(0).normal(size=depth.shape)
+    return with_scene(observation, 1 / q, target)
+
+
+def test_the_ground_tells_the_vertical_and_the_noise():
+    lean = Rotation.from_rotvec([0.05, -0.04, 0.0]).as_matrix()
+    image = MetricImage.of(standing_view(l_block(), lean, noise=0.01))
+    assert image.ground is not None
+    np.testing.assert_allclose(image.ground.normal, lean[:, 2], atol=0.003)
+    assert image.ground.noise == pytest.approx(0.01, rel=0.15)
+    level = image.turned(levelling([image.ground]))
+    np.testing.assert_allclose(level.ground.normal, (0, 0, 1), atol=1e-9)
+    exact = views_of(l_block())[0]
+    assert MetricImage.of(exact).ground is None
+    np.testing.assert_allclose(levelling([]), np.eye(3))
+
+
+def test_a_thing_is_found_upright_on_a_table_that_leans():
+    mesh = cup(True)
+    lean = Rotation.from_rotvec([0.06, -0.05, 0.0]).as_matrix() @ rotation_about_z(np.array([0.7]))[0]
+    observation = standing_view(mesh, lean, noise=0.003)
+    found = verifier_of(mesh, l_block())([observation], even_belief(2))
+    true = np.eye(4)
+    true[:3, :3] = lean
+    true[:3, 3] = -(lean @ mesh.centre + rotated(mesh, lean).centre)
+    turn, moved = off_by(found.poses[0], true, mesh.centre)
+    assert found.things[0] == 0
+    assert turn < 1
+    assert moved < 1.5
+
+
+def test_nothing_reaches_below_the_ground():
+    # Seen from the front, a higher block would hide its lower part below the table.
+    low = mesh_of(((0.08, 0.06, 0.04), (0, 0, 0)))
+    high = mesh_of(((0.08, 0.06, 0.09), (0, 0, 0)))
+    observation = standing_view(low, np.eye(3), noise=0.002)
+    caster = SurfaceCaster([Surface.from_mesh(mesh, "block") for mesh in (low, high)])
+    placed = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
+    lowered = replace(placed, centres=np.array([[0, 0, 0], [0, 0, -0.025]]))
+    view = depth_view(observation, SIDE)
+    fits, sunk = likelihood(view, render(caster, lowered, view, 0)).mean
+    assert fits > -0.3
+    assert sunk < fits - 0.5
+    unaware = replace(view, ground=None)
+    assert likelihood(unaware, render(caster, lowered, unaware, 0)).mean[1] > fits - 0.3
+
+
+def test_hypotheses_that_come_to_one_pose_are_one():
+    caster = SurfaceCaster([Surface.from_mesh(mesh, "thing") for mesh in (l_block(), cup(True))])
+    turns = rotation_about_z(np.array([0.5, 0.51, 0.5, 0.9, 0.5]))
+    placed = start(np.array([0, 0, 1, 0, 0]), turns, 1)
+    placed.centres[4, 0] += 0.01
+    assert different_poses(caster, placed).tolist() == [0, 2, 3, 4]
+
+
+def test_more_pixels_show_what_is_thin():
+    rod = mesh_of(((0.2, 0.01, 0.01), (0, 0, 0)))
+    slanted, ball = views_of(rod, 0.7)[0], views_of(l_block(), 0.3)[0]
+    thin, thick = depth_view(slanted, 16), depth_view(ball, 16)
+    assert thin.shape[0] > thick.shape[0]
+    assert (thin.kind == THING).sum() > 40
 
 
 @pytest.fixture
@@ -283,31 +372,6 @@ def test_a_surface_keeps_the_frame_of_its_scan_and_loses_what_no_camera_sees():
         Surface.from_mesh(make_mesh(ball.vertices, ball.faces), "ball")
 
 
-@pytest.mark.parametrize(
-    ("body", "part"),
-    [
-        (trimesh.creation.icosphere(subdivisions=5, radius=0.04), trimesh.creation.box((0.02, 0.012, 0.012))),
-        (trimesh.creation.box((0.1, 0.07, 0.08)), trimesh.creation.icosphere(subdivisions=5, radius=0.01)),
-    ],
-    ids=["few triangles on a fine body", "a fine knob on a body of few triangles"],
-)
-def test_a_small_part_is_not_simplified_away_and_does_not_spoil_the_rest(body, part):
-    part = part.copy()
-    part.apply_translation((0.5 * body.extents[0], 0.0, 0.0))
-    whole = trimesh.util.concatenate([body, part])
-    mesh = make_mesh(whole.vertices, whole.faces, unit="m")
-    few = Surface.from_mesh(mesh, "thing").simplified()
-    assert len(few.faces) < len(mesh.faces)
-
-    camera = SimulatedCamera(mesh)
-    simple = SimulatedCamera(make_mesh(few.vertices, few.faces, unit="m"))
-    for around in (0.0, 60.0, 180.0):
-        pose = look_at_origin(np.radians(20.0), np.radians(around))
-        exact = camera.observe(pose).depth
-        off = np.abs(simple.observe(pose).depth - exact) * mesh.metres
-        assert np.mean(off[exact > 0] > 0.003) < 0.01
-
-
 def test_few_are_proposed_where_it_is_clear_and_a_ball_does_not_crowd_out_the_rest():
     clear = np.full((50, 16), 1e-12)
     clear[7, 3] = 1
@@ -320,8 +384,8 @@ def test_few_are_proposed_where_it_is_clear_and_a_ball_does_not_crowd_out_the_re
     unclear = rng.uniform(0.9, 1, (50, 16))
     unclear[4] = 20  # every azimuth suits it
     found = propose(unclear / unclear.sum())
-    assert len(found) == 72
-    assert (found.hypotheses == 4).sum() == 8
+    assert 90 < len(found) <= 96
+    assert np.bincount(found.hypotheses).max() == (found.hypotheses == 4).sum() == 8
     assert len(set(found.hypotheses.tolist())) > 20
 
 

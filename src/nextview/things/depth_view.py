@@ -1,6 +1,6 @@
 """Depth images as they are compared with surfaces: few pixels, metres, and what each shows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,17 +8,24 @@ from scipy.ndimage import distance_transform_edt
 
 from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
-from nextview.sensing.facets import estimate_noise
+from nextview.sensing.facets import Noise, estimate_noise
+from nextview.things.ground import Ground, find_ground
 
 Float32 = NDArray[np.float32]
 Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 NOT_MEASURED, ELSEWHERE, THING = np.arange(3, dtype=np.uint8)
 """What a pixel shows: nothing was measured; something else, or nothing at all, was; the thing."""
 
 WINDOW_MARGIN = 0.35  # of the size of the thing's outline that is looked at around it
+USUAL_FILL = 0.2  # share of the pixels that show the thing, below which more of them are chosen
+MOST_DENSE = 2.0  # times as many rows and columns at most
 SMALLEST_MARGIN = 4  # pixels of the image around the outline, at least
 NOISE_ROWS = 40  # rows of an image in which its noise is measured
+GROUND_MARGIN = 1.0  # of the size of the outline, around which the ground is looked for
+GROUND_SIDE = 48  # rows and columns of pixels that it is looked for in
+LEVEL_NOISE = 3.0  # deviations of the noise within which a pixel lies on the ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +46,8 @@ class DepthView:
             within it.
         towards: direction in the image, x and y, to the nearest pixel of the thing, (P, 2) float32,
             unit vectors; zero within it.
+        ground: plane that the thing stands on, if it is seen.
+        level: pixels of the thing that lie on the ground, (P,) bool: they may not be of the thing.
         shape: rows and columns of the grid; P is their product.
         step: distance between the grid's rows, and between its columns, (2,) float64, pixels of the
             image.
@@ -54,6 +63,8 @@ class DepthView:
     noise: Float32
     edge: Float32
     towards: Float32
+    ground: Ground | None
+    level: Mask
     shape: tuple[int, int]
     step: Float
     pitch: float
@@ -71,12 +82,9 @@ def depth_view(
 ) -> DepthView | None:
     """Choose the pixels of an observation that are compared with surfaces.
 
-    An observation that knows all that its camera saw is taken as it was measured. Without that,
-    pixels beside the thing show that nothing is there if the depth is exact, and nothing otherwise.
-
     Args:
         observation: a view of the thing.
-        side: about so many rows, and so many columns, are chosen.
+        side: about so many rows, and so many columns, are chosen; more if the thing is thin.
         radius: object radius, metres, for an observation that knows none.
 
     Returns:
@@ -85,54 +93,143 @@ def depth_view(
     Raises:
         ObservationError: neither the observation nor the caller knows the scale.
     """
-    metres = observation.radius if observation.radius is not None else radius
-    if metres is None:
-        raise ObservationError(
-            "the object radius in metres is not known, and surfaces are compared in metres"
+    image = MetricImage.of(observation, radius)
+    return None if image is None else image.view(side)
+
+
+@dataclass(frozen=True, eq=False)
+class MetricImage:
+    """All pixels of one view, in metres, from which few or many are chosen.
+
+    Attributes:
+        depth: along the optical axis, (H, W) float32; infinity where nothing is there, 0 where
+            nothing was measured.
+        kind: NOT_MEASURED, ELSEWHERE or THING, (H, W) uint8.
+        pose: camera-to-object, (4, 4), metres.
+        intrinsics: pinhole matrix, (3, 3), pixels; the first pixel's centre is at 0.5.
+        noise: of single pixels.
+        ground: plane that the thing stands on, if it is seen.
+    """
+
+    depth: Float32
+    kind: NDArray[np.uint8]
+    pose: Float
+    intrinsics: Float
+    noise: Noise
+    ground: Ground | None
+
+    @classmethod
+    def of(cls, observation: Observation, radius: float | None = None) -> "MetricImage | None":
+        """Take over what a camera saw; None if it did not see the thing.
+
+        An observation that knows all that its camera saw is taken as it was measured. Without that,
+        pixels beside the thing show that nothing is there if the depth is exact, and nothing
+        otherwise.
+
+        Args:
+            observation: a view of the thing.
+            radius: object radius, metres, for an observation that knows none.
+
+        Raises:
+            ObservationError: neither the observation nor the caller knows the scale.
+        """
+        metres = observation.radius if observation.radius is not None else radius
+        if metres is None:
+            raise ObservationError(
+                "the object radius in metres is not known, and surfaces are compared in metres"
+            )
+        depth, kind, pose, intrinsics = _what_is_seen(observation)
+        if not (kind == THING).any():
+            return None
+
+        depth = depth * np.float32(metres)
+        pose = pose.copy()
+        pose[:3, 3] *= metres
+        some_rows = depth[:: max(1, len(depth) // NOISE_ROWS)]
+        noise = estimate_noise(some_rows, (some_rows > 0) & np.isfinite(some_rows))
+        image = cls(depth, kind, pose, intrinsics, noise, None)
+        return replace(image, ground=image._find_ground())
+
+    def turned(self, rotation: Float) -> "MetricImage":
+        """The same in an object frame that is turned about its origin.
+
+        Args:
+            rotation: from the axes so far to the new ones, (3, 3).
+        """
+        pose = self.pose.copy()
+        pose[:3] = rotation @ pose[:3]
+        ground = self.ground
+        if ground is not None:
+            ground = replace(ground, normal=rotation @ ground.normal)
+        return replace(self, pose=pose, ground=ground)
+
+    def _find_ground(self) -> Ground | None:
+        """The plane that the thing stands on."""
+        rows, columns = _window(self.kind == THING, GROUND_SIDE, GROUND_MARGIN)
+        chosen = np.ix_(rows, columns)
+        depth = self.depth[chosen].ravel()
+        kind = self.kind[chosen].ravel()
+        origin = self.pose[:3, 3]
+        some = (depth > 0) & np.isfinite(depth)
+        points = origin + self._rays(rows, columns)[some] * depth[some, None].astype(np.float64)
+        thing = kind[some] == THING
+        return find_ground(points[~thing], points[thing], origin, self.pose[:3, 2])
+
+    def _rays(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Float:
+        """Rays through some rows and columns of pixels, (rows * columns, 3), object frame."""
+        focal = self.intrinsics[[0, 1], [0, 1]]
+        x = (columns + 0.5 - self.intrinsics[0, 2]) / focal[0]
+        y = (rows + 0.5 - self.intrinsics[1, 2]) / focal[1]
+        ahead = np.ones((len(rows), len(columns)))
+        return np.stack([*np.meshgrid(x, y), ahead], -1).reshape(-1, 3) @ self.pose[:3, :3].T
+
+    def view(self, side: int) -> DepthView:
+        """Choose pixels on a grid over the outline of the thing and a margin around it.
+
+        Args:
+            side: about so many rows, and so many columns; more if the thing is thin.
+        """
+        mask = self.kind == THING
+        rows, columns = _window(mask, side, WINDOW_MARGIN)
+        top, left = rows[0], columns[0]
+        edge, towards = _outline(mask[top : rows[-1] + 1, left : columns[-1] + 1])
+        in_window = np.ix_(rows - top, columns - left)
+        in_image = np.ix_(rows, columns)
+
+        origin = self.pose[:3, 3]
+        rays = self._rays(rows, columns).astype(np.float32)
+        depth = self.depth[in_image].ravel()
+        kind = self.kind[in_image].ravel()
+        finite = np.where(np.isfinite(depth), depth, 0)
+        level = np.zeros(len(depth), bool)
+        if self.ground is None:
+            noise = self.noise.at(finite) * finite**2
+        else:
+            # It tells more than single pixels, which are too few beside edges.
+            noise = self.ground.noise * finite**2
+            heights = self.ground.heights(origin + rays * finite[:, None].astype(np.float64))
+            level = (kind == THING) & (np.abs(heights) < LEVEL_NOISE * noise)
+
+        return DepthView(
+            origin=origin,
+            camera_axes=self.pose[:3, :3],
+            rays=rays,
+            depth=depth,
+            kind=kind,
+            noise=noise.astype(np.float32),
+            edge=edge[in_window].ravel(),
+            towards=towards[in_window].reshape(-1, 2),
+            ground=self.ground,
+            level=level,
+            shape=(len(rows), len(columns)),
+            step=np.array([_step(rows), _step(columns)]),
+            pitch=float(1 / self.intrinsics[[0, 1], [0, 1]].mean()),
+            whole=int(mask.sum()),
         )
 
-    depth, mask, kind, pose, intrinsics = _what_is_seen(observation)
-    rows, columns = _window(mask, side)
-    if not len(rows):
-        return None
 
-    top, left = rows[0], columns[0]
-    inside = mask[top : rows[-1] + 1, left : columns[-1] + 1]
-    edge, towards = _outline(inside)
-    chosen = np.ix_(rows - top, columns - left)
-    in_image = np.ix_(rows, columns)
-
-    focal = intrinsics[[0, 1], [0, 1]]
-    x = (columns + 0.5 - intrinsics[0, 2]) / focal[0]
-    y = (rows + 0.5 - intrinsics[1, 2]) / focal[1]
-    rays = np.stack([*np.meshgrid(x, y), np.ones((len(rows), len(columns)))], -1).reshape(-1, 3)
-
-    some_rows = slice(None, None, max(1, len(depth) // NOISE_ROWS))
-    measured = (depth[some_rows] > 0) & np.isfinite(depth[some_rows])
-    noise = estimate_noise(depth[some_rows] * np.float32(metres), measured)
-    here = depth[in_image].ravel() * np.float32(metres)
-    finite = np.where(np.isfinite(here), here, 0)
-
-    return DepthView(
-        origin=pose[:3, 3] * metres,
-        camera_axes=pose[:3, :3],
-        rays=(rays @ pose[:3, :3].T).astype(np.float32),
-        depth=here.astype(np.float32),
-        kind=kind[in_image].ravel(),
-        noise=(noise.at(finite) * finite**2).astype(np.float32),
-        edge=edge[chosen].ravel(),
-        towards=towards[chosen].reshape(-1, 2),
-        shape=(len(rows), len(columns)),
-        step=np.array([_step(rows), _step(columns)]),
-        pitch=float(1 / focal.mean()),
-        whole=int(mask.sum()),
-    )
-
-
-def _what_is_seen(
-    observation: Observation,
-) -> tuple[Float32, NDArray[np.bool_], NDArray[np.uint8], Float, Float]:
-    """Depth, object radii, pixels of the thing, what each pixel shows, pose and intrinsics."""
+def _what_is_seen(observation: Observation) -> tuple[Float32, NDArray[np.uint8], Float, Float]:
+    """Depth, object radii, what each pixel shows, pose and intrinsics."""
     scene = observation.scene
     if scene is None:
         mask = observation.depth > 0
@@ -152,23 +249,31 @@ def _what_is_seen(
         kind = np.full(depth.shape, ELSEWHERE)
         depth = np.where(depth > 0, depth, np.float32(np.inf))
     kind[mask] = THING
-    return depth, mask, kind, pose, intrinsics
+    return depth, kind, pose, intrinsics
 
 
-def _window(mask: NDArray[np.bool_], side: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _window(
+    mask: Mask, side: int, relative_margin: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Ascending rows and columns that lie evenly over an outline and a margin around it."""
-    chosen = []
+    ends = []
     for axis in (1, 0):
         filled = np.flatnonzero(mask.any(axis))
-        if not len(filled):
-            return np.zeros(0, np.int64), np.zeros(0, np.int64)
-
         length = filled[-1] + 1 - filled[0]
-        margin = max(SMALLEST_MARGIN, int(np.ceil(WINDOW_MARGIN * length)))
+        margin = max(SMALLEST_MARGIN, int(np.ceil(relative_margin * length)))
         first = max(0, filled[0] - margin)
         last = min(mask.shape[1 - axis] - 1, filled[-1] + margin)
-        chosen.append(np.unique(np.rint(np.linspace(first, last, side)).astype(np.int64)))
-    return chosen[0], chosen[1]
+        ends.append((first, last))
+
+    # What is thin, and lies across the image, fills little of it.
+    area = np.prod([last + 1 - first for first, last in ends])
+    fill = np.count_nonzero(mask) / area
+    denser = np.clip(np.sqrt(USUAL_FILL / fill), 1, MOST_DENSE)
+    count = int(np.ceil(side * denser))
+    rows, columns = (
+        np.unique(np.rint(np.linspace(first, last, count)).astype(np.int64)) for first, last in ends
+    )
+    return rows, columns
 
 
 def _step(lines: NDArray[np.int64]) -> float:
@@ -176,7 +281,7 @@ def _step(lines: NDArray[np.int64]) -> float:
     return float(lines[-1] - lines[0]) / max(1, len(lines) - 1)
 
 
-def _outline(mask: NDArray[np.bool_]) -> tuple[Float32, Float32]:
+def _outline(mask: Mask) -> tuple[Float32, Float32]:
     """Distance of each pixel to the outline, negative within, and the direction to it."""
     if mask.all():
         return np.full(mask.shape, -np.inf, np.float32), np.zeros((*mask.shape, 2), np.float32)

@@ -10,12 +10,13 @@ Index = NDArray[np.int64]
 
 BASIN = 2  # azimuth bins to each side that registration reaches from a peak
 FEWEST_PROPOSALS = 24
-MOST_PROPOSALS = 72
-ENOUGH_BELIEF = 0.9995  # of the flattened belief that the proposals hold together
-FLATTENING = 0.5  # exponent of the belief: features alone are too sure
+MOST_PROPOSALS = 96
+ENOUGH_BELIEF = 0.99  # of the flattened belief that the proposals hold together
+FLATTENING = 0.35  # exponent of the belief: features alone are too sure, above all of real frames
 ALL_AROUND = (
     3  # likeliest hypotheses that are proposed at azimuths all around: features may be wrong there
 )
+MOST_PEAKS = 2  # azimuths of any other hypothesis
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +75,13 @@ def propose(
     proposed[likeliest[:, None], around] = True
 
     rank = np.where(proposed, joint, 0)
+    others = np.setdiff1d(np.arange(len(joint)), likeliest)
+    rows = np.arange(len(others))[:, None]
+    lower = np.argsort(-rank[others], axis=1, kind="stable")[:, MOST_PEAKS:]
+    rank[others[rows], lower] = 0
     rank[likeliest[:, None], around] += 2  # first
-    hypotheses, bin_of = np.divmod(
-        np.argsort(-rank, axis=None, kind="stable")[: min(most, proposed.sum())], bins
-    )
+    order = np.argsort(-rank, axis=None, kind="stable")
+    hypotheses, bin_of = np.divmod(order[: min(most, np.count_nonzero(rank))], bins)
 
     flat = joint[hypotheses, bin_of] ** FLATTENING
     so_far = np.cumsum(flat) / flat.sum()

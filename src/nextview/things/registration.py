@@ -29,8 +29,11 @@ POSE = 6
 
 FIXED = 1e9  # weight of an unknown that does not change
 FREE = 1e-3  # weight of one that nothing is known of
-SHIFT_LIMIT = 0.02  # metres that a step moves a hypothesis at most
+SHIFT_LIMIT = 0.25  # radii that a step moves a hypothesis at most
 TURN_LIMIT = 0.3  # radians that a step turns it at most
+SAME_TURN = np.radians(3.0)
+SAME_PLACE = 0.03  # radii
+"""Hypotheses of one thing that are not farther apart are one."""
 
 
 @dataclass(frozen=True)
@@ -41,32 +44,54 @@ class RegistrationPrior:
         tilt: of the vertical, radians.
         place: of the centre, object radii.
         camera: of the place of each camera, metres.
+        aim: of the direction in which each camera looks, radians. It displaces what is seen by so
+            many times the distance, and is aligned as an error of the camera's place.
         pixels: how many pixels of a view are as good as so many that err independently.
     """
 
     tilt: float = 0.04
     place: float = 0.5
-    camera: float = 0.004
+    camera: float = 0.003
+    aim: float = 0.006
     pixels: float = 60.0
+
+    def displaced(self, views: Sequence[DepthView]) -> Float:
+        """How far off each view may see the thing along each axis, (V,) float64, metres."""
+        distances = np.array([np.linalg.norm(view.origin) for view in views])
+        return np.hypot(self.camera, self.aim * distances)
 
 
 @dataclass(frozen=True)
 class Level:
-    """Some steps of a registration.
+    """Some steps of a registration, and how far off the hypotheses still are.
+
+    A pixel that deviates by as much counts half.
 
     Attributes:
         steps: how many.
-        reach: deviation at which a pixel counts half, metres.
+        off: by which part of its radius a surface is off.
+        displaced: by which part of what it may be a view is still displaced.
         turned: whether the tilt is aligned too, and not only azimuth and place.
     """
 
     steps: int
-    reach: float
+    off: float
+    displaced: float
     turned: bool
 
+    def reach(self, radii: Float32, displaced: float) -> Float32:
+        """Deviation to be expected of each hypothesis, (H,) float32, metres, without noise.
 
-COARSE = (Level(2, 0.02, False), Level(2, 0.008, False), Level(1, 0.004, True))
-FINE = (Level(2, 0.003, True), Level(1, 0.002, True))
+        Args:
+            radii: of the surfaces of the hypotheses, (H,), metres.
+            displaced: how far off the view may see them, metres.
+        """
+        return np.hypot(self.off * radii, np.float32(self.displaced * displaced))
+
+
+FIRST = (Level(2, 0.25, 2.0, False),)
+COARSE = (Level(2, 0.1, 1.0, False), Level(1, 0.05, 0.5, True))
+FINE = (Level(2, 0.035, 0.25, True), Level(1, 0.02, 0.1, True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +112,19 @@ class Alignment:
     rotations: Float
     centres: Float
     cameras: Float
+
+    def turned(self, rotation: Float) -> "Alignment":
+        """The same in an object frame that is turned about its origin.
+
+        Args:
+            rotation: from the axes so far to the new ones, (3, 3).
+        """
+        return replace(
+            self,
+            rotations=rotation @ self.rotations,
+            centres=self.centres @ rotation.T,
+            cameras=self.cameras @ rotation.T,
+        )
 
     def __len__(self) -> int:
         """Number of hypotheses."""
@@ -139,6 +177,14 @@ def start(things: NDArray[np.integer], rotations: Float, views: int) -> Alignmen
     )
 
 
+SCAN_ERROR = 0.0007  # deviation of a surface from the thing itself, metres
+RELATIVE_SCAN_ERROR = 0.005  # and a part of its radius: large things are scanned less exactly
+SUNK = 0.005  # metres that a hypothesis may be below the ground, beside the errors of the scan
+HIDING = 0.005  # metres by which something stands before a surface that it hides, at least
+HIDING_NOISE = 4.0  # deviations of the noise by which it does
+NOISE_REACH = 2.0  # deviations of the noise at which a pixel counts half, however fine the level
+
+
 @dataclass(frozen=True, eq=False)
 class Rendered:
     """What one view would see of H hypotheses, object frame, metres.
@@ -146,10 +192,33 @@ class Rendered:
     Attributes:
         depth: (H, P) float32, infinity where a hypothesis does not show.
         normals: towards the camera, (H, P, 3) float32.
+        radii: of the surfaces, (H,) float32.
     """
 
     depth: Float32
     normals: Float32
+    radii: Float32
+
+    def sunk(self, view: DepthView) -> NDArray[np.bool_]:
+        """Where a hypothesis shows below the ground, (H, P) bool: nothing can be there."""
+        if view.ground is None:
+            return np.zeros(self.depth.shape, bool)
+        shows = np.isfinite(self.depth)
+        away = view.rays @ view.ground.normal.astype(np.float32)
+        height = np.float32(view.ground.normal @ view.origin + view.ground.offset)
+        heights = height + away * np.where(shows, self.depth, 0)
+        deep = np.hypot(SUNK, view.ground.noise * self.depth.clip(0, 100) ** 2)
+        return shows & (heights < -deep - self.errors[:, None])
+
+    @property
+    def errors(self) -> Float32:
+        """Deviation of each surface from the thing itself, (H,) float32, metres."""
+        return np.hypot(SCAN_ERROR, RELATIVE_SCAN_ERROR * self.radii).astype(np.float32)
+
+    def hidden(self, view: DepthView) -> NDArray[np.bool_]:
+        """Where something else stands before a hypothesis, (H, P) bool."""
+        before = np.hypot(HIDING, HIDING_NOISE * view.noise) + self.errors[:, None]
+        return (view.kind == ELSEWHERE) & (view.depth < self.depth - before)
 
 
 def render(caster: SurfaceCaster, alignment: Alignment, view: DepthView, number: int) -> Rendered:
@@ -170,14 +239,16 @@ def render(caster: SurfaceCaster, alignment: Alignment, view: DepthView, number:
     turns = alignment.rotations.astype(np.float32)
 
     depth, normals = caster.cast(alignment.things, origins.astype(np.float32), view.rays @ turns)
-    return Rendered(depth, normals @ turns.swapaxes(1, 2))
+    radii = caster.radii[alignment.things]
+    return Rendered(depth, normals @ turns.swapaxes(1, 2), radii)
 
 
 def centred(caster: SurfaceCaster, alignment: Alignment, views: Sequence[DepthView]) -> Alignment:
     """Move each hypothesis so that what shows of it lies about where the thing was measured.
 
     The centre of the object frame is that of what was seen, which need not be the centre of the
-    thing. A hypothesis that covers the outline of the thing better where it was stays there.
+    thing. A hypothesis that covers the outline of the thing better where it was stays there. Where
+    the ground is seen, each stands on it.
 
     Args:
         caster: of all surfaces.
@@ -200,12 +271,32 @@ def centred(caster: SurfaceCaster, alignment: Alignment, views: Sequence[DepthVi
         points = view.origin + view.rays * depth[some, :, None]
         change[some] += (seen - np.nanmedian(points, axis=1)) / len(views)
 
+    standing = _heights_on_the_ground(caster, alignment, views)
+    if standing is not None:
+        change[:, 2] = standing - alignment.centres[:, 2]
+
     moved = replace(alignment, centres=alignment.centres + change)
     after = np.zeros(len(alignment))
     for number, view in enumerate(views):
         after += _overlap(view, np.isfinite(render(caster, moved, view, number).depth))
     better = after > before
     return replace(alignment, centres=np.where(better[:, None], moved.centres, alignment.centres))
+
+
+def _heights_on_the_ground(
+    caster: SurfaceCaster, alignment: Alignment, views: Sequence[DepthView]
+) -> Float | None:
+    """Heights of the centres of hypotheses that stand on the ground, (H,); None if none is seen."""
+    grounds = [view.ground for view in views if view.ground is not None]
+    if not grounds:
+        return None
+    ground = np.mean([-ground.offset / ground.normal[2] for ground in grounds])
+    lowest = np.empty(len(alignment))
+    for hypothesis, thing in enumerate(alignment.things):
+        surface = caster.surfaces[thing]
+        down = alignment.rotations[hypothesis, 2].astype(np.float32)
+        lowest[hypothesis] = ((surface.vertices - surface.centre) @ down).min()
+    return ground - lowest
 
 
 def _overlap(view: DepthView, shows: NDArray[np.bool_]) -> Float:
@@ -234,12 +325,13 @@ class _Pulls:
 
 
 OUTLINE_PIXELS = 1.5  # deviation of an outline, pixels
-SURFACE_ERROR = 0.001  # deviation of a surface from its scan, metres
-HIDING = 0.005  # metres by which something stands before a surface that it hides
 
 
-def _pulls(view: DepthView, rendered: Rendered, centres: Float, reach: float) -> _Pulls:
-    """What draws the hypotheses whose centres are these, (H, 3), as this view sees them."""
+def _pulls(view: DepthView, rendered: Rendered, centres: Float, reach: Float32) -> _Pulls:
+    """What draws the hypotheses whose centres are these, (H, 3), as this view sees them.
+
+    ``reach`` is the deviation of each that is to be expected beside the noise, (H,), metres.
+    """
     shows = np.isfinite(rendered.depth)
     depth = np.where(shows, rendered.depth, 0)
     origin = view.origin.astype(np.float32)
@@ -252,7 +344,7 @@ def _pulls(view: DepthView, rendered: Rendered, centres: Float, reach: float) ->
     along = np.einsum("hpi,pi->hp", rendered.normals, view.rays)
     surface = gap * along
     # Where the hypothesis shows, and the outline says that it does not: towards the outline.
-    beyond = shows & (view.kind == ELSEWHERE) & (view.depth > depth - HIDING)
+    beyond = shows & (view.kind == ELSEWHERE) & ~rendered.hidden(view)
     aside = view.towards @ view.camera_axes[:, :2].T.astype(np.float32)
     off = np.where(beyond, view.edge * view.pitch * depth, 0)
 
@@ -261,7 +353,7 @@ def _pulls(view: DepthView, rendered: Rendered, centres: Float, reach: float) ->
 
     # Where the thing was measured and the hypothesis does not show: the nearest of its pixels is
     # drawn there.
-    missing = ~shows & (view.kind == THING)
+    missing = ~shows & (view.kind == THING) & ~view.level
     nearest, gap, aside = _nearest_shown(view, shows)
     missing &= nearest >= 0
     row, pixel = np.nonzero(missing)
@@ -271,8 +363,10 @@ def _pulls(view: DepthView, rendered: Rendered, centres: Float, reach: float) ->
     distances[row, pixel] = gap[row, pixel] * view.pitch * depth[row, from_pixel]
 
     outline = OUTLINE_PIXELS * view.pitch * np.where(shows, depth, view.depth)
-    variance = np.where(thing, SURFACE_ERROR**2 + view.noise**2, SURFACE_ERROR**2 + outline**2)
-    weights = (thing | beyond | missing) / variance / (1 + (distances / reach) ** 2)
+    error = rendered.errors[:, None]
+    variance = error**2 + np.where(thing, view.noise, outline) ** 2
+    expected = reach[:, None] ** 2 + (NOISE_REACH * view.noise) ** 2
+    weights = (thing | beyond | missing) / variance / (1 + distances**2 / expected)
     return _Pulls(arms, directions, distances, weights.astype(np.float32))
 
 
@@ -342,10 +436,17 @@ def _step(
 ) -> Alignment:
     """One Gauss-Newton step: turn, place and, with several views, the cameras' errors."""
     left, right = _equations(caster, alignment, views, level, prior)
+    # Damped: an outline that fits holds nothing in place, and few pixels beside it would move it
+    # farther than it can be off.
+    farthest = level.reach(caster.radii[alignment.things], prior.displaced(views).max())
+    for unknown in range(POSE):
+        off = level.off if unknown < PLACE.start else farthest
+        left[:, unknown, unknown] += 1 / off**2
     change = np.linalg.solve(left, right[..., None])[..., 0]
 
     turn = np.clip(change[:, TURN], -TURN_LIMIT, TURN_LIMIT)
-    moved = np.clip(change[:, 3:], -SHIFT_LIMIT, SHIFT_LIMIT)
+    limit = SHIFT_LIMIT * caster.radii[alignment.things].astype(np.float64)[:, None]
+    moved = np.clip(change[:, 3:], -limit, limit)
     cameras = alignment.cameras
     if moved.shape[1] > 3:
         cameras = cameras + moved[:, 3:].reshape(cameras.shape)
@@ -366,14 +467,16 @@ def _equations(
 ) -> tuple[Float, Float]:
     """Matrices, (H, U, U), and right-hand sides, (H, U), of a step with U unknowns."""
     errors_too = len(views) > 1  # one camera's error is the same as one of the place
-    unknowns = POSE + 3 * len(views) * errors_too
+    unknowns = POSE + 3 * len(views) if errors_too else POSE
     left = np.zeros((len(alignment), unknowns, unknowns))
     right = np.zeros((len(alignment), unknowns))
+    displaced = prior.displaced(views)
 
     for number, view in enumerate(views):
         rendered = render(caster, alignment, view, number)
         centres = alignment.centres + alignment.cameras[:, number]
-        square, towards = _normal_equations(_pulls(view, rendered, centres, level.reach), prior)
+        reach = level.reach(rendered.radii, displaced[number])
+        square, towards = _normal_equations(_pulls(view, rendered, centres, reach), prior)
         left[:, :POSE, :POSE] += square
         right[:, :POSE] += towards
         if errors_too:
@@ -385,10 +488,33 @@ def _equations(
             left[:, own, :POSE] += square[:, PLACE, :]
             right[:, own] += towards[:, PLACE]
 
-    weights, so_far = _priors(caster, alignment, unknowns, level, prior)
+    weights, so_far = _priors(caster, alignment, displaced if errors_too else None, level, prior)
     left += weights[:, :, None] * np.eye(unknowns)
     right -= weights * so_far
     return left, right
+
+
+def different_poses(caster: SurfaceCaster, alignment: Alignment) -> NDArray[np.int64]:
+    """Leave out hypotheses that have come to the pose of an earlier one.
+
+    Args:
+        caster: of all surfaces.
+        alignment: hypotheses, the best ones first.
+
+    Returns:
+        Indices of those that are left, ascending.
+    """
+    rotations = alignment.rotations.reshape(len(alignment), 9)
+    apart = np.linalg.norm(alignment.centres[:, None] - alignment.centres, axis=-1)
+    near = apart < SAME_PLACE * caster.radii[alignment.things][:, None]
+    alike = (rotations @ rotations.T - 1) / 2 > np.cos(SAME_TURN)
+    same = near & alike & (alignment.things[:, None] == alignment.things)
+
+    kept: list[int] = []
+    for number in range(len(alignment)):
+        if not same[number, kept].any():
+            kept.append(number)
+    return np.array(kept, np.int64)
 
 
 def pose_covariances(
@@ -447,7 +573,7 @@ def _outline(view: DepthView, rendered: Rendered, centres: Float) -> _Pulls:
     points = view.origin.astype(np.float32) + view.rays * shown[..., None]
     arms = points - centres.astype(np.float32)[:, None]
     deviation = OUTLINE_PIXELS * view.pitch * shown
-    weights = rim / (SURFACE_ERROR**2 + deviation**2)
+    weights = rim / (rendered.errors[:, None] ** 2 + deviation**2)
     directions = np.broadcast_to(aside, arms.shape)
     return _Pulls(arms, directions, np.zeros_like(shown), weights.astype(np.float32))
 
@@ -465,13 +591,17 @@ def _normal_equations(pulls: _Pulls, prior: RegistrationPrior) -> tuple[Float, F
 def _priors(
     caster: SurfaceCaster,
     alignment: Alignment,
-    unknowns: int,
+    displaced: Float | None,
     level: Level,
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
-    """Weights that hold unknowns near zero, and where these are by now, (H, unknowns) each."""
-    weights = np.zeros((len(alignment), unknowns))
-    so_far = np.zeros((len(alignment), unknowns))
+    """Weights that hold unknowns near zero, and where these are by now, (H, unknowns) each.
+
+    ``displaced`` says how far off each view may be, (V,); None if the cameras are no unknowns.
+    """
+    cameras = 0 if displaced is None else 3 * len(displaced)
+    weights = np.zeros((len(alignment), POSE + cameras))
+    so_far = np.zeros((len(alignment), POSE + cameras))
 
     weights[:, :2] = 1 / prior.tilt**2 if level.turned else FIXED
     weights[:, 2] = FREE
@@ -481,8 +611,8 @@ def _priors(
     reach = prior.place * caster.radii[alignment.things].astype(np.float64)
     weights[:, PLACE] = 1 / reach[:, None] ** 2
     so_far[:, PLACE] = alignment.centres
-    if unknowns > POSE:
-        weights[:, POSE:] = 1 / prior.camera**2
+    if displaced is not None:
+        weights[:, POSE:] = np.repeat(1 / displaced**2, 3)
         so_far[:, POSE:] = alignment.cameras.reshape(len(alignment), -1)
     return weights, so_far
 
@@ -499,6 +629,17 @@ def rotation_about_z(angles: Float) -> Float:
     return rotations_of(np.asarray(angles)[:, None] * (0.0, 0.0, 1.0))
 
 
-def camera_cost(alignment: Alignment, prior: RegistrationPrior = RegistrationPrior()) -> Float:
-    """Half the squared deviations of the cameras' places, (H, V) float64: a cost."""
-    return 0.5 * (alignment.cameras**2).sum(-1) / prior.camera**2
+def camera_cost(
+    alignment: Alignment,
+    views: Sequence[DepthView],
+    prior: RegistrationPrior = RegistrationPrior(),
+) -> Float:
+    """Half the squared deviations of the cameras' places, (H, V) float64: a cost.
+
+    Args:
+        alignment: the hypotheses.
+        views: the views, in the order of ``alignment.cameras``.
+        prior: how far off cameras may be.
+    """
+    squared = (alignment.cameras**2).sum(-1)
+    return np.asarray(0.5 * squared / prior.displaced(views) ** 2, np.float64)

@@ -20,18 +20,18 @@ class PixelModel:
             explains exactly.
         hole: that of a pixel where the surface was not measured, seen face on. A grazing one costs
             less.
-        surface: deviation of a surface from its scan and of its alignment, metres.
         steep: how many pixels a steep surface may be off sideways.
         edge: pixels of the outline within which a deviation is usual.
-        hiding: metres by which something stands before a surface that it hides.
+        missing: weight of the share of the thing's pixels that show no surface in the misfit.
+        through: weight of the share of a hypothesis that is seen through.
     """
 
     outlier: float = -4.0
     hole: float = -0.5
-    surface: float = 0.0008
     steep: float = 1.0
     edge: float = 3.0
-    hiding: float = 0.006
+    missing: float = 0.06
+    through: float = 0.12
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +44,14 @@ class ViewLikelihood:
         pixels: pixels that it is a sum over: those of the thing and those where the hypothesis
             shows, (H,) float64.
         explained: share of the thing's pixels that the hypothesis explains, (H,) float64.
+        misfit: how badly the hypothesis explains the view if nothing is known of others, (H,)
+            float64, 0 for exactly: see ``likelihood``.
     """
 
     total: Float
     pixels: Float
     explained: Float
+    misfit: Float
 
     @property
     def mean(self) -> Float:
@@ -76,16 +79,16 @@ def likelihood(
     measured = np.isfinite(view.depth)
     observed = np.where(measured, view.depth, 0)
     sideways = model.steep * view.pitch * depth * steepness
-    variance = view.noise**2 + model.surface**2 + sideways**2
+    variance = view.noise**2 + rendered.errors[:, None] ** 2 + sideways**2
     squared = (observed - depth) ** 2 / variance
     # A mixture of the sensor's noise and of outliers.
     match = np.log(np.exp(-squared / 2) + np.exp(model.outlier)) - np.log1p(np.exp(model.outlier))
 
     # Mismatches at an outline cost less, the nearer to it they are.
     deep = np.clip(np.abs(view.edge) / model.edge, 0.1, 1)
+    deep = np.where(view.level, 0.1, deep)  # of the ground, more likely
     thing = view.kind == THING
-    hidden = (view.kind == ELSEWHERE) & (view.depth < depth - model.hiding)
-    through = shows & (view.kind == ELSEWHERE) & ~hidden
+    through = shows & (view.kind == ELSEWHERE) & (~rendered.hidden(view) | rendered.sunk(view))
     hole = shows & (view.kind == NOT_MEASURED)
 
     judged = np.zeros(shows.shape)
@@ -96,4 +99,11 @@ def likelihood(
 
     counted = thing | through | hole
     explained = (shows & thing & (squared < 9)).sum(1) / max(1, int(thing.sum()))
-    return ViewLikelihood(judged.sum(1), counted.sum(1).astype(np.float64), explained)
+    # Depths tell best whether a thing was taught. Outlines depend on how well it was segmented.
+    missing = np.where(~shows & thing, deep, 0).sum(1) / max(1, int(thing.sum()))
+    seen_through = np.where(through, deep, 0).sum(1) / np.maximum(shows.sum(1), 1)
+    both = (shows & thing).sum(1)
+    mismatch = -np.where(shows & thing, match, 0).sum(1) / np.maximum(both, 1)
+    mismatch = np.where(both, mismatch, -model.outlier)
+    misfit = mismatch - model.outlier * (model.missing * missing + model.through * seen_through)
+    return ViewLikelihood(judged.sum(1), counted.sum(1).astype(np.float64), explained, misfit)

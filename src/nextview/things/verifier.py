@@ -8,16 +8,20 @@ from numpy.typing import NDArray
 
 from nextview.errors import ModelError, ObservationError
 from nextview.geometry.observation import Observation
-from nextview.things.depth_view import DepthView, depth_view
+from nextview.things.depth_view import DepthView, MetricImage
+from nextview.things.ground import levelling
 from nextview.things.proposals import Proposals, propose
 from nextview.things.registration import (
     COARSE,
     FINE,
+    FIRST,
     Alignment,
+    Level,
     RegistrationPrior,
     align,
     camera_cost,
     centred,
+    different_poses,
     render,
     rotation_about_z,
     start,
@@ -28,11 +32,33 @@ from nextview.things.weighing import EvidenceWeights, JudgedEpisode
 
 Float = NDArray[np.float64]
 
-COARSE_SIDE = 24  # rows and columns of pixels that decide which hypotheses survive
+AGAINST_FEATURES = 0.1  # misfit for each unit of log-belief that features hold against a thing
+LEAST_BY_FEATURES = 0.01  # belief by features below which it does not matter
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Hypotheses are aligned with few pixels first, and those that survive with more.
+
+    Attributes:
+        side: rows and columns of pixels.
+        levels: steps of the alignment.
+        most: how many hypotheses survive at most.
+        hopeless: a hypothesis that is by so much less likely than the best one, as a logarithm, is
+            given up.
+    """
+
+    side: int
+    levels: tuple[Level, ...]
+    most: int
+    hopeless: float
+
+
 FINE_SIDE = 40  # rows and columns of pixels that survivors are judged by
-MOST_SURVIVORS = 12
-HOPELESS = (
-    25.0  # a hypothesis that is so much less likely than the best one, as a logarithm, is given up
+STAGES = (
+    Stage(16, FIRST, 24, 50.0),
+    Stage(24, COARSE, 12, 25.0),
+    Stage(FINE_SIDE, FINE, 12, np.inf),
 )
 
 
@@ -54,6 +80,7 @@ class Verified:
         by_features: belief in each thing by features and size alone, (T,) float64.
         explained: share of the thing's pixels in each view that each hypothesis explains, (M, V)
             float64.
+        misfit: how badly each hypothesis explains each view, (M, V) float64; 0 for exactly.
     """
 
     belief: Float
@@ -67,6 +94,7 @@ class Verified:
     log_belief: Float
     by_features: Float
     explained: Float
+    misfit: Float
 
     def judged(self, truth: int) -> JudgedEpisode:
         """The same as an example of the thing of this number, to fit weights to."""
@@ -76,8 +104,12 @@ class Verified:
 
     @property
     def residual(self) -> float:
-        """How badly the likeliest hypothesis explains the views, in the mean; 0 for exactly."""
-        return float(-self.mean[0].mean())
+        """How badly the likeliest hypothesis explains the views, in the mean; 0 for exactly.
+
+        Features that speak against it add a little.
+        """
+        against = -np.log(max(self.by_features[self.things[0]], LEAST_BY_FEATURES))
+        return float(self.misfit[0].mean() + AGAINST_FEATURES * against)
 
 
 class Verifier:
@@ -144,27 +176,29 @@ class Verifier:
                 f"a belief in {joint.shape[0]} hypotheses, and there are {len(self.owners)}"
             )
 
-        coarse_views = _views(observations, COARSE_SIDE)
         proposals = propose(joint)
-        alignment, proposals = self._survivors(proposals, coarse_views)
-
-        fine_views = _views(observations, FINE_SIDE)
-        alignment = align(self.caster, alignment, fine_views, FINE, self.prior)
-        return self._verified(proposals, alignment, self._judge(alignment, fine_views), joint)
-
-    def _survivors(
-        self, proposals: Proposals, views: Sequence[DepthView]
-    ) -> tuple[Alignment, Proposals]:
-        """The proposals that are likely after an alignment with coarse images, and that."""
         turns = rotation_about_z(proposals.azimuths) @ self.rotations[proposals.hypotheses]
+        images = _images(observations)
+        level = levelling([image.ground for image in images if image.ground is not None])
+        images = [image.turned(level) for image in images]
+        views = [image.view(STAGES[0].side) for image in images]
         alignment = start(self.owners[proposals.hypotheses], turns, len(views))
         alignment = centred(self.caster, alignment, views)
-        alignment = align(self.caster, alignment, views, COARSE, self.prior)
 
-        scores = self._scores(proposals.log_belief, alignment, self._judge(alignment, views))
-        order = np.argsort(-scores, kind="stable")[:MOST_SURVIVORS]
-        rows = order[scores[order] > scores[order[0]] - HOPELESS]
-        return alignment.select(rows), proposals.select(rows)
+        for stage in STAGES:
+            views = [image.view(stage.side) for image in images]
+            alignment = align(self.caster, alignment, views, stage.levels, self.prior)
+            judged = self._judge(alignment, views)
+            scores = self._scores(proposals.log_belief, alignment, views, judged)
+
+            order = np.argsort(-scores, kind="stable")
+            order = order[scores[order] >= scores[order[0]] - stage.hopeless]
+            rows = order[different_poses(self.caster, alignment.select(order))][: stage.most]
+            alignment = alignment.select(rows)
+            proposals = proposals.select(rows)
+
+        aligned = alignment.turned(level.T)
+        return self._verified(proposals, aligned, scores[rows], views, judged, rows, joint)
 
     def _judge(self, alignment: Alignment, views: Sequence[DepthView]) -> list[ViewLikelihood]:
         return [
@@ -173,48 +207,54 @@ class Verifier:
         ]
 
     def _scores(
-        self, log_belief: Float, alignment: Alignment, judged: Sequence[ViewLikelihood]
+        self,
+        log_belief: Float,
+        alignment: Alignment,
+        views: Sequence[DepthView],
+        judged: Sequence[ViewLikelihood],
     ) -> Float:
         """Log-likelihood of each hypothesis by all evidence, up to a constant, (M,)."""
         mean = np.stack([view.mean for view in judged], 1)
-        return self.weights.scores(mean, camera_cost(alignment, self.prior), log_belief)
+        return self.weights.scores(mean, camera_cost(alignment, views, self.prior), log_belief)
 
     def _verified(
         self,
         proposals: Proposals,
         alignment: Alignment,
+        scores: Float,
+        views: Sequence[DepthView],
         judged: Sequence[ViewLikelihood],
+        rows: NDArray[np.int64],
         joint: Float,
     ) -> Verified:
-        """The answer of the proposals that were aligned, sorted by their scores."""
-        scores = self._scores(proposals.log_belief, alignment, judged)
+        """The answer of the proposals that survived, sorted by their scores.
+
+        ``rows`` are theirs in what was judged.
+        """
         by_features = np.zeros(len(self.caster.surfaces))
         np.add.at(by_features, self.owners, joint.sum(1))
         by_features /= by_features.sum()
-        belief = self.weights.belief(scores, alignment.things, by_features)
-
-        order = np.argsort(-scores, kind="stable")
-        shares = np.exp(scores[order] - scores.max())
-        sorted_alignment = alignment.select(order)
+        shares = np.exp(scores - scores.max())
         return Verified(
-            belief=belief,
-            things=sorted_alignment.things,
-            resting=proposals.hypotheses[order],
+            belief=self.weights.belief(scores, alignment.things, by_features),
+            things=alignment.things,
+            resting=proposals.hypotheses,
             probabilities=shares / shares.sum(),
-            poses=sorted_alignment.poses(self.caster),
-            cameras=sorted_alignment.cameras,
-            mean=np.stack([view.mean for view in judged], 1)[order],
-            camera_costs=camera_cost(sorted_alignment, self.prior),
-            log_belief=proposals.log_belief[order],
+            poses=alignment.poses(self.caster),
+            cameras=alignment.cameras,
+            mean=np.stack([view.mean[rows] for view in judged], 1),
+            camera_costs=camera_cost(alignment, views, self.prior),
+            log_belief=proposals.log_belief,
             by_features=by_features,
-            explained=np.stack([view.explained for view in judged], 1)[order],
+            explained=np.stack([view.explained[rows] for view in judged], 1),
+            misfit=np.stack([view.misfit[rows] for view in judged], 1),
         )
 
 
-def _views(observations: Sequence[Observation], side: int) -> list[DepthView]:
-    """The pixels of the observations that show the thing; ObservationError if none does."""
-    found = (depth_view(observation, side) for observation in observations)
-    views = [view for view in found if view is not None]
-    if not views:
+def _images(observations: Sequence[Observation]) -> list[MetricImage]:
+    """The observations that show the thing; ObservationError if none does."""
+    found = (MetricImage.of(observation) for observation in observations)
+    images = [image for image in found if image is not None]
+    if not images:
         raise ObservationError("no view shows the thing, so nothing can be aligned")
-    return views
+    return images

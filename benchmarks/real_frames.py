@@ -1,0 +1,198 @@
+"""Real frames of things on a table, one view each: what they are called, and where their scans lie.
+
+    python benchmarks/real_frames.py FOLDER SCANS [--models ycb]
+
+FOLDER holds frames: NAME.depth.png (uint16, millimetres), NAME.labels.png (uint8, what each pixel shows) and
+names.txt, a line a label, the first of what is none. No pose of the camera is known: up is the normal of the table.
+SCANS holds the scans of the things that the memory knows, in metres, by their names.
+
+Each thing is given once by a point, the median of what its label shows, and once by its label as a mask. Printed are
+the answer by features and size alone and with the geometry, whether the thing is among the first three, the belief in
+the answer, its residual, and the intersection over union of the label with the outline of the posed scan (of the true
+thing, if it is among the hypotheses; what stands before it is not taken off). Labels of few pixels are left out.
+"""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from PIL import Image
+
+from nextview.errors import ObservationError, UsageError
+from nextview.geometry.mesh import load_mesh
+from nextview.geometry.observation import Observation
+from nextview.sensing import Frame, ObservedObject
+from nextview.things.memory import TaughtRecogniser
+from nextview.things.surface import Surface
+from nextview.things.taught import TaughtThings
+from nextview.things.verifier import Verified
+
+INTRINSICS = (618.017, 618.003, 312.377, 232.375)  # of the camera of the PoseCNN demo: fx, fy, cx, cy
+LEAST_PIXELS = 200  # of a label
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Named:
+    """What a thing in a frame was called.
+
+    Attributes:
+        frame: name of the frame.
+        thing: its label.
+        by: how it was given: by a point or by a mask.
+        by_features: the answer by features and size alone.
+        answer: the answer with the geometry.
+        among_three: whether the thing is among the first three.
+        confidence: belief in the answer.
+        residual: how badly the likeliest hypothesis explains the view.
+        overlap: of the outline of the posed scan with the label.
+        seconds: of CPU for the geometry.
+    """
+
+    frame: str
+    thing: str
+    by: str
+    by_features: str
+    answer: str
+    among_three: bool
+    confidence: float
+    residual: float
+    overlap: float
+    seconds: float
+
+
+def memory_with_surfaces(models: str, scans: Path) -> TaughtThings:
+    """A memory, and the surfaces of all that it knows."""
+    recogniser = TaughtRecogniser(models, threads=1)
+    assert recogniser.card.memory is not None
+    names = [thing.name for thing in recogniser.card.memory.things]
+    files = {path.stem: path for path in scans.iterdir() if path.is_file()}
+    missing = [name for name in names if name not in files]
+    if missing:
+        raise UsageError(f"{scans}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things")
+
+    whole = [Surface.from_mesh(load_mesh(files[name], unit="m"), name) for name in names]
+    return TaughtThings(recogniser, [surface.simplified() for surface in whole])
+
+
+def outline(things: TaughtThings, found: Verified, hypothesis: int, view: Observation, frame: Frame) -> Mask:
+    """The pixels of a frame in which the scan of a hypothesis shows."""
+    assert view.scene is not None
+    assert view.radius is not None
+    caster = things.verifier.caster
+    pose = found.poses[hypothesis]
+    turn = pose[:3, :3]
+    place = pose[:3, 3] + found.cameras[hypothesis, 0]
+
+    rows, columns = np.indices(frame.shape)
+    focal = frame.intrinsics[[0, 1], [0, 1]]
+    x = (columns + 0.5 - frame.intrinsics[0, 2]) / focal[0]
+    y = (rows + 0.5 - frame.intrinsics[1, 2]) / focal[1]
+    rays = np.stack([x, y, np.ones(frame.shape)], -1).reshape(-1, 3) @ view.scene.pose[:3, :3].T
+
+    origin = (view.scene.pose[:3, 3] * view.radius - place) @ turn
+    thing = found.things[hypothesis : hypothesis + 1]
+    depth, _ = caster.cast(thing, origin[None].astype(np.float32), (rays @ turn)[None].astype(np.float32))
+    return np.isfinite(depth[0]).reshape(frame.shape)
+
+
+def name_one(things: TaughtThings, name: str, label: Mask, frame: Frame, given: dict[str, Frame | str]) -> Named | None:
+    """Name the thing of a label, which is given by a point or by a mask; None where it is not found."""
+    by = str(given["by"])
+    shown = label & (frame.depth > 0)
+    point = np.median(frame.positions(*np.nonzero(shown)), axis=0)
+    thing = ObservedObject(up=None, point=point) if by == "point" else ObservedObject(up=None)
+    masked = Frame(frame.depth, frame.intrinsics, np.eye(4), mask=label, pixel_centre=0.5)
+    try:
+        view = thing.add(frame if by == "point" else masked)
+    except ObservationError as error:
+        print(f"{given['name']} {name} by {by}: {error}")
+        return None
+
+    evidence = things.log_evidence([view])
+    begun = time.process_time()
+    found = things.verify([view], evidence)
+    seconds = time.process_time() - begun
+
+    number = things.names.index(name)
+    own = np.flatnonzero(found.things == number)
+    hypothesis = int(own[0]) if len(own) else 0
+    posed = outline(things, found, hypothesis, view, frame)
+    return Named(
+        frame=str(given["name"]),
+        thing=name,
+        by=by,
+        by_features=things.names[found.by_features.argmax()],
+        answer=things.names[found.belief.argmax()],
+        among_three=number in np.argsort(-found.belief)[:3],
+        confidence=float(found.belief.max()),
+        residual=found.residual,
+        overlap=float((posed & label).sum() / (posed | label).sum()),
+        seconds=seconds,
+    )
+
+
+def named_in(things: TaughtThings, path: Path, names: list[str], intrinsics: NDArray[np.float64]) -> Iterator[Named]:
+    """All things of one frame, by a point and by a mask."""
+    depth = np.asarray(Image.open(path))
+    labels = np.asarray(Image.open(path.with_name(path.name.replace("depth", "labels"))))
+    frame = Frame(depth, intrinsics, np.eye(4))
+    for number, name in enumerate(names[1:], 1):
+        label = labels == number
+        if (label & (frame.depth > 0)).sum() < LEAST_PIXELS or name not in things.names:
+            continue
+        for by in ("point", "mask"):
+            found = name_one(things, name, label, frame, {"name": path.name.split(".")[0], "by": by})
+            if found is not None:
+                yield found
+
+
+def main(
+    folder: tyro.conf.Positional[Path],
+    scans: tyro.conf.Positional[Path],
+    models: str = "ycb",
+    intrinsics: tuple[float, float, float, float] = INTRINSICS,
+) -> None:
+    """Name the things in all frames of a folder, and print what was found.
+
+    Args:
+        folder: of the frames.
+        scans: folder of the scans.
+        models: memory of the things.
+        intrinsics: of the camera: fx, fy, cx, cy, pixels.
+    """
+    things = memory_with_surfaces(models, scans)
+    names = (folder / "names.txt").read_text().split()
+    fx, fy, cx, cy = intrinsics
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+    found: list[Named] = []
+    print("| frame | thing | given by | features | verified | belief | residual | overlap |")
+    print("|---|---|---|---|---|---|---|---|")
+    for path in sorted(folder.glob("*.depth.png")):
+        for each in named_in(things, path, names, matrix):
+            found.append(each)
+            said = f"{each.by_features} | {each.answer} | {each.confidence:.2f}"
+            print(f"| {each.frame} | {each.thing} | {each.by} | {said} | {each.residual:.2f} | {each.overlap:.2f} |")
+
+    print()
+    for by in ("point", "mask"):
+        some = [each for each in found if each.by == by]
+        features = sum(each.by_features == each.thing for each in some)
+        right = sum(each.answer == each.thing for each in some)
+        three = sum(each.among_three for each in some)
+        overlap = np.mean([each.overlap for each in some])
+        slowest = 1000 * max(each.seconds for each in some)
+        print(
+            f"by {by}: of {len(some)} things {features} named right by features, {right} with the geometry, {three} "
+            f"among the first three; mean overlap {overlap:.2f}; at most {slowest:.0f} ms of CPU for the geometry"
+        )
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,114 @@
+"""The plane that a thing stands on, as one view shows it beside the thing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+FEWEST_POINTS = 50  # on the plane
+LEAST_SHARE = 0.25  # of what is measured beside the thing
+LAYER = 0.15  # thickness of the layer that the plane is looked for in, half sizes of the thing
+THINNEST_LAYER = 0.006  # metres
+STEEPEST = np.cos(np.radians(15.0))  # vertical part of the normal: the vertical is known up to this
+FITS = 4
+NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal number
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The plane that a thing stands on.
+
+    Attributes:
+        normal: unit vector upwards, object frame, (3,) float64.
+        offset: height of the object frame's origin above it, metres.
+        noise: deviation of what is measured of it, as inverse depth, 1/metres. It holds the errors
+            that neighbouring pixels have in common.
+    """
+
+    normal: Float
+    offset: float
+    noise: float
+
+    def heights(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Height of points, (..., 3), object frame, above the plane, (...,), metres."""
+        normal = self.normal.astype(points.dtype)
+        return points @ normal + points.dtype.type(self.offset)
+
+
+def find_ground(beside: Float, thing: Float, origin: Float, axis: Float) -> Ground | None:
+    """Find the plane that a thing stands on in what is measured beside it.
+
+    It is the level plane that most points lie on, at the bottom of what is seen of the thing or
+    below.
+
+    Args:
+        beside: what is measured beside the thing, object frame, (N, 3), metres.
+        thing: what is measured of the thing, (M, 3).
+        origin: where the camera stands, (3,).
+        axis: the direction that it looks in, (3,).
+
+    Returns:
+        The plane; None where too few of the points lie on one.
+    """
+    enough = max(FEWEST_POINTS, LEAST_SHARE * len(beside))
+    if len(beside) < enough or not len(thing):
+        return None
+
+    half_size = float(np.linalg.norm(np.ptp(thing, axis=0))) / 2
+    layer = max(LAYER * half_size, THINNEST_LAYER)
+    heights = np.sort(beside[:, 2])
+    inside = np.searchsorted(heights, heights + layer) - np.arange(len(heights))
+    lowest = heights[inside.argmax()]
+    near = (beside[:, 2] >= lowest) & (beside[:, 2] <= lowest + layer)
+
+    centre = beside.mean(0) * (1, 1, 0)
+    level = np.column_stack([(beside - centre)[:, :2], np.ones(len(beside))])
+    plane = np.zeros(3)
+    off = np.zeros(len(beside))
+    for _ in range(FITS):
+        if near.sum() < enough:
+            return None
+        plane = np.linalg.lstsq(level[near], beside[near, 2], rcond=None)[0]
+        off = beside[:, 2] - level @ plane
+        typical = np.median(np.abs(off[near])) / NORMAL_MEDIAN
+        near = np.abs(off) < np.clip(3 * typical, THINNEST_LAYER / 2, layer)
+
+    normal = np.array([-plane[0], -plane[1], 1.0]) / np.sqrt(1 + plane[:2] @ plane[:2])
+    offset = -(plane[2] - plane[:2] @ centre[:2]) * normal[2]
+    ground = Ground(
+        normal, float(offset), _noise(off[near] * normal[2], beside[near], normal, origin, axis)
+    )
+    bottom = np.quantile(ground.heights(thing), 0.1)
+    if normal[2] < STEEPEST or bottom < -layer:
+        return None
+    return ground
+
+
+def _noise(off: Float, points: Float, normal: Float, origin: Float, axis: Float) -> float:
+    """Deviation of inverse depth from a plane, 1/metres, of points by their heights, (N,)."""
+    away = points - origin
+    depth = away @ axis
+    along = np.abs(away @ normal) / depth  # by how much a metre of depth changes the height
+    deviation = np.abs(off) / np.maximum(along, 0.05) / depth**2
+    return float(np.median(deviation)) / NORMAL_MEDIAN
+
+
+def levelling(grounds: Sequence[Ground]) -> Float:
+    """The smallest turn after which the grounds, as some views show them, are level in the mean.
+
+    Args:
+        grounds: none or more.
+
+    Returns:
+        A rotation matrix, (3, 3); that of no turn without a ground.
+    """
+    if not grounds:
+        return np.eye(3)
+    up = np.sum([ground.normal for ground in grounds], axis=0)
+    up = up / np.linalg.norm(up)
+    axis = np.array([up[1], -up[0], 0.0])  # up x z
+    skew = np.array([[0, 0, axis[1]], [0, 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + up[2])
