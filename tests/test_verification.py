@@ -372,6 +372,31 @@ def test_a_surface_keeps_the_frame_of_its_scan_and_loses_what_no_camera_sees():
         Surface.from_mesh(make_mesh(ball.vertices, ball.faces), "ball")
 
 
+@pytest.mark.parametrize(
+    ("body", "part"),
+    [
+        (trimesh.creation.icosphere(subdivisions=5, radius=0.04), trimesh.creation.box((0.02, 0.012, 0.012))),
+        (trimesh.creation.box((0.1, 0.07, 0.08)), trimesh.creation.icosphere(subdivisions=5, radius=0.01)),
+    ],
+    ids=["few triangles on a fine body", "a fine knob on a body of few triangles"],
+)
+def test_a_small_part_is_not_simplified_away_and_does_not_spoil_the_rest(body, part):
+    part = part.copy()
+    part.apply_translation((0.5 * body.extents[0], 0.0, 0.0))
+    whole = trimesh.util.concatenate([body, part])
+    mesh = make_mesh(whole.vertices, whole.faces, unit="m")
+    few = Surface.from_mesh(mesh, "thing").simplified()
+    assert len(few.faces) < len(mesh.faces)
+
+    camera = SimulatedCamera(mesh)
+    simple = SimulatedCamera(make_mesh(few.vertices, few.faces, unit="m"))
+    for around in (0.0, 60.0, 180.0):
+        pose = look_at_origin(np.radians(20.0), np.radians(around))
+        exact = camera.observe(pose).depth
+        off = np.abs(simple.observe(pose).depth - exact) * mesh.metres
+        assert np.mean(off[exact > 0] > 0.003) < 0.01
+
+
 def test_few_are_proposed_where_it_is_clear_and_a_ball_does_not_crowd_out_the_rest():
     clear = np.full((50, 16), 1e-12)
     clear[7, 3] = 1

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,9 @@ from nextview.errors import PolicyError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.recognition.evidence import Evidence, items_at
+
+if TYPE_CHECKING:
+    from nextview.things.expected_views import Outlook  # SciPy, which few policies need
 
 Float = NDArray[np.float64]
 Scope = Literal["global", "local"]  # where a policy may go: to all views, or to those of the local window
@@ -38,6 +41,7 @@ class EpisodeState:
         observations: all views taken so far, in order, B sequences; None unless the policy needs them.
         visibility: expected share of the object that shows from each view, 0 to 1, (B, V) float64; None unless the
             policy needs it.
+        outlook: what is known of the thing's geometry, of B episodes; None unless the policy needs it.
     """
 
     current: NDArray[np.int64]
@@ -53,6 +57,7 @@ class EpisodeState:
     observations: Sequence[Sequence[Observation]] | None = None
     visibility: Float | None = None
     joint: Float | None = None
+    outlook: "Sequence[Outlook] | None" = None
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -64,8 +69,10 @@ class EpisodeState:
         parts: dict[str, Any] = {}
         for name, value in vars(self).items():
             parts[name] = value[rows] if isinstance(value, np.ndarray) else value
-        observations = items_at(self.observations, rows)
-        return EpisodeState(**parts | {"evidence": self.evidence.select(rows), "observations": observations})
+        parts["evidence"] = self.evidence.select(rows)
+        parts["observations"] = items_at(self.observations, rows)
+        parts["outlook"] = items_at(self.outlook, rows)
+        return EpisodeState(**parts)
 
 
 class Policy(Protocol):
@@ -73,7 +80,9 @@ class Policy(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of maps that it wants in the evidence, "azimuth_bins", "joint", "observations", "visibility"."""
+        """Names of maps that it wants in the evidence, "azimuth_bins", "joint", "observations", "outlook",
+        "visibility".
+        """
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """The next view of each episode, (B,) int64: one of ``state.free``, of which each episode has at least one."""

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from nextview.errors import MeshError
 from nextview.geometry.mesh import UNITS, Mesh
@@ -18,6 +19,8 @@ FINEST_ERROR = (
     0.0004  # metres by which a simplified surface may be off: less than depth cameras measure
 )
 SURFACE_SAMPLES = 2000  # points at which the error of a simplified surface is measured
+LARGEST_ERROR = 5.0  # errors by which no point of a simplified surface is off
+NEARBY_SAMPLES = 50_000  # points of a simplified surface that others are looked for beside
 SPACING = 3.0  # distance between surfaces in a shared scene, in radii of the largest
 MISSED = np.float32(np.inf)  # depth along a ray that meets nothing
 
@@ -85,9 +88,9 @@ class Surface:
     def simplified(self, error: float = FINEST_ERROR) -> "Surface":
         """Reduce the number of triangles as far as the surface stays the same to a depth camera.
 
-        The triangles are halved (quadric error metric, ``fast_simplification``) until 95 % of
-        points on the original are no longer within ``error`` of the simplified surface; the last
-        one that was near enough is taken.
+        The triangles are halved (quadric error metric, ``fast_simplification``) until 5 % of the
+        points on the original are no longer within ``error`` of the simplified surface, or one of
+        them is far from it; the last one that was near enough is taken.
 
         Args:
             error: metres by which the surface may be off.
@@ -104,11 +107,27 @@ class Surface:
             smaller = Surface(
                 self.name, vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32)
             )
-            if not len(faces) or _deviation(self, smaller) > error:
+            if not len(faces) or not _near_enough(self, smaller, error):
                 break
             kept = smaller
             count //= 2
         return kept
+
+    @cached_property
+    def _areas(self) -> NDArray[np.float64]:
+        """Area of each triangle, (F,), square metres."""
+        corners = self.vertices[self.faces].astype(np.float64)
+        edges = corners[:, 1:] - corners[:, :1]
+        return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
+
+    @property
+    def area(self) -> float:
+        """Square metres."""
+        return float(self._areas.sum())
+
+    def triangles_by_area(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Draw triangles, each with the chance of its share of the area, (count,) int64."""
+        return rng.choice(len(self._areas), count, p=self._areas / self._areas.sum())
 
     def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         """Draw points that are spread evenly over the surface.
@@ -122,8 +141,7 @@ class Surface:
         """
         corners = self.vertices[self.faces].astype(np.float64)
         edges = corners[:, 1:] - corners[:, :1]
-        areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-        chosen = rng.choice(len(areas), count, p=areas / areas.sum())
+        chosen = self.triangles_by_area(count, rng)
 
         shares = rng.random((count, 2))
         outside = shares.sum(1) > 1  # of the triangle, in the other half of the parallelogram
@@ -131,20 +149,22 @@ class Surface:
         return corners[chosen, 0] + (shares[:, :, None] * edges[chosen]).sum(1)
 
 
-def _deviation(surface: Surface, simplified: Surface) -> float:
-    """Distance to a simplified surface within which 95 % of points on the original lie, metres.
+def _near_enough(surface: Surface, simplified: Surface, error: float) -> bool:
+    """Whether a simplified surface is nowhere far from its original, and seldom off by the error.
 
-    It is measured along the normals of the original by casting rays both ways.
+    Points are drawn evenly over the original, and as many on triangles of any size, which are most
+    numerous where there is detail. 95 % of each half have to lie within the error, along their
+    normals. And all have to lie within LARGEST_ERROR errors, along their normals or in any
+    direction: so a small part, such as a knob, is not lost.
     """
     rng = np.random.default_rng(0)
-    corners = surface.vertices[
-        surface.faces[rng.integers(len(surface.faces), size=SURFACE_SAMPLES)]
-    ]
+    evenly = surface.triangles_by_area(SURFACE_SAMPLES, rng)
+    anywhere = rng.integers(len(surface.faces), size=SURFACE_SAMPLES)
+    corners = surface.vertices[surface.faces[np.concatenate([evenly, anywhere])]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    some = lengths[:, 0] > 0
-    normals = normals[some] / lengths[some]
-    points = corners.mean(1)[some]
+    normals = normals / np.maximum(lengths, 1e-30)
+    points = (rng.dirichlet(np.ones(3), len(corners))[..., None] * corners).sum(1)
 
     scene = embree_scene([(simplified.vertices, simplified.faces)])
     distances = []
@@ -152,7 +172,19 @@ def _deviation(surface: Surface, simplified: Surface) -> float:
         start = np.ascontiguousarray(points - 1e-6 * direction, np.float32)
         hits = scene.run(start, np.ascontiguousarray(direction, np.float32), output=1)
         distances.append(np.where(hits["primID"] >= 0, hits["tfar"], np.inf))
-    return float(np.quantile(np.minimum(*distances), 0.95))
+    along = np.where(lengths[:, 0] > 0, np.minimum(*distances), 0)
+    for half in (along[:SURFACE_SAMPLES], along[SURFACE_SAMPLES:]):
+        if np.quantile(half, 0.95, method="lower") > error:
+            return False
+
+    # Along its normal a point at a crease may miss what is right beside it.
+    far = along > LARGEST_ERROR * error
+    if not far.any():
+        return True
+    nearby = simplified.sample(NEARBY_SAMPLES, rng)
+    spacing = float(np.sqrt(simplified.area / NEARBY_SAMPLES))
+    beside = np.asarray(cKDTree(nearby).query(points[far])[0])
+    return bool(beside.max() <= LARGEST_ERROR * error + spacing)
 
 
 class SurfaceCaster:

@@ -1,0 +1,85 @@
+"""The policy that tells things of known geometry apart: it looks where a view tells most."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.errors import PolicyError
+from nextview.geometry.viewsphere import Viewpoints
+from nextview.policies.base import EpisodeState, best_view, check_weight, travel_from
+from nextview.things.expected_views import Goal, Outlook
+
+Float = NDArray[np.float64]
+
+NEAR_TIE = 0.05  # of the best value: among views that are worth so nearly the same, travel decides
+LEAST_INFORMATION = 1e-3  # nats, below which no view is expected to tell anything
+
+
+@dataclass(frozen=True, eq=False)
+class DiscriminateGeometry:
+    """Goes where the view is expected to tell most of which thing it is.
+
+    The leading hypotheses are rendered from each candidate view, see ``things.expected_views``.
+    Among views that are worth nearly the same, that with the shortest way is taken. If no view is
+    expected to tell anything, the camera goes to the view farthest from all others, where the
+    belief is tested hardest.
+
+    Attributes:
+        viewpoints: the candidates, anywhere.
+        goal: what is to be told: which "thing" it is, or its "pose" too.
+        travel_weight: of a grid cell of travel, nats.
+    """
+
+    viewpoints: Viewpoints
+    goal: Goal = "thing"
+    travel_weight: float = 0.0
+    needs: tuple[str, ...] = ("outlook",)
+
+    def __post_init__(self) -> None:
+        check_weight(self.travel_weight)
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """The free view with the highest value, of each episode, (B,) int64."""
+        values = self.view_values(state)
+        values = np.where(np.isnan(values), -np.inf, values)
+        return best_view(self.viewpoints, state, values + 1e-9 * rng.random(values.shape))
+
+    def view_values(self, state: EpisodeState) -> Float:
+        """Expected information of each free view, nats, less what its way counts, (B, V)."""
+        if state.outlook is None:
+            raise PolicyError("this policy needs things of known geometry: a memory that was taught from scans")
+        travel = travel_from(self.viewpoints, state)
+        rows = zip(state.outlook, state.free, state.visited, travel, strict=True)
+        return np.stack([self._values(*row) for row in rows])
+
+    def _values(
+        self,
+        outlook: Outlook,
+        free: NDArray[np.bool_],
+        visited: NDArray[np.bool_],
+        travel: Float,
+    ) -> Float:
+        """Values of the views of one episode, (V,); NaN for those that are not free."""
+        values = np.full(len(free), np.nan)
+        some = np.flatnonzero(free)
+        if not len(some):
+            return values
+
+        cameras = outlook.cameras(self.viewpoints.directions[some])
+        information = outlook.expect(cameras).information(self.goal)
+        best = information.max()
+        if best < LEAST_INFORMATION:
+            information = self._apart(some, visited)
+            best = LEAST_INFORMATION
+        way = travel[some]
+        share = way / max(way.max(), 1e-12)
+        values[some] = information - NEAR_TIE * best * share - self.travel_weight * way
+        return values
+
+    def _apart(self, views: NDArray[np.int64], visited: NDArray[np.bool_]) -> Float:
+        """Values below LEAST_INFORMATION, by the distance from all visited views, (N,)."""
+        if not visited.any():
+            return np.zeros(len(views))
+        nearest = self.viewpoints.arc[views][:, visited].min(1)
+        return LEAST_INFORMATION * nearest / np.pi

@@ -1,0 +1,308 @@
+"""What candidate views are expected to tell: closed forms, and what the verifier really says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from nextview.errors import PolicyError
+from nextview.geometry.mesh import Mesh, make_mesh
+from nextview.geometry.observation import SceneView
+from nextview.geometry.viewsphere import ViewSphere, angle_between, look_at_origin
+from nextview.policies.base import EpisodeState
+from nextview.policies.discriminate_geometry import DiscriminateGeometry
+from nextview.recognition.evidence import Evidence
+from nextview.simulation.sensed_camera import SensedCamera
+from nextview.simulation.sensor import SENSORS
+from nextview.simulation.simulated import SimulatedCamera
+from nextview.things.depth_view import depth_view
+from nextview.things.expected_views import (
+    ExpectedSensor,
+    ExpectedViews,
+    Hypotheses,
+    Outlook,
+    Surroundings,
+    expected_views,
+)
+from nextview.things.registration import RegistrationPrior, render, rotation_about_z, start
+from nextview.things.surface import Surface, SurfaceCaster
+from nextview.things.verification import PixelModel, likelihood
+from nextview.things.verifier import Verifier
+from nextview.things.weighing import EvidenceWeights
+
+SPHERE = ViewSphere.named("40")
+AWAY = 0.45  # metres from the centre
+SENSOR = ExpectedSensor(pitch=1 / 424, noise=0.004)
+BODY = ((0.08, 0.08, 0.1), (0.0, 0.0, 0.0))
+KNOB = ((0.02, 0.02, 0.02), (0.05, 0.0, 0.0))  # on the side of +x
+HANDLE = ((0.05, 0.015, 0.06), (0.06, 0.0, 0.0))
+
+
+def box_mesh(*boxes) -> Mesh:
+    parts = [trimesh.creation.box(extents) for extents, _ in boxes]
+    for part, (_, middle) in zip(parts, boxes, strict=True):
+        part.apply_translation(middle)
+    whole = trimesh.util.concatenate(parts)
+    return make_mesh(whole.vertices, whole.faces, unit="m")
+
+
+def surfaces_of(*meshes: Mesh) -> SurfaceCaster:
+    return SurfaceCaster([Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)])
+
+
+def hypotheses_of(things, belief, yaws=None) -> Hypotheses:
+    poses = np.tile(np.eye(4), (len(things), 1, 1))
+    if yaws is not None:
+        poses[:, :3, :3] = rotation_about_z(np.array(yaws))
+    return Hypotheses(np.array(things), poses, np.array(belief, float))
+
+
+def cameras(sphere=SPHERE) -> np.ndarray:
+    poses = sphere.poses.copy()
+    poses[:, :3, 3] *= AWAY / sphere.distance
+    return poses
+
+
+def knob_or_not(belief=(0.5, 0.5), order=(0, 1), surroundings=None) -> ExpectedViews:
+    """A box, and the same with a knob; hypotheses in some order."""
+    caster = surfaces_of(box_mesh(BODY), box_mesh(BODY, KNOB))
+    hypotheses = hypotheses_of(order, np.array(belief)[list(order)])
+    return expected_views(caster, hypotheses, cameras(), SENSOR, surroundings)
+
+
+def test_the_best_view_shows_the_place_in_which_two_things_differ():
+    values = knob_or_not().information()
+    towards = np.degrees(angle_between(SPHERE.directions, np.array([1.0, 0, 0])))
+    assert towards[values.argmax()] < 60
+    assert values[(towards > 120)].max() < 0.01  # the body hides the knob
+    assert values[(towards < 40)].min() > 0.35
+    assert values.max() < np.log(2) + 1e-9
+
+
+def test_views_of_identical_things_are_worth_nothing():
+    caster = surfaces_of(box_mesh(BODY, KNOB), box_mesh(BODY, KNOB))
+    found = expected_views(caster, hypotheses_of((0, 1), (0.3, 0.7)), cameras(), SENSOR)
+    np.testing.assert_allclose(found.information(), 0, atol=1e-6)
+    np.testing.assert_allclose(found.divergence, 0, atol=1e-5)
+
+
+def test_a_small_motion_that_registration_takes_away_tells_nothing():
+    caster = surfaces_of(box_mesh(BODY), box_mesh(BODY))
+    hypotheses = hypotheses_of((0, 1), (0.5, 0.5))
+    hypotheses.poses[1, :3, 3] = (0.0015, -0.001, 0.0)
+    found = expected_views(caster, hypotheses, cameras(), SENSOR)
+    assert found.information().max() < 0.2
+    hypotheses.poses[1, :3, 3] = (0.03, 0.0, 0.0)
+    assert expected_views(caster, hypotheses, cameras(), SENSOR).information().max() > 0.4
+
+
+def wall(distance: float) -> np.ndarray:
+    """Points of a wall on the side of +x, metres."""
+    y, z = np.meshgrid(np.linspace(-0.3, 0.3, 121), np.linspace(-0.3, 0.5, 161))
+    return np.stack([np.full(y.size, distance), y.ravel(), z.ravel()], 1)
+
+
+def test_views_from_behind_an_obstacle_are_worth_nothing():
+    open_view = knob_or_not().information()
+    hidden = knob_or_not(surroundings=Surroundings(wall(0.12))).information()
+    ahead = (SPHERE.elevation < 0.4) & (SPHERE.directions[:, 0] > 0.6)
+    assert open_view[ahead].min() > 0.3
+    np.testing.assert_allclose(hidden[ahead], 0, atol=1e-9)
+    behind = knob_or_not(surroundings=Surroundings(wall(-0.2))).information()
+    np.testing.assert_allclose(behind[ahead], open_view[ahead], atol=0.2)
+    assert behind[ahead].min() > 0.3
+
+
+def test_the_order_of_the_hypotheses_does_not_matter():
+    forth = knob_or_not((0.3, 0.7), (0, 1))
+    back = knob_or_not((0.3, 0.7), (1, 0))
+    np.testing.assert_allclose(forth.information(), back.information(), atol=1e-6)
+    np.testing.assert_allclose(forth.divergence[:, 0, 1], back.divergence[:, 1, 0], atol=1e-5)
+    np.testing.assert_allclose(forth.divergence, forth.divergence.swapaxes(1, 2))
+
+
+def expected(divergence, belief, things) -> ExpectedViews:
+    """Views of which the divergences are known."""
+    divergence = np.asarray(divergence, float)
+    hypotheses = hypotheses_of(things, belief)
+    return ExpectedViews(hypotheses, divergence, np.zeros_like(divergence))
+
+
+@pytest.mark.parametrize("belief", [(0.5, 0.5), (0.9, 0.1)])
+def test_information_has_the_known_limits_and_is_between_them(belief):
+    divergence = np.zeros((3, 2, 2))
+    divergence[1] = 4.0 * (1 - np.eye(2))
+    divergence[2] = 4000.0 * (1 - np.eye(2))
+    found = expected(divergence, belief, (0, 1))
+    entropy = -sum(p * np.log(p) for p in belief)
+    kept = np.exp(-1)  # a quarter of the divergence
+    between = -sum(p * np.log(p + kept * (1 - p)) for p in belief)
+    np.testing.assert_allclose(found.information(), [0, between, entropy], atol=1e-12)
+    np.testing.assert_allclose(found.entropy(), entropy)
+    np.testing.assert_allclose(found.gain(0)[2], -np.log(belief[0]))
+
+
+def test_poses_of_one_thing_are_worth_telling_apart_only_for_the_pose():
+    far = 4000.0 * (1 - np.eye(2))[None]
+    found = expected(far, (0.5, 0.5), (3, 3))
+    np.testing.assert_allclose(found.information("thing"), 0, atol=1e-12)
+    np.testing.assert_allclose(found.information("pose"), np.log(2))
+
+    caster = surfaces_of(box_mesh(BODY, HANDLE))
+    two = hypotheses_of((0, 0), (0.5, 0.5), yaws=(0.0, np.pi))
+    by_render = expected_views(caster, two, cameras(), SENSOR)
+    np.testing.assert_allclose(by_render.information("thing"), 0, atol=1e-12)
+    assert by_render.information("pose").max() > 0.6
+    quarter = hypotheses_of((0, 0), (0.5, 0.5), yaws=(0.0, np.pi / 2))
+    square = expected_views(surfaces_of(box_mesh(BODY)), quarter, cameras(), SENSOR)
+    assert square.information("pose").max() < 0.1  # it looks the same
+
+
+@pytest.mark.parametrize("shown", [0, 1])
+@pytest.mark.parametrize("side", [0.0, 180.0])
+def test_what_is_expected_is_what_the_verifier_says(shown, side):
+    meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
+    mesh = meshes[shown]
+    camera = SimulatedCamera(mesh, 200)
+    found = camera.observe(look_at_origin(np.radians(36.0), np.radians(side)))
+    rng = np.random.default_rng(shown)
+    depth = found.depth
+    noise = SENSOR.noise * depth**2 * found.radius * rng.standard_normal(depth.shape)
+    measured = np.where(depth > 0, depth + noise, 5.0).astype(np.float32)
+    scene = SceneView(measured, depth > 0, found.pose, found.intrinsics)
+    view = depth_view(replace(found, scene=scene), 40)
+
+    caster = surfaces_of(*meshes)
+    placed = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
+    centre = mesh.centre
+    placed = replace(placed, centres=caster.centres.astype(float) - centre)
+    said = likelihood(view, render(caster, placed, view, 0)).mean
+    ratio = said[shown] - said[1 - shown]
+
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = -centre
+    hypotheses = Hypotheses(np.array([0, 1]), poses, np.array([0.5, 0.5]))
+    pose = found.pose.copy()
+    pose[:3, 3] *= found.radius
+    sensor = ExpectedSensor(view.pitch, SENSOR.noise)
+    floor = Surroundings(np.zeros((0, 3)), -0.05, 10.0)
+    plain = EvidenceWeights(geometry=1.0, correlation=0.0)
+    expected_ratio = expected_views(caster, hypotheses, pose[None], sensor, floor, 1, plain)
+    divergence = expected_ratio.divergence[0, 0, 1]
+    if side == 0.0:
+        assert ratio > 0.15
+        assert divergence == pytest.approx(ratio, rel=0.5)
+    else:
+        assert abs(ratio) < 0.15
+        assert divergence < 0.15
+
+
+def settled(belief, visited, reachable=None, travel=None, **policy) -> tuple[int, np.ndarray]:
+    """Where the policy goes from some views, a box or the same with a knob, and its values."""
+    caster = surfaces_of(box_mesh(BODY), box_mesh(BODY, KNOB))
+    outlook = Outlook(
+        caster=caster,
+        hypotheses=hypotheses_of((0, 1), belief),
+        sensor=SENSOR,
+        surroundings=Surroundings.nothing(),
+        distance=AWAY,
+        taken=len(visited),
+        weights=EvidenceWeights(),
+        pixels=PixelModel(),
+        prior=RegistrationPrior(),
+    )
+    been = np.isin(np.arange(len(SPHERE)), visited)[None]
+    state = EpisodeState(
+        current=np.array(visited[-1:]),
+        visited=been,
+        belief=np.array([belief]),
+        evidence=Evidence(np.zeros((1, 2))),
+        step=len(visited),
+        reachable=reachable,
+        travel=travel,
+        outlook=[outlook],
+    )
+    chooses = DiscriminateGeometry(SPHERE, **policy)
+    values = chooses.view_values(state)[0]
+    return int(chooses.next_views(state, np.random.default_rng(0))[0]), values
+
+
+def test_the_policy_goes_where_the_knob_shows_and_can_be_reached():
+    from_behind = 4  # on the ring of elevation 0, at an azimuth of 180 degrees
+    chosen, values = settled((0.5, 0.5), [from_behind])
+    assert SPHERE.directions[chosen, 0] > 0.5
+    assert np.isnan(values[from_behind])
+
+    reachable = (SPHERE.directions[:, 0] < 0.3)[None]
+    chosen, values = settled((0.5, 0.5), [from_behind], reachable)
+    assert reachable[0, chosen]
+    assert (np.isnan(values) == ~(reachable[0] & (np.arange(40) != from_behind))).all()
+
+
+@pytest.mark.parametrize("near", [1, 7])
+def test_among_views_that_are_worth_the_same_the_nearer_one_is_taken(near, monkeypatch):
+    def the_same(outlook, cameras):
+        divergence = np.tile(5.0 * (1 - np.eye(2)), (len(cameras), 1, 1))
+        return ExpectedViews(outlook.hypotheses, divergence, divergence)
+
+    monkeypatch.setattr(Outlook, "expect", the_same)
+    travel = np.where(np.arange(40) == near, 1.0, 9.0)[None]
+    assert settled((0.5, 0.5), [4], travel=travel)[0] == near
+
+
+def test_where_nothing_is_left_to_tell_the_belief_is_tested_from_afar():
+    chosen, _ = settled((1.0, 0.0), [0])
+    assert SPHERE.arc[0, chosen] == SPHERE.arc[0].max()
+    _, values = settled((0.5, 0.5), [4], travel=np.full((1, 40), 3.0), travel_weight=0.1)
+    _, free = settled((0.5, 0.5), [4], travel=np.full((1, 40), 3.0))
+    np.testing.assert_allclose(values[0], free[0] - 0.3)
+
+
+def test_a_policy_without_known_geometry_says_so():
+    state = EpisodeState(
+        current=np.zeros(1, np.int64),
+        visited=np.zeros((1, 40), bool),
+        belief=np.ones((1, 1)),
+        evidence=Evidence(np.zeros((1, 1))),
+        step=1,
+    )
+    with pytest.raises(PolicyError, match="needs things of known geometry"):
+        DiscriminateGeometry(SPHERE).view_values(state)
+    with pytest.raises(PolicyError, match="travel weight"):
+        DiscriminateGeometry(SPHERE, travel_weight=-1.0)
+
+
+def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
+    meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
+    verifier = Verifier([Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)], [0, 1], [np.eye(3)] * 2)
+    sensor = replace(SENSORS["none"], radius=meshes[1].metres, distance=AWAY)
+    block = trimesh.creation.box((0.2, 1.0, 1.5))
+    block.apply_translation((1.8, 0.0, 0.0))  # object radii
+    obstacle = Mesh(np.asarray(block.vertices), block.faces.astype(np.int32), np.zeros(3), 1.0)
+    camera = SensedCamera(meshes[1], sensor, np.random.default_rng(0), around=obstacle)
+    observations = [camera.observe(SPHERE.poses[view]) for view in (12, 18)]
+    found = verifier(observations, np.full((2, 16), 1 / 32))
+    outlook = Outlook.of(verifier, found, observations)
+    assert outlook.taken == 2
+    assert outlook.distance == pytest.approx(AWAY, rel=1e-3)
+    assert outlook.sensor.pitch == pytest.approx(1 / observations[0].scene.intrinsics[0, 0])
+    assert outlook.hypotheses.belief.sum() == pytest.approx(1)
+    around = outlook.surroundings
+    metres = meshes[1].metres
+    assert around.floor == pytest.approx(-0.05, abs=0.003)
+    assert around.reach == pytest.approx(1.5 * metres, rel=0.1)  # radius of the table
+    assert len(around.obstacles) > 20
+    assert around.obstacles[:, 0].min() > 1.6 * metres
+
+
+def test_words_name_the_rivals_and_how_much_is_settled():
+    found = knob_or_not((0.6, 0.4))
+    best = int(found.information().argmax())
+    worst = int(found.information().argmin())
+    names = ("box", "knob")
+    assert found.words(best, names).startswith("would settle box or knob: they differ in ")
+    assert found.words(worst, names).startswith("would tell little of box or knob")
+    alone = expected(np.zeros((1, 1, 1)), (1.0,), (1,))
+    assert alone.words(0, names) == "there is no rival of knob"
+    assert found.told_apart(best) == (0, 1)
