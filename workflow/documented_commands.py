@@ -138,7 +138,7 @@ class Step:
     @property
     def needs(self) -> frozenset[str]:
         """What has to be installed besides the base installation, as pip is told."""
-        return frozenset(wanted for pattern, wanted in NEEDS.items() if re.search(pattern, self.text))
+        return needs_of(self.text)
 
     @property
     def why_not(self) -> str | None:
@@ -159,6 +159,11 @@ class Step:
                     name = f"--{option.removeprefix('--').split()[0]}"
                     text += "" if name in text else f" --{option.removeprefix('--')}"
         return text
+
+
+def needs_of(text: str) -> frozenset[str]:
+    """What the commands or the Python code of a text need besides the base installation."""
+    return frozenset(wanted for pattern, wanted in NEEDS.items() if re.search(pattern, text))
 
 
 def steps_of(page: str) -> Iterator[Step]:
@@ -298,6 +303,11 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
     "docs/add_a_policy.md": "cp -r views.zarr modelnet10.zarr",
     "docs/add_a_recogniser.md": "cp test.npz mine.npz; mkdir models; python own_recogniser.py models/linear",
     "docs/scenes.md": "python own_recogniser.py recogniser",
+    # Predictions name their store: those that are planned for have to be of the one in this folder.
+    "research/README.md": (
+        "nextview predict views.zarr test.npz --split test --workers 1 --overwrite; "
+        "nextview train map views.zarr runs/lem --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
+    ),
 }
 BESIDE = ("docs/your_objects.md",)  # pages whose Python blocks do again what their commands did: in a folder of its own
 STORES = (  # made once, for all pages
@@ -361,7 +371,7 @@ def run_page(page: str, environments: Environments, folder: Path, beside: Path |
     """
     failed = []
     if page in PREPARED:
-        status, said, _ = environments.run(PREPARED[page], folder)
+        status, said, _ = environments.run(PREPARED[page], folder, needs_of(PREPARED[page]))
         if status != 0:
             raise SystemExit(f"{page}: {PREPARED[page]}\n{said}")
     python: list[str] = [BEFORE[page]] if page in BEFORE else []
