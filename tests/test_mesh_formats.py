@@ -1,7 +1,10 @@
 """Mesh files as editors save them and exporters write them: encodings, line ends, kinds of PLY and STL."""
 
+import bz2
 import codecs
+import gzip
 import itertools
+import lzma
 import re
 
 import numpy as np
@@ -150,6 +153,22 @@ def test_a_binary_ply_cut_anywhere_in_its_rows_is_refused(tmp_path):
             load_mesh(path)
 
 
+@pytest.mark.parametrize("order", ["<", ">"], ids=["little endian", "big endian"])
+def test_numbers_beside_lists_of_different_lengths(tmp_path, order):
+    header = f"ply\nformat binary_{'little' if order == '<' else 'big'}_endian 1.0\nelement vertex {len(POINTS)}\n"
+    header += "property float x\nproperty list uchar short faces\nproperty double y\nproperty float z\n"
+    header += f"element face {len(FACES)}\nproperty list int ushort vertex_indices\nend_header\n"
+    body = b""
+    for k, (x, y, z) in enumerate(POINTS):
+        body += np.array([x], f"{order}f4").tobytes() + bytes([k % 3]) + np.arange(k % 3, dtype=f"{order}i2").tobytes()
+        body += np.array([y], f"{order}f8").tobytes() + np.array([z], f"{order}f4").tobytes()
+    for face in FACES:
+        body += np.array([len(face)], f"{order}i4").tobytes() + np.array(face, f"{order}u2").tobytes()
+    path = tmp_path / "house.ply"
+    path.write_bytes(header.encode() + body)
+    same_house(load_mesh(path))
+
+
 STRIPS = [[0, 1, 2, 3, -1, 3, 2, 4], [4, 5, 4, 6, 7]]  # the second one turns: it names a vertex twice
 STRIP_TRIANGLES = [(0, 1, 2), (2, 1, 3), (3, 2, 4), (4, 5, 6), (4, 6, 7)]
 
@@ -195,6 +214,11 @@ REFUSED = {
     "a list of less than nothing": (header_of(*XYZ, "element face 1", CORNERS) + "-3 0 1 2\n", "a list of -3"),
     "a word": (header_of(*XYZ, "element face 1", CORNERS) + "3 0 one 2\n", "something else than numbers"),
     "less than no rows": (header_of(*XYZ, "element face -1", CORNERS), "announces -1 rows"),
+    "rows that are no number": (header_of(*XYZ, "element face many", CORNERS), "the line 'element face many'"),
+    "an element without rows": (header_of(*XYZ, "element face", CORNERS), "the line 'element face'"),
+    "two elements of one name": (header_of(*XYZ, "element vertex 3", *XYZ), "two elements vertex"),
+    "a column of nothing": ("ply\nformat ascii 1.0\nproperty float x\nend_header\n0\n", "before any element"),
+    "a list of one type": (header_of(*XYZ, "element face 1", "property list int vertex_indices"), "property list int"),
     "no format": ("ply\nelement vertex 1\nend_header\n0\n", "binary_big_endian, not missing"),
     "a binary file saved as text": (
         codecs.BOM_UTF16_LE + binary_ply().decode("latin-1").encode("utf-16-le"),
@@ -277,4 +301,87 @@ def test_a_signalling_nan_in_single_precision_is_refused_like_any_other(tmp_path
     path = tmp_path / f"nan.{kind}"
     path.write_bytes(data)
     with pytest.raises(MeshError, match="finite"):
+        load_mesh(path)
+
+
+# Dialects, and files that are something else
+
+
+BARE = "\n".join([*map(numbers, POINTS), *(numbers([len(face), *face]) for face in FACES)])
+COLOURED = "\n".join(
+    [*(f"{numbers(p)} 0.5 0.25 1 1" for p in POINTS), *(f"{numbers([len(face), *face])} 9 9 9" for face in FACES)]
+)
+COUNTS = f"{len(POINTS)} {len(FACES)}"
+OFF_DIALECTS = {
+    "lower case": f"off\n{COUNTS} 0\n{BARE}\n",
+    "mixed case": f"Off {COUNTS} 0\n{BARE}\n",
+    "counts on three lines": f"OFF\n{len(POINTS)}\n{len(FACES)}\n0\n{BARE}\n",
+    "counts on three lines, the first beside OFF": f"OFF {len(POINTS)}\n{len(FACES)}\n  17 \n{BARE}\n",
+    "counts on two lines": f"OFF\n{len(POINTS)}\n{len(FACES)} 0\n{BARE}\n",
+    "no count of edges": f"OFF\n{COUNTS}\n{BARE}\n",
+    "counts beside OFF without a gap": f"OFF{COUNTS} 0\n{BARE}\n",
+    "colours": f"COFF\n{COUNTS} 0\n{COLOURED}\n",
+    "colours in lower case": f"coff {COUNTS} 0\n{COLOURED}\n",
+    "colours without a gap": f"COFF{COUNTS} 0\n{COLOURED}\n",
+    "normals": f"NOFF\n{COUNTS} 0\n{COLOURED}\n",
+    "normals and colours": f"NCOFF\n{COUNTS} 0\n{COLOURED}\n",
+    "all of them": f"STCNOFF\n{COUNTS} 0\n{COLOURED}\n",
+}
+
+
+@pytest.mark.parametrize("dialect", OFF_DIALECTS)
+def test_dialects_of_off(tmp_path, dialect):
+    path = tmp_path / "house.off"
+    path.write_text(OFF_DIALECTS[dialect])
+    same_house(load_mesh(path))
+
+
+def test_an_obj_in_capitals(tmp_path):
+    path = tmp_path / "house.obj"
+    path.write_text(as_obj("house").upper())
+    same_house(load_mesh(path))
+
+
+WEB_PAGE = "<html><head><title>Sign in</title></head></html>"
+FOREIGN = {
+    "OFF with four coordinates": ("a.off", f"4OFF\n{COUNTS} 0\n{COLOURED}", "begins with 4OFF, a kind of OFF that"),
+    "OFF of any dimension": ("a.off", f"nOFF 3\n{COUNTS} 0\n{BARE}", "begins with nOFF"),
+    "OFF in binary": ("a.off", b"OFF BINARY\n" + bytes(60), "begins with OFF BINARY"),
+    "gzip": ("a.obj", gzip.compress(as_obj().encode()), "packed with gzip; unpack"),
+    "bzip2": ("a.ply", bz2.compress(as_ply().encode()), "packed with bzip2"),
+    "xz": ("a.off", lzma.compress(as_off().encode()), "packed with xz"),
+    "ZIP": ("a.stl", b"PK\x03\x04" + bytes(200), "ZIP archive"),
+    "a picture": ("a.glb", b"\x89PNG\r\n\x1a\n" + bytes(20), "a PNG picture"),
+    "a web page": ("a.obj", f"\n<!DOCTYPE html>\n{WEB_PAGE}", "a web page"),
+    "a web page in XML, in UTF-16": (
+        "a.ply", codecs.BOM_UTF16_LE + f'<?xml version="1.0"?>\n{WEB_PAGE}'.encode("utf-16-le"), "a web page",
+    ),
+    "a pointer": ("a.ply", "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 9\n", "git lfs pull"),
+    "COLLADA": ("a.obj", '<?xml version="1.0"?>\n<COLLADA version="1.4.1"></COLLADA>', "a COLLADA file"),
+    "glTF": ("a.glb", '{\n  "asset": {"version": "2.0"}}', "export it as GLB"),
+    "OFF called OBJ": ("a.obj", as_off(), "content is that of an OFF file"),
+    "OBJ called PLY": ("a.ply", f"# by hand\n\n\nmtllib a.mtl\n{as_obj()}", "content is that of an OBJ file"),
+    "PLY called STL": ("a.stl", as_ply("x"), "content is that of a PLY file"),
+    "PLY called OBJ": ("a.obj", binary_ply(), "content is that of a PLY file"),
+    "STL called OFF": ("a.off", as_stl("x"), "content is that of an STL file"),
+    "GLB called OBJ": ("a.obj", b"glTF" + bytes(50), "content is that of a GLB file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FOREIGN)
+def test_a_file_that_is_something_else_is_called_what_it_is(tmp_path, case):
+    name, content, sentence = FOREIGN[case]
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(MeshError, match=f"{name}: not a readable .*{re.escape(sentence)}"):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize("kind", TEXTS)
+def test_decimal_commas_are_named(tmp_path, kind):
+    path = tmp_path / f"house.{kind}"
+    halves = re.sub(r"(?m)^(v |vertex )?(\d) (\d) (\d)$", r"\g<1>\2,5 \3,0 \4,0", TEXTS[kind]())
+    assert ",5 " in halves
+    path.write_text(halves)
+    with pytest.raises(MeshError, match=r"decimal commas \(\d,5\); export it with points"):
         load_mesh(path)

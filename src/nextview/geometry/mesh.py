@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from nextview.checks import one_line, whole
 from nextview.errors import MeshError
 from nextview.files import regular_file
+from nextview.geometry.file_content import foreign_content
 from nextview.geometry.mesh_file import READERS
 from nextview.geometry.mesh_parts import keep_largest_part, mesh_doubts, refuse_lost_shape
 from nextview.geometry.triangles import MAX_FACES, check_faces, no_faces
@@ -165,14 +166,16 @@ def load_mesh(
             raise MeshError("the file is empty")
         vertices, faces = READERS[suffix](data, max_faces)
         check_faces(len(faces), max_faces)
-        if len(faces) == 0 and len(vertices):
-            raise MeshError(no_faces(len(vertices)))
+        if len(faces) == 0:
+            raise MeshError(no_faces(len(vertices)) if len(vertices) else "it holds neither vertices nor faces")
     except OSError as error:
         raise MeshError(f"{path}: cannot be read ({error.strerror})") from None
     except MemoryError:
         raise MeshError(f"{path}: too large for this machine's memory") from None
     except (ValueError, OverflowError) as error:  # MeshErrors, and numbers that are none or too large
-        reason = str(error) if isinstance(error, MeshError) else f"{type(error).__name__}: {error}"
+        reason = foreign_content(data, suffix)
+        if reason is None:
+            reason = str(error) if isinstance(error, MeshError) else f"{type(error).__name__}: {error}"
         raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({one_line(reason, 240)})") from None
     if is_y_up(path, up):
         vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)

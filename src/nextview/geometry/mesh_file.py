@@ -21,6 +21,14 @@ from nextview.geometry.ply_file import read_ply
 from nextview.geometry.stl_file import read_stl
 from nextview.geometry.triangles import MAX_FACES, check_faces, triangulate
 
+# The letters before OFF announce texture coordinates, colours and normals, which follow each vertex's position. Four
+# coordinates a vertex (4OFF), any number of them (nOFF) and binary files are not read.
+OFF_HEADER = re.compile(
+    rb"\s*(?:(?P<unread>(?:ST|C|N)*(?:4n?|(?-i:n)(?=OFF))OFF|\w*OFF[ \t]+BINARY)\b|(?:ST|C|N)*OFF(?:\b|(?=[0-9])))",
+    re.IGNORECASE,
+)
+# Of vertices, faces and edges, on one line or on three; the last is often missing.
+OFF_COUNTS = re.compile(rb"\s*(\d+)\s+(\d+)(?:\s+\d+(?=[ \t]*(?:\n|$)))?[ \t]*(?=\n|$)")
 Shape = tuple[NDArray[np.float64], NDArray[np.int64]]  # vertices, (V, 3), and triangles, (F, 3)
 GLB_TRIANGLES, GLB_STRIP, GLB_FAN = 4, 5, 6
 GLB_NODES = 20_000  # Trimesh takes some seconds to place so many
@@ -39,10 +47,12 @@ def read_off(data: bytes, max_faces: int = MAX_FACES) -> Shape:
     text = plain_text(data)
     if b"#" in text:
         text = re.sub(rb"#[^\n]*", b"", text)
-    header = re.match(rb"\s*(?:ST)?(?:C|N|CN)?OFF\b|\s*OFF(?=[0-9])", text)
+    header = OFF_HEADER.match(text)
     if header is None:
         raise MeshError("it does not begin with OFF")
-    counts = re.compile(rb"\s*(\d+)\s+(\d+)(?:[ \t]+\d+)?[ \t]*(?=\n|$)").match(text, header.end())
+    if header["unread"]:
+        raise MeshError(f"it begins with {header[0].strip().decode()}, a kind of OFF that is not read here")
+    counts = OFF_COUNTS.match(text, header.end())
     if counts is None:
         raise MeshError("the counts of vertices and faces are missing")
     n_vertices = int(counts[1])
@@ -110,10 +120,10 @@ def read_obj(data: bytes, max_faces: int = MAX_FACES) -> Shape:
     sizes = array("q")
     count = 0
     for word, *words in lines_of_words(text):
-        if word == b"v":
+        if word in (b"v", b"V"):
             positions.extend(_coordinates(words, count))
             count += 1
-        elif word == b"f":
+        elif word in (b"f", b"F"):
             if len(words) < 3:
                 raise MeshError(f"cut short, a face has {len(words)} of 3 or more corners")
             asked = [int(word.partition(b"/")[0]) for word in words]

@@ -23,6 +23,7 @@ KINDS = {  # the format's names of its numbers, and those that are found in the 
 FORMAT_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q", "f8": "d"}
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 CORNER_LISTS = ("vertex_indices", "vertex_index")
+BYTES_OF_NUMBER = 8  # of a text, all of which are read as doubles
 STRIP_END = -1  # among the vertices of a strip: here another one begins
 
 Corners = tuple[NDArray[np.int64], NDArray[np.int64]]  # of polygons, one after the other, and how many each has
@@ -89,13 +90,10 @@ def read_ply(data: bytes, max_faces: int = MAX_FACES) -> tuple[NDArray[np.float6
     lists: dict[str, Lists] = {}
     for element in elements:
         scalars[element.name], lists[element.name], sizes = _read_element(body, at, element)
+        sizes = np.broadcast_to(sizes, element.rows)
         if row_bytes is not None:
-            own = row_bytes[row : row + element.rows]
-            if (own != sizes).any():
-                first = int(np.flatnonzero(own != sizes)[0])
-                wrong = f"row {first} of element {element.name} has {own[first] // 8} numbers"
-                raise MeshError(f"{wrong}, not {np.broadcast_to(sizes, own.shape)[first] // 8} as the header says")
-        at += int(np.broadcast_to(sizes, element.rows).sum())
+            _check_rows(element, row_bytes[row : row + element.rows], sizes)
+        at += int(sizes.sum())
         row += element.rows
 
     vertices = _vertices(scalars.get("vertex", {}))
@@ -104,6 +102,17 @@ def read_ply(data: bytes, max_faces: int = MAX_FACES) -> tuple[NDArray[np.float6
     if len(faces) + len(strips) == 0 and len(vertices):
         _say_what_it_is(elements, len(vertices))
     return vertices, np.concatenate([faces, strips])
+
+
+def _check_rows(element: Element, there: NDArray[np.int64], wanted: NDArray[np.int64]) -> None:
+    """Refuse rows of a text that have more or fewer numbers than the header and their lists say; in bytes, (rows,)."""
+    wrong = np.flatnonzero(there != wanted)
+    if len(wrong):
+        row = int(wrong[0])
+        numbers_there = there[row] // BYTES_OF_NUMBER
+        numbers_wanted = wanted[row] // BYTES_OF_NUMBER
+        said = f"row {row} of element {element.name} has {numbers_there} numbers"
+        raise MeshError(f"{said}, not {numbers_wanted} as the header says")
 
 
 def _open(data: bytes) -> tuple[bool, list[Element], bytes]:
@@ -134,20 +143,49 @@ def _open(data: bytes) -> tuple[bool, list[Element], bytes]:
 
 
 def _elements(lines: list[list[str]], is_text: bool, order: str) -> list[Element]:
-    """The elements that a header announces, without those that have no columns."""
+    """The elements that a header announces, without those that have no columns.
+
+    Args:
+        lines: the words of each line of the header.
+        is_text: whether the rows are text, of which all numbers are read as doubles.
+        order: of the bytes, as NumPy has it.
+    """
     found: list[tuple[str, int, list[Property]]] = []
     for words in lines:
-        if words[:1] == ["element"] and len(words) == 3:
-            found.append((words[1], int(words[2]), []))
-            if found[-1][1] < 0:
-                raise MeshError(f"its header announces {words[2]} rows of element {words[1]}")
+        if words[:1] == ["element"]:
+            name, rows = _name_and_rows(words)
+            if name in (earlier for earlier, _, _ in found):
+                raise MeshError(f"its header has two elements {name}")
+            found.append((name, rows, []))
         elif words[:1] == ["property"]:
-            *kinds, name = words[2 if words[1:2] == ["list"] else 1 :] or [""]
-            if not found or len(kinds) != (2 if words[1:2] == ["list"] else 1) or not KINDS.keys() >= set(kinds):
-                raise MeshError(f"its header has the line {' '.join(words)!r}, which is none of a PLY file")
-            types = [np.dtype("f8" if is_text else order + KINDS[kind]) for kind in kinds]
-            found[-1][2].append(Property(name, types[-1], types[0] if len(types) == 2 else None))
+            if not found:
+                raise MeshError(f"its header has the line {' '.join(words)!r} before any element")
+            found[-1][2].append(_property(words, is_text, order))
     return [Element(name, rows, tuple(properties)) for name, rows, properties in found if properties]
+
+
+def _name_and_rows(words: list[str]) -> tuple[str, int]:
+    """What a line "element NAME ROWS" says."""
+    if len(words) != 3 or not words[2].lstrip("-").isdecimal():
+        raise _bad_line(words)
+    rows = int(words[2])
+    if rows < 0:
+        raise MeshError(f"its header announces {rows} rows of element {words[1]}")
+    return words[1], rows
+
+
+def _property(words: list[str], is_text: bool, order: str) -> Property:
+    """What a line "property KIND NAME" or "property list KIND KIND NAME" says."""
+    is_list = words[1:2] == ["list"]
+    kinds = words[2:-1] if is_list else words[1:-1]
+    if len(kinds) != (2 if is_list else 1) or not KINDS.keys() >= set(kinds):
+        raise _bad_line(words)
+    types = [np.dtype("f8" if is_text else order + KINDS[kind]) for kind in kinds]
+    return Property(words[-1], types[-1], types[0] if is_list else None)
+
+
+def _bad_line(words: list[str]) -> MeshError:
+    return MeshError(f"its header has the line {' '.join(words)!r}, which is none of a PLY file")
 
 
 def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, NDArray[np.int64]]:
@@ -165,34 +203,61 @@ def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, NDArray[np.int64]]:
     found = numbers(text if total == len(begins) else text[: begins[total]])
     if len(found) != total:
         raise MeshError("its rows hold something else than numbers")
-    return found.tobytes(), 8 * words
+    return found.tobytes(), BYTES_OF_NUMBER * words
 
 
 def _read_element(data: bytes, at: int, element: Element) -> tuple[Scalars, Lists, NDArray[np.int64]]:
     """The columns of an element whose rows begin at a byte, and the bytes of each row: (rows,), or () if all are equal.
 
-    Of rows with lists of different lengths, no single numbers are read.
+    Args:
+        data: the bytes that the rows stand in.
+        at: the byte with which they begin.
+        element: whose rows they are.
+
+    Raises:
+        MeshError: there are fewer bytes than the rows need, or the length of a list is none.
     """
     least = sum(
         column.kind.itemsize if column.count is None else column.count.itemsize for column in element.properties
     )
     if at + element.rows * least > len(data):
         raise MeshError("the file is cut short, its header announces more rows than there are")
-    first_lengths, _ = _walk(data, at, element, 1)
-    lengths = {name: int(own[0, 1]) for name, own in first_lengths.items()}
+
+    first_row, _ = _walk(data, at, element, 1)
+    lengths = {name: int(own[0, 1]) for name, own in first_row.items()}
     table = _table(data, at, element, lengths)
     if table is not None:
         return table
+    return _columns(data, at, element)
+
+
+def _columns(data: bytes, at: int, element: Element) -> tuple[Scalars, Lists, NDArray[np.int64]]:
+    """As ``_read_element``, of rows with lists of different lengths."""
     found, ends = _walk(data, at, element, element.rows)
-    lists = {}
-    for column in element.lists:
+    scalars: Scalars = {}
+    lists: Lists = {}
+    place = np.append(at, ends[:-1])  # in each row, of the next column
+    for column in element.properties:
+        if column.count is None:
+            scalars[column.name] = _gathered(data, place, column.kind)
+            place = place + column.kind.itemsize
+            continue
         starts, counts = found[column.name].T
         before = np.cumsum(counts) - counts
         within = np.arange(int(counts.sum())) - np.repeat(before, counts)
         places = np.repeat(starts, counts) + within * column.kind.itemsize
-        single_bytes = np.frombuffer(data, np.uint8)[places[:, None] + np.arange(column.kind.itemsize)]
-        lists[column.name] = (single_bytes.view(column.kind)[:, 0], counts)
-    return {}, lists, np.diff(ends, prepend=at)
+        lists[column.name] = (_gathered(data, places, column.kind), counts)
+        place = starts + counts * column.kind.itemsize
+    return scalars, lists, np.diff(ends, prepend=at)
+
+
+def _gathered(data: bytes, places: NDArray[np.int64], kind: np.dtype) -> NDArray:
+    """The numbers that begin at some bytes, (n,)."""
+    held = np.frombuffer(data, np.uint8)
+    single_bytes = np.empty((len(places), kind.itemsize), np.uint8)
+    for byte in range(kind.itemsize):  # one after the other: an index of all would take eight times the memory
+        single_bytes[:, byte] = held[places + byte]
+    return single_bytes.view(kind)[:, 0]
 
 
 def _table(
