@@ -223,6 +223,24 @@ def test_boxes_hide_what_is_behind_them_and_are_not_taken_for_the_object():
     assert min(shares) < 0.5 < max(shares)
 
 
+def test_the_visible_share_of_a_ball_behind_a_wall():
+    ball = replace(SENSORS["wrist"], boxes=0)
+    alone = SensedCamera(BALL, ball, rng(3))
+    pose = SPHERE.poses[0]
+    assert alone.visible_share(pose) == 1
+
+    # A wall before the half of the ball that is on the right of a camera in the horizontal plane, and all of it.
+    towards = pose[:3, 2]
+    right = pose[:3, 0]
+    for share, centre in ((0.5, right), (0.0, 0 * right), (1.0, 2.5 * right)):
+        frame = np.eye(4)
+        frame[:3, :3] = np.stack([right, np.cross(towards, right), towards], 1)
+        frame[:3, 3] = -1.2 * towards + 1.0 * centre
+        wall = trimesh.creation.box((2.0, 4.0, 0.01), frame)
+        around = replace(BALL, vertices=np.asarray(wall.vertices), faces=np.asarray(wall.faces, np.int32))
+        assert SensedCamera(BALL, ball, rng(3), around=around).visible_share(pose) == pytest.approx(share, abs=0.02)
+
+
 def test_a_mix_is_another_sensor_for_every_object():
     drawn = [SensedCamera(BALL, "mix", rng(26, i)).sensor for i in range(300)]
     assert drawn == [SensedCamera(BALL, SensorMix(), rng(26, i)).sensor for i in range(300)]

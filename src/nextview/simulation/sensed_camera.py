@@ -111,6 +111,27 @@ class SensedCamera:
         mask[part] &= inside_sphere(frame, self.object_frame.centre, REACH * self.object_frame.radius, part)
         return replace(frame, mask=mask, pixel_centre=0.5) if np.count_nonzero(mask) >= FEWEST else None
 
+    def visible_share(self, pose: Float) -> float:
+        """Share of the object's picture that no box hides, without the sensor's errors.
+
+        Args:
+            pose: as in ``observe``.
+
+        Returns:
+            A number from 0 to 1; 0 if nothing of the object is in the picture.
+        """
+        inside = self._truth.pose_in_object(self._truth.pose_in_world(pose, self.sensor.distance))
+        depth = self._camera.observe(inside).depth
+        shown = depth > 0
+        count = np.count_nonzero(shown)
+        if count == 0:
+            return 0.0
+        if self._around is None:
+            return 1.0
+        boxes = self._around.observe(inside).depth
+        hidden = shown & (boxes > 0) & (boxes < depth)
+        return 1 - np.count_nonzero(hidden) / count
+
     def _scene(self, pose: Float) -> tuple[Depth, NDArray[np.uint8]]:
         """True depth of object, boxes and table, metres, and what each pixel shows."""
         inside = self._truth.pose_in_object(pose)
