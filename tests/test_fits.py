@@ -15,7 +15,7 @@ from nextview import SimulatedCamera
 from nextview.data.predictions import Predictions
 from nextview.data.samples import sample_mesh
 from nextview.data.splits import divide
-from nextview.errors import DatasetError, ModelError, PredictionsError, ResultsError
+from nextview.errors import DatasetError, ModelError, PredictionsError, ResultsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning import card_fits as calibration
 from nextview.learning.card_fits import error_bound, fit_calibration, fit_risk, fit_temperature, loss, valley_gains
@@ -358,6 +358,20 @@ def test_what_is_fitted_finds_the_strange_and_keeps_the_rate_that_was_asked_for(
             usual, novel = (score.p_value(scores, n) < 0.05 for scores in novelty)
             assert usual.mean() == pytest.approx(0.05, abs=0.03)
             assert novel.mean() > 0.8
+
+
+def test_meshes_that_teach_nothing_unknown_are_named(furniture, models, tmp_path, caplog, capsys):
+    card = Path(shutil.copy(models / "tiny.json", tmp_path))
+    shutil.copy(models / "tiny.onnx", tmp_path)
+    meshes = Path(shutil.copytree(furniture, tmp_path / "meshes"))
+    known = sorted(meshes.glob("*/train/*.off"))
+    known[0].write_text("OFF\n3 1 0\n0 0 0\n")
+    fitted = fit_unknown(meshes, card, workers=0)
+    assert fitted.left_out == 1
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert said.startswith(f"left out: {known[0]}: not a readable OFF mesh")
+    with pytest.raises(UsageError, match="no sensor is called 'foo'"):
+        fit_unknown(meshes, card, sensor="foo", workers=0)
 
 
 def test_a_recogniser_learns_to_notice_unknown_objects(furniture, models, tmp_path):

@@ -1,6 +1,7 @@
 """What a folder teaches, wherever the result goes; sizes that give a wrong unit away; the picture of all things."""
 
 import os
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,8 +11,9 @@ import pytest
 from matplotlib.figure import Figure
 
 import nextview.learning.learn as learning
+from nextview import learn
 from nextview.cli.main import main
-from nextview.errors import DatasetError
+from nextview.errors import DatasetError, UsageError
 from nextview.learning.learned_picture import draw_learned
 from nextview.learning.sizes import check_sizes
 from nextview.learning.things import find_things
@@ -72,6 +74,32 @@ def test_what_is_for_tests_is_not_taught(tmp_path):
     assert found.left_out == ["cup/test/b.ply: of the split test"]
     with pytest.raises(DatasetError, match=r"holds no mesh .*; left out: a\.step: of a format that is not read"):
         find_things(scans_in(tmp_path / "drawings", "a.step"))
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("sensor", "foo"),
+        ("sensor", "wrist:x"),
+        ("sensor", "wrist:-1"),
+        ("seed", -1),
+        ("seed", 1.5),
+        ("unit", "km"),
+        ("up", "x"),
+        ("turntable", "left"),
+        ("workers", -1),
+        ("workers", "two"),
+    ],
+)
+def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(tmp_path, monkeypatch, option, value):
+    def teach(*arguments):
+        raise AssertionError("a thing was taught")
+
+    monkeypatch.setattr("nextview.learning.learn.teach", teach)
+    scans_in(tmp_path / "things", "box.ply", "tin.ply")
+    with pytest.raises(UsageError, match=re.escape(str(value).rpartition(":")[2])):
+        learn(tmp_path / "things", tmp_path / "mine", **({"workers": 0} | {option: value}))
+    assert not (tmp_path / "mine").exists()
 
 
 @pytest.mark.parametrize(("folder", "out"), [(".", "mine"), ("../things", "."), ("../things", "../things/mine")])

@@ -183,6 +183,22 @@ def test_a_store_keeps_what_its_meshes_were_cut_to(tmp_path):
         list(render(scans.parent, tmp_path / "x.zarr", ViewSphere.named("12"), 32, replace(options, meshes=scans)))
 
 
+def test_render_says_which_meshes_look_odd(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr("nextview.data.rendering.ODD_MESHES", 2)
+    scans = tmp_path / "scans" / "eggs"
+    scans.mkdir(parents=True)
+    saved(scans / "plain.ply", thing())
+    for name in ("a", "b", "c"):
+        saved(scans / f"{name}.ply", joined(thing(), disc(0.4)))
+    done = dict(render(scans.parent, tmp_path / "x.zarr", ViewSphere.named("12"), 32, workers=0))
+    assert set(done.values()) == {None}
+    said = [record.getMessage() for record in caplog.records]
+    assert [line.partition(":")[0] for line in said[:2]] == [str(scans / "a.ply"), str(scans / "b.ply")]
+    assert all("times as large" in line for line in said[:2])
+    assert said[2].startswith("and 1 more meshes look odd")
+    assert len(said) == 3
+
+
 def test_recognise_warns_and_takes_the_largest_part(tmp_path):
     path = saved(tmp_path / "scan.ply", joined(thing(), disc(0.4)))
     with pytest.warns(UserWarning, match=r"scan\.ply: it has 2 parts"):

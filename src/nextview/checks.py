@@ -96,6 +96,14 @@ def whole(value: Any, what: str, least: int = 0, most: int = 2**31 - 1) -> int:
     return int(value)
 
 
+def one_of(value: Any, known: Iterable[Any], what: str) -> None:
+    """See that a value is one of some; UsageError if it is none, with those that are known."""
+    known = list(known)
+    if value not in known:
+        named = ", ".join(str(one) for one in known if one is not None)
+        raise UsageError(f"{what} is one of {named}, not {one_line(repr(value))}")
+
+
 def number(value: Any, what: str, least: float = -np.inf, most: float = np.inf, above: float = -np.inf) -> float:
     """A finite number within limits, ``above`` the last excluded; UsageError if it is none."""
     fits = isinstance(value, Real) and not isinstance(value, bool | np.bool_)

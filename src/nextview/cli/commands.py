@@ -73,7 +73,8 @@ COMMANDS = {  # by name, in the order in which they are listed
     "fit unknown": Command(
         f"{LEARNING}.unknown:fit_unknown",
         "learn to notice objects of no known class",
-        "views of {found.objects} known objects; false-alarm rates by {found.held_out} others",
+        "views of {found.objects} known objects; false-alarm rates by {found.held_out} others; "
+        "meshes left out: {found.left_out}",
     ),
     "fit valleys": Command(
         f"{LEARNING}.card_fits:fit_valleys",

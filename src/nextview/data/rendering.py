@@ -1,5 +1,6 @@
 """Render a dataset into a view store, on all cores, resumable."""
 
+import logging
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -19,7 +20,7 @@ from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, Attributes
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.files import command, sha256_of
 from nextview.geometry.depth import POINTS
-from nextview.geometry.mesh import FORMATS, MAX_FACES, UNITS, Mesh, load_mesh, make_mesh
+from nextview.geometry.mesh import FORMATS, MAX_FACES, UNITS, Mesh, load_mesh, make_mesh, mesh_warnings
 from nextview.geometry.observation import Camera
 from nextview.geometry.viewsphere import DISTANCE, ViewSphere, rotation_z
 from nextview.sensing.observed_object import SIZE
@@ -32,8 +33,11 @@ from nextview.simulation.simulated import OccludedCamera, SimulatedCamera
 
 AnySensor = Sensor | SensorMix | None
 LARGEST_CHUNK = 2**31 - 2**20  # bytes that may be compressed at once, the compressor's own included
+ODD_MESHES = 10  # that are named
 FARTHEST = np.iinfo(np.uint16).max * DEPTH_UNIT  # depth that can be stored, object radii
 SENSING = 256  # sets the draws of a sensor apart from those of a deformation: no byte of a name is as large
+
+_log = logging.getLogger("nextview")
 
 
 @dataclass(frozen=True)
@@ -126,8 +130,14 @@ def render(
         # Largest files first, so that no worker is left with a long one at the end.
         todo = sorted(np.flatnonzero(~store.done).tolist(), key=lambda i: -entries[i].path.stat().st_size)
         items = [(i, entries[i]) for i in todo]
+        odd: list[str] = []
         for (i, entry), result in each(partial(_render_entry, path, options, sensor), items, workers, scheduler):
-            reason = f"{entry.path}: {result}" if isinstance(result, WorkerDied) else result
+            reason: str | None
+            if isinstance(result, WorkerDied):
+                reason = f"{entry.path}: {result}"
+            else:
+                reason, doubts = result
+                odd += [f"{entry.path}: {'; '.join(doubts)}"] if doubts else []
             others = {name: said for name, said in store.attributes.failures.items() if name != entry.name}
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is done.
@@ -136,6 +146,15 @@ def render(
             elif len(others) < len(store.attributes.failures):
                 store.note(failures=others)
             yield entry.name, reason
+    _warn(odd)
+
+
+def _warn(odd: list[str]) -> None:
+    """Log what is odd about meshes, a sentence for each of them; of many, the first."""
+    for sentence in sorted(odd)[:ODD_MESHES]:
+        _log.warning("%s", sentence)
+    if len(odd) > ODD_MESHES:
+        _log.warning("and %d more meshes look odd; nextview recognise says it of each", len(odd) - ODD_MESHES)
 
 
 def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) -> AnySensor:
@@ -215,29 +234,42 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
     return store
 
 
-def _render_entry(path: Path, options: RenderOptions, sensor: AnySensor, item: tuple[int, Entry]) -> str | None:
-    """Render one object, or the target of one scene, into the store; the reason if its mesh cannot be used."""
+def _render_entry(
+    path: Path, options: RenderOptions, sensor: AnySensor, item: tuple[int, Entry]
+) -> tuple[str | None, tuple[str, ...]]:
+    """Render one object, or the target of one scene, into the store.
+
+    Returns:
+        The reason if its mesh cannot be used; and what is odd about it, a sentence each.
+    """
     (i, entry), store = item, opened(path)
     try:
-        rendered = _rendered(store, options, sensor, entry)
+        rendered, doubts = _rendered(store, options, sensor, entry)
     except (MeshError, DatasetError) as error:
-        return str(error)
+        return str(error), ()
     except MemoryError:
-        return f"{entry.path}: too large for this machine's memory"
+        return f"{entry.path}: too large for this machine's memory", ()
     store.write(i, rendered | {"status": np.array(DONE, np.uint8)})  # last: an object counts only when it is whole
-    return None
+    return None, doubts
 
 
-def _rendered(store: ViewStore, options: RenderOptions, sensor: AnySensor, entry: Entry) -> dict[str, NDArray]:
-    sphere, size = store.sphere, store.attributes.size
+def _rendered(
+    store: ViewStore, options: RenderOptions, sensor: AnySensor, entry: Entry
+) -> tuple[dict[str, NDArray], tuple[str, ...]]:
+    """What the store keeps of an object, and what is odd about its mesh."""
+    sphere = store.sphere
+    size = store.attributes.size
     seed = options.seed if options.noise_seed is None else options.noise_seed
     rng = np.random.default_rng([seed, SENSING, *entry.name.encode()])
     camera: Camera
     if options.meshes is None:
         read = load_mesh(entry.path, max_faces=options.max_faces, largest_part=options.largest_part)
+        doubts = mesh_warnings(replace(read, unit=options.unit))
         mesh = deformed(store, read, entry.name)
         camera = SimulatedCamera(mesh, size, sphere.distance) if sensor is None else SensedCamera(mesh, sensor, rng)
-        return render_object(camera, sphere, size) | {"radius": np.array(mesh.radius)}
+        return render_object(camera, sphere, size) | {"radius": np.array(mesh.radius)}, doubts
+
     scene = build_scene(SceneLayout.load(entry.path), Path(options.meshes).absolute(), options.max_faces)
     camera = OccludedCamera(scene, size, sphere.distance) if sensor is None else sensed_camera(scene, sensor, rng)
-    return render_object(camera, sphere, size) | render_scene(scene, sphere) | {"radius": np.array(scene.target.radius)}
+    rendered = render_object(camera, sphere, size) | render_scene(scene, sphere)
+    return rendered | {"radius": np.array(scene.target.radius)}, ()

@@ -108,6 +108,8 @@ def learn_things(
     """
     folder = Path(folder)
     out = Path(out)
+    how.check()
+    count_workers(workers)  # refuses a number that is none
     keeps = add or bool(remove)
     _check_places(out, keeps, overwrite)
     nothing_new = bool(remove) and folder.resolve() == out.resolve()

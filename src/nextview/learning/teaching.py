@@ -12,8 +12,9 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from nextview.checks import one_of, whole
 from nextview.errors import DatasetError, ObservationError
-from nextview.geometry.mesh import Y_UP, Mesh, is_y_up, load_mesh, mesh_warnings
+from nextview.geometry.mesh import UNITS, Y_UP, Mesh, is_y_up, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import resting_poses, rotated
 from nextview.geometry.viewsphere import ViewSphere, angle_between, direction_of, look_at_origin
@@ -24,6 +25,7 @@ from nextview.simulation.captured import Capture, is_capture, read_capture
 from nextview.simulation.captured_camera import CapturedCamera
 from nextview.simulation.captured_check import summary
 from nextview.simulation.sensed_camera import SensedCamera
+from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.simulation.turntable import read_turntable
 from nextview.things.memory import AZIMUTHS, RINGS, joined
@@ -56,6 +58,18 @@ class How:
     # by equal steps, counter-clockwise (ccw) or clockwise (cw) as seen from above
     turntable: Literal["ccw", "cw"] | None = None
     seed: int = 0  # of all random draws
+
+    def check(self) -> None:
+        """Refuse, before anything is taught, what every thing would be refused for.
+
+        Raises:
+            UsageError: a value that makes no sense.
+        """
+        sensor_named(self.sensor)
+        whole(self.seed, "the seed", most=2**63 - 1)
+        one_of(self.unit, (None, *UNITS), "the unit")
+        one_of(self.up, (None, "y", "z"), "the up axis")
+        one_of(self.turntable, (None, "ccw", "cw"), "the way that the turntable turned")
 
 
 def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:

@@ -1,5 +1,6 @@
 """Learn to notice objects of no known class, from views of known objects and of other objects of the same classes."""
 
+import logging
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from nextview.data.folders import Entry, list_dataset
+from nextview.data.folders import Entry, left_out_phrases, list_dataset
 from nextview.data.pool import WorkerDied, each
 from nextview.data.progress import Track, silently
 from nextview.data.rendering import Deform
@@ -22,6 +23,7 @@ from nextview.learning.fitting_set import card_to_fit
 from nextview.learning.teaching import embeddings
 from nextview.recognition.novelty import Novelty, as_stored, novelty_path
 from nextview.simulation.sensed_camera import SensedCamera
+from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 
 Float32 = NDArray[np.float32]
@@ -36,7 +38,8 @@ DEFORMATIONS = (Deform(rotated=True), Deform(stretch=0.25, rotated=True))
 CONDITIONS = 2 * len(DEFORMATIONS)
 """Through the sensor and without one, each deformation: of views of a held-out object, in this order."""
 LEVELS = 201  # of the quantiles
-NO_VIEWS = np.zeros((0, 0, 0), np.float32)
+
+_log = logging.getLogger("nextview")
 
 
 @dataclass(frozen=True)
@@ -46,10 +49,12 @@ class FittedUnknown:
     Attributes:
         objects: how many objects are remembered.
         held_out: how many other objects the score was calibrated on.
+        left_out: how many meshes were left out; which and why is logged.
     """
 
     objects: int
     held_out: int
+    left_out: int = 0
 
 
 def fit_unknown(
@@ -67,18 +72,24 @@ def fit_unknown(
     novelty score goes into NAME.novelty.safetensors beside the card, and its SHA-256 into the card. A run that was
     stopped begins anew.
     """
+    sensor_named(sensor)  # refused here, not by every object
     with card_to_fit(card) as (model, write):
         entries = [e for e in list_dataset(meshes) if e.split != "test" and e.label in model.classes]
         look = partial(_looked_at, frozenset(model.held_out), sensor, seed)
         seen: dict[Entry, Float32] = {}
+        left_out: list[tuple[Path, str]] = []
 
         def work() -> Iterator[int]:
             for done, (entry, views) in enumerate(each(look, entries, workers), 1):
-                if not isinstance(views, WorkerDied) and len(views):
+                if isinstance(views, str | WorkerDied):
+                    left_out.append((entry.path, str(views)))
+                else:
                     seen[entry] = views
                 yield done
 
         track(work(), len(entries), f"views of {meshes.name}")
+        for phrase in left_out_phrases(left_out):
+            _log.warning("left out: %s", phrase)
         known = [seen[e] for e in entries if e in seen and e.name not in model.held_out]
         held_out = [e for e in entries if e in seen and e.name in model.held_out]
         if not known or not held_out:
@@ -93,11 +104,11 @@ def fit_unknown(
         # Killed between the two files, this leaves a card without a score, not one with the hash of another.
         write("novelty", "nothing, the fit was cut off", [], novelty_sha256="")
         write("novelty", about, [], novelty_sha256=novelty.save(novelty_path(model.path), overwrite=True))
-    return FittedUnknown(len(known), len(held_out))
+    return FittedUnknown(len(known), len(held_out), len(left_out))
 
 
-def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -> Float32:
-    """Embeddings of views of a mesh; none if it cannot be seen.
+def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -> Float32 | str:
+    """Embeddings of views of a mesh, or why there are none.
 
     Of a held-out object, (CONDITIONS, views, F). Of any other, clean views of each deformation, (deformations, views,
     F).
@@ -105,8 +116,8 @@ def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -
     rng = np.random.default_rng([seed, zlib.crc32(entry.name.encode())])
     try:
         mesh = load_mesh(entry.path)
-    except MeshError:
-        return NO_VIEWS
+    except MeshError as error:
+        return str(error).removeprefix(f"{entry.path}: ")
 
     objects = [deform(mesh, seed, entry.name) for deform in DEFORMATIONS]
     cameras: list[Camera] = [SimulatedCamera(thing) for thing in objects]
@@ -120,7 +131,7 @@ def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -
     for camera in cameras:
         views = _random_views(camera, wanted, rng)
         if len(views) < wanted:
-            return NO_VIEWS
+            return "it is seen from too few directions"
         found.append(views)
     return np.stack(found)
 
@@ -137,7 +148,7 @@ def _random_views(camera: Camera, wanted: int, rng: Generator) -> Float32:
             seen.append(view)
         if len(seen) == wanted:
             break
-    return embeddings(seen) if seen else NO_VIEWS[0]
+    return embeddings(seen) if seen else np.zeros((0, 0), np.float32)
 
 
 def fit_novelty(
