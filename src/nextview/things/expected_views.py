@@ -24,7 +24,7 @@ from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, elevation_of, look_at_origin
 from nextview.things.depth_view import THING, DepthView, depth_view
-from nextview.things.registration import RegistrationPrior
+from nextview.things.registration import SCAN_ERROR, RegistrationPrior
 from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel
 from nextview.things.verifier import Verified, Verifier
@@ -572,7 +572,7 @@ def _depth_variance(images: _Images, sensor: ExpectedSensor, pixels: PixelModel)
     steepness = np.sqrt(1 - images.cosine**2) / images.cosine
     noise = sensor.noise * depth**2
     sideways = pixels.steep * sensor.pitch * depth * steepness
-    return (noise**2 + pixels.surface**2 + sideways**2).astype(np.float32)
+    return (noise**2 + SCAN_ERROR**2 + sideways**2).astype(np.float32)
 
 
 def _fitted(images: _Images, sensor: ExpectedSensor, prior: RegistrationPrior) -> Float32:
