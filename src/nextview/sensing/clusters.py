@@ -56,7 +56,9 @@ class Footprint:
 
     def pixels_of(self, chosen: Mask) -> Mask:
         """Pixels of the pieces that have one of the chosen pairs, (H, W) bool."""
-        return np.isin(np.arange(len(self.pieces.stands)), self.piece[chosen])[self.pieces.grown]
+        its_own = np.zeros(len(self.pieces.stands), bool)
+        its_own[self.piece[chosen]] = True
+        return np.take(its_own, self.pieces.grown)
 
 
 def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Float) -> Footprint:
@@ -71,6 +73,7 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
             from there is left out.
     """
     rows, columns = np.divmod(np.flatnonzero(pieces.label), pieces.label.shape[1])
+    label = pieces.label[rows, columns]
     z = frame.depth[rows, columns]
     pose, (x, y) = frame.camera_to_world, frame.rays
     ij = []
@@ -78,19 +81,21 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
         a, b, c = (pose[:3, :3].T @ axis / cell).astype(np.float32)
         position = z * (a * x[columns] + b * y[rows] + c) + np.float32(axis @ pose[:3, 3] / cell)
         ij.append(np.floor(position).astype(np.int64))
-    low = np.floor(middle).astype(np.int64) - REACH
-    side = 2 * REACH + 1
-    i, j = ij[0] - low[0], ij[1] - low[1]
-    within = (i >= 0) & (i < side) & (j >= 0) & (j < side)
-    rows, columns, z = rows[within], columns[within], z[within]
-    place = i[within] * side + j[within]
-    shown, many = np.bincount(place, minlength=side**2) > 0, len(pieces.stands)
+    there = np.floor(middle).astype(np.int64)
+    i, j = ij
+    within = (np.abs(i - there[0]) <= REACH) & (np.abs(j - there[1]) <= REACH)
+    z, label, i, j = z[within], label[within], i[within], j[within]
+    low = np.array([i.min(initial=there[0]), j.min(initial=there[1])])
+    side = int(j.max(initial=there[1])) - low[1] + 1
+    place = (i - low[0]) * side + j - low[1]
+    shown, many = np.bincount(place) > 0, len(pieces.stands)
     used = np.flatnonzero(shown)
-    key = many * (np.cumsum(shown) - 1)[place] + pieces.label[rows, columns]
+    key = many * (np.cumsum(shown) - 1)[place] + label
     count = np.bincount(key, minlength=many * len(used))
-    level = (cell / np.median(z)) ** 2 * frame.intrinsics[0, 0] * frame.intrinsics[1, 1] if len(z) else 0.0
+    focal = frame.intrinsics[0, 0] * frame.intrinsics[1, 1]
+    level = (cell / np.median(z)) ** 2 * focal if len(z) else 0.0
     pairs = np.flatnonzero(count > FEWEST * level)
-    area = np.bincount(key, z * z, len(count))[pairs] / (frame.intrinsics[0, 0] * frame.intrinsics[1, 1])
+    area = np.bincount(key, z * z, len(count))[pairs] / focal
     at, piece = np.divmod(pairs, many)
     cells, pixels = np.stack(np.divmod(used[at], side), 1) + low, count[pairs]
     return Footprint(cells, piece, pieces, area, pixels)

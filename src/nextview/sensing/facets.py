@@ -7,6 +7,7 @@ edges stay sharp because a pixel may take the plane of a window beside it.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,12 +83,12 @@ class Facets:
     columns: Index
     pitch: Float  # distance between neighbouring rays along x and y at depth 1, (2,)
 
-    @property
+    @cached_property
     def points(self) -> Float:
         """Where the rays meet the planes, camera frame, (N, 3) float64, metres."""
         return self.rays / np.einsum("ni,ni->n", self.planes, self.rays)[:, None]
 
-    def some(self, which: slice | Mask) -> "Facets":
+    def some(self, which: slice | Mask | Index) -> "Facets":
         """Those of some of the pixels."""
         return Facets(self.planes[which], self.rays[which], self.rows[which], self.columns[which], self.pitch)
 
@@ -98,14 +99,21 @@ def drop_flying(depth: NDArray[np.float32], usable: Mask, noise: float, pitch: f
     A pixel stays if at least three of its eight neighbours are on its surface: as near in depth as noise of inverse
     depth, 1/metres, and a steep slope allow. ``pitch`` is the angle between neighbouring pixels, radians.
     """
-    h, w = depth.shape
-    padded = np.pad(depth, 1)
     tolerance = 5 * noise * depth**2 + STEEPEST * pitch * depth
-    friends = np.zeros((h, w), np.uint8)
-    for row in range(3):
-        for column in range(3):
-            friends += np.abs(padded[row : row + h, column : column + w] - depth) < tolerance
-    return usable & (friends >= 4)  # a pixel is its own friend
+    return usable & (count_beside(depth, tolerance) >= 3)
+
+
+def count_beside(picture: NDArray[np.float32], limit: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """How many of the eight pixels beside each, (H, W), differ from it by less than its limit."""
+    height, width = picture.shape
+    count = np.zeros(picture.shape, np.uint8)
+    for down, right in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        first = np.s_[: height - down, max(0, -right) : width - max(0, right)]
+        second = np.s_[down:, max(0, right) : width - max(0, -right)]
+        apart = np.abs(picture[first] - picture[second])
+        count[first] += apart < limit[first]
+        count[second] += apart < limit[second]
+    return count
 
 
 def fit_facets(
@@ -162,11 +170,12 @@ def fit_facets(
     # Back from coordinates about the middle:
     planes[:, 2] += middle[2] - planes[:, 0] * middle[0] - planes[:, 1] * middle[1]
     rays = np.stack([x[columns], y[rows], np.ones(len(rows))], 1)
-    good = np.asarray(np.isfinite(planes).all(1))
-    good[good] = (planes[good] * rays[good]).sum(1) > 0.2 * middle[2]
+    towards = np.einsum("ni,ni->n", planes, rays)  # inverse depth; NaN where there is no plane
+    good = np.isfinite(towards) & (towards > 0.2 * middle[2])
     half = (coarse - 1) // 2
     rows, columns = corner[0] + coarse * rows + half, corner[1] + coarse * columns + half
-    return Facets(planes[good], rays[good], rows[good], columns[good], pitch)
+    facets = Facets(planes, rays, rows, columns, pitch)
+    return facets if good.all() else facets.some(np.flatnonzero(good))
 
 
 def _typical_noise(depth: NDArray[np.float32], usable: Mask, frame_noise: Noise | None) -> tuple[float, int]:
@@ -181,16 +190,25 @@ def _typical_noise(depth: NDArray[np.float32], usable: Mask, frame_noise: Noise 
 def _moments(weight: Float, x: Float, y: Float, q: Float) -> Float:
     """Moments for a fit of planes, (10, H, W): 1, x, y, xx, xy, yy, q, xq, yq, qq."""
     x, y = x[None, :], y[:, None]
-    wx, wy = weight * x, weight * y
-    return np.stack([weight, wx, wy, wx * x, wx * y, wy * y, q, x * q, y * q, q * q])
+    moments = np.empty((10, *weight.shape))
+    moments[0] = weight
+    moments[6] = q
+    for product, one, other in ((1, 0, x), (2, 0, y), (3, 1, x), (4, 1, y), (5, 2, y), (7, 6, x), (8, 6, y)):
+        np.multiply(moments[one], other, out=moments[product])
+    np.multiply(q, q, out=moments[9])
+    return moments
 
 
 def _blocks(images: Float, side: int) -> Float:
     """Sums over squares of pixels; those at the end may be cut off by the image."""
-    h, w = images.shape[1:]
-    padded = np.pad(images, ((0, 0), (0, -h % side), (0, -w % side)))
-    rows = np.add.reduce([padded[:, i::side] for i in range(side)])
-    return np.add.reduce([rows[:, :, i::side] for i in range(side)])
+    for axis in (1, 2):
+        every = np.moveaxis(images, axis, 0)
+        sums = every[::side].copy(order="K")
+        for first in range(1, side):
+            more = every[first::side]
+            sums[: len(more)] += more
+        images = np.moveaxis(sums, 0, axis)
+    return images
 
 
 def _radii(noise: float, inverse: float, pitch: Float, grain: float) -> tuple[int, int]:
@@ -211,7 +229,7 @@ def _fit(sums: Float, radius: int, enough: float) -> Float:
     The last, of the residuals, is infinite for windows with fewer than ``enough`` pixels.
     """
     side = 2 * radius + 1
-    means = np.stack([ndimage.uniform_filter(image, side, mode="constant") for image in sums])
+    means = ndimage.uniform_filter(sums, (1, side, side), mode="constant")
     n = means[0] * side**2
     x, y, xx, xy, yy, q, xq, yq, qq = means[1:] / np.maximum(means[0], 1e-9)
     for square, a, b in ((xx, x, x), (xy, x, y), (yy, y, y), (xq, x, q), (yq, y, q), (qq, q, q)):
@@ -249,23 +267,28 @@ def _choose(
         good &= ~(np.abs(_deviation(guess, here[left], own[left])) > 3 * noise)  # NaN: a hole takes what there is
         found[left[good]] = guess[good, :3]
         left = left[~good]
-    rows, columns, here, own = rows[left], columns[left], here[left], own[left]
-    best, cost = np.full((len(left), 3), np.nan), np.full(len(left), np.inf)
-    reach = max(1, radii[-1] // step)
-    for dy in (-reach, 0, reach):
-        row = np.clip(rows + dy, 0, h - 1) * w
-        for dx in (-reach, 0, reach):
-            guess = windows[row + np.clip(columns + dx, 0, w - 1)]
-            its_cost = guess[:, 3] + np.nan_to_num(_deviation(guess, here, own)) ** 2 / 4
-            better = its_cost < cost
-            best[better], cost[better] = guess[better, :3], its_cost[better]
-    found[left] = best
+    found[left] = _nearest_window(windows, (h, w), rows[left], columns[left], here[left], own[left], radii[-1] // step)
     return found
 
 
+def _nearest_window(
+    windows: Float, shape: tuple[int, int], rows: Index, columns: Index, here: Float, own: Float, reach: int
+) -> Float:
+    """Of the windows, (H W, 4), around each cell and a reach beside it, the plane that fits it best, (N, 3), or NaN."""
+    steps = (-max(1, reach), 0, max(1, reach))
+    down = np.stack([np.clip(rows + step, 0, shape[0] - 1) * shape[1] for step in steps])
+    right = np.stack([np.clip(columns + step, 0, shape[1] - 1) for step in steps])
+    window = (down[:, None] + right).reshape(len(steps) ** 2, -1)
+    guess = windows[window]
+    cost = guess[..., 3] + np.nan_to_num(_deviation(guess, here, own)) ** 2 / 4
+    best = cost.argmin(0)
+    every = np.arange(len(rows))
+    return np.where(np.isfinite(cost[best, every])[:, None], guess[best, every, :3], np.nan)
+
+
 def _deviation(planes: Float, here: Float, own: Float) -> Float:
-    """Distance of planes, (N, 3 or more), at x and y, (N, 2), from the cells' own inverse depth, (N,), NaN in holes."""
-    return planes[:, 0] * here[:, 0] + planes[:, 1] * here[:, 1] + planes[:, 2] - own
+    """Distance of planes, (..., N, 3 or more), at x and y, (N, 2), from the cells' own inverse depth, (N,), or NaN."""
+    return planes[..., 0] * here[:, 0] + planes[..., 1] * here[:, 1] + planes[..., 2] - own
 
 
 def virtual_pose(pose: Float) -> Float:
@@ -293,11 +316,10 @@ def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[N
     focal = pinhole(size, DISTANCE)[0, 0]
     turn = target[:3, :3].T @ pose[:3, :3]
     shift = target[:3, :3].T @ (pose[:3, 3] - target[:3, 3])
-    points = facets.points / radius
-    seen_from = points[:, 2]  # depth in the sensor's own image
-    points = points @ turn.T + shift
+    seen_from = facets.points[:, 2] / radius  # depth in the sensor's own image
+    points = facets.points @ (turn.T / radius) + shift
     # n . P = 1 in the sensor's frame; P = turn^T (P' - shift), so n' . P' = 1 + n' . shift.
-    normals = facets.planes * radius @ turn.T
+    normals = facets.planes @ (radius * turn.T)
     offset = 1 + normals @ shift
     z = points[:, 2]
     front = np.flatnonzero((z > NEAREST) & (z < FARTHEST))
@@ -309,12 +331,12 @@ def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[N
     left, top = (np.clip(np.ceil(at - half - 0.5), -size, size).astype(np.int64) for at in (x, y))
     layer = (z[front] / LAYER).astype(np.int64) << 48 | front
     best = np.full(size * size, np.iinfo(np.int64).max)
-    across = range(int(2 * half.max()) + 1) if len(front) else range(0)
-    for down in across:
+    covered = range(int(2 * half.max()) + 1) if len(front) else range(0)
+    for down in covered:
         row = top + down
         dy = np.abs(row + 0.5 - y)
         some = np.flatnonzero((dy <= half) & (row >= 0) & (row < size))
-        for right in across:
+        for right in covered:
             column = left[some] + right
             dx = np.abs(column + 0.5 - x[some])
             hit = np.flatnonzero((dx <= half[some]) & (column >= 0) & (column < size))
@@ -324,10 +346,11 @@ def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[N
     shown = np.flatnonzero(best < np.iinfo(np.int64).max)
     facet = np.full(size * size, -1)
     facet[shown] = chosen = best[shown] & 0xFFFFFFFF
-    rays = np.stack([(shown % size + 0.5) / focal, (shown // size + 0.5) / focal, np.ones(len(shown))], 1)
-    rays[:, :2] -= size / 2 / focal
+    slopes = (np.arange(size) + 0.5 - size / 2) / focal
+    normal_x, normal_y, normal_z = normals.T.copy()
+    towards = normal_x[chosen] * slopes[shown % size] + normal_y[chosen] * slopes[shown // size] + normal_z[chosen]
     with np.errstate(divide="ignore"):
-        meets = offset[chosen] / (normals[chosen] * rays).sum(1)
+        meets = offset[chosen] / towards
     depth = np.zeros(size * size, np.float32)
     # A plane seen edge-on runs away within a pixel: stay near the facet.
     depth[shown] = np.where(np.abs(meets - z[chosen]) < LAYER, meets, z[chosen])

@@ -4,6 +4,7 @@ from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from nextview.checks import one_line
 from nextview.errors import ObservationError
@@ -127,6 +128,14 @@ def within(shown: NDArray[np.float32 | np.bool_], margin: int = 0) -> Part:
     at = [np.flatnonzero(shown.any(1 - axis)) for axis in (0, 1)]
     low, high = zip(*((k[0], k[-1] + 1) if len(k) else (0, 0) for k in at), strict=True)
     return spans(np.array(low) - margin, np.array(high) + margin * bool(high[0]), shown.shape)
+
+
+def holes_of(shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The pixels that a mask, (H, W), surrounds and does not hold, (H, W) bool."""
+    beside, _ = ndimage.label(np.pad(~shown, 1, constant_values=True))
+    around = beside[0, 0]
+    beside = beside[1:-1, 1:-1]
+    return np.asarray((beside > 0) & (beside != around))
 
 
 def spans(low: NDArray[np.floating], high: NDArray[np.floating], shape: tuple[int, ...]) -> Part:

@@ -2,10 +2,10 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion, binary_fill_holes, label, minimum_filter, uniform_filter
+from scipy.ndimage import binary_erosion, label, minimum_filter, uniform_filter
 
 from nextview.sensing.facets import Noise
-from nextview.sensing.frame import within
+from nextview.sensing.frame import holes_of, within
 
 EDGE = 6  # a segmenter's edge may be off by so many pixels
 STEP = 0.01  # neighbouring pixels of one surface differ by at most this part of their depth, and THICK
@@ -35,7 +35,7 @@ def trimmed(depth: NDArray[np.float32], mask: Mask, noise: Noise, high: Mask | N
         return mask
     own, z = measured[part], depth[part].astype(np.float64)
     step = np.maximum(STEP * z + THICK, NOISE_STEP * noise.at(z) * z**2)
-    whole = np.pad(mask[part] | binary_fill_holes(own) & (z == 0), 1)
+    whole = np.pad(mask[part] | holes_of(own) & (z == 0), 1)
     for width in range(EDGE, 0, -1):
         inside = binary_erosion(whole, np.ones((3, 3), bool), width)[1:-1, 1:-1] & own
         if 3 * inside.sum() >= own.sum():
@@ -49,10 +49,17 @@ def trimmed(depth: NDArray[np.float32], mask: Mask, noise: Noise, high: Mask | N
         reached = np.zeros(count + 1, bool)
         reached[part_of[inside]] = True
         found = reached[part_of]
+    depth_there = z.astype(np.float32)
+    left = own & ~found
     for _ in range(EDGE):
-        share = uniform_filter(found.astype(np.float64), AROUND, mode="constant")
-        usual = uniform_filter(np.where(found, z, 0), AROUND, mode="constant") / np.maximum(share, 1e-6)
-        found |= own & (share > 1e-3) & (np.abs(z - usual) < step)
+        share = uniform_filter(found.astype(np.float32), AROUND, mode="constant")
+        total = uniform_filter(found * depth_there, AROUND, mode="constant")
+        usual = total / np.maximum(share, np.float32(1e-6))
+        joins = left & (share > 1e-3) & (np.abs(depth_there - usual) < step)
+        if not joins.any():
+            break
+        found |= joins
+        left &= ~joins
     trimmed_mask = np.zeros_like(mask)
     trimmed_mask[part] = found
     return trimmed_mask

@@ -297,7 +297,10 @@ class ObservedObject:
             if self.known is None:  # else its size does not hang on pixels at the edge
                 high = None if plane is None else frame.along(plane.normal, plane.offset) > STANDS * frame.depth
                 mask = trimmed(frame.depth, mask, noise, high)
-                above = mask if plane is None else mask & segmentation.above_plane(frame, plane, noise)
+                above = mask.copy()
+                if plane is not None:
+                    part = within(mask)
+                    above[part] &= segmentation.above_plane(frame, plane, noise, part)
                 mask = above if 2 * above.sum() > mask.sum() else mask  # a plane may lie above what is hidden or flat
         elif self.known is not None:
             if self.box is not None:
@@ -317,6 +320,7 @@ class ObservedObject:
 
     def _on_the_plane(self, frame: Frame, axes: Float, plane: Plane, samples: Samples, noise: Noise) -> Found:
         earlier, cell = self.state.sightings, self.state.cell
+        height = frame.along(plane.normal, plane.offset)
         above = segmentation.above_plane(frame, plane, noise)
         place = self._place()
         walls = find_walls(samples, plane, np.random.default_rng(0), place)
@@ -335,7 +339,6 @@ class ObservedObject:
                 points = points if len(points) else _ahead(frame)[None]
                 distance = float(np.median(np.linalg.norm(points - camera, axis=1)))
             cell = clusters.CELL * distance
-        height = frame.along(plane.normal, plane.offset)
         pieces = cut(frame.depth, above, height, noise, free if walls else None)
         middle = axes[:2] @ (_ahead(frame) if place is None else place)
         if place is None:  # what is far ahead, such as a wall, is no place on the plane

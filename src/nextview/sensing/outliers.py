@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy import ndimage
 
-from nextview.sensing.facets import Facets, Noise
+from nextview.sensing.facets import Facets, Noise, count_beside
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -44,60 +43,50 @@ def without_outliers(facets: Facets, noise: Noise, coarse: int) -> Facets:
 
     spacing = float(facets.pitch.mean()) * depth  # between neighbouring points of a surface that faces the camera
     error = NOISE_GAP * noise.at(depth) * depth**2 / coarse
-    many = _neighbours(rows, columns, depth, STEEPEST_SLOPE * spacing, error)
-    kept = np.flatnonzero(many >= FEWEST_NEIGHBOURS)
+    kept = np.flatnonzero(_enough_neighbours(rows, columns, depth, STEEPEST_SLOPE * spacing, error))
     if not len(kept):
         return facets
 
-    side = GAP_PIXELS * float(np.median(spacing[kept])) + float(np.median(error[kept]))
-    group = _groups(points[kept], side)
+    step = GAP_PIXELS * float(facets.pitch.mean()) + float(np.median(error[kept] / depth[kept]))
+    layer = (np.log(depth[kept] / depth[kept].min()) / step).astype(np.int64)
+    group = _groups(rows[kept] // GAP_PIXELS, columns[kept] // GAP_PIXELS, layer)
     share = np.bincount(group) / len(kept)
     kept = kept[share[group] >= SMALLEST_GROUP]
-    chosen = np.zeros(len(depth), bool)
-    chosen[kept] = True
-    return facets.some(chosen) if chosen.any() else facets
+    return facets.some(kept) if 0 < len(kept) < len(depth) else facets
 
 
-def _neighbours(rows: Index, columns: Index, depth: Float, slope: Float, error: Float) -> Index:
-    """How many of the pixels around each, (N,), are as deep, up to a slope for each pixel between, and an error."""
-    height, width = int(rows.max()) + 1, int(columns.max()) + 1
-    top, left = int(rows.min()), int(columns.min())
-    picture = np.full((height - top + 2 * WINDOW, width - left + 2 * WINDOW), np.nan)
-    at = rows - top + WINDOW, columns - left + WINDOW
-    picture[at] = depth
+def _enough_neighbours(rows: Index, columns: Index, depth: Float, slope: Float, error: Float) -> Mask:
+    """Which pixels, (N,), have FEWEST_NEIGHBOURS around them that are as deep.
 
-    many = np.zeros(len(depth), np.int64)
+    Depths may differ by a slope for each pixel between, and an error. Most pixels have so many among the eight beside
+    them; the wider window is looked at for the others only.
+    """
+    picture = np.full((int(np.ptp(rows)) + 1 + 2 * WINDOW, int(np.ptp(columns)) + 1 + 2 * WINDOW), np.nan, np.float32)
+    at = (rows - rows.min() + WINDOW) * picture.shape[1] + columns - columns.min() + WINDOW
+    picture.ravel()[at] = depth
+    limit = np.zeros_like(picture)
+    limit.ravel()[at] = slope + error
+
+    enough = count_beside(picture, limit).ravel()[at] >= FEWEST_NEIGHBOURS
+    left = np.flatnonzero(~enough)
+    here = at[left]
+    many = np.zeros(len(left), np.int64)
     steps = range(-WINDOW, WINDOW + 1)
     for down in steps:
         for right in steps:
             if down == right == 0:
                 continue
-            there = picture[at[0] + down, at[1] + right]
-            many += np.abs(there - depth) < slope * max(abs(down), abs(right)) + error
-    return many
+            there = picture.ravel()[here + down * picture.shape[1] + right]
+            far = max(abs(down), abs(right))
+            many += np.abs(there - depth[left]) < slope[left] * far + error[left]
+    enough[left] = many >= FEWEST_NEIGHBOURS
+    return enough
 
 
-def _groups(points: Float, side: float) -> Index:
-    """The group of each point, (N,): voxels of a side, metres, that touch are of one group."""
-    voxel = np.floor((points - points.min(0)) / side).astype(np.int64) + 1
-    size = voxel.max(0) + 2
-    place = np.ravel_multi_index(tuple(voxel.T), tuple(size))
-    used, which = np.unique(place, return_inverse=True)
-
-    links = []
-    for step in _half_of_the_steps(size):
-        found = np.searchsorted(used, used + step)
-        found[found == len(used)] = 0
-        there = used[found] == used + step
-        links.append(np.stack([np.flatnonzero(there), found[there]]))
-    one, other = np.concatenate(links, 1)
-    graph = coo_array((np.ones(len(one), bool), (one, other)), shape=(len(used), len(used)))
-    group = connected_components(graph, directed=False)[1].astype(np.int64)
-    return np.asarray(group[which])
-
-
-def _half_of_the_steps(size: Index) -> Index:
-    """Steps in a raveled grid to half of the 26 cells around one: the others are the same links backwards."""
-    across = np.array(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij")).reshape(3, -1)
-    steps = (across[0] * size[1] + across[1]) * size[2] + across[2]
-    return steps[steps > 0]
+def _groups(rows: Index, columns: Index, layers: Index) -> Index:
+    """The group of each point, (N,): cells of the view, as wide as deep, that touch are of one group."""
+    at = (rows - rows.min(), columns - columns.min(), layers)
+    size = [int(index.max()) + 1 for index in at]
+    cells = np.zeros(size, bool)
+    cells[at] = True
+    return np.asarray(ndimage.label(cells, np.ones((3, 3, 3)))[0][at])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.sensing.facets import Noise
-from nextview.sensing.frame import within
+from nextview.sensing.frame import holes_of, within
 
 Mask = NDArray[np.bool_]
 Inverse = NDArray[np.float32]
@@ -105,9 +105,10 @@ def cut(
     low = mask & (high / usual - 2 * error < STANDS)
     stands = np.bincount(found[low], minlength=kept.sum() + 1) > LOWEST
     stands[0] = False
+    shape = above[part].shape
+    kept_pixels = above[part] | _enlarged(bottom, step, shape) if bottom.any() else above[part]
     for shown, small in ((label, found), (grown, _grown(found, mask, inverse, tolerance))):
-        own, whole = (_enlarged(a, step, above[part].shape) for a in (bottom, small))
-        shown[part] = np.where(above[part] | own, whole, 0)
+        np.copyto(shown[part], _enlarged(small, step, shape), where=kept_pixels, casting="unsafe")
     whole = _grown(found, mask, inverse, 4 * tolerance)
     at_plane = _borders(whole, [low[a] | low[b] for a, b in NEXT]) >= LOW
     touch = _touching(whole, inverse, 2 * tolerance)
@@ -139,11 +140,11 @@ def _enlarged(small: NDArray[Any], step: int, shape: tuple[int, ...]) -> NDArray
 
 def _bottoms(depth: NDArray[np.float32], mask: Mask, height: NDArray[np.float32]) -> Mask:
     """Pixels of holes of the mask that lie over the plane as a whole, (H, W) bool: the bottom of a bowl."""
-    holes = ndimage.binary_fill_holes(mask) & ~mask & (depth > 0)
+    holes = holes_of(mask) & (depth > 0)
     label, count = ndimage.label(holes)
     if not count:
         return holes
-    middle = ndimage.median(height / np.where(holes, depth, 1), label, np.arange(1, count + 1))
+    middle = ndimage.median(height[holes] / depth[holes], label[holes], np.arange(1, count + 1))
     return np.append(False, np.asarray(middle) > BOTTOM)[label]
 
 

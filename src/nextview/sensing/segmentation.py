@@ -20,6 +20,7 @@ LEAST = 0.04  # share of what is seen that lies on a support plane, at least; mo
 LEAST_ALONE = 0.15
 RANGE = 1.05  # times as much of a frame lies on a plane as range, if it is range: narrow lenses hardly bend one
 SAMPLES = 1500  # blocks of pixels in which planes are searched
+LARGE_SIDE = 8  # pixels across such a block from which on every second one is looked at
 STEEP_LAG = 2  # samples between two that tell how steep a surface is
 STEEP_RISE = 0.7  # rise of a steep surface, as a part of the way
 MOST_ALONE = 4.0  # times by which the mean over a block is more exact than a pixel, at most: the lens errs, too
@@ -46,28 +47,36 @@ def sample(frame: Frame, pixels: NDArray[np.bool_], noise: Noise) -> Samples:
     The mean inverse depth of some pixels of a plane is that at the mean of their places in the picture, with less noise
     than that of one. A block is left out where fewer than half of its pixels are given.
     """
-    side = max(1, int(np.sqrt(pixels.sum() / SAMPLES)))
-    count = _block_sums(pixels.astype(np.float64), side)
+    step = 1
+    side = max(1, int(np.sqrt(np.count_nonzero(pixels) / SAMPLES)))
+    if side >= LARGE_SIDE:  # every second pixel is enough: those side by side err together anyway
+        step = 2
+        side //= step
+    few = (slice(None, None, step), slice(None, None, step))
+    given = pixels[few]
+    count = _block_sums(given.astype(np.float32), side)
     rows, columns = np.nonzero(2 * count >= side**2)
     count = count[rows, columns]
 
-    inverse = np.where(pixels, 1 / np.where(pixels, frame.depth, 1), 0)
+    inverse = np.zeros(given.shape, np.float32)
+    np.divide(1, frame.depth[few], out=inverse, where=given)
     ray_x, ray_y = frame.rays
     z = count / _block_sums(inverse, side)[rows, columns]
-    x = _block_sums(pixels * ray_x[None, :], side)[rows, columns] / count
-    y = _block_sums(pixels * ray_y[:, None], side)[rows, columns] / count
+    x = _block_sums(given * ray_x[None, ::step], side)[rows, columns] / count
+    y = _block_sums(given * ray_y[::step, None], side)[rows, columns] / count
 
     pose = frame.camera_to_world
     points = (np.stack([x, y, np.ones(len(z))], 1) * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    alone = np.clip(np.sqrt(count) / (2 * noise.grain + 1), 1, MOST_ALONE)  # root of how many err for themselves
+    erring_together = max(1.0, (2 * noise.grain + 1) / step)  # pixels across
+    alone = np.clip(np.sqrt(count) / erring_together, 1, MOST_ALONE)  # root of how many err for themselves
     return Samples(points, 3 * noise.at(z) * z**2 / alone + 0.003 * z, rows, columns, pose[:3, 3])
 
 
 def _block_sums(values: NDArray[np.floating], side: int) -> Float:
     """Sums over squares of so many pixels; what is left over at the right and at the bottom is left out."""
     height, width = (n // side for n in values.shape)
-    blocks = values[: height * side, : width * side].reshape(height, side, width, side)
-    return np.asarray(blocks.sum((1, 3), dtype=np.float64))
+    rows = values[: height * side].reshape(height, side, -1).sum(1)
+    return np.asarray(rows[:, : width * side].reshape(height, width, side).sum(2), np.float64)
 
 
 @dataclass(frozen=True)
@@ -138,7 +147,10 @@ def find_plane(samples: Samples, rng: Generator, up: Float | None = None, above:
     normals, offsets = normals[fits], offsets[fits]
     if len(normals) == 0:
         return None
-    count = (np.abs(points @ normals.T + offsets) < samples.tolerance[:, None]).sum(0)
+    # From the camera on, so that half as many digits are enough.
+    away = (points - samples.camera).astype(np.float32) @ normals.T.astype(np.float32)
+    away += (offsets + normals @ samples.camera).astype(np.float32)
+    count = (np.abs(away) < samples.tolerance[:, None].astype(np.float32)).sum(0)
     best = int(count.argmax())
     plane = refine_plane(Plane(normals[best], float(offsets[best])), samples)
     level = up is None or plane.normal @ up > TILT
@@ -224,15 +236,22 @@ def inside_sphere(frame: Frame, centre: Float, radius: float, part: Part = WHOLE
     return (frame.depth[part] > 0) & (x * x + y * y + z * z < radius**2)
 
 
-def above_plane(frame: Frame, plane: Plane, noise: Noise) -> Mask:
-    """Pixels that are higher above a plane than the noise of the frame explains, (H, W) bool."""
-    height = frame.along(plane.normal, plane.offset)
-    high = height > np.float32(0.003) * frame.depth
-    high &= frame.depth > 0
-    rows, columns = np.divmod(np.flatnonzero(high), high.shape[1])
+def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) -> Mask:
+    """Pixels that are higher above a plane than the noise of the frame explains, (H, W) bool; or those of a part."""
+    depth, height = frame.depth[part], frame.along(plane.normal, plane.offset, part)
+    least = np.float32(0.003) * depth
+    high = (height > least) & (depth > 0)
+
     # Noise moves a point along its ray: it rises by so much as the ray does.
     a, b, c = (frame.camera_to_world[:3, :3].T @ plane.normal).astype(np.float32)
-    (x, y), z = frame.rays, frame.depth[rows, columns]
+    x, y = frame.rays[0][part[1]], frame.rays[1][part[0]]
+    most_noise = 4 * float(noise.sigmas.max(initial=0.0))
+    steepest = float(np.abs(a) * np.abs(x).max() + np.abs(b) * np.abs(y).max() + np.abs(c))
+    unsure = height < least + np.float32(most_noise * steepest) * depth**2
+    unsure &= high
+
+    rows, columns = np.divmod(np.flatnonzero(unsure), high.shape[1])
+    z = depth[rows, columns]
     rise = np.abs((a * x)[columns] + (b * y + c)[rows])
     high[rows, columns] = height[rows, columns] > z * (4 * noise.at(z) * z * rise + 0.003)
     return high
