@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from nextview.errors import PolicyError
+from nextview.errors import PolicyError, UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.observation import SceneView
 from nextview.geometry.viewsphere import ViewSphere, angle_between, look_at_origin
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.evidence import Evidence
+from nextview.session.ranked import camera_poses, rank_views
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
@@ -198,20 +199,23 @@ def test_what_is_expected_is_what_the_verifier_says(shown, side):
         assert divergence < 0.15
 
 
-def settled(belief, visited, reachable=None, travel=None, **policy) -> tuple[int, np.ndarray]:
-    """Where the policy goes from some views, a box or the same with a knob, and its values."""
-    caster = surfaces_of(box_mesh(BODY), box_mesh(BODY, KNOB))
-    outlook = Outlook(
-        caster=caster,
+def outlook_of(belief, taken=1) -> Outlook:
+    """A box, or the same with a knob, last seen from the side of -x."""
+    return Outlook(
+        caster=surfaces_of(box_mesh(BODY), box_mesh(BODY, KNOB)),
         hypotheses=hypotheses_of((0, 1), belief),
         sensor=SENSOR,
         surroundings=Surroundings.nothing(),
-        distance=AWAY,
-        taken=len(visited),
+        place=np.array([-AWAY, 0.0, 0.0]),
+        taken=taken,
         weights=EvidenceWeights(),
         pixels=PixelModel(),
         prior=RegistrationPrior(),
     )
+
+
+def settled(belief, visited, reachable=None, travel=None, **policy) -> tuple[int, np.ndarray]:
+    """Where the policy goes from some views, a box or the same with a knob, and its values."""
     been = np.isin(np.arange(len(SPHERE)), visited)[None]
     state = EpisodeState(
         current=np.array(visited[-1:]),
@@ -221,7 +225,7 @@ def settled(belief, visited, reachable=None, travel=None, **policy) -> tuple[int
         step=len(visited),
         reachable=reachable,
         travel=travel,
-        outlook=[outlook],
+        outlook=[outlook_of(belief, len(visited))],
     )
     chooses = DiscriminateGeometry(SPHERE, **policy)
     values = chooses.view_values(state)[0]
@@ -294,6 +298,57 @@ def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
     assert around.reach == pytest.approx(1.5 * metres, rel=0.1)  # radius of the table
     assert len(around.obstacles) > 20
     assert around.obstacles[:, 0].min() > 1.6 * metres
+
+
+def test_nothing_can_be_foreseen_without_geometry():
+    visited = np.arange(40) == 0
+    state = EpisodeState(
+        current=np.zeros(1, np.int64),
+        visited=visited[None],
+        belief=np.ones((1, 1)),
+        evidence=Evidence(np.zeros((1, 1))),
+        step=1,
+        outlook=[None],
+    )
+    chosen = DiscriminateGeometry(SPHERE).next_views(state, np.random.default_rng(0))[0]
+    assert SPHERE.arc[0, chosen] == SPHERE.arc[0].max()
+
+
+def test_poses_of_a_robot_are_ranked():
+    outlook = outlook_of((0.5, 0.5))
+    behind, aside, ahead = (look_at_origin(0.3, azimuth, AWAY) for azimuth in (3.1, 1.5, 0.1))
+    inside = np.stack([behind, aside, ahead])
+    ranked = rank_views(outlook, inside, 1.0, inside, np.array([7, 8, 9]), "thing")
+    assert ranked[0].index == 9
+    np.testing.assert_array_equal(ranked[0].pose, ahead)
+    assert ranked[0].settles > 0.5
+    assert ranked[0].words.startswith("would settle 0 or 1")
+    assert "9: would settle 0 or 1" in repr(ranked[0])
+    worth = [view.information for view in ranked]
+    assert worth[0] > worth[1] >= worth[2]
+    # In a scene whose unit is half a metre, the same poses are half as far away in radii.
+    inside[:, :3, 3] *= 2
+    again = rank_views(outlook, inside, 0.5, inside, np.arange(3), "thing")
+    np.testing.assert_allclose([view.information for view in again], worth, rtol=1e-6)
+    assert rank_views(outlook, inside[:0], 0.5, inside[:0], np.arange(0), "thing") == ()
+    with pytest.raises(UsageError, match="the goal is thing or pose, not 'name'"):
+        rank_views(outlook, inside, 0.5, inside, np.arange(3), "name")
+
+
+@pytest.mark.parametrize(
+    ("poses", "what"),
+    [
+        (np.eye(4), r"\(V, 4, 4\), not \(4, 4\)"),
+        ("here", r"camera-to-world matrices"),
+        (np.zeros((2, 4, 4)), "pose 0 of those to rank: the last row"),
+        (np.stack([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])]), "pose 1 of those to rank: .*mirrored"),
+        (np.full((1, 4, 4), np.nan), "pose 0 of those to rank"),
+        (np.zeros((0, 4, 4)), "camera-to-world matrices"),
+    ],
+)
+def test_what_is_no_list_of_poses_is_refused(poses, what):
+    with pytest.raises(UsageError, match=what):
+        camera_poses(poses)
 
 
 def test_words_name_the_rivals_and_how_much_is_settled():

@@ -12,12 +12,15 @@ from scipy.spatial.transform import Rotation
 from test_household import bottle, mug
 
 import nextview
+from nextview.errors import SessionError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.resting import rotated
 from nextview.learning.learn import learn
+from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.belief import FixedLength
 from nextview.recognition.poses import PoseCandidate, uncertainty_of
 from nextview.sensing import Frame
+from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
 from nextview.things.taught import TaughtThings
@@ -271,3 +274,41 @@ def test_the_uncertainty_is_the_root_mean_square_of_all_candidates():
 def test_turns_that_change_nothing_are_no_uncertainty(symmetry, turn, left):
     both = [candidate(probability=0.0, symmetry=symmetry), candidate(turn, probability=1.0, symmetry=symmetry)]
     assert uncertainty_of(both).degrees == pytest.approx(left, abs=1e-5)
+
+
+def test_the_next_view_is_chosen_by_geometry_and_views_are_ranked(system):
+    assert isinstance(system.policy, DiscriminateGeometry)
+    session = session_of(system, 3, distance=0.5)
+    with pytest.raises(SessionError, match="not known before the first one"):
+        session.ranked()
+    true = placed("mug", 0.7)
+    camera = pose_at(35, 20, 0.5, np.add(SPOT, (0, 0, 0.03)))
+    view = session.update(frame_of("mug", true, camera))
+    assert np.isnan(view.values[view.index])
+    assert view.values[view.next_view] == np.nanmax(view.values)
+
+    ranked = session.ranked()
+    left = np.flatnonzero(~np.isnan(view.values))
+    assert sorted(each.index for each in ranked) == left.tolist()
+    assert all(0 <= each.settles <= 1 for each in ranked)
+    np.testing.assert_allclose(ranked[0].pose, session.poses[ranked[0].index])
+    assert ranked[0].words
+
+    mine = np.stack([pose_at(20, 200, 0.6, SPOT), pose_at(60, 20, 0.4, SPOT), pose_at(35, 110, 0.5, SPOT)])
+    own = session.ranked(mine, goal="pose")
+    assert sorted(each.index for each in own) == [0, 1, 2]
+    assert "the pose of" in own[0].words
+    with pytest.raises(UsageError, match=r"\(V, 4, 4\), not \(4, 4\)"):
+        session.ranked(mine[0])
+
+
+def test_nothing_is_ranked_where_nothing_can_be_foreseen(known, meshes):
+    session = nextview.load(models=known, threads=1).session()
+    exact = SimulatedCamera(meshes["mug"]).observe(session.pose)
+    session.update(replace(exact, radius=None))
+    with pytest.raises(SessionError, match="no taught thing of known geometry explains them"):
+        session.ranked()
+    plain = nextview.load(threads=1)
+    policy = DiscriminateGeometry(plain.sphere)
+    with pytest.raises(SessionError, match="needs things of known geometry"):
+        nextview.Session(plain.models, policy, plain.sphere)

@@ -41,7 +41,8 @@ class EpisodeState:
         observations: all views taken so far, in order, B sequences; None unless the policy needs them.
         visibility: expected share of the object that shows from each view, 0 to 1, (B, V) float64; None unless the
             policy needs it.
-        outlook: what is known of the thing's geometry, of B episodes; None unless the policy needs it.
+        outlook: what can be foreseen of views by the geometry of taught things, of B episodes, None in those where
+            that is nothing; None unless the policy needs it.
     """
 
     current: NDArray[np.int64]
@@ -57,7 +58,7 @@ class EpisodeState:
     observations: Sequence[Sequence[Observation]] | None = None
     visibility: Float | None = None
     joint: Float | None = None
-    outlook: "Sequence[Outlook] | None" = None
+    outlook: "Sequence[Outlook | None] | None" = None
 
     @property
     def free(self) -> NDArray[np.bool_]:

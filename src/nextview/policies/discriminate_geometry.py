@@ -23,7 +23,7 @@ class DiscriminateGeometry:
     The leading hypotheses are rendered from each candidate view, see ``things.expected_views``.
     Among views that are worth nearly the same, that with the shortest way is taken. If no view is
     expected to tell anything, the camera goes to the view farthest from all others, where the
-    belief is tested hardest.
+    belief is tested hardest; so it does where nothing can be foreseen.
 
     Attributes:
         viewpoints: the candidates, anywhere.
@@ -55,7 +55,7 @@ class DiscriminateGeometry:
 
     def _values(
         self,
-        outlook: Outlook,
+        outlook: Outlook | None,
         free: NDArray[np.bool_],
         visited: NDArray[np.bool_],
         travel: Float,
@@ -66,8 +66,10 @@ class DiscriminateGeometry:
         if not len(some):
             return values
 
-        cameras = outlook.cameras(self.viewpoints.directions[some])
-        information = outlook.expect(cameras).information(self.goal)
+        information = np.zeros(len(some))
+        if outlook is not None:
+            cameras = outlook.cameras(self.viewpoints.directions[some])
+            information = outlook.expect(cameras).information(self.goal)
         best = information.max()
         if best < LEAST_INFORMATION:
             information = self._apart(some, visited)

@@ -11,11 +11,13 @@ from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Furthest, Random, RandomAll, Spread, Unidirectional, Visibility
 from nextview.policies.discriminate import Discriminate
+from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.gain import Gain, VisibleGain
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card
 from nextview.recognition.map_names import SPHERE, in_order
 from nextview.recognition.model_card import DISCRIMINATE, MAPS, is_memory
+from nextview.things.memory import open_memory
 
 POLICIES: dict[str, Callable[[Any], Policy]] = {  # those of no map; each map has its own, see ``map_policy``
     "random": Random,
@@ -61,7 +63,7 @@ def make_policy(
         return by_map
     card = _card(name)
     if card is not None and is_memory(card):
-        return Discriminate.from_card(card, sphere, None if classes is None else tuple(classes))
+        return _of_memory(card, sphere, None if classes is None else tuple(classes))
     if card is not None:
         policy = read_policy(card, sphere, classes)
         if not name.startswith(VISIBLE):
@@ -137,8 +139,15 @@ def with_cards(name: str, cards: Mapping[str, Path]) -> str:
     return name if card is None else f"{VISIBLE}{card}{weighted}{travel_weight}"
 
 
+def _of_memory(card: Path, sphere: Viewpoints, classes: tuple[str, ...] | None) -> Policy:
+    """The policy that tells the things of a memory apart: by their surfaces, or else by what is remembered of them."""
+    by_pictures = Discriminate.from_card(card, sphere, classes)
+    _, memory = open_memory(card)
+    return DiscriminateGeometry(sphere) if memory.surfaces.counts.any() else by_pictures
+
+
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
-    if not isinstance(policy, Discriminate | Gain | Visibility | VisibleGain):
+    if not isinstance(policy, Discriminate | DiscriminateGeometry | Gain | Visibility | VisibleGain):
         raise PolicyError(f"{name}: this policy does not weigh travel")
     try:
         return replace(policy, travel_weight=float(travel_weight))

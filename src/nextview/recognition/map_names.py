@@ -8,6 +8,8 @@ CONFIDENCE = "confidence"  # a measure of views: that of the recogniser where it
 LEM, LCM = "lem", "lcm"
 MAP_NAMES = {"depth_entropy": LEM, CONFIDENCE: LCM}  # the thesis's; all others are called as their measure
 SPHERE = "-sphere"  # how the name of a map of the whole sphere ends; without this it is the map of the local window
+# what else a policy may need
+NO_MAPS = ("azimuth_bins", "joint", "observations", "outlook", "visibility")
 
 
 def map_name(measure: str) -> str:
@@ -22,7 +24,7 @@ def measure_of(name: str) -> str:
 
 def maps_among(needs: Sequence[str]) -> list[str]:
     """Those of a policy's needs that are maps."""
-    return [name for name in needs if name not in ("azimuth_bins", "joint", "observations", "visibility")]
+    return [name for name in needs if name not in NO_MAPS]
 
 
 def in_order(maps: Iterable[str]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,7 @@ class JointBelief:
         p_value: share of known objects that are explained as badly as this one, 0 to 1; None if
             that is not known.
         why_no_pose: why there is no pose, in words; "" if there is one, or none was to be expected.
+        found: what the recogniser goes by if it is asked for more; None if that is nothing.
     """
 
     belief: Float
@@ -73,6 +74,7 @@ class JointBelief:
     camera_error: float = 0.0
     p_value: float | None = None
     why_no_pose: str = ""
+    found: Any = None
 
 
 @runtime_checkable
@@ -90,6 +92,22 @@ class JudgesTogether(Protocol):
                 least one.
             total: sum of the log-evidence of these views, (D,), see ``belief.log_evidence_of``.
             counted: number of these views.
+        """
+
+
+@runtime_checkable
+class LooksAhead(Protocol):
+    """A recogniser that judges views together, and knows what other views would show."""
+
+    def outlook(self, observations: Sequence[Observation], joint: JointBelief) -> Any:
+        """What policies that need an "outlook" are shown.
+
+        Args:
+            observations: all views so far in which anything was seen.
+            joint: what they say together.
+
+        Returns:
+            A ``things.expected_views.Outlook``; None where nothing can be foreseen.
         """
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,7 @@ class Taken:
 Visible = Callable[[EpisodeState], Float]  # expected share of the object that shows from each view, (B, V)
 Constrain = Callable[[EpisodeState], EpisodeState]  # with where robots can go, and what it costs
 Together = Callable[[Sequence[Observation], Float, int], JointBelief]  # see ``protocol.JudgesTogether.together``
+LookAhead = Callable[[Sequence[Observation], JointBelief], Any]  # see ``protocol.LooksAhead.outlook``
 
 
 def unconstrained(state: EpisodeState) -> EpisodeState:
@@ -87,9 +89,11 @@ class Episodes:
         # for policies that need it; by default from the scenes in the observations, see ``SeenScene``
         visibility: Visible | None = None,
         together: Together | None = None,  # judges all views of an episode; by default their evidence is added up
+        outlook: LookAhead | None = None,  # what it foresees of other views, for policies that need it
     ) -> None:
         self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
         self.calibration, self.visibility, self.together = calibration, visibility, together
+        self.outlook = outlook
         self.running = np.arange(len(starts))
         self.current = np.array(starts, np.int64)
         if ((self.current < 0) | (self.current >= len(sphere))).any():
@@ -197,8 +201,21 @@ class Episodes:
             places=None if taken.places is None else taken.places[going],
             joint=joint,
             observations=self._observations(step, step.episodes[going]) if "observations" in needs else None,
+            outlook=self.outlooks(step, going) if "outlook" in needs else None,
         )
         return replace(state, visibility=self._visibility(step, state)) if "visibility" in needs else state
+
+    def outlooks(self, step: Step, some: NDArray[np.bool_]) -> list[Any]:
+        """What can be foreseen after a step in some of its episodes, None where that is nothing."""
+        rows = np.flatnonzero(some)
+        if self.outlook is None or not any(step.joint):
+            return [None] * len(rows)
+        taken = self._observations(step, step.episodes, counted=True)
+        found = []
+        for row in rows:
+            joint = step.joint[row]
+            found.append(None if joint is None else self.outlook(taken[row], joint))
+        return found
 
     def _taken(
         self,

@@ -23,17 +23,19 @@ from nextview.recognition.belief import MUCH, Stopping, log_evidence_of
 from nextview.recognition.inference import Models, NetworkRecogniser
 from nextview.recognition.map_names import maps_among
 from nextview.recognition.novelty import Novelty, ViewScore, values_of
-from nextview.recognition.protocol import JudgesTogether
+from nextview.recognition.protocol import JudgesTogether, LooksAhead
 from nextview.sensing.frame import Frame
 from nextview.sensing.plausibility import ViewWarning, check_observation, check_views
 from nextview.session.episode import Episodes, Step
 from nextview.session.limits import Limits, in_words
 from nextview.session.pose_frame import PoseFrame
+from nextview.session.ranked import RankedView, camera_poses, rank_views
 from nextview.session.reach import Reach, Reachable, TravelCost, as_reachable, as_travel_cost
 from nextview.session.recognition import SUSPICIOUS, Recognition
 from nextview.session.repeated import REPEATED, after_repeated, is_repeated
 from nextview.session.surroundings import Surroundings
 from nextview.session.view import View
+from nextview.things.expected_views import Goal
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
@@ -161,6 +163,7 @@ class Session:
             self._rng,
             recogniser.calibration,
             together=recogniser.together if isinstance(recogniser, JudgesTogether) else None,
+            outlook=recogniser.outlook if isinstance(recogniser, LooksAhead) else None,
         )
 
     # Where to look
@@ -200,6 +203,53 @@ class Session:
     def target(self) -> Float | None:
         """Where to look now, one of ``poses``, (4, 4); None where the episode has ended."""
         return None if self.done else self.poses[self.view]
+
+    def ranked(self, poses: ArrayLike | None = None, goal: Goal = "thing") -> tuple[RankedView, ...]:
+        """Candidate views, those first that are expected to tell most of which taught thing it is.
+
+        Of the views that are worth nearly the same the nearer ones come first. What stands in the way by the frames so
+        far is allowed for; whether the camera can be brought there is yours to know.
+
+        Args:
+            poses: of the camera, as your robot can take them, camera-to-world, (V, 4, 4), OpenCV axes, in the world and
+                metres; without frames in the object frame and object radii. By default those of ``poses`` that are
+                left: not visited, within ``limits`` and ``reachable``.
+            goal: "thing" ranks by what is told of which thing it is, "pose" by what is told of its pose too.
+
+        Raises:
+            SessionError: nothing can be foreseen: no view was taken, or the geometry of what is seen is not known.
+            UsageError: these are no poses.
+        """
+        with self._lock:
+            return self._ranked(poses, goal)
+
+    def _ranked(self, poses: ArrayLike | None, goal: Goal) -> tuple[RankedView, ...]:
+        if not self.views:
+            raise SessionError("what views would tell is not known before the first one")
+        step = self._episodes.steps[-1]
+        outlook = self._episodes.outlooks(step, np.ones(1, bool))[0]
+        if outlook is None:
+            raise SessionError("what views would tell is not known: no taught thing of known geometry explains them")
+
+        if poses is None:
+            left = np.flatnonzero(self._left())
+            given = self.poses[left]
+        else:
+            given = camera_poses(poses)
+            left = np.arange(len(given))
+        inside = given if self.object is None else self.object.object_frame.pose_in_object(given)
+        radius = self.views[-1].observation.radius
+        assert radius is not None  # else nothing was foreseen
+        return rank_views(outlook, inside, radius, given, left, goal)
+
+    def _left(self) -> NDArray[np.bool_]:
+        """Which candidates may still be chosen, (V,) bool."""
+        state = self._episodes.steps[-1].state
+        if state is not None:
+            return state.free[0]
+        left = np.ones(len(self.sphere), bool)
+        left[[view.index for view in self.views]] = False
+        return left & ~self._reach.failed & (self._reasons(self.object) == "")
 
     # What the robot can do
 
@@ -598,6 +648,8 @@ def _check_needs(policy: Policy, models: Models) -> None:
         raise UsageError(f"a policy has needs and next_views, see nextview.Policy, not {one_line(repr(policy))}")
     if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:
         raise SessionError("this policy needs the azimuth bin that is seen, and the recogniser was not taught it")
+    if "outlook" in policy.needs and not isinstance(models.recogniser, LooksAhead):
+        raise SessionError("this policy needs things of known geometry: a memory that was taught from scans")
     missing = [name for name in maps_among(policy.needs) if name not in models.map_names]
     if missing:
         raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")

@@ -269,25 +269,27 @@ class ExpectedViews:
         pair = (int(first), int(second))
         return pair if belief[first] >= belief[second] else pair[::-1]
 
-    def words(self, view: int, names: Sequence[str]) -> str:
+    def words(self, view: int, names: Sequence[str], goal: Goal = "thing") -> str:
         """What a view is expected to settle, as a phrase.
 
         Args:
             view: which candidate.
             names: of the things.
+            goal: what is to be told.
         """
+        entropy = self.entropy(goal)
+        share = min(1.0, float(self.information(goal)[view]) / entropy) if entropy > 0 else 0.0
+        verb = "would settle" if share >= 0.5 else "would tell little of"
+        doubt = f"{100 * share:.0f} % of the doubt"
         pair = self.told_apart(view)
-        entropy = self.entropy()
+        if goal == "pose":
+            return f"{verb} the pose of {names[self.hypotheses.things[0]]}: {doubt}"
         if pair is None or entropy == 0:
             return f"there is no rival of {names[self.hypotheses.things[0]]}"
+
         first, second = (names[self.hypotheses.things[row]] for row in pair)
-        share = min(1.0, float(self.information()[view]) / entropy)
-        differs = self.different[view][pair]
-        verb = "would settle" if share >= 0.5 else "would tell little of"
-        return (
-            f"{verb} {first} or {second}: they differ in {100 * differs:.0f} % of the pixels, "
-            f"{100 * share:.0f} % of the doubt"
-        )
+        differs = f"they differ in {100 * self.different[view][pair]:.0f} % of the pixels"
+        return f"{verb} {first} or {second}: {differs}, {doubt}"
 
 
 def expected_views(
@@ -339,7 +341,7 @@ class Outlook:
         hypotheses: the leading hypotheses.
         sensor: the camera.
         surroundings: what is known of the scene.
-        distance: of the last camera from the origin of the object frame, metres.
+        place: of the last camera, (3,) float64, object frame, metres.
         taken: how many views there are.
         weights: how much geometry counts.
         pixels: how a pixel is judged.
@@ -350,7 +352,7 @@ class Outlook:
     hypotheses: Hypotheses
     sensor: ExpectedSensor
     surroundings: Surroundings
-    distance: float
+    place: Float
     taken: int
     weights: EvidenceWeights
     pixels: PixelModel
@@ -381,12 +383,22 @@ class Outlook:
             hypotheses=hypotheses,
             sensor=sensor,
             surroundings=Surroundings.of(used, verifier.caster, hypotheses),
-            distance=float(np.linalg.norm(seen[-1][1].origin)),
+            place=seen[-1][1].origin,
             taken=len(used),
             weights=verifier.weights,
             pixels=verifier.pixels,
             prior=verifier.prior,
         )
+
+    @property
+    def distance(self) -> float:
+        """Of the last camera from the origin of the object frame, metres."""
+        return float(np.linalg.norm(self.place))
+
+    @property
+    def towards(self) -> Float:
+        """Unit vector from the origin of the object frame towards the last camera, (3,)."""
+        return self.place / self.distance
 
     def cameras(self, directions: Float) -> Float:
         """Level cameras in some directions, as far away as the last one.

@@ -15,6 +15,7 @@ from nextview.geometry.observation import Observation
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import find_card
 from nextview.recognition.protocol import JointBelief
+from nextview.things.expected_views import Outlook
 from nextview.things.memory import TaughtRecogniser, open_memory
 from nextview.things.pose_candidates import candidates_of
 from nextview.things.taught import TaughtThings
@@ -116,9 +117,28 @@ class VerifiedRecogniser(TaughtRecogniser):
 
         best = int(belief.argmax())
         if best not in self.labels:
-            return JointBelief(belief, why_no_pose=self._no_geometry(belief))
-        poses = candidates_of(self.things, found, observations, self.labels)
-        return JointBelief(belief, poses, self._camera_error(observations), self._p_value(found))
+            return JointBelief(belief, why_no_pose=self._no_geometry(belief), found=found)
+        return JointBelief(
+            belief,
+            poses=candidates_of(self.things, found, observations, self.labels),
+            camera_error=self._camera_error(observations),
+            p_value=self._p_value(found),
+            found=found,
+        )
+
+    def outlook(self, observations: Sequence[Observation], joint: JointBelief) -> Outlook | None:
+        """What is known when the next view is to be chosen.
+
+        Args:
+            observations: the views, in one object frame; something is seen in each.
+            joint: what ``together`` said of them.
+
+        Returns:
+            The leading hypotheses and their surroundings; None where geometry said nothing.
+        """
+        if not isinstance(joint.found, Verified):
+            return None
+        return Outlook.of(self.things.verifier, joint.found, observations)
 
     def _no_geometry(self, belief: Float) -> str:
         """Why there is no pose of the class believed most, in words."""

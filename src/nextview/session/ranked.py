@@ -1,0 +1,117 @@
+"""Candidate camera poses, ranked by what their views are expected to tell."""
+
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nextview.checks import one_line
+from nextview.errors import ObservationError, UsageError
+from nextview.geometry.observation import checked_pose
+from nextview.geometry.viewsphere import angle_between, direction_of
+from nextview.policies.discriminate_geometry import NEAR_TIE
+from nextview.things.expected_views import Goal, Outlook
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RankedView:
+    """A candidate view, and what it is expected to tell.
+
+    Attributes:
+        index: of the pose in the list that was ranked; of the candidate in ``Session.sphere``.
+        pose: camera-to-world, (4, 4), as it was given.
+        information: expected information, natural units (nats).
+        settles: the same as a share of what is not known yet, 0 to 1.
+        words: which things it would tell apart.
+    """
+
+    index: int
+    pose: Float
+    information: float
+    settles: float
+    words: str
+
+    def __repr__(self) -> str:
+        return f"RankedView({self.index}: {self.words})"
+
+
+def camera_poses(given: ArrayLike) -> Float:
+    """Check camera poses that a user hands in.
+
+    Args:
+        given: camera-to-world, (V, 4, 4).
+
+    Returns:
+        The same, float64.
+
+    Raises:
+        UsageError: they are of another shape, or no rigid motions.
+    """
+    try:
+        poses = np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        raise UsageError("poses to rank are camera-to-world matrices, (V, 4, 4)") from None
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
+        raise UsageError(f"poses to rank are camera-to-world matrices, (V, 4, 4), not {poses.shape}")
+    for number, pose in enumerate(poses):
+        turned = np.eye(4)
+        turned[:3, :3] = pose[:3, :3]
+        turned[3] = pose[3]
+        try:
+            checked_pose(turned)
+        except ObservationError as error:
+            raise UsageError(f"pose {number} of those to rank: {error}") from None
+        if not np.isfinite(pose[:3, 3]).all():
+            raise UsageError(f"pose {number} of those to rank: its place is not finite")
+    return poses
+
+
+def rank_views(
+    outlook: Outlook,
+    inside: Float,
+    radius: float,
+    given: Float,
+    index: NDArray[np.int64],
+    goal: Goal,
+) -> tuple[RankedView, ...]:
+    """Rank candidate poses.
+
+    Args:
+        outlook: what can be foreseen.
+        inside: the poses in the object frame, object radii, (V, 4, 4).
+        radius: of the object, metres.
+        given: the poses as they are shown, (V, 4, 4).
+        index: what they are called, (V,).
+        goal: what is to be told.
+
+    Returns:
+        The best first.
+
+    Raises:
+        UsageError: there is no such goal.
+    """
+    if goal not in get_args(Goal):
+        raise UsageError(f"the goal is {' or '.join(get_args(Goal))}, not {one_line(repr(goal))}")
+    if not len(inside):
+        return ()
+
+    cameras = inside.copy()
+    cameras[:, :3, 3] *= radius
+    expected = outlook.expect(cameras)
+    information = expected.information(goal)
+    most = expected.entropy(goal)
+    names = [surface.name for surface in outlook.caster.surfaces]
+
+    towards = np.stack([direction_of(pose) for pose in inside])
+    way = angle_between(towards, outlook.towards)
+    values = information - NEAR_TIE * information.max() * way / np.pi
+    ranked = []
+    for row in np.argsort(-values, kind="stable"):
+        worth = float(information[row])
+        settles = min(1.0, worth / most) if most > 0 else 0.0
+        words = expected.words(int(row), names, goal)
+        ranked.append(RankedView(int(index[row]), given[row], worth, settles, words))
+    return tuple(ranked)
