@@ -80,7 +80,8 @@ def test_another_policy_takes_over_the_views(chair):
 
 def test_objects_of_files_and_folders(tmp_path):
     assert [shown.name for shown in shown_objects()] == ["chair", "table", "monitor"]
-    assert [shown.name for shown in shown_objects(SAMPLES)] == ["chair.off", "monitor.off", "table.off"]
+    flat = [(shown.name, shown.label) for shown in shown_objects(SAMPLES)]
+    assert flat == [("chair", None), ("monitor", None), ("table", None)]
     (one,) = shown_objects(SAMPLES / "chair.off")
     assert one.open().faces.shape == sample_mesh("chair").faces.shape
     for label, split in (("chair", "train"), ("table", "test")):
@@ -88,6 +89,11 @@ def test_objects_of_files_and_folders(tmp_path):
         shutil.copy(SAMPLES / f"{label}.off", tmp_path / label / split / f"{label}_1.off")
     shown = [(shown.name, shown.label) for shown in shown_objects(tmp_path)]
     assert shown == [("chair_1", "chair"), ("table_1", "table")]
+    shutil.copy(SAMPLES / "chair.off", tmp_path / "loose.off")
+    shown = [(shown.name, shown.label) for shown in shown_objects(tmp_path)]
+    assert shown == [("chair_1", "chair"), ("loose", None), ("table_1", "table")]
+    shutil.copy(SAMPLES / "chair.off", tmp_path / "loose.ply")  # another format of the same model
+    assert len(shown_objects(tmp_path)) == 3
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match="no meshes"):
         shown_objects(tmp_path / "empty")

@@ -100,6 +100,21 @@ CASES = {  # what lies in a folder; what is taken, (name, label, split); and wha
         [("a", "a", "train"), ("b", "b", "test"), ("c", "c", "test")],
         {},
     ),
+    "splits of single things in capitals": (
+        ["Train/a.ply", "TEST/b.ply", "Validation/c.ply"],
+        [("a", "a", "train"), ("b", "b", "test"), ("c", "c", "val")],
+        {},
+    ),
+    "splits in capitals": (
+        ["Training/cup/a.ply", "Test/cup/b.ply", "Valid/jar/c.ply"],
+        [("a", "cup", "train"), ("b", "cup", "test"), ("c", "jar", "val")],
+        {},
+    ),
+    "splits of classes in capitals": (
+        ["cup/Train/a.ply", "cup/test/b.ply", "jar/VAL/c.ply"],
+        [("a", "cup", "train"), ("b", "cup", "test"), ("c", "jar", "val")],
+        {},
+    ),
     "a mesh beside the classes of a split": (
         ["train/cup/a.ply", "train/loose.ply"],
         [("a", "cup", "train")],
@@ -132,9 +147,8 @@ CASES = {  # what lies in a folder; what is taken, (name, label, split); and wha
 def test_all_that_is_in_a_folder_is_taken_or_left_out_with_a_reason(tmp_path, case):
     places, expected, left_out = CASES[case]
     listing = read_folder(meshes(tmp_path, *places), loose=True)
-    assert [(entry.name, entry.label, entry.split) for entry in listing.entries] == sorted(
-        expected, key=lambda e: e[1:]
-    )
+    in_order = sorted(expected, key=lambda e: (e[1], e[2] != "train"))
+    assert [(entry.name, entry.label, entry.split) for entry in listing.entries] == in_order
     phrases = left_out_phrases(listing.left_out)
     for path, reason in left_out.items():
         assert any(path in phrase.partition(": ")[0] and reason in phrase for phrase in phrases), phrases
@@ -169,8 +183,16 @@ def test_links_that_lead_nowhere_and_folders_of_results_are_left_out(tmp_path):
 
 
 def test_a_folder_called_as_a_split_is_a_class_only_with_a_word(tmp_path):
-    summary = scan_dataset(meshes(tmp_path, "train/a.ply", "plane/b.ply")).summary()
-    assert summary == "2 objects: 2 in CLASS/MESH; the folder train is taken for a class, not for a split"
+    summary = scan_dataset(meshes(tmp_path, "Train/a.ply", "plane/b.ply")).summary()
+    assert summary == "2 objects: 2 in CLASS/MESH; the folder Train is taken for a class, not for a split"
+
+
+def test_a_folder_around_the_classes_is_told(tmp_path):
+    root = meshes(tmp_path, "data/cup/a.ply", "data/cup/b.ply", "data/jar/train/c.ply")
+    (note,) = scan_dataset(root).notes
+    assert note == f"all are of the class data; if the folders in it are the classes, give {root / 'data'}"
+    assert not scan_dataset(root / "data").notes
+    assert not scan_dataset(meshes(tmp_path / "one", "bed/77/models/m.ply", "bed/78/models/m.ply")).notes
 
 
 def test_a_dataset_without_meshes_is_refused_and_says_what_it_holds(tmp_path, caplog):

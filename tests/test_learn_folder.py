@@ -77,6 +77,33 @@ def test_what_is_for_tests_is_not_taught(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("places", "inside"),
+    [
+        (["only/a.ply", "only/b.ply", "only/c.off"], "only"),
+        (["scans/cups/a.ply", "scans/cups/b.ply", "scans/tins/c.ply"], "scans"),
+        (["train/cup/a.ply", "train/cup/b.ply", "test/cup/c.ply"], "train/cup"),
+        (["cup/Train/a.ply", "cup/Train/b.ply", "cup/Test/c.ply"], "cup/Train"),
+    ],
+)
+def test_a_folder_around_all_things_is_asked_about(tmp_path, quickly, places, inside):
+    root = scans_in(tmp_path / "things", *places)
+    with pytest.raises(
+        DatasetError, match=rf"all . things are of the one class .*; give {root / inside} if .*--one-class"
+    ):
+        find_things(root)
+    assert len({thing.label for thing in find_things(root / inside).things}) > 1
+    assert len({thing.label for thing in find_things(root, one_class=True).things}) == 1
+    assert learn(root, tmp_path / "mine", one_class=True, workers=0).classes == 1
+
+
+def test_a_class_beside_those_that_are_known_is_not_asked_about(tmp_path, quickly):
+    learn(scans_in(tmp_path / "first", "box.ply", "tin.ply"), tmp_path / "mine", workers=0)
+    learned = learn(scans_in(tmp_path / "new", "cup/a.ply", "cup/b.ply"), tmp_path / "mine", add=True, workers=0)
+    assert (learned.things, learned.classes) == (4, 3)
+    assert [thing.label for thing in find_things(scans_in(tmp_path / "one", "cup/a.ply")).things] == ["cup"]
+
+
+@pytest.mark.parametrize(
     ("option", "value"),
     [
         ("sensor", "foo"),

@@ -170,10 +170,10 @@ def test_of_two_runs_at_once_one_is_refused_and_none_loses_what_the_other_wrote(
     find = module.find_things
     waiting = [place / "third"]
 
-    def find_things(folder, out):  # while this run looks for its things, another one begins and ends
+    def find_things(folder, out, one_class):  # while this run looks for its things, another one begins and ends
         if waiting:
             learn(waiting.pop(), place / "mine", add=True, workers=0)
-        return find(folder, out)
+        return find(folder, out, one_class)
 
     monkeypatch.setattr(module, "find_things", find_things)
     learn(place / "more", place / "mine", add=True, workers=0)

@@ -6,6 +6,7 @@ Understood are, with MESH for a file:
 - CLASS/MESH, CLASS/SPLIT/MESH and SPLIT/CLASS/MESH, each also with folders before the mesh
   (CLASS/ID/models/MESH).
 - SPLIT/MESH, with two splits or more: each mesh is a class of its own.
+  A SPLIT is a folder called as in SPLIT_NAMES, in capitals or not.
 - NAME/google_16k/nontextured.ply, the download of the YCB object set: each NAME is one object.
 
 Files of one name beside each other, in several formats, are one model, of which the best is taken. Links
@@ -25,6 +26,15 @@ from nextview.geometry.mesh import FORMATS
 from nextview.recognition.model_card import find_card
 
 SPLITS = ("train", "test", "val")
+SPLIT_NAMES = {  # of folders, in lower case, and the split that each holds
+    "train": "train",
+    "training": "train",
+    "test": "test",
+    "testing": "test",
+    "val": "val",
+    "valid": "val",
+    "validation": "val",
+}
 NAMED_FILES = 3  # that are named of those left out for one reason
 LONGEST_PATH = 200  # letters of a path in a sentence
 
@@ -119,21 +129,21 @@ def left_out_phrases(left_out: Iterable[tuple[Path, str]]) -> list[str]:
     return phrases
 
 
-def list_dataset(root: str | Path) -> list[Entry]:
+def list_dataset(root: str | Path, loose: bool = False) -> list[Entry]:
     """All meshes of a dataset folder, see ``scan_dataset``; what is left out is logged."""
-    listing = scan_dataset(root)
+    listing = scan_dataset(root, loose=loose)
     for phrase in left_out_phrases(listing.left_out):
         _log.warning("%s: left out: %s", root, phrase)
     return listing.entries
 
 
-def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS) -> Listing:
+def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS, loose: bool = False) -> Listing:
     """List the objects of a dataset folder, and what was left out; see ``read_folder``.
 
     Raises:
         DatasetError: there is no such folder, it holds no object, or two of them would have one name.
     """
-    listing = read_folder(Path(root), suffixes)
+    listing = read_folder(Path(root), suffixes, loose)
     if listing.entries:
         return listing
 
@@ -190,7 +200,7 @@ def read_folder(
 
     entries = _uniquely_named(found)
     entries.sort(key=lambda entry: (entry.label, entry.split != "train", entry.name))
-    return Listing(entries, left_out, _split_notes(entries))
+    return Listing(entries, left_out, _notes(root, entries))
 
 
 def select(entries: list[Entry], dataset: Path, split: str | None, held_out: str | Path | None) -> list[Entry]:
@@ -338,7 +348,13 @@ def _split_first(in_folders: list[Path]) -> bool:
     """
     tops = {model.parts[0] for model in in_folders}
     with_classes = any(len(model.parts) > 2 for model in in_folders)
-    return bool(tops) and tops <= set(SPLITS) and (with_classes or len(tops) > 1)
+    splits = {_split_of(top) for top in tops}
+    return bool(tops) and "" not in splits and (with_classes or len(splits) > 1)
+
+
+def _split_of(folder: str) -> str:
+    """The split that a folder of this name holds; "" if it is none."""
+    return SPLIT_NAMES.get(folder.lower(), "")
 
 
 def _entry(root: Path, model: Path, path: Path, split_first: bool, own_class: bool) -> Entry | None:
@@ -347,15 +363,15 @@ def _entry(root: Path, model: Path, path: Path, split_first: bool, own_class: bo
     split = ""
     layout = ""
     if split_first and folders:
-        split = folders.pop(0)
+        split = _split_of(folders.pop(0))
         layout = f"{split}/"
     if not folders:
         return Entry(path, stem, stem, split, f"{layout}MESH") if own_class else None
 
     label, *rest = folders
     layout += "CLASS/"
-    if rest and rest[0] in SPLITS and not split_first:
-        split = rest.pop(0)
+    if rest and _split_of(rest[0]) and not split_first:
+        split = _split_of(rest.pop(0))
         layout += f"{split}/"
     return Entry(path, stem, label, split, layout + (".../MESH" if rest else "MESH"))
 
@@ -386,7 +402,16 @@ def _uniquely_named(found: Mapping[Path, Entry]) -> list[Entry]:
     raise DatasetError(f"{both} would both be called {twice.name}; rename one of them")
 
 
-def _split_notes(entries: Iterable[Entry]) -> list[str]:
-    """What was decided about folders that are called as splits."""
-    taken = sorted({entry.label for entry in entries if entry.label in SPLITS})
-    return [f"the folder {label} is taken for a class, not for a split" for label in taken]
+def _notes(root: Path, entries: list[Entry]) -> list[str]:
+    """What was decided about folders that may be meant otherwise, a sentence each."""
+    labels = sorted({entry.label for entry in entries})
+    notes = [f"the folder {label} is taken for a class, not for a split" for label in labels if _split_of(label)]
+    if len(labels) == 1 and any(count > 1 for count in _deep_folders(entries).values()):
+        inside = one_line(str(root / labels[0]), LONGEST_PATH)
+        notes.append(f"all are of the class {labels[0]}; if the folders in it are the classes, give {inside}")
+    return notes
+
+
+def _deep_folders(entries: list[Entry]) -> Counter[Path]:
+    """How many objects lie directly in each of the folders below those of the classes."""
+    return Counter(entry.path.parent for entry in entries if entry.layout.endswith(".../MESH"))

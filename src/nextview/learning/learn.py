@@ -113,7 +113,7 @@ def learn_things(
     keeps = add or bool(remove)
     _check_places(out, keeps, overwrite)
     nothing_new = bool(remove) and folder.resolve() == out.resolve()
-    found = Found([], []) if nothing_new else find_things(folder, out)
+    found = Found([], []) if nothing_new else find_things(folder, out, how.one_class or add)
     left_out = list(found.left_out)
 
     with only_one(out), unfinished(out, PARTS) as part:

@@ -54,6 +54,7 @@ class How:
     sensor: str = "wrist"  # the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help
     largest_part: bool = False  # leave out all that is not connected to the largest part of each mesh
     any_size: bool = False  # take things of very different sizes as they are
+    one_class: bool = False  # take things that all lie in one folder for a class, as beside others with --add
     # depth frames without poses, beside camera-intrinsics.txt: the camera stood still, and the thing turned once around
     # by equal steps, counter-clockwise (ccw) or clockwise (cw) as seen from above
     turntable: Literal["ccw", "cw"] | None = None

@@ -1,5 +1,6 @@
 """Which things a folder teaches: mesh files, class folders of them, and folders of captured depth frames."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,7 +44,7 @@ class Found:
     notes: tuple[str, ...] = ()
 
 
-def find_things(folder: Path, out: Path | None = None) -> Found:
+def find_things(folder: Path, out: Path | None = None, one_class: bool = False) -> Found:
     """Find the things that a folder teaches.
 
     A mesh in the folder itself, and a folder of captured frames, is a thing and a class of its own name. All else is as
@@ -53,12 +54,14 @@ def find_things(folder: Path, out: Path | None = None) -> Found:
     Args:
         folder: to be looked through.
         out: where the result goes, which is no source of things if it lies in the folder.
+        one_class: whether all things may be of one class.
 
     Returns:
         The things, and all that was left out.
 
     Raises:
-        DatasetError: there is no such folder, nothing in it can be taught, or two things have one name.
+        DatasetError: there is no such folder, nothing in it can be taught, two things have one name, or all are of one
+            class: a folder around the things, as an archive has one, looks the same.
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: there is no such folder")
@@ -82,6 +85,8 @@ def find_things(folder: Path, out: Path | None = None) -> Found:
         raise DatasetError("; left out: ".join([text, *filter(None, ["; ".join(left_out)])]))
     things.sort(key=lambda thing: (thing.label, thing.name))
     _check_names(things)
+    if not one_class:
+        _check_classes(folder, things)
 
     layout = [listing.layout()] if entries else []
     if captures:
@@ -110,3 +115,15 @@ def _check_names(things: list[Source]) -> None:
         if first.setdefault(thing.name, thing) is not thing:
             both = f"{first[thing.name].path} and {thing.path}"
             raise DatasetError(f"{both} would both be called {thing.name}; rename one of them")
+
+
+def _check_classes(folder: Path, things: list[Source]) -> None:
+    """Ask about several things that all lie in one class folder."""
+    label = things[0].label
+    if len(things) == 1 or any(thing.label != label for thing in things):
+        return
+    all_things = f"all {len(things)} things are of the one class {one_line(label)}"
+    inside = one_line(os.path.commonpath([thing.path.parent for thing in things]), 200)
+    raise DatasetError(
+        f"{folder}: {all_things}; give {inside} if that holds the things, or --one-class if they are one"
+    )

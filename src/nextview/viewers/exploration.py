@@ -14,7 +14,7 @@ from nextview.data.folders import list_dataset
 from nextview.data.samples import SAMPLES, sample_mesh
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, MeshError, UsageError
-from nextview.geometry.mesh import FORMATS, Mesh, load_mesh, make_mesh
+from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import azimuth_of, direction_of, level_pose, look_at_origin
@@ -67,11 +67,15 @@ def shown_objects(path: Path | None = None, up: str | None = None, unit: str | N
             raise DatasetError(f"{path}: no object in it is rendered yet")
         labels = [store.classes[label] for label in store.labels]
         return tuple(ShownObject(store.names[k], partial(StoredViews, store, k), labels[k]) for k in rows)
-    flat = sorted(file for file in path.iterdir() if file.suffix.lower() in FORMATS and file.is_file())
-    if flat:
-        return tuple(ShownObject(file.name, partial(load_mesh, file, up, unit)) for file in flat)
-    entries = list_dataset(path)
-    return tuple(ShownObject(entry.name, partial(load_mesh, entry.path, up, unit), entry.label) for entry in entries)
+    # A mesh of its own, outside of class folders, has no label.
+    return tuple(
+        ShownObject(
+            entry.name,
+            partial(load_mesh, entry.path, up, unit),
+            entry.label if "CLASS" in entry.layout else None,
+        )
+        for entry in list_dataset(path, loose=True)
+    )
 
 
 class Walk:
