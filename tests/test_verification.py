@@ -470,6 +470,19 @@ def test_what_no_hypothesis_explains_has_a_small_p_value():
     assert known.p_value(taught.residual, int(taught.things[0]), 2) > 0.5
 
 
+def test_what_is_always_explained_badly_is_not_unknown_for_that():
+    rng = np.random.default_rng(0)
+    things = np.arange(2).repeat(100)
+    usual = np.array([0.5, 0.05])
+    residuals = usual[things] * np.exp(rng.normal(0, 0.3, 200))
+    known = KnownResiduals.fit(things, residuals, np.ones(200, int), 2)
+    np.testing.assert_allclose(known.usual, usual, rtol=0.15)
+    assert known.p_value(0.6, 0, 1) > 0.2
+    assert known.p_value(0.6, 1, 1) < 0.01
+    assert known.p_value(0.0, 1, 1) == 1
+    assert known.p_value(0.6, 0, 7) == known.p_value(0.6, 0, 1)  # of more views nothing else is known
+
+
 def episode(geometry: float, features: float, truth: int = 0, views: int = 1) -> JudgedEpisode:
     """Two things; by how much geometry, in each view, and features speak for the first one."""
     mean = np.tile([[geometry], [0.0]], (1, views))

@@ -10,6 +10,7 @@ Float = NDArray[np.float64]
 SHRINKAGE = (
     2.0  # number of residuals that the mean of all things counts for, beside those of a thing
 )
+LEAST_RESIDUAL = 0.02  # below which residuals do not differ
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,13 +18,13 @@ class KnownResiduals:
     """Residuals of taught things, as their own geometry explains them through the sensor.
 
     Some things are always explained worse than others: thin ones, and those that moved since they
-    were scanned. So each thing has its own usual residual, and what counts is by how much it is
+    were scanned. So each thing has its own usual residual, and what counts is how many times it is
     exceeded.
 
     Attributes:
         usual: usual residual of each thing, (T,) float64.
-        excess: by how much known things exceed it, ascending, for each number of views, (views, N)
-            float64.
+        excess: logarithms of how many times known things exceed it, ascending, for each number of
+            views, (views, N) float64.
     """
 
     usual: Float
@@ -44,10 +45,12 @@ class KnownResiduals:
         Raises:
             ModelError: there is no residual for some number of views.
         """
-        mean = residuals.mean()
-        sums = np.bincount(things, residuals - mean, count)
-        usual = mean + sums / (np.bincount(things, minlength=count) + SHRINKAGE)
-        over = residuals - usual[things]
+        logarithms = np.log(np.maximum(residuals, 0) + LEAST_RESIDUAL)
+        mean = logarithms.mean()
+        sums = np.bincount(things, logarithms - mean, count)
+        typical = mean + sums / (np.bincount(things, minlength=count) + SHRINKAGE)
+        usual = np.exp(typical) - LEAST_RESIDUAL
+        over = logarithms - typical[things]
 
         excess = []
         for number in range(1, int(views.max()) + 1):
@@ -67,6 +70,7 @@ class KnownResiduals:
             Between 0 and 1; small for a thing that was not taught.
         """
         excess = self.excess[min(views, len(self.excess)) - 1]
-        over = residual - self.usual[thing]
+        exceeded = (max(residual, 0) + LEAST_RESIDUAL) / (self.usual[thing] + LEAST_RESIDUAL)
+        over = np.log(exceeded)
         as_bad = len(excess) - np.searchsorted(excess, over - 1e-12)
         return float((1 + as_bad) / (1 + len(excess)))
