@@ -1,5 +1,6 @@
 """Taught things through the front door: named by their geometry, with poses where a robot needs them."""
 
+import json
 import pickle
 from copy import deepcopy
 from dataclasses import replace
@@ -7,13 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.contour import ContourSet
 from pipeline import INTRINSICS, TABLE, box, cast, pose_at
 from scipy.spatial.transform import Rotation
 from test_household import bottle, mug
 
 import nextview
+from nextview.cli.main import main
 from nextview.errors import SessionError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
+from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.resting import rotated
 from nextview.learning.learn import learn
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
@@ -235,6 +239,67 @@ def test_a_copy_of_a_session_with_geometry_goes_on_alike(system, meshes, again):
     other = again(session)
     assert len(other.views) == 1
     assert repr(other.run(camera)) == repr(session.run(camera))
+
+
+# What is made of it
+
+
+def test_json_and_the_table_tell_the_pose(known, metric_scans, capsys):
+    asked = ["recognise", str(metric_scans / "carton.ply"), "--models", str(known), "--unit", "m", "--start", "12"]
+    main([*asked, "--json"])
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["answer"], printed["pose_of"], printed["pose_frame"]) == ("carton", "carton", "object")
+    pose = np.array(printed["pose"])
+    np.testing.assert_allclose((pose @ [*ORIGIN, 1])[:3], 0, atol=0.002)  # its middle is that of the object frame
+    assert [each["thing"] for each in printed["pose_candidates"]] == ["carton"] * 2  # from both sides it is the same
+    assert sum(each["probability"] for each in printed["pose_candidates"]) == pytest.approx(1, abs=1e-5)
+    assert printed["pose_uncertainty"]["millimetres"] < 3
+    assert printed["why_no_pose"] == ""
+
+    main(asked)
+    table = capsys.readouterr().out
+    assert "From the frame of its scan into the object frame, metres (±" in table
+    assert "Other poses that it may have, by their probability: carton 0.50" in table
+    main([*asked[:4], "--start", "12"])
+    assert "Where it is: not known, for the scale" in capsys.readouterr().out
+
+
+def test_the_outline_of_the_scan_is_that_of_what_was_seen(system, meshes, tmp_path):
+    result = system.recognise(meshes["mug"], start=12)
+    vertices, faces = result.posed_surface
+    seen = result.views[0].observation
+    rays = pixel_rays(seen.intrinsics, seen.depth.shape).reshape(-1, 3) @ seen.pose[:3, :3].T
+    depth, _ = RayCaster([(vertices, faces)]).cast(seen.pose[:3, 3], rays)
+    shown = np.isfinite(depth).reshape(seen.depth.shape)
+    assert (shown & (seen.depth > 0)).sum() > 0.95 * (shown | (seen.depth > 0)).sum()
+
+    drawn = [axes for axes in result.plot(tmp_path / "mug.png").axes if axes.findobj(ContourSet)]
+    assert len(drawn) == len(result.views)
+
+
+def test_a_recording_shows_the_scan_where_it_was_found(system, meshes, tmp_path):
+    recording = pytest.importorskip("nextview.viewers.recording", reason="the extra 'record' is not installed")
+    reading = pytest.importorskip("test_recording")
+    session = session_of(system, 1, start=12)
+    session.observers.append(recording.Recorder(tmp_path / "mug.rrd"))
+    result = session.run(nextview.SimulatedCamera(meshes["mug"]))
+    rows = reading.Recording(tmp_path / "mug.rrd")
+    shown = np.array(rows.at("world/thing", "Mesh3D:vertex_positions", 1).tolist())
+    np.testing.assert_allclose(shown, result.posed_surface[0], atol=1e-5)
+
+
+def test_the_explorer_tells_the_place(known, metric_scans):
+    pytest.importorskip("viser", reason="the extra 'explore' is not installed")
+    from nextview.viewers.card import walk_card
+    from nextview.viewers.exploration import Exploration, shown_objects
+
+    shown = shown_objects(metric_scans / "mug.ply", None, "m")
+    exploration = Exploration(shown, start=12, models=str(known))
+    exploration.step()
+    assert "m in the object frame, ±" in walk_card(exploration.walks[0])
+
+
+# How sure it is
 
 
 def candidate(turn=(0, 0, 0), at=(0, 0, 0), probability=1.0, symmetry=None, degrees=0.0, millimetres=0.0):

@@ -203,6 +203,21 @@ def test_whatever_fails_while_the_node_answers_is_an_answer(node, monkeypatch):
     assert answer.message
 
 
+def test_the_pose_of_the_thing_goes_into_a_message(node, monkeypatch):
+    def empty():
+        parts = {"pose": SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace())}
+        return SimpleNamespace(header=SimpleNamespace(frame_id=""), **parts)
+
+    monkeypatch.setattr(sys.modules[type(node).__module__], "PoseStamped", empty)
+    pose = pose_at(20, 70, 0.5, (0.1, 0.2, 0.3))
+    message = node.pose_of(SimpleNamespace(pose=pose))
+    assert message.header.frame_id == "base"
+    x, y, z, w = (getattr(message.pose.orientation, part) for part in "xyzw")
+    np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), pose[:3, :3], atol=1e-9)
+    np.testing.assert_allclose([getattr(message.pose.position, part) for part in "xyz"], pose[:3, 3])
+    assert node.pose_of(SimpleNamespace(pose=None)).header.frame_id == ""
+
+
 # What cannot be run here is at least well formed
 
 

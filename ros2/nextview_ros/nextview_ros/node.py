@@ -22,6 +22,7 @@ from tf2_ros import Buffer, TransformException, TransformListener
 
 import nextview
 from nextview.recognition.belief import Stopping
+from nextview.recognition.protocol import JudgesTogether
 from nextview.sensing import ObservedObject
 from nextview_ros.conversion import fill_pose, frame_of, seconds
 
@@ -138,14 +139,29 @@ class RecogniseNode(Node):
             classes=list(found.classes),
             belief=found.views[-1].belief.tolist(),
             views=len(found.views),
+            pose=self.pose_of(found),
+            pose_of=found.pose_of or "",
+            pose_degrees=0.0 if found.pose_uncertainty is None else found.pose_uncertainty.degrees,
+            pose_millimetres=0.0 if found.pose_uncertainty is None else found.pose_uncertainty.millimetres,
         )
+
+    def pose_of(self, found: nextview.Recognition) -> PoseStamped:
+        """Where the thing is that was named; an empty message where that is not known."""
+        message = PoseStamped()
+        if found.pose is not None:
+            message.header.frame_id = self.value("world_frame")
+            message.header.stamp = self.get_clock().now().to_msg()
+            fill_pose(message.pose, found.pose)
+        return message
 
     def begin(self, asked: Recognise.Goal) -> nextview.Session:
         """A session for a goal; what it leaves at zero is the node's."""
         threshold, max_views = asked.threshold or self.value("threshold"), asked.max_views or self.value("max_views")
         stopping = Stopping.of(self.system.models.recogniser.calibration, threshold, max_views=max_views)
         near = [[point.x, point.y, point.z] for point in asked.near]
-        thing = ObservedObject(point=near[0] if near else None, life_size=self.value("life_size"))
+        # Things are as large as they were taught, and known by it.
+        life_size = self.value("life_size") or isinstance(self.system.models.recogniser, JudgesTogether)
+        thing = ObservedObject(point=near[0] if near else None, life_size=life_size)
         return replace(self.system, stopping=stopping).session(object=thing, distance=asked.distance or None)
 
     # The services

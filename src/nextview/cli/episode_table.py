@@ -13,6 +13,8 @@ from nextview.cli.ending import printable
 from nextview.cli.progress import Terminal
 from nextview.session.recognition import Recognition
 
+SHOWN_POSES = 5  # beside the likeliest
+
 
 def _angles(view: int, angles: tuple[float, float]) -> str:
     return f"{view}\n{angles[0]:.0f}°, {round(angles[1]) % 360}°"
@@ -59,6 +61,22 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
         console.print(Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), ", belief ", rest))
     if result.novelty is not None and not result.unknown:
         console.print(f"Of objects of known classes, {100 * result.novelty:.3g} % are at least as novel.")
+    for line in _pose_in_words(result):
+        console.print(line, soft_wrap=True)
+
+
+def _pose_in_words(result: Recognition) -> list[str]:
+    """Where the object is, or why that is not known, a line each."""
+    if result.pose is None:
+        return [f"Where it is: not known, for {printable(result.why_no_pose)}."] if result.why_no_pose else []
+    others = [each for each in result.pose_candidates if not np.array_equal(each.pose, result.pose)]
+    rows = [" ".join(f"{value:9.4f}" for value in row) for row in result.pose]
+    lines = [f"From the frame of its scan into {result.poses_in}, metres ({result.pose_uncertainty}):", *rows]
+    if others:
+        alike = ", ".join(f"{printable(each.thing)} {each.probability:.2f}" for each in others[:SHOWN_POSES])
+        more = ", ..." if len(others) > SHOWN_POSES else ""
+        lines.append(f"Other poses that it may have, by their probability: {alike}{more}.")
+    return lines
 
 
 def episode_as_json(result: Recognition, name: str, frames: Sequence[str] = (), indent: int | None = 1) -> str:
@@ -78,9 +96,36 @@ def episode_as_json(result: Recognition, name: str, frames: Sequence[str] = (), 
         views.append(one | {"warnings": [warning.message for warning in view.warnings]})
     parts = ("answer", "confidence", "beliefs", "most_like", "unknown", "novelty", "radius")
     whole = {"name": name} | {part: getattr(result, part) for part in parts}
+    whole |= _pose_as_json(result)
     whole |= {"unit": None if result.radius is None else "m", "threshold_reached": result.confident, "views": views}
     whole["warnings"] = sorted({warning.name for view in result.views for warning in view.warnings})
     return json.dumps(_plain(whole), indent=indent)
+
+
+def _pose_as_json(result: Recognition) -> dict[str, Any]:
+    """Where the object is: what ``Recognition`` says of it, by the same names."""
+    off = result.pose_uncertainty
+    candidates = [
+        {
+            "thing": each.thing,
+            "probability": each.probability,
+            "pose": each.pose,
+            "degrees": each.degrees,
+            "millimetres": each.millimetres,
+        }
+        for each in result.pose_candidates
+    ]
+    symmetry = result.symmetry
+    axes = None if symmetry is None else [{"axis": each.axis, "order": each.order} for each in symmetry]
+    return {
+        "pose": result.pose,
+        "pose_of": result.pose_of,
+        "pose_frame": result.pose_frame,
+        "pose_uncertainty": None if off is None else {"degrees": off.degrees, "millimetres": off.millimetres},
+        "pose_candidates": candidates,
+        "symmetry": axes,
+        "why_no_pose": result.why_no_pose,
+    }
 
 
 def _plain(value: Any) -> Any:

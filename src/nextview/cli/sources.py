@@ -33,6 +33,7 @@ class Looking:
     risk: float | None = None
     max_views: int = 5  # stop after so many views
     stopping: str | None = None  # MODULE:NAME of a stopping rule of your own, docs/add_a_policy.md
+    recogniser: str | None = None  # MODULE:NAME of a recogniser of your own, docs/add_a_recogniser.md
     # where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in degrees by views on each ring), or
     # fibonacci:60 (spread evenly over the upper half)
     viewpoints: str = "40"

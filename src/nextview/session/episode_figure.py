@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from nextview.errors import UsageError
+from nextview.geometry.ray_caster import RayCaster, Triangles, pixel_rays
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere, great_circle, look_at_origin
 from nextview.recognition.belief import Stopping
 from nextview.session.soft_light import SoftLight
@@ -40,9 +41,17 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 @matplotlib.rc_context(STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER})
 def draw_episode(
-    views: Sequence[View], classes: Sequence[str], sphere: Viewpoints, stopping: Stopping, heading: str
+    views: Sequence[View],
+    classes: Sequence[str],
+    sphere: Viewpoints,
+    stopping: Stopping,
+    heading: str,
+    posed: Triangles | None = None,
 ) -> Figure:
-    """A column for each view (image, belief, what the policy valued the views at); beside them object and path."""
+    """A column for each view (image, belief, what the policy valued the views at); beside them object and path.
+
+    ``posed`` is a surface in the object frame and object radii whose outline is drawn over the images.
+    """
     valued = any(view.values is not None for view in views)
     light, path = SoftLight([view.observation for view in views]), np.array([view.direction for view in views])
     seen_from = _best_side(path)
@@ -74,6 +83,8 @@ def draw_episode(
             axis = axes(GAP + k * (WIDE + GAP), y, WIDE, high)
             if title == rows[0][0]:
                 _draw_image(axis, view, k + 1, light)
+                if posed is not None:
+                    _draw_outline(axis, view, posed)
             elif title == rows[1][0]:
                 _draw_belief(axis, view, float(stopping.threshold_at(k + 1)), classes, shown)
             else:
@@ -113,6 +124,21 @@ def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
     said = [] if seen.seen else ["nothing is seen"]
     said += [warning.name for warning in view.warnings]
     axis.text(0.04, 0.03, "\n".join(said), va="bottom", color=ACCENT, **inside)
+
+
+def _draw_outline(axis: Axes, view: View, posed: Triangles) -> None:
+    """The outline of a surface as a view sees it, over the image of that view."""
+    seen = view.observation
+    height, width = axis.get_images()[0].get_size()
+    shape = (int(height), int(width))
+    times = shape[0] / seen.depth.shape[0]
+    rays = pixel_rays(seen.intrinsics * [[times], [times], [1]], shape).reshape(-1, 3)
+
+    along = rays @ seen.pose[:3, :3].T.astype(np.float32)
+    depth, _ = RayCaster([posed]).cast(seen.pose[:3, 3], along)
+    shows = np.isfinite(depth).reshape(shape)
+    if shows.any() and not shows.all():
+        axis.contour(shows, levels=[0.5], colors=[ACCENT], linewidths=1.3)
 
 
 def _draw_belief(axis: Axes, view: View, threshold: float, classes: Sequence[str], shown: NDArray[np.int64]) -> None:

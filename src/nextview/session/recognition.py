@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.geometry.ray_caster import Triangles
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.recognition.belief import Stopping
 from nextview.recognition.novelty import Quantiles, values_of
@@ -121,6 +122,18 @@ class Recognition:
         return found[0].pose if found else None
 
     @property
+    def pose_of(self) -> str | None:
+        """Name of the thing whose scan ``pose`` is of: one of the things of the class that is the answer."""
+        found = self._candidates_of_answer
+        return found[0].thing if found else None
+
+    @property
+    def place(self) -> NDArray[np.float64] | None:
+        """Where the middle of the thing is, in ``pose_frame``, (3,), metres; None without a pose."""
+        found = self._candidates_of_answer
+        return found[0].place if found else None
+
+    @property
     def pose_frame(self) -> PoseFrameName:
         """The frame in which poses are given.
 
@@ -137,10 +150,7 @@ class Recognition:
         There are several where a thing looks alike from several sides, or two things look alike: each says of which
         thing it is. None are known where ``pose`` is None because the geometry is not known.
         """
-        joint = self._joint
-        if joint is None:
-            return ()
-        return tuple(candidate.moved(self.poses_in.from_object) for candidate in joint.poses)
+        return tuple(candidate.moved(self.poses_in.from_object) for candidate in self._joint_poses)
 
     @property
     def pose_uncertainty(self) -> PoseUncertainty | None:
@@ -163,6 +173,22 @@ class Recognition:
         return found[0].symmetry if found else None
 
     @property
+    def posed_surface(self) -> Triangles | None:
+        """The scan of the thing that was named, where it was found; None without a pose or a surface.
+
+        Vertices, (V, 3) float64, in the object frame and object radii as observations are, and faces, (F, 3).
+        """
+        radius = self.radius
+        if not self._candidates_of_answer or radius is None:
+            return None
+        label = self._candidates_of_answer[0].label
+        found = next(each for each in self._joint_poses if each.label == label)
+        if found.vertices is None or found.faces is None:
+            return None
+        in_metres = found.vertices @ found.pose[:3, :3].T + found.pose[:3, 3]
+        return in_metres / radius, found.faces
+
+    @property
     def why_no_pose(self) -> str:
         """Why there is no pose though all views were judged together, in words; "" if there is one."""
         joint = self._joint
@@ -172,6 +198,12 @@ class Recognition:
     def _joint(self) -> JointBelief | None:
         """What all views say together; None where views are judged one by one, or nothing is seen."""
         return self.views[-1].joint if self.views else None
+
+    @property
+    def _joint_poses(self) -> tuple[PoseCandidate, ...]:
+        """The poses that the object may have, in the object frame."""
+        joint = self._joint
+        return () if joint is None else joint.poses
 
     @property
     def _explained(self) -> float | None:
@@ -211,20 +243,20 @@ class Recognition:
     @property
     def _place_in_words(self) -> str:
         """``, at (0.412, -0.103, 0.050) m in the world, ± 1.2°, 0.8 mm``: the thing's centre; "" without a pose."""
-        if self.pose is None:
+        if self.place is None:
             return ""
-        place = place_in_words(self._candidates_of_answer[0].place)
-        return f", at {place} in {self.poses_in}, {self.pose_uncertainty}"
+        return f", at {place_in_words(self.place)} in {self.poses_in}, {self.pose_uncertainty}"
 
     def plot(self, path: str | Path | None = None, title: str = "") -> "Figure":
         """Draw the episode: images, what the policy valued the views at, beliefs and the path on the sphere.
 
+        The outline of the scan of the thing that was named, in its pose, is drawn over the images.
         With a path it is written to that file too, PNG, PDF or SVG; UsageError if it cannot be.
         """
         from nextview.session.episode_figure import draw_episode, save_figure
 
         heading = f"{title}: {self!r}" if title else repr(self)
-        figure = draw_episode(self.views, self.classes, self.sphere, self.stopping, heading)
+        figure = draw_episode(self.views, self.classes, self.sphere, self.stopping, heading, self.posed_surface)
         if path is not None:
             save_figure(figure, Path(path))
         return figure

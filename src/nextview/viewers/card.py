@@ -11,6 +11,7 @@ from PIL import Image
 
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere, direction_of
+from nextview.recognition.poses import place_in_words
 from nextview.session.style import ACCENT, FAINT, GROUND, INK, WOOD, heat, rgb
 from nextview.session.view import View
 from nextview.viewers.exploration import Walk
@@ -42,9 +43,23 @@ def walk_card(walk: Walk) -> str:
     believed = f"{escape(classes[best])} <small>{view.belief[best]:.1%}</small>"
     believed = believed if view.observation.seen else "Nothing is seen"
     goes_on = "It would stop here." if walk.stopped else "Not sure enough yet: it would look again."
-    parts = [f"<h3>{believed}</h3><p>{goes_on}</p>", _figures(walk, view), _beliefs(walk), rivals_card(walk)]
+    parts = [f"<h3>{believed}</h3><p>{goes_on}</p>", _pose(walk), _figures(walk, view), _beliefs(walk)]
+    parts.append(rivals_card(walk))
     parts += [_maps(view), _steps(walk)]
     return f'{STYLE}<div class="nv">{"".join(parts)}</div>'
+
+
+def _pose(walk: Walk) -> str:
+    """Where the thing is, or why that is not known; nothing for models that know no geometry."""
+    result = walk.session.result
+    if result.why_no_pose:
+        return f"<p>No pose: {escape(result.why_no_pose)}.</p>"
+    if result.place is None:
+        return ""
+    likely = max(each.probability for each in result.pose_candidates)
+    count = len(result.pose_candidates)
+    several = f", the likeliest of {count} poses ({likely:.0%})" if count > 1 else ""
+    return f"<p>At {place_in_words(result.place)} in {result.poses_in}, {result.pose_uncertainty}{several}.</p>"
 
 
 def preview_card(observation: Observation, walk: Walk) -> str:

@@ -29,6 +29,7 @@ class Recorder:
     - ``world/camera``: pose and pinhole of the last view; ``depth`` and ``image`` below it.
     - ``world/views/K`` and ``world/seen/K``: pose of view K, and the points that were seen from there. Where a later
       frame shows better where the object is, they are written anew.
+    - ``world/thing``: the scan of the thing that is believed most, where it was found.
     - ``world/candidates``: the candidate views, in the colours of what the policy values them at, and
       ``world/next``: the one that it chose.
     - ``belief/CLASS``, ``threshold``, ``travel/cells``, ``travel/radians``: numbers over the steps, as they were then.
@@ -49,6 +50,7 @@ class Recorder:
             raise UsageError(f"{path}: cannot be written ({error})") from None
         self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._shown: list[object] = []
+        self._shows_surface = False
         self._open = True
 
     def __call__(self, session: "Session") -> None:
@@ -63,6 +65,7 @@ class Recorder:
         self._shown = [earlier.observation for earlier in session.views]
         if new:
             self._log_belief(session, view, step)
+            self._log_surface(session)
         self._log_choice(session, view, step)
         self._stream.flush()
         if session.done:
@@ -87,6 +90,20 @@ class Recorder:
         self._stream.log(f"world/seen/{step}", rr.Points3D(points, colors=rgb(ACCENT), radii=0.006))
         self._stream.log("world/camera/depth", rr.DepthImage(observation.depth, meter=1.0))
         self._stream.log("world/camera/image", rr.Image(observation.picture, color_model="L"))
+
+    def _log_surface(self, session: "Session") -> None:
+        """The scan of the thing that is believed most, where it was found."""
+        posed = session.result.posed_surface
+        if posed is None:
+            if self._shows_surface:
+                self._stream.log("world/thing", rr.Clear(recursive=False))
+            self._shows_surface = False
+            return
+        vertices, faces = posed
+        colours = np.tile([*rgb(ACCENT), 90], (len(vertices), 1)).astype(np.uint8)
+        mesh = rr.Mesh3D(vertex_positions=vertices, triangle_indices=faces, vertex_colors=colours)
+        self._stream.log("world/thing", mesh)
+        self._shows_surface = True
 
     def _log_belief(self, session: "Session", view: "View", step: int) -> None:
         for name, belief in zip(session.models.classes, view.belief, strict=True):
