@@ -56,6 +56,14 @@ def test_an_example_names_what_it_sees(name, monkeypatch):
         assert not any(view.warnings for view in result.views)
 
 
+def test_a_grasp_point_arrives_where_the_handle_is(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    importlib.import_module("grasp_point").main()
+    printed = capsys.readouterr().out
+    assert printed.startswith("mug (")
+    assert float(re.search(r"([\d.]+) mm from where the handle is", printed)[1]) < 3
+
+
 def test_tests_that_a_page_names_are_there():
     tests = [path for folder in ("tests", "research/tests") for path in (ROOT / folder).glob("test_*.py")]
     names = {name for path in tests for name in re.findall(r"def (test_\w+)", path.read_text())}

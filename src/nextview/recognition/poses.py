@@ -92,9 +92,9 @@ def _digits(value: float) -> str:
 
 
 def place_in_words(place: Float) -> str:
-    """A place, (3,), metres, to the millimetre: ``(0.412, -0.103, 0.050) m``."""
+    """A place, (3,), metres, to the millimetre: ``[0.412, -0.103, 0.050] m``."""
     rounded = np.round(place, 3) + 0.0  # no -0.000
-    return "({:.3f}, {:.3f}, {:.3f}) m".format(*rounded)
+    return "[{:.3f}, {:.3f}, {:.3f}] m".format(*rounded)
 
 
 def turn_between(first: Float, second: Float) -> float:

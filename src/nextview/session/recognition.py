@@ -242,7 +242,7 @@ class Recognition:
 
     @property
     def _place_in_words(self) -> str:
-        """``, at (0.412, -0.103, 0.050) m in the world, ± 1.2°, 0.8 mm``: the thing's centre; "" without a pose."""
+        """``, at [0.412, -0.103, 0.050] m in the world, ± 1.2°, 0.8 mm``: the thing's centre; "" without a pose."""
         if self.place is None:
             return ""
         return f", at {place_in_words(self.place)} in {self.poses_in}, {self.pose_uncertainty}"
