@@ -115,7 +115,15 @@ FEWER = {  # what a page says of the published runs, and how many it is here
     r"--batch \d+": "--batch 8",
 }
 BEFORE = {  # what Python blocks of a page take for granted
-    "docs/your_camera.md": "from stand_ins import arm, intrinsics, np",
+    "docs/your_camera.md": """
+import nextview
+from nextview.sensing import Frame
+from stand_ins import arm, intrinsics
+
+system = nextview.load()
+session = system.session(distance=0.6)
+depth, pose = arm.look()
+""",
     "docs/see_it.md": "import nextview",
 }
 
@@ -313,6 +321,7 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
         "nextview train map views.zarr runs/lem --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
     ),
 }
+ALONE = ("docs/your_camera.md",)  # pages of which each Python block runs by itself: the session of one has ended in it
 BESIDE = ("docs/your_objects.md",)  # pages whose Python blocks do again what their commands did: in a folder of its own
 STORES = (  # made once, for all pages
     "nextview render data/ModelNet10 views.zarr --workers 1",
@@ -391,7 +400,7 @@ def run_page(page: str, environments: Environments, folder: Path, beside: Path |
         place = folder
         if step.python:
             place = beside or folder
-            python.append(step.text)
+            python = [*(python[:1] if page in ALONE else python), step.text]
             needs_of_python |= needs
             needs = needs_of_python
             (place / "page_block.py").write_text("\n\n".join(python) + "\n", encoding="utf-8")

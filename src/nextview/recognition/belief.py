@@ -101,6 +101,11 @@ class RiskBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         raise RiskError(f"this recogniser cannot promise an error rate of {risk}, only {min(row):.3f} and more")
 
 
+LARGEST_NUMBER = (
+    1e4  # of a calibration, and the reciprocal of its least temperature; what is fitted is within 0.01 to 100
+)
+
+
 class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """How far to trust a sum of logits. Views of one object err together, so k of them are not k pieces of evidence.
 
@@ -124,7 +129,8 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 
     def __post_init__(self) -> None:
         numbers = (self.correlation, self.bin_correlation or 0.0)
-        if not 0 < self.temperature < np.inf or not all(0 <= x < np.inf for x in numbers):
+        sound = LARGEST_NUMBER**-1 <= self.temperature <= LARGEST_NUMBER
+        if not sound or not all(0 <= x <= LARGEST_NUMBER for x in numbers):
             given = f"temperature {self.temperature}, correlation {self.correlation}"
             raise ModelError(f"no calibration: {given}, of azimuth bins {self.bin_correlation}")
         if self.hypotheses and not (set(np.diff((-1, *self.hypotheses)).tolist()) <= {0, 1}):

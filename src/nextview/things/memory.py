@@ -24,6 +24,8 @@ from nextview.things.stored_surfaces import StoredSurfaces
 RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the remembered views, degrees
 AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
 PICTURE = 64  # side of the picture of a thing, pixels
+LARGEST_RADIUS = 1e4  # of a thing, metres; nothing as large is looked at from around
+LARGEST_LOGIT = 700.0  # that a head can say: the exponential of more is no number
 Float = NDArray[np.floating]
 _log = logging.getLogger("nextview")
 
@@ -92,8 +94,17 @@ class Memory:
             raise ModelError("its thing does not ascend")
 
         known = self.radii[~np.isnan(self.radii)]
-        if not ((known > 0) & np.isfinite(known)).all():
-            raise ModelError("its radii are not above zero and finite")
+        if not ((known > 0) & (known <= LARGEST_RADIUS)).all():
+            raise ModelError(f"its radii are not above zero and at most {LARGEST_RADIUS:g} m")
+
+        head = self.head.astype(np.float64)
+        largest = np.linalg.norm(head, axis=0) + np.abs(
+            self.head_bias.astype(np.float64)
+        )  # views are unit vectors
+        if largest.max() > LARGEST_LOGIT:
+            raise ModelError(
+                f"its head says more than {LARGEST_LOGIT:g} of a view, which no chance has"
+            )
 
         for name in ("views", "held_out"):
             lengths = np.linalg.norm(getattr(self, name).astype(np.float32), axis=-1)
