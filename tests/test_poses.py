@@ -241,6 +241,30 @@ def test_a_copy_of_a_session_with_geometry_goes_on_alike(system, meshes, again):
     assert repr(other.run(camera)) == repr(session.run(camera))
 
 
+def test_errors_are_as_large_as_the_uncertainty_says(system):
+    """Cameras that stand 3 mm and look 0.3 degrees elsewhere than they are said to, as behind the wrist sensor."""
+    rng = np.random.default_rng(3)
+    turns, places = [], []
+    for episode in range(8):
+        name = ("block", "mug")[episode % 2]
+        true = placed(name, rng.uniform(-0.8, 0.8))  # the handle is seen
+        session = session_of(system, 2, distance=0.5)
+        for around in rng.uniform([-50, 0], [0, 50]):
+            camera = pose_at(rng.uniform(25, 50), around, 0.5, np.add(SPOT, (0, 0, 0.04)))
+            shown = frame_of(name, true, camera, seed=episode, sigma=0.0015)
+            believed = camera.copy()
+            believed[:3, :3] = camera[:3, :3] @ Rotation.from_rotvec(np.radians(rng.normal(0, 0.3, 3))).as_matrix()
+            believed[:3, 3] += rng.normal(0, 0.003, 3)
+            seen = np.isin(cast([THINGS[name]().apply_translation(ORIGIN).apply_transform(true), TABLE], camera)[1], 0)
+            session.update(replace(shown, pose=believed, mask=seen, pixel_centre=0.5))
+        result = session.result
+        degrees, millimetres = off_by(result.pose, true, name)
+        turns.append(degrees / result.pose_uncertainty.degrees)
+        places.append(millimetres / result.pose_uncertainty.millimetres)
+    for ratios in (turns, places):
+        assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 2
+
+
 # What is made of it
 
 
@@ -334,6 +358,9 @@ def test_the_uncertainty_is_the_root_mean_square_of_all_candidates():
         ((About((0, 0, 1), 0),), (0, 20, 0), 20),
         ((About((0, 0, 1), 0), About((1, 0, 0), 2)), (180, 0, 0), 0),
         ((About((0, 0, 1), 0), About((1, 0, 0), 2)), (0, 175, 0), 5),
+        ((About((0, 0, 1), 2), About((1, 0, 0), 2)), (0, 175, 0), 5),  # half a turn about y follows
+        ((About((0, 0, 1), 4), About((1, 0, 0), 4)), (90, 0, 0), 0),  # a cube
+        ((About((0, 0, 1), 0), About((1, 0, 0), 0)), (10, 20, 30), 0),  # a ball
     ],
 )
 def test_turns_that_change_nothing_are_no_uncertainty(symmetry, turn, left):

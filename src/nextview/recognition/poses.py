@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,9 @@ Float = NDArray[np.float64]
 ALIKE_TURN = 5.0  # degrees between poses that are taken for one
 ALIKE_SHIFT = 0.005  # metres between the centres of poses that are taken for one
 RIGID = 1e-3  # how far a pose may be from a rigid motion
+SAME_AXIS = 0.1  # sine of the angle between axes that are one
+SAME_TURN = 0.05  # difference of the matrices of turns that are one: axes are found to some degrees
+MOST_TURNS = 60  # of a symmetric thing: those of a dodecahedron
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +36,11 @@ class PoseCandidate:
             together.
         millimetres: standard deviation of the place of the centre, if this is the right candidate
             and the cameras stand where they are said to.
-        centre: of the thing in the scan file's frame, (3,) float64, metres.
+        centre: the centroid of the thing's surface in the scan file's frame, (3,) float64, metres.
         vertices: of its surface, in the scan file's frame, (V, 3) float32, metres; None if it has
             none.
         faces: triangles of the surface, indices of its vertices, (F, 3) int32.
-        symmetry: axes through the centre, in the scan file's frame, about which the thing looks the
+        symmetry: axes through its centroid, in the scan file's frame, about which the thing looks the
             same after a turn, each with ``axis`` and ``order``, 0 for any turn; None if they are
             not known.
     """
@@ -97,12 +101,6 @@ def place_in_words(place: Float) -> str:
     return "[{:.3f}, {:.3f}, {:.3f}] m".format(*rounded)
 
 
-def turn_between(first: Float, second: Float) -> float:
-    """Angle between the orientations of two poses, (4, 4), degrees."""
-    cosine = (np.trace(first[:3, :3].T @ second[:3, :3]) - 1) / 2
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
 def distinct(candidates: Sequence[PoseCandidate]) -> list[int]:
     """Which candidates are not as good as the same as a likelier one.
 
@@ -114,7 +112,7 @@ def distinct(candidates: Sequence[PoseCandidate]) -> list[int]:
 
     Returns:
         Indices of those that differ from all before them in the thing, or by ALIKE_TURN or
-        ALIKE_SHIFT.
+        ALIKE_SHIFT. Turns about an axis of which any is a symmetry make no difference.
     """
     kept: list[int] = []
     for index, candidate in enumerate(candidates):
@@ -127,7 +125,8 @@ def _alike(first: PoseCandidate, second: PoseCandidate) -> bool:
     if first.thing != second.thing:
         return False
     shift = float(np.linalg.norm(first.place - second.place))
-    return shift < ALIKE_SHIFT and turn_between(first.pose, second.pose) < ALIKE_TURN
+    between = first.pose[:3, :3].T @ second.pose[:3, :3]
+    return shift < ALIKE_SHIFT and _least_turn(between, first.symmetry or ()) < ALIKE_TURN
 
 
 def uncertainty_of(candidates: Sequence[PoseCandidate], camera: float = 0.0) -> PoseUncertainty:
@@ -156,18 +155,34 @@ def uncertainty_of(candidates: Sequence[PoseCandidate], camera: float = 0.0) -> 
 
 def _turn_apart(first: PoseCandidate, second: PoseCandidate) -> float:
     """Angle between two poses of one thing, degrees, but for its symmetries."""
-    between = first.pose[:3, :3].T @ second.pose[:3, :3]  # in the axes of the scan file
     symmetries = first.symmetry or ()
-    turns = [np.eye(3)]
-    for one in symmetries:
-        turns += [_turn_about(one.axis, 2 * np.pi * k / one.order) for k in range(1, one.order)]
-    axes = [np.array(one.axis) for one in symmetries if one.order == 0]
+    between = first.pose[:3, :3].T @ second.pose[:3, :3]  # in the axes of the scan file
+    turns = _turns_of(tuple(symmetries))
+    return min(_least_turn(between @ turn, symmetries) for turn in turns)
 
-    least = np.pi
-    for turn in turns:
-        turned = between @ turn
-        least = min(least, _angle_of(turned), *(_angle_but_about(turned, axis) for axis in axes))
-    return float(np.degrees(least))
+
+def _least_turn(turn: Float, symmetries: Sequence[Any]) -> float:
+    """The angle of a turn, degrees, but for symmetries of any angle."""
+    axes = [np.array(one.axis) for one in symmetries if one.order == 0]
+    if not axes:
+        return float(np.degrees(_angle_of(turn)))
+    if any(np.linalg.norm(np.cross(axis, axes[0])) > SAME_AXIS for axis in axes):
+        return 0.0  # a ball
+    return float(np.degrees(_angle_but_about(turn, axes[0])))
+
+
+@lru_cache(maxsize=256)
+def _turns_of(symmetries: tuple[Any, ...]) -> tuple[Float, ...]:
+    """All turns that follow from symmetries of a finite order, one after the other."""
+    steps = [_turn_about(one.axis, 2 * np.pi / one.order) for one in symmetries if one.order > 1]
+    turns = [np.eye(3)]
+    for turn in turns:  # it grows
+        for step in steps:
+            new = step @ turn
+            known = any(np.abs(new - other).max() < SAME_TURN for other in turns)
+            if not known and len(turns) < MOST_TURNS:
+                turns.append(new)
+    return tuple(turns)
 
 
 def _turn_about(axis: Sequence[float] | Float, angle: float) -> Float:

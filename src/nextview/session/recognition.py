@@ -129,7 +129,7 @@ class Recognition:
 
     @property
     def place(self) -> NDArray[np.float64] | None:
-        """Where the middle of the thing is, in ``pose_frame``, (3,), metres; None without a pose."""
+        """Where the centroid of the thing's surface is, in ``pose_frame``, (3,), metres; None without a pose."""
         found = self._candidates_of_answer
         return found[0].place if found else None
 

@@ -2,19 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nextview.geometry.observation import Observation
 from nextview.recognition.poses import PoseCandidate, distinct
-from nextview.things.depth_view import depth_view
+from nextview.things.depth_view import DepthView, depth_view
 from nextview.things.registration import Alignment, pose_covariances
+from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import FINE_SIDE, Verified, Verifier
 
 Float = NDArray[np.float64]
 
+AXES = 3  # along each of which a camera's place errs
 LEAST_PROBABILITY = 0.01  # of a pose that is named beside the likeliest one
 
 
@@ -23,7 +26,7 @@ def candidates_of(
     found: Verified,
     observations: Sequence[Observation],
     labels: NDArray[np.integer],
-) -> tuple[PoseCandidate, ...]:
+) -> tuple[tuple[PoseCandidate, ...], float]:
     """The poses that a thing may have, the likeliest first, in the object frame.
 
     Args:
@@ -33,8 +36,11 @@ def candidates_of(
         labels: class of each of the things, (T,).
 
     Returns:
-        Different poses, of one or several things.
+        Different poses, of one or several things; and by how much errors of the cameras' places
+        displace them all, millimetres, one standard deviation.
     """
+    shown = [depth_view(observation, FINE_SIDE) for observation in observations]
+    views = [view for view in shown if view is not None]
     candidates = []
     for thing, pose, probability in zip(
         found.things, found.poses, found.probabilities, strict=True
@@ -45,7 +51,7 @@ def candidates_of(
             label=int(labels[thing]),
             pose=pose,
             probability=float(probability),
-            centre=surface.centre.astype(np.float64),
+            centre=_centroid(surface),
             vertices=surface.vertices,
             faces=surface.faces,
             symmetry=things.symmetries[thing],
@@ -58,7 +64,7 @@ def candidates_of(
         if row == 0 or candidates[row].probability > LEAST_PROBABILITY
     ]
     total = sum(candidates[row].probability for row in rows)
-    deviations = _deviations(things.verifier, found, observations, np.array(rows))
+    deviations = _deviations(things.verifier, found, views, np.array(rows))
     kept = []
     for row, (degrees, millimetres) in zip(rows, deviations, strict=True):
         share = candidates[row].probability / total
@@ -66,13 +72,32 @@ def candidates_of(
             candidates[row], probability=share, degrees=degrees, millimetres=millimetres
         )
         kept.append(candidate)
-    return tuple(kept)
+    return tuple(kept), _camera_error(things.verifier, observations, views)
+
+
+def _camera_error(
+    verifier: Verifier, observations: Sequence[Observation], views: Sequence[DepthView]
+) -> float:
+    """By how much errors of the cameras' places displace a pose, millimetres; 0 for exact ones."""
+    if all(observation.exact for observation in observations):
+        return 0.0
+    variances = AXES * verifier.prior.displaced(views) ** 2
+    return float(1000 * np.sqrt(variances.sum()) / len(views))
+
+
+@lru_cache(maxsize=256)
+def _centroid(surface: Surface) -> Float:
+    """The centroid of a surface, (3,) float64, metres, which its symmetries keep in its place."""
+    corners = surface.vertices[surface.faces].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(normals, axis=1)
+    return np.asarray(areas @ corners.mean(1) / areas.sum(), np.float64)
 
 
 def _deviations(
     verifier: Verifier,
     found: Verified,
-    observations: Sequence[Observation],
+    views: Sequence[DepthView],
     rows: NDArray[np.int64],
 ) -> list[tuple[float, float]]:
     """Standard deviations of turn, degrees, and place, millimetres, of some hypotheses."""
@@ -88,9 +113,7 @@ def _deviations(
         cameras=found.cameras[rows],
     )
 
-    views = [depth_view(observation, FINE_SIDE) for observation in observations]
-    shown = [view for view in views if view is not None]
-    covariances = pose_covariances(verifier.caster, alignment, shown, verifier.prior)
+    covariances = pose_covariances(verifier.caster, alignment, views, verifier.prior)
     turns = np.degrees(np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2)))
     places = 1000 * np.sqrt(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))
     return list(zip(turns.tolist(), places.tolist(), strict=True))

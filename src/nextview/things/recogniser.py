@@ -24,7 +24,6 @@ from nextview.things.verifier import Verified
 Float = NDArray[np.float64]
 
 NO_SCALE = "the scale of what is seen is not known in metres"
-AXES = 3  # along each of which a camera's place errs
 
 
 class VerifiedRecogniser(TaughtRecogniser):
@@ -118,10 +117,11 @@ class VerifiedRecogniser(TaughtRecogniser):
         best = int(belief.argmax())
         if best not in self.labels:
             return JointBelief(belief, why_no_pose=self._no_geometry(belief), found=found)
+        poses, camera_error = candidates_of(self.things, found, observations, self.labels)
         return JointBelief(
             belief,
-            poses=candidates_of(self.things, found, observations, self.labels),
-            camera_error=self._camera_error(observations),
+            poses=poses,
+            camera_error=camera_error,
             p_value=self._p_value(found),
             found=found,
         )
@@ -150,13 +150,6 @@ class VerifiedRecogniser(TaughtRecogniser):
         if residuals is None:
             return None
         return residuals.p_value(found.residual, int(found.things[0]), found.mean.shape[1])
-
-    def _camera_error(self, observations: Sequence[Observation]) -> float:
-        """By how much errors of the cameras' places displace a pose, millimetres."""
-        if all(observation.exact for observation in observations):
-            return 0.0
-        one = 1000 * np.sqrt(AXES) * self.things.verifier.prior.camera
-        return float(one / np.sqrt(len(observations)))
 
 
 def open_recogniser(model: str | Path, threads: int = 0) -> NetworkRecogniser:
