@@ -14,13 +14,17 @@ around the thing that hide parts of it.
 | spread | the view farthest from all others |
 | furthest | the farthest view of the local window |
 | picture | where the remembered pictures of the leading things differ most |
-| geometry | where the leading hypotheses, rendered, tell most |
+| geometry | where the leading hypotheses, rendered, tell most of the thing |
+| pose | where they tell most of thing and pose |
 | ceiling | where they tell most if the truth and its pose are known beforehand |
 
-Every episode is a line of OUT/episodes.jsonl as soon as it is finished; a run that was stopped goes
-on behind the last one. The tables are printed and written to OUT/tables.md: accuracy after each
-number of views; the views until the belief reaches 0.97, the share that reaches it, and how much
-of this is wrong; travel on the sphere; the time of a decision, and of the last verification.
+A policy of your own is MODULE:CLASS; it is given the viewpoints, and may need "joint" and "outlook".
+
+Every episode is a line of OUT/episodes.jsonl as soon as it is finished. A run that was stopped goes
+on where it was, and one with more policies, or more draws, adds what is missing. The tables are
+printed and written to OUT/tables.md: accuracy after each number of views; the views until the
+belief reaches 0.97, the share that reaches it, and how much of this is wrong; travel on the sphere;
+the time of a decision, and of the last verification.
 Differences to random are tested by a paired bootstrap over things (with ``--pairs`` over bodies),
 with Holm's correction over the policies and numbers of views.
 
@@ -37,11 +41,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 import tyro
 from numpy.typing import NDArray
 from rich.progress import track
+from scipy.spatial import cKDTree
 
 from nextview.benchmark.statistics import bootstrap_p, holm, interval, resample
 from nextview.errors import UsageError
@@ -53,16 +59,18 @@ from nextview.policies.base import EpisodeState, Policy, best_view
 from nextview.policies.baselines import Furthest, RandomAll, Spread
 from nextview.policies.discriminate import Discriminate
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
+from nextview.policies.registry import make_policy
 from nextview.recognition.evidence import Evidence
 from nextview.simulation.scene import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
+from nextview.things.depth_view import depth_view
 from nextview.things.expected_views import Hypotheses, Outlook
 from nextview.things.memory import TaughtRecogniser
-from nextview.things.registration import rotation_about_z
+from nextview.things.registration import FINE, align, rotation_about_z, start
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
-from nextview.things.verifier import Verified
+from nextview.things.verifier import FINE_SIDE, Verified
 
 Float = NDArray[np.float64]
 
@@ -73,7 +81,8 @@ RADII_AWAY = 5.0
 CONFIDENT = 0.97
 SAMPLES = 10_000  # of the bootstrap
 TRUTH_BELIEF = 0.01  # in the true pose, beside the hypotheses, for the ceiling
-POLICIES = ("random", "spread", "furthest", "picture", "geometry", "ceiling")
+POLICIES = ("random", "spread", "furthest", "picture", "geometry", "pose", "ceiling")
+POINTS = 500  # of a surface, for the error of a pose
 
 
 @dataclass(frozen=True)
@@ -98,6 +107,7 @@ class Episode:
         self.thing = thing
         self._seed = (thing, draw)
         self._views: dict[int, Observation] = {}
+        self._in_camera: dict[int, Float] = {}
         self._evidence: dict[int, NDArray[np.floating]] = {}
         self._verified: dict[frozenset[int], tuple[Verified, float]] = {}
 
@@ -115,6 +125,7 @@ class Episode:
         in_truth = np.eye(4)
         in_truth[:3, :3] = turn
         in_truth[:3, 3] = -(turn @ mesh.centre + self._standing.centre)
+        self._in_truth = in_truth
         frame = self._camera(0).object_frame
         to_object = np.eye(4)
         to_object[:3, :3] = frame.axes
@@ -139,7 +150,10 @@ class Episode:
     def observation(self, view: int) -> Observation:
         """What one viewpoint shows."""
         if view not in self._views:
-            self._views[view] = self._camera(view).observe(SPHERE.poses[view])
+            camera = self._camera(view)
+            self._views[view] = camera.observe(SPHERE.poses[view])
+            if camera.true_pose is not None:
+                self._in_camera[view] = np.linalg.inv(camera.true_pose) @ self._in_truth
         return self._views[view]
 
     def log_evidence(self, view: int) -> NDArray[np.floating]:
@@ -163,6 +177,44 @@ class Episode:
             found = self.things.verify(observations, evidence)
             self._verified[used] = (found, time.process_time() - begun)
         return self._verified[used]
+
+    def pose_error(self, views: list[int]) -> float | None:
+        """Mean distance of the thing's surface where it is found from where it is (ADD-S), millimetres.
+
+        As the last view sees it. None where the thing is not named right.
+        """
+        found, _ = self.verified(views)
+        rows = np.flatnonzero(found.things == self.thing)
+        if int(found.belief.argmax()) != self.thing or not len(rows):
+            return None
+        last = self.seen(views)[-1]
+        number = sorted(self.seen(views)).index(last)
+        scene = self.observation(last).scene
+        radius = self.observation(last).radius
+        assert scene is not None
+        assert radius is not None
+        camera = scene.pose.copy()
+        camera[:3, 3] *= radius
+        pose = found.poses[rows[0]].copy()
+        pose[:3, 3] += found.cameras[rows[0], number]
+
+        surface = self.things.verifier.caster.surfaces[self.thing]
+        points = surface.sample(POINTS, np.random.default_rng(0))
+        there, here = (
+            points @ each[:3, :3].T + each[:3, 3] for each in (self._in_camera[last], np.linalg.inv(camera) @ pose)
+        )
+        return float(1000 * cKDTree(there).query(here)[0].mean())
+
+    def aligned_truth(self, views: list[int]) -> Float:
+        """The true pose, aligned with some views as the hypotheses are, (4, 4)."""
+        verifier = self.things.verifier
+        found = [depth_view(self.observation(view), FINE_SIDE) for view in self.seen(views)]
+        shown = [view for view in found if view is not None]
+        truth = start(np.array([self.thing]), self.true_pose[None, :3, :3], len(shown))
+        centre = verifier.caster.centres[self.thing].astype(np.float64)
+        place = self.true_pose[:3, :3] @ centre + self.true_pose[:3, 3]
+        truth = replace(truth, centres=place[None])
+        return align(verifier.caster, truth, shown, FINE, verifier.prior).poses(verifier.caster)[0]
 
     def state(self, views: list[int]) -> EpisodeState:
         """Where the episode stands, as a policy sees it."""
@@ -205,9 +257,10 @@ class Ceiling:
         others = outlook.hypotheses
         rivals = others.things != self.episode.thing
         belief = np.append(TRUTH_BELIEF + others.belief[~rivals].sum(), others.belief[rivals])
+        views = np.flatnonzero(state.visited[0]).tolist()
         hypotheses = Hypotheses(
             np.append(self.episode.thing, others.things[rivals]),
-            np.concatenate([self.episode.true_pose[None], others.poses[rivals]]),
+            np.concatenate([self.episode.aligned_truth(views)[None], others.poses[rivals]]),
             belief / belief.sum(),
         )
         cameras = outlook.cameras(SPHERE.directions)
@@ -225,6 +278,7 @@ class Run:
         confidence: belief in the answer after each.
         decision: seconds of CPU of each choice.
         verification: seconds of CPU of each verification.
+        pose_error: mean distance of the surface, millimetres; None where it is not named right.
     """
 
     views: list[int]
@@ -232,6 +286,7 @@ class Run:
     confidence: list[float] = field(default_factory=list)
     decision: list[float] = field(default_factory=list)
     verification: list[float] = field(default_factory=list)
+    pose_error: list[float | None] = field(default_factory=list)
 
 
 def run(episode: Episode, policy: Policy, count: int, rng: np.random.Generator) -> Run:
@@ -242,6 +297,7 @@ def run(episode: Episode, policy: Policy, count: int, rng: np.random.Generator) 
         made.right.append(int(found.belief.argmax()) == episode.thing)
         made.confidence.append(float(found.belief.max()))
         made.verification.append(seconds)
+        made.pose_error.append(episode.pose_error(made.views))
         if len(made.views) == count:
             return made
         state = episode.state(made.views)
@@ -264,8 +320,13 @@ def policies_of(names: tuple[str, ...], things: TaughtThings) -> dict[str, Calla
         "furthest": lambda _: Furthest(SPHERE),
         "picture": lambda _: picture,  # type: ignore[dict-item,return-value]
         "geometry": lambda _: geometry,
+        "pose": lambda _: replace(geometry, goal="pose"),
         "ceiling": Ceiling,
     }
+    for name in names:
+        if ":" in name:
+            own = make_policy(name, SPHERE)
+            known[name] = lambda _, own=own: own  # type: ignore[misc]
     unknown = sorted(set(names) - set(known))
     if unknown:
         raise UsageError(f"no policy is called {unknown[0]}; there are {', '.join(known)}")
@@ -285,7 +346,8 @@ class Results:
         until: views until it is sure; all, if it never is, (N, T).
         travel: radians on the sphere up to each view, (N, T, views).
         decision: seconds of a choice, by policy.
-        verification: seconds of a verification after each number of views, by policy.
+        verification: seconds of the last verification, by policy.
+        pose_error: millimetres after each number of views, by policy; NaN where not named right.
     """
 
     policies: list[str]
@@ -297,18 +359,20 @@ class Results:
     travel: Float
     decision: dict[str, list[float]]
     verification: dict[str, list[float]]
+    pose_error: dict[str, Float]
 
     @classmethod
     def read(cls, file: Path, pairs: bool) -> Results:
         """Read the lines of a run."""
-        episodes = [json.loads(line) for line in file.read_text().splitlines()]
-        policies = list(episodes[0]["runs"])
+        episodes = read_episodes(file)
+        policies = [name for name in episodes[0]["runs"] if all(name in e["runs"] for e in episodes)]
         names = sorted({episode["thing"] for episode in episodes})
         bodies = [name.partition("_")[0] if pairs else name for name in names]
         groups = np.unique(bodies, return_inverse=True)[1]
         parts: dict[str, list[list[NDArray]]] = {}
         decision: dict[str, list[float]] = {name: [] for name in policies}
         verification: dict[str, list[float]] = {name: [] for name in policies}
+        pose_error = {}
         for policy in policies:
             rows: dict[str, list[NDArray]] = {}
             for name in names:
@@ -317,10 +381,13 @@ class Results:
                     rows.setdefault(key, []).append(value)
                 decision[policy] += [x for each in runs for x in each["decision"]]
                 verification[policy] += [each["verification"][-1] for each in runs]
+            every = [each for episode in episodes for each in episode["runs"][policy]]
+            pose_error[policy] = np.array([each["pose_error"] for each in every], float)
             for key, values in rows.items():
                 parts.setdefault(key, []).append(values)
         arrays = {key: np.array(values, float) for key, values in parts.items()}
-        return cls(policies, groups, decision=decision, verification=verification, **arrays)
+        times = {"decision": decision, "verification": verification}
+        return cls(policies, groups, pose_error=pose_error, **times, **arrays)
 
     @cached_property
     def weights(self) -> Float:
@@ -336,6 +403,16 @@ class Results:
         mean = float(per_thing.mean())
         p = bootstrap_p(np.array([mean]), samples[:, None])
         return mean, float(low[0]), float(high[0]), float(p[0])
+
+
+def read_episodes(file: Path) -> list[dict]:
+    """The episodes of a file, each once with all policies that it was replayed with."""
+    found: dict[tuple[str, int], dict] = {}
+    for line in file.read_text().splitlines() if file.exists() else []:
+        episode = json.loads(line)
+        known = found.setdefault((episode["thing"], episode["draw"]), episode)
+        known["runs"] |= episode["runs"]
+    return list(found.values())
 
 
 def _means(runs: list[dict]) -> dict[str, NDArray]:
@@ -360,7 +437,9 @@ def tables(results: Results, episodes: int) -> str:
     """The results as text."""
     count = results.right.shape[2]
     after = [f"after {k}" for k in range(1, count + 1)]
-    head = ["policy", *after, "views until sure", "sure", "sure and wrong", "travel, rad", "decision, ms: median, 95 %"]
+    error = [f"pose error after {k}, mm: median, 95 %" for k in range(2, count + 1)]
+    head = ["policy", *after, "views until sure", "sure", "sure and wrong", "travel, rad", *error]
+    head.append("decision, ms: median, 95 %")
     lines = [f"{episodes} episodes, {results.right.shape[1]} things", ""]
     lines += [_row(head), "|---" * len(head) + "|"]
     for n, policy in enumerate(results.policies):
@@ -368,7 +447,8 @@ def tables(results: Results, episodes: int) -> str:
         spent = f"{np.median(times):.0f}, {np.quantile(times, 0.95):.0f}"
         accuracy = [f"{x:.3f}" for x in results.right[n].mean(0)]
         rest = [f"{x[n].mean():.3f}" for x in (results.until, results.sure, results.sure_and_wrong)]
-        lines.append(_row([policy, *accuracy, *rest, f"{results.travel[n, :, -1].mean():.2f}", spent]))
+        errors = [spread_of(results.pose_error[policy][:, k]) for k in range(1, count)]
+        lines.append(_row([policy, *accuracy, *rest, f"{results.travel[n, :, -1].mean():.2f}", *errors, spent]))
     verification = 1000 * np.concatenate(list(results.verification.values()))
     lines += ["", f"verification of {count} views: {np.median(verification):.0f} ms (median)", ""]
 
@@ -384,6 +464,12 @@ def tables(results: Results, episodes: int) -> str:
     for (policy, measure, (mean, low, high, _)), p in zip(tests, adjusted, strict=True):
         lines.append(_row([policy, measure, f"{mean:+.3f}", f"{low:+.3f} to {high:+.3f}", f"{p:.4f}"]))
     return "\n".join(lines)
+
+
+def spread_of(values: Float) -> str:
+    """Median and 95th percentile of those that are known."""
+    known = values[~np.isnan(values)]
+    return f"{np.median(known):.1f}, {np.quantile(known, 0.95):.1f}" if len(known) else "-"
 
 
 def _row(cells: list[str]) -> str:
@@ -425,7 +511,7 @@ def main(
         models: memory of the things.
         draws: numbers of the draws.
         views: how many are taken.
-        policies: which ones.
+        policies: which ones, or MODULE:CLASS.
         repeats: runs of the policy "random" in each episode.
         sensor: what the views are taken with.
         boxes: mean number of boxes around a thing.
@@ -437,24 +523,24 @@ def main(
     chosen = policies_of(policies, things)
     out.mkdir(parents=True, exist_ok=True)
     file = out / "episodes.jsonl"
-    lines = file.read_text().splitlines() if file.exists() else []
-    done = {(episode["thing"], episode["draw"]) for episode in map(json.loads, lines)}
+    done = {(e["thing"], e["draw"]): set(e["runs"]) for e in read_episodes(file)}
 
     wanted = [(t, d) for d in draws for t in range(len(meshes)) if (t - d) % every == 0]
-    missing = [(t, d) for t, d in wanted if (things.names[t], d) not in done]
+    missing = [(t, d) for t, d in wanted if set(policies) - done.get((things.names[t], d), set())]
     for thing, draw in track(missing, "episodes"):
+        left = set(policies) - done.get((things.names[thing], draw), set())
         episode = Episode(things, meshes[thing], thing, draw, Setting(sensor, boxes))
         runs = {}
-        for name, make in chosen.items():
+        for name, make in ((name, make) for name, make in chosen.items() if name in left):
             times = repeats if name == "random" else 1
-            rng = np.random.default_rng((thing, draw, POLICIES.index(name)))
+            rng = np.random.default_rng((thing, draw, crc32(name.encode())))
             runs[name] = [vars(run(episode, make(episode), views, rng)) for _ in range(times)]
         line = {"thing": things.names[thing], "draw": draw, "runs": runs}
         with file.open("a") as lines_file:
             lines_file.write(json.dumps(line) + "\n")
 
     results = Results.read(file, pairs)
-    text = tables(results, len(file.read_text().splitlines()))
+    text = tables(results, len(read_episodes(file)))
     (out / "tables.md").write_text(text + "\n")
     print(text)
 
