@@ -23,6 +23,7 @@ USUAL_FILL = 0.2  # share of the pixels that show the thing, below which more of
 MOST_DENSE = 2.0  # times as many rows and columns at most
 SMALLEST_MARGIN = 4  # pixels of the image around the outline, at least
 NOISE_ROWS = 40  # rows of an image in which its noise is measured
+NOISIEST = 0.005  # of the depth: its deviation, where no ground shows it
 GROUND_MARGIN = 1.0  # of the size of the outline, around which the ground is looked for
 GROUND_SIDE = 48  # rows and columns of pixels that it is looked for in
 LEVEL_NOISE = 3.0  # deviations of the noise within which a pixel lies on the ground
@@ -203,7 +204,8 @@ class MetricImage:
         finite = np.where(np.isfinite(depth), depth, 0)
         level = np.zeros(len(depth), bool)
         if self.ground is None:
-            noise = self.noise.at(finite) * finite**2
+            # Of what has many edges the noise is overrated.
+            noise = np.minimum(self.noise.at(finite) * finite**2, NOISIEST * finite)
         else:
             # It tells more than single pixels, which are too few beside edges.
             noise = self.ground.noise * finite**2
