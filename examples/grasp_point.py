@@ -11,9 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+import tyro
 from scipy.spatial.transform import Rotation
 
 import nextview
+from nextview.cli.ending import orderly_end
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing import Frame
@@ -99,4 +101,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with orderly_end("nothing was written"):
+        tyro.cli(main)
