@@ -153,8 +153,10 @@ def test_every_module_imports_in_the_base_installation_or_names_its_extra(base):
 
 RUN_EACH = """
 import os, runpy, sys, tempfile
-import matplotlib.figure, scipy.optimize, scipy.stats, trimesh, tyro  # once, before each is run in a process of its own
-import nextview
+
+# Once, before each is run in a process of its own.
+import matplotlib.figure, rich.progress, scipy.optimize, scipy.stats, trimesh, tyro
+import nextview.data.rendering, nextview.data.store, nextview.session.system, nextview.things.recogniser
 
 options, scripts = sys.argv[1], sys.argv[2:]
 sys.path.insert(0, os.getcwd())
