@@ -1,12 +1,15 @@
-"""Whether posed depth frames agree about one rigid scene, and by which change of their poses they would.
+"""Whether posed depth frames agree about one rigid scene.
 
-What one frame shows is looked up in the pictures of all others. A surface is confirmed where another frame measures
-the same depth, and contradicted where another frame looks through it. What is hidden, outside of the picture or not
-measured says nothing.
+Points on the surfaces of each frame are looked up in the pictures of all others. A point is confirmed where another
+frame measures the same depth, and contradicted where another frame looks through it. Points that are hidden, outside
+of the picture or not measured say nothing.
+
+Points that stand out of the largest plane of a frame can be judged on their own: a table looks the same after any turn
+about its normal, so its points agree where the object's do not.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,30 +20,49 @@ from nextview.sensing.frame import Frame
 from nextview.sensing.segmentation import find_plane, sample
 
 Float = NDArray[np.float64]
+Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-BLOCKS_ACROSS = 160  # columns of the coarse pictures in which surfaces are looked up
-SURFACE_POINTS = 200  # of each frame, that are looked up in the others
-DEPTH_TOLERANCE = 0.02  # part of the depth up to which two frames agree, beside the noise of both
+POINT_GRID = 160  # columns of the grid from which surface points are drawn
+SURFACE_POINTS = 200  # points of each frame that are looked up in the others
 NOISE_TOLERANCE = 3.0  # standard deviations of the noise
 SMOOTH_STEP = 0.05  # part of the depth by which it may vary around a point that is looked up: no edges
 ABOVE_PLANE = 0.012  # height over the largest plane, as a part of the depth, from which a point is not on it
 FAR_BEHIND = 1.5  # times the depth in the middle of the picture: what lies farther is background
-SMALLEST_MIDDLE = 20  # blocks in the middle of the picture that tell its depth
+SMALLEST_MIDDLE = 20  # grid points in the middle of the picture that tell its depth
+LEAST_DEPTH = 1e-6  # metres before a camera from which a point can be in its picture
 
 
 @dataclass(frozen=True)
-class SurfaceView:
-    """A frame as it is compared with others.
+class Sharpness:
+    """How closely two frames have to agree.
 
     Attributes:
-        intrinsics: pinhole matrix of the coarse picture, (3, 3).
-        nearest: least depth around each block, (h, w), metres; infinite where nothing was measured.
-        farthest: greatest depth around each block, (h, w), metres; 0 where nothing was measured.
-        complete: whether something was measured in each block around each block, (h, w).
-        object_near: blocks on the object or beside it, (h, w); None without a mask.
-        points: on the surfaces, (N, 3), camera frame, metres.
-        tolerance: difference in depth up to which another frame confirms each point, (N,), metres.
+        columns: of the picture in which points are looked up. A point agrees with any depth in the block that it
+            falls on and in the blocks around that.
+        depth_tolerance: part of the depth by which two frames may differ, beside the noise of both.
+    """
+
+    columns: int
+    depth_tolerance: float
+
+
+ROUGH = Sharpness(160, 0.02)
+"""Forgives the errors of a usual calibration, 4 mm and half a degree: what is contradicted is wrong altogether."""
+SHARP = Sharpness(320, 0.006)
+"""Tells poses apart that differ by a few degrees. Right poses leave contradictions, too, where they are not exact."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The depth image of a frame in blocks of pixels.
+
+    Attributes:
+        intrinsics: pinhole matrix, pixels are blocks, (3, 3).
+        nearest: least depth in each block and around it, (h, w), metres; infinite where nothing was measured.
+        farthest: greatest depth in each block and around it, (h, w), metres; 0 where nothing was measured.
+        complete: whether something was measured in each block and in all around it, (h, w).
+        object_near: blocks on the object's mask or beside it, (h, w); None without a mask.
     """
 
     intrinsics: Float
@@ -48,8 +70,40 @@ class SurfaceView:
     farthest: Float
     complete: Mask
     object_near: Mask | None
+
+
+@dataclass(frozen=True)
+class SurfaceView:
+    """A frame as it is compared with others.
+
+    Attributes:
+        pictures: the depth image for each sharpness.
+        points: on the surfaces, (N, 3), camera frame, metres.
+        noise: error of the depth of each point that noise explains, (N,), metres.
+        standing: which points stand out of the largest plane, (N,); all of them if there is a mask or no plane.
+    """
+
+    pictures: dict[Sharpness, Picture]
     points: Float
-    tolerance: Float
+    noise: Float
+    standing: Mask
+
+    def tolerance(self, sharpness: Sharpness) -> Float:
+        """Difference in depth up to which another frame confirms each point, (N,), metres."""
+        return sharpness.depth_tolerance * self.points[:, 2] + self.noise
+
+    def some(self, which: Mask) -> "SurfaceView":
+        """The frame with some of its points, (N,) bool."""
+        return replace(self, points=self.points[which], noise=self.noise[which], standing=self.standing[which])
+
+    def with_focal_length(self, times: float) -> "SurfaceView":
+        """The frame as it would be if its focal lengths were so many times as long."""
+        pictures = {}
+        for sharpness, picture in self.pictures.items():
+            intrinsics = picture.intrinsics.copy()
+            intrinsics[[0, 1], [0, 1]] *= times
+            pictures[sharpness] = replace(picture, intrinsics=intrinsics)
+        return replace(self, pictures=pictures, points=self.points / [times, times, 1])
 
 
 @dataclass(frozen=True)
@@ -78,6 +132,10 @@ class Agreement:
         """That of some pairs of frames, (N, N)."""
         return Agreement(np.where(pairs, self.confirmed, 0), np.where(pairs, self.contradicted, 0))
 
+    def of_frames(self, which: Index | Mask) -> "Agreement":
+        """That of some frames with each other."""
+        return Agreement(self.confirmed[which][:, which], self.contradicted[which][:, which])
+
     def of_each(self) -> tuple[Float, Float]:
         """The confirmed share and the number of judged points of each frame, both ways, (N,) each."""
         confirmed = self.confirmed.sum(0) + self.confirmed.sum(1)
@@ -90,93 +148,85 @@ def surface_view(frame: Frame, rng: np.random.Generator) -> SurfaceView:
     """Prepare a frame for comparison.
 
     Points are taken from the object's mask. Without one they are taken from the middle of the picture: one half
-    from the largest plane, the other half from what stands out of it, which tells a turn about the plane's normal.
+    from the largest plane, the other half from what stands out of it.
 
     Args:
         frame: its pose is not used.
         rng: draws the points.
     """
-    step = max(1, frame.shape[1] // BLOCKS_ACROSS)
-    measured = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
-    block_nearest = _blockwise(measured, step, np.min)
-    block_farthest = _blockwise(frame.depth, step, np.max)
-
-    nearest = ndimage.minimum_filter(block_nearest, 3, mode="nearest")
-    farthest = ndimage.maximum_filter(block_farthest, 3, mode="nearest")
-    complete = ndimage.minimum_filter(block_farthest > 0, 3, mode="constant")
-    object_near = None
-    if frame.mask is not None:
-        object_near = ndimage.maximum_filter(_blockwise(frame.mask, step, np.max), 3)
-
     few_rows = slice(None, None, max(1, frame.shape[0] // ROWS))
     noise = estimate_noise(frame.depth[few_rows], frame.depth[few_rows] > 0)
-    intrinsics = frame.intrinsics.copy()
-    intrinsics[:2] /= step
-
-    centre = step // 2
-    height, width = block_farthest.shape
-    grid = frame.depth[centre::step, centre::step][:height, :width]
-    usable = grid > 0
-    if frame.mask is not None:
-        usable &= frame.mask[centre::step, centre::step][:height, :width]
-    else:
-        usable &= (farthest - nearest < SMOOTH_STEP * grid) & _in_the_middle(grid)
-    rows, columns = np.nonzero(usable)
-    points = frame.positions_in_camera(centre + step * rows, centre + step * columns)
+    points = _surface_points(frame)
     if frame.mask is None:
-        points = _half_off_the_plane(points, frame, noise, rng)
+        points, standing = _half_off_the_plane(points, frame, noise, rng)
     else:
         points = _some(points, SURFACE_POINTS, rng)
+        standing = np.ones(len(points), bool)
+
     depth = points[:, 2]
-    tolerance = DEPTH_TOLERANCE * depth + NOISE_TOLERANCE * noise.at(depth) * depth**2
-    return SurfaceView(intrinsics, nearest, farthest, complete, object_near, points, tolerance)
+    by_noise = NOISE_TOLERANCE * noise.at(depth) * depth**2
+    pictures = {sharpness: _picture(frame, sharpness.columns) for sharpness in (ROUGH, SHARP)}
+    return SurfaceView(pictures, points, by_noise, standing)
 
 
-def compare(views: Sequence[SurfaceView], poses: Float, scale: float = 1.0) -> Agreement:
+def compare(
+    views: Sequence[SurfaceView],
+    poses: Float,
+    scale: float = 1.0,
+    sharpness: Sharpness = ROUGH,
+    looked_up_with: Float | None = None,
+) -> Agreement:
     """Look up the points of every frame in all others.
 
     Args:
         views: N frames.
         poses: of their cameras, camera-to-world, (N, 4, 4), metres.
         scale: by which all depths are multiplied.
+        sharpness: how closely the frames have to agree.
+        looked_up_with: poses of the cameras in whose pictures the points are looked up, (N, 4, 4); by default the same.
     """
     count = len(views)
     owner = np.repeat(np.arange(count), [len(view.points) for view in views])
-    tolerance = np.concatenate([view.tolerance for view in views])
+    tolerance = np.concatenate([view.tolerance(sharpness) for view in views])
     world = np.concatenate(
         [scale * v.points @ pose[:3, :3].T + pose[:3, 3] for v, pose in zip(views, poses, strict=True)]
     )
 
     confirmed = np.zeros((count, count))
     contradicted = np.zeros((count, count))
-    for j, (view, pose) in enumerate(zip(views, poses, strict=True)):
+    there = poses if looked_up_with is None else looked_up_with
+    for j, (view, pose) in enumerate(zip(views, there, strict=True)):
         seen_from = (world - pose[:3, 3]) @ pose[:3, :3] / scale
-        which, agrees, looks_through = _looked_up(view, seen_from, tolerance)
+        which, agrees, looks_through = _looked_up(view.pictures[sharpness], seen_from, tolerance)
         other = owner[which] != j
         confirmed[:, j] = np.bincount(owner[which], agrees & other, minlength=count)
         contradicted[:, j] = np.bincount(owner[which], looks_through & other, minlength=count)
     return Agreement(confirmed, contradicted)
 
 
-def _looked_up(view: SurfaceView, points: Float, tolerance: Float) -> tuple[NDArray[np.int64], Mask, Mask]:
+def _looked_up(picture: Picture, points: Float, tolerance: Float) -> tuple[Index, Mask, Mask]:
     """Which points, (P, 3), lie in a picture; which of these it confirms, and which it contradicts."""
-    height, width = view.nearest.shape
-    k = view.intrinsics
-    ahead = points[:, 2] > 1e-6
+    height, width = picture.nearest.shape
+    k = picture.intrinsics
+    ahead = points[:, 2] > LEAST_DEPTH
     z = np.where(ahead, points[:, 2], 1.0)
     column = np.floor(np.clip(points[:, 0] / z * k[0, 0] + k[0, 2], -1, width)).astype(np.int64)
     row = np.floor(np.clip(points[:, 1] / z * k[1, 1] + k[1, 2], -1, height)).astype(np.int64)
+
     # At the border a small error of the pose leads out of the picture.
     inside = ahead & (row >= 1) & (row < height - 1) & (column >= 1) & (column < width - 1)
     which = np.flatnonzero(inside)
-    row, column, z, limit = row[which], column[which], z[which], tolerance[which]
+    row = row[which]
+    column = column[which]
+    z = z[which]
+    limit = tolerance[which]
 
-    nearest = view.nearest[row, column]
-    farthest = view.farthest[row, column]
+    nearest = picture.nearest[row, column]
+    farthest = picture.farthest[row, column]
     agrees = (z > nearest - limit) & (z < farthest + limit)
-    looks_through = (z <= nearest - limit) & view.complete[row, column]
-    if view.object_near is not None:
-        on_object = view.object_near[row, column]
+    looks_through = (z <= nearest - limit) & picture.complete[row, column]
+    if picture.object_near is not None:
+        on_object = picture.object_near[row, column]
         hidden = nearest < z - limit
         # Where nothing nearer hides it, a point of the object has to be in the mask, measured or not.
         looks_through = np.where(on_object, looks_through, ~hidden)
@@ -184,11 +234,54 @@ def _looked_up(view: SurfaceView, points: Float, tolerance: Float) -> tuple[NDAr
     return which, agrees, looks_through
 
 
-def _blockwise(image: NDArray, step: int, reduce: np.ufunc | object) -> NDArray:
-    """Minimum or maximum of each square of ``step`` pixels; rows and columns that fill none are left out."""
-    height, width = (size // step * step for size in image.shape)
-    squares = image[:height, :width].reshape(height // step, step, width // step, step)
-    return reduce(squares, axis=(1, 3))  # type: ignore[operator]
+def _picture(frame: Frame, columns: int) -> Picture:
+    """The depth image of a frame in blocks of pixels, about so many across."""
+    side = max(1, frame.shape[1] // columns)
+    measured = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
+    block_nearest = _blockwise(measured, side, np.min)
+    block_farthest = _blockwise(frame.depth, side, np.max)
+
+    intrinsics = frame.intrinsics.copy()
+    intrinsics[:2] /= side
+    object_near = None
+    if frame.mask is not None:
+        object_near = ndimage.maximum_filter(_blockwise(frame.mask, side, np.max), 3)
+    return Picture(
+        intrinsics,
+        nearest=ndimage.minimum_filter(block_nearest, 3, mode="nearest"),
+        farthest=ndimage.maximum_filter(block_farthest, 3, mode="nearest"),
+        complete=ndimage.minimum_filter(block_farthest > 0, 3, mode="constant"),
+        object_near=object_near,
+    )
+
+
+def _surface_points(frame: Frame) -> Float:
+    """A grid of points on the object's mask; without one, on smooth surfaces in the middle of the picture, (N, 3)."""
+    side = max(1, frame.shape[1] // POINT_GRID)
+    first = side // 2
+    grid = frame.depth[first::side, first::side]
+    usable = grid > 0
+    if frame.mask is None:
+        usable &= _is_smooth(grid) & _in_the_middle(grid)
+    else:
+        usable &= frame.mask[first::side, first::side]
+    rows, columns = np.nonzero(usable)
+    return frame.positions_in_camera(first + side * rows, first + side * columns)
+
+
+def _is_smooth(grid: NDArray[np.float32]) -> Mask:
+    """Where the depth, (h, w), varies little from one grid point to all around it."""
+    measured = np.where(grid > 0, grid, np.float32(np.inf))
+    nearest = ndimage.minimum_filter(measured, 3, mode="nearest")
+    farthest = ndimage.maximum_filter(grid, 3, mode="nearest")
+    return farthest - nearest < SMOOTH_STEP * grid
+
+
+def _blockwise(image: NDArray, side: int, reduce: Callable[..., NDArray]) -> NDArray:
+    """Minimum or maximum of each square of ``side`` pixels; rows and columns that fill none are left out."""
+    height, width = (size // side * side for size in image.shape)
+    squares = image[:height, :width].reshape(height // side, side, width // side, side)
+    return reduce(squares, axis=(1, 3))
 
 
 def _in_the_middle(grid: NDArray[np.float32]) -> Mask:
@@ -203,19 +296,22 @@ def _in_the_middle(grid: NDArray[np.float32]) -> Mask:
     return inner & (grid < FAR_BEHIND * np.median(measured))
 
 
-def _half_off_the_plane(points: Float, frame: Frame, noise: Noise, rng: np.random.Generator) -> Float:
-    """Some points, one half on the largest plane of a frame and the other half above it, if there are so many."""
+def _half_off_the_plane(points: Float, frame: Frame, noise: Noise, rng: np.random.Generator) -> tuple[Float, Mask]:
+    """Some points, and which stand out of the largest plane of a frame: one half, if there are so many."""
     # The plane is searched in the camera's frame: the pose may be wrong.
     unposed = Frame(frame.depth, frame.intrinsics, pixel_centre=0.5)
     plane = find_plane(sample(unposed, unposed.depth > 0, noise), rng)
     if plane is None or not len(points):
-        return _some(points, SURFACE_POINTS, rng)
+        points = _some(points, SURFACE_POINTS, rng)
+        return points, np.ones(len(points), bool)
+
     z = points[:, 2]
     above = plane.height(points) > ABOVE_PLANE * z + NOISE_TOLERANCE * noise.at(z) * z**2
     half = SURFACE_POINTS // 2
     on_it = _some(points[~above], max(half, SURFACE_POINTS - int(above.sum())), rng)
     off_it = _some(points[above], SURFACE_POINTS - min(half, len(on_it)), rng)
-    return np.concatenate([off_it, on_it[: SURFACE_POINTS - len(off_it)]])
+    chosen = np.concatenate([off_it, on_it[: SURFACE_POINTS - len(off_it)]])
+    return chosen, np.arange(len(chosen)) < len(off_it)
 
 
 def _some(points: Float, most: int, rng: np.random.Generator) -> Float:

@@ -1,14 +1,16 @@
 """Check captured frames: leave out and count what cannot be used, and refuse poses that cannot be right."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from nextview.errors import DatasetError, ObservationError
-from nextview.sensing.agreement import Agreement, compare, surface_view
+from nextview.sensing.agreement import SHARP, Agreement, SurfaceView, compare, surface_view
 from nextview.sensing.frame import Frame
 from nextview.simulation.captured import Capture, CapturedFrame
+from nextview.simulation.captured_cameras import find_camera_mistake, find_offset
+from nextview.simulation.captured_shifts import Shift, find_shifts
 from nextview.simulation.pose_mistakes import (
     FEWEST_JUDGED,
     UNIT_NAMES,
@@ -20,6 +22,9 @@ from nextview.simulation.pose_mistakes import (
 MOST_COMPARED = 60  # frames of a capture that are compared with each other, evenly spread
 MOST_REFUSED = 0.1  # share of the frames that may be left out; a single one always may
 CONTRADICTED_SHARE = 0.5  # a frame of which less is confirmed contradicts the others
+CONTRADICTED_SHARPLY = 0.3  # the same, looked at sharply, if it is also so many times what is usual
+TIMES_USUAL = 4.0
+CONTRADICTED_IN_ALL = 0.3  # share of what stands on the plane that is contradicted where frames disagree altogether
 FEWEST_TO_BLAME = 5  # frames of which one may be blamed if they disagree
 PLAUSIBLE_DEPTH = (0.05, 15.0)  # metres that a capture of an object may have as its median depth
 NEVER_A_DEPTH = 25  # times by which a depth scale is hardly ever wrong, and a unit of length often
@@ -117,43 +122,167 @@ def _contradicting(capture: Capture, compared: np.ndarray, frames: list[Frame]) 
     unit = 0.001 if capture.layout == "BOP" else 1.0
     posed = Posed(views, compared, poses, capture.layout != "BOP", unit)
 
-    agreement = compare(views, posed.as_read())
-    mistake = find_mistake(posed, agreement)
+    mistake = find_mistake(posed, compare(views, posed.as_read()))
     if mistake is not None:
         depth = float(np.median([np.median(v.points[:, 2]) for v in views if len(v.points)]))
-        looks = _in_words(capture, mistake, depth, unit)
-        problem = "its frames do not agree about one rigid object, and without this mistake they would"
-        raise DatasetError(f"{capture.folder}: {problem}: {looks}")
+        raise _disagree(capture, _in_words(capture, mistake, depth, unit))
+    looks = find_camera_mistake(views, posed.as_read(), capture.frames[0].intrinsics)
+    if looks:
+        raise _disagree(capture, looks)
 
-    blamed = _to_blame(agreement)
-    if not blamed:
-        return {}
-    if len(frames) < FEWEST_TO_BLAME or len(blamed) > max(1, MOST_REFUSED * len(frames)):
-        contradicted = 1 - agreement.share
-        problem = f"its frames do not agree about one rigid object ({contradicted:.0%} of what they "
-        problem += "show in common is contradicted), and no usual mistake explains it"
-        hint = "are the poses of another recording, or did the object move in between?"
-        raise DatasetError(f"{capture.folder}: {problem}: {hint}")
-    return {
-        capture.frames[compared[i]].name: f"it contradicts the other frames ({1 - share:.0%} of "
-        "what it shows with them): was its pose lost?"
-        for i, share in blamed.items()
-    }
+    most = max(1, int(MOST_REFUSED * len(frames)))
+    shifts = find_shifts(views, compared, poses)
+    late = np.zeros(len(frames), bool)
+    for shift in shifts:
+        late[shift.first : shift.end] = True
+    if late.sum() > most:
+        raise _disagree(capture, " and ".join(_shift_in_words(capture, compared, shift) for shift in shifts))
+    refused = _late_frames(capture, compared, shifts)
+
+    kept = np.flatnonzero(~late)
+    evidence = Evidence.of([views[i] for i in kept], poses[compared[kept]])
+    blamed = _to_blame(evidence)
+    left = np.setdiff1d(np.arange(len(kept)), list(blamed))
+    if len(frames) < FEWEST_TO_BLAME:
+        too_many = bool(blamed)
+    else:
+        too_many = len(blamed) + late.sum() > most
+    if too_many or (len(left) > 1 and _disagreeing(evidence, left)):
+        looks = find_offset(views, posed.as_read())
+        raise _disagree(capture, looks) if looks else _unexplained(capture, compared[kept], evidence)
+
+    for i, share in blamed.items():
+        what = f"it contradicts the other frames ({1 - share:.0%} of what it shows with them): was its pose lost?"
+        refused[capture.frames[compared[kept[i]]].name] = what
+    return refused
 
 
-def _to_blame(agreement: Agreement) -> dict[int, float]:
-    """Frames of which most is contradicted, the worst first, with the share that is confirmed."""
-    kept = np.ones(len(agreement.confirmed), bool)
+def _disagree(capture: Capture, looks: str) -> DatasetError:
+    """The error where a mistake explains what the frames contradict."""
+    problem = "its frames do not agree about one rigid object, and without this mistake they would"
+    return DatasetError(f"{capture.folder}: {problem}: {looks}")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Agreement of N frames, by what is judged and how closely.
+
+    Attributes:
+        all: of all points, roughly.
+        standing: of the points that stand out of the largest plane, roughly.
+        sharp: of the same points, sharply.
+    """
+
+    all: Agreement
+    standing: Agreement
+    sharp: Agreement
+
+    @classmethod
+    def of(cls, views: Sequence[SurfaceView], poses: np.ndarray) -> "Evidence":
+        """That of frames with some poses, camera-to-world, (N, 4, 4)."""
+        standing = [view.some(view.standing) for view in views]
+        return cls(compare(views, poses), compare(standing, poses), compare(standing, poses, sharpness=SHARP))
+
+
+def _to_blame(evidence: Evidence) -> dict[int, float]:
+    """Frames that contradict the others much more than these each other, the worst first, with the confirmed share.
+
+    A frame is blamed where most of its points are contradicted, or most of those that stand out of the largest plane;
+    or, looked at sharply, many times as many of them as in the other frames.
+    """
+    kept = np.ones(len(evidence.all.confirmed), bool)
     blamed: dict[int, float] = {}
-    while kept.any():
-        share, judged = agreement.among(kept[:, None] & kept).of_each()
-        share = np.where(kept & (judged >= FEWEST_JUDGED), share, 1.0)
-        worst = int(share.argmin())
-        if share[worst] >= CONTRADICTED_SHARE:
+    while kept.sum() > 1:
+        pairs = kept[:, None] & kept
+        share = np.ones(len(kept))
+        for rough in (evidence.all, evidence.standing):
+            share = np.minimum(share, np.where(kept, _enough_judged(rough.among(pairs)), 1.0))
+        sharp = np.where(kept, _enough_judged(evidence.sharp.among(pairs)), 1.0)
+        usual = float(np.median(1 - sharp[kept]))
+        outlier = 1 - sharp > max(CONTRADICTED_SHARPLY, TIMES_USUAL * usual)
+
+        to_blame = (share < CONTRADICTED_SHARE) | outlier
+        if not to_blame.any():
             break
-        blamed[worst] = float(share[worst])
+        worst = int(np.where(to_blame, np.minimum(share, sharp), 1.0).argmin())
+        blamed[worst] = float(sharp[worst] if outlier[worst] else share[worst])
         kept[worst] = False
     return blamed
+
+
+def _enough_judged(agreement: Agreement) -> np.ndarray:
+    """The confirmed share of each frame, (N,); 1 where too few of its points could be judged."""
+    share, judged = agreement.of_each()
+    return np.where(judged >= FEWEST_JUDGED, share, 1.0)
+
+
+def _disagreeing(evidence: Evidence, left: np.ndarray) -> bool:
+    """Whether frames, without those that are blamed, contradict each other about what stands on the plane."""
+    standing = evidence.standing.of_frames(left)
+    return standing.judged >= FEWEST_JUDGED and 1 - standing.share > CONTRADICTED_IN_ALL
+
+
+def _unexplained(capture: Capture, compared: np.ndarray, evidence: Evidence) -> DatasetError:
+    """The error where the frames contradict each other, and no usual mistake explains it."""
+    contradicted = 1 - min(evidence.all.share, evidence.standing.share)
+    problem = f"its frames do not agree about one rigid object ({contradicted:.0%} of what they "
+    problem += "show in common is contradicted), and no usual mistake explains it"
+    hint = "are the poses of another recording, or did the object move in between?"
+    first = _break(evidence.standing)
+    if first:
+        name = capture.frames[compared[first]].name
+        hint = f"the frames from {name} on contradict those before: did the object or the camera's base move there?"
+    return DatasetError(f"{capture.folder}: {problem}: {hint}")
+
+
+def _break(agreement: Agreement) -> int:
+    """The first of the frames that agree with each other, but not with those before; 0 if there is none."""
+    count = len(agreement.confirmed)
+    best = 0
+    largest = 0.0
+    for first in range(2, count - 1):
+        later = np.arange(count) >= first
+        across = agreement.among(later[:, None] != later)
+        within = agreement.among(later[:, None] == later)
+        if min(across.judged, within.judged) < FEWEST_JUDGED:
+            continue
+        wrong_across = 1 - across.share
+        wrong_within = 1 - within.share
+        if wrong_across > TIMES_USUAL * wrong_within and wrong_across - wrong_within > largest:
+            largest = wrong_across - wrong_within
+            best = first
+    return best
+
+
+def _late_frames(capture: Capture, compared: np.ndarray, shifts: Sequence[Shift]) -> dict[str, str]:
+    """Frames with the poses of others and why they are left out; also those between them that were not compared."""
+    refused = {}
+    for shift in shifts:
+        reason = f"its pose is {_frames_late(shift)}"
+        for i in range(compared[shift.first], compared[shift.end - 1] + 1):
+            refused[capture.frames[i].name] = reason
+    return refused
+
+
+def _shift_in_words(capture: Capture, compared: np.ndarray, shift: Shift) -> str:
+    """From which frame on the poses are late, or up to which."""
+    first = capture.frames[compared[shift.first]].name
+    last = capture.frames[compared[shift.end - 1]].name
+    late = f"the poses are {_frames_late(shift)}"
+    if shift.first == 0 and shift.end == len(compared):
+        return late
+    if shift.end < len(compared):
+        return f"from frame {first} to {last} {late}"
+    lost = "an image" if shift.frames > 0 else "a pose"
+    return f"from frame {first} on {late} (was {lost} lost there?)"
+
+
+def _frames_late(shift: Shift) -> str:
+    """By how many frames poses are late: one frame late: each frame has the pose of an earlier one."""
+    many = "one frame" if abs(shift.frames) == 1 else f"{abs(shift.frames)} frames"
+    if shift.frames > 0:
+        return f"{many} late: each frame has the pose of an earlier one"
+    return f"{many} early: each frame has the pose of a later one"
 
 
 def _in_words(capture: Capture, mistake: PoseMistake, depth: float, unit: float) -> str:
