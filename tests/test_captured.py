@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 from pipeline import refused
 from scipy.spatial.transform import Rotation
@@ -188,14 +189,24 @@ SMALL_K = np.array([[131.25, 0, 80], [0, 131.25, 60], [0, 0, 1]])
 STEPS = {"bop": 0.001, "tum": 1 / 5000, "7scenes": 0.001}  # metres, of the depth images
 
 
-def seen(count=9, moved=0.0, turned=0.0):
-    """Depth images, metres, of the sample chair on a table, and poses that are off by some metres and degrees."""
+def seen(count=9, moved=0.0, turned=0.0, evenly=False, thing=None):
+    """Depth images, metres, of a thing on a table, by default the sample chair, and poses around it.
+
+    The poses are off by some metres and degrees; they are random or evenly around at one height.
+    """
     rng = np.random.default_rng(3)
-    mesh = sample_mesh("chair")
-    vertices = 0.3 * (mesh.vertices - [0, 0, mesh.vertices[:, 2].min()])
-    caster = RayCaster([(vertices, mesh.faces), square(0.6, 0.0)])
+    if thing is None:
+        mesh = sample_mesh("chair")
+        thing = 0.3 * (mesh.vertices - [0, 0, mesh.vertices[:, 2].min()]), mesh.faces
+    caster = RayCaster([thing, square(0.6, 0.0)])
     rays = pixel_rays(SMALL_K, (120, 160)).reshape(-1, 3)
-    poses = look_at_origin(np.radians(rng.uniform(20, 70, count)), rng.uniform(0, 2 * np.pi, count), 1.0)
+    if evenly:
+        elevation = np.full(count, np.radians(35))
+        azimuth = 2 * np.pi * np.arange(count) / count
+    else:
+        elevation = np.radians(rng.uniform(20, 70, count))
+        azimuth = rng.uniform(0, 2 * np.pi, count)
+    poses = look_at_origin(elevation, azimuth, 1.0)
     poses[:, 2, 3] += 0.25
     depths = []
     for pose in poses:
@@ -279,6 +290,102 @@ def test_right_frames_pass(layout, count, moved, turned, tmp_path):
     checked, left_out = check_capture(read_capture(tmp_path))
     assert len(checked.frames) == count
     assert left_out == {}
+
+
+@pytest.fixture(scope="module")
+def around():
+    """The sample chair on a table, from 24 places around it at one height: a turn leaves the table as it is."""
+    return seen(24, evenly=True)
+
+
+def late_from(first, frames, end=None):
+    """Poses of which those from one frame on are the ones of some frames before."""
+
+    def change(poses):
+        changed = poses.copy()
+        for i in range(first, len(poses) if end is None else end):
+            changed[i] = poses[min(max(i - frames, 0), len(poses) - 1)]
+        return changed
+
+    return change
+
+
+def two_lost(poses):
+    changed = late_from(7, 1)(poses)
+    changed[16:] = late_from(16, 2)(poses)[16:]
+    return changed
+
+
+def moved(x, y, z):
+    """Poses of a place beside the camera, in all frames the same, metres in the camera's axes."""
+    step = np.eye(4)
+    step[:3, 3] = x, y, z
+    return lambda poses: poses @ step
+
+
+def bumped(poses):
+    changed = poses.copy()
+    changed[12:, 0, 3] += 0.15
+    return changed
+
+
+PARTS = {
+    "one image lost": (late_from(12, 1), "from frame 000012 on the poses are one frame late"),
+    "one image lost early": (late_from(4, 1), "from frame 000004 on the poses are one frame late"),
+    "two images lost": (late_from(9, 2), "from frame 000009 on the poses are 2 frames late"),
+    "one pose lost": (late_from(12, -1), "from frame 00001. to 00002. the poses are one frame early"),
+    "an image lost twice": (two_lost, "from frame 000007 to .* one frame late.* and from frame 0000.* 2 frames late"),
+    "bumped": (bumped, "the frames from 000012 on contradict those before"),
+}
+
+
+@pytest.mark.parametrize("what", PARTS)
+def test_the_frame_from_which_poses_are_wrong_is_named(what, around, tmp_path):
+    depths, poses = around
+    change, said = PARTS[what]
+    write_frames(tmp_path, "7scenes", depths, change(poses))
+    with pytest.raises(DatasetError, match=said):
+        check_capture(read_capture(tmp_path))
+
+
+def test_a_few_frames_with_the_poses_of_others_are_left_out_and_named(around, tmp_path):
+    depths, poses = around
+    write_frames(tmp_path, "7scenes", depths, late_from(10, 1, end=12)(poses))
+    left_out = check_capture(read_capture(tmp_path))[1]
+    assert set(left_out) <= {"000010", "000011"}
+    assert "its pose is one frame late" in left_out["000010"]
+
+
+CAMERAS_WRONG = {
+    "offset along x": (lambda d: d, moved(0.1, 0, 0), 1.0, "beside its poses"),
+    "offset along z": (lambda d: d, moved(0, 0, -0.1), 1.0, "beside its poses"),
+    "offset": (lambda d: d, moved(0.08, 0.05, 0.04), 1.0, "hand-eye"),
+    "mirrored": (np.fliplr, lambda p: p, 1.0, "flipped left to right"),
+    "flipped": (np.flipud, lambda p: p, 1.0, "flipped top to bottom"),
+    "long focal length": (lambda d: d, lambda p: p, 1.15, "the focal length is some 1[3-7] % too long"),
+    "short focal length": (lambda d: d, lambda p: p, 0.85, "the focal length is some 1[3-7] % too short"),
+}
+
+
+@pytest.mark.parametrize("what", CAMERAS_WRONG)
+def test_a_mistake_of_the_camera_is_named(what, around, tmp_path):
+    depths, poses = around
+    see, change, times, said = CAMERAS_WRONG[what]
+    write_frames(tmp_path, "7scenes", [see(depth) for depth in depths], change(poses))
+    path = tmp_path / "camera-intrinsics.txt"
+    np.savetxt(path, np.loadtxt(path) * [[times, 1, 1], [1, times, 1], [1, 1, 1]])
+    with pytest.raises(DatasetError, match=said):
+        check_capture(read_capture(tmp_path))
+
+
+@pytest.mark.parametrize("change", [lambda p: p, late_from(12, 1)])
+def test_of_a_can_on_a_table_nothing_is_said(change, tmp_path):
+    """Whatever it is turned by, it looks the same."""
+    can = trimesh.creation.cylinder(0.15, 0.4, sections=180)
+    can.apply_translation([0, 0, 0.2])
+    depths, poses = seen(24, evenly=True, thing=(can.vertices, can.faces.astype(np.int32)))
+    write_frames(tmp_path, "7scenes", depths, change(poses))
+    assert check_capture(read_capture(tmp_path))[1] == {}
 
 
 def test_a_thing_that_looks_the_same_from_all_sides_contradicts_nothing(tmp_path):

@@ -8,7 +8,7 @@ Points that stand out of the largest plane of a frame can be judged on their own
 about its normal, so its points agree where the object's do not.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -238,14 +238,14 @@ def _picture(frame: Frame, columns: int) -> Picture:
     """The depth image of a frame in blocks of pixels, about so many across."""
     side = max(1, frame.shape[1] // columns)
     measured = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
-    block_nearest = _blockwise(measured, side, np.min)
-    block_farthest = _blockwise(frame.depth, side, np.max)
+    block_nearest = _blockwise(measured, side, np.minimum)
+    block_farthest = _blockwise(frame.depth, side, np.maximum)
 
     intrinsics = frame.intrinsics.copy()
     intrinsics[:2] /= side
     object_near = None
     if frame.mask is not None:
-        object_near = ndimage.maximum_filter(_blockwise(frame.mask, side, np.max), 3)
+        object_near = ndimage.maximum_filter(_blockwise(frame.mask, side, np.maximum), 3)
     return Picture(
         intrinsics,
         nearest=ndimage.minimum_filter(block_nearest, 3, mode="nearest"),
@@ -277,11 +277,19 @@ def _is_smooth(grid: NDArray[np.float32]) -> Mask:
     return farthest - nearest < SMOOTH_STEP * grid
 
 
-def _blockwise(image: NDArray, side: int, reduce: Callable[..., NDArray]) -> NDArray:
-    """Minimum or maximum of each square of ``side`` pixels; rows and columns that fill none are left out."""
+def _blockwise(image: NDArray, side: int, choose: np.ufunc) -> NDArray:
+    """Minimum or maximum of each square of ``side`` pixels; rows and columns that fill none are left out.
+
+    ``choose`` is ``np.minimum`` or ``np.maximum``. Rows first, as that is several times as fast as a reduction over two axes.
+    """
     height, width = (size // side * side for size in image.shape)
-    squares = image[:height, :width].reshape(height // side, side, width // side, side)
-    return reduce(squares, axis=(1, 3))
+    of_rows = image[0:height:side, :width]
+    for row in range(1, side):
+        of_rows = choose(of_rows, image[row:height:side, :width])
+    found = of_rows[:, ::side]
+    for column in range(1, side):
+        found = choose(found, of_rows[:, column::side])
+    return found
 
 
 def _in_the_middle(grid: NDArray[np.float32]) -> Mask:

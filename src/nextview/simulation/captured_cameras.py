@@ -101,7 +101,8 @@ def _focal_length(views: Sequence[SurfaceView], poses: Float, as_read: Agreement
         return ""
     what = "long" if wrong > 0 else "short"
     percent = f"the focal length is some {100 * abs(wrong):.0f} % too {what}"
-    return f"{percent} ({given:.0f} pixels, about {times * given:.0f} fit): are the intrinsics of another camera or size?"
+    pixels = f"{given:.0f} pixels, about {times * given:.0f} fit"
+    return f"{percent} ({pixels}): are these the intrinsics of another camera or picture size?"
 
 
 def _with_focal_length(views: Sequence[SurfaceView], poses: Float, times: float) -> Agreement:
@@ -127,8 +128,10 @@ def _fitted_offset(views: Sequence[SurfaceView], poses: Float) -> Float:
 
     start = min((_offset_of_middles(views, poses), np.zeros(3)), key=contradicted)
     simplex = start + np.vstack([np.zeros(3), FIRST_STEP * np.eye(3)])
-    options = {"maxfev": MOST_TRIALS, "initial_simplex": simplex}
-    return np.asarray(minimize(contradicted, start, method="Nelder-Mead", options=options).x, np.float64)
+    found = minimize(
+        contradicted, start, method="Nelder-Mead", options={"maxfev": MOST_TRIALS, "initial_simplex": simplex}
+    )
+    return np.asarray(found.x, np.float64)
 
 
 def _offset_of_middles(views: Sequence[SurfaceView], poses: Float) -> Float:

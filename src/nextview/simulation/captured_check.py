@@ -143,10 +143,8 @@ def _contradicting(capture: Capture, compared: np.ndarray, frames: list[Frame]) 
     evidence = Evidence.of([views[i] for i in kept], poses[compared[kept]])
     blamed = _to_blame(evidence)
     left = np.setdiff1d(np.arange(len(kept)), list(blamed))
-    if len(frames) < FEWEST_TO_BLAME:
-        too_many = bool(blamed)
-    else:
-        too_many = len(blamed) + late.sum() > most
+    most_blamed = most - int(late.sum()) if len(frames) >= FEWEST_TO_BLAME else 0
+    too_many = len(blamed) > most_blamed
     if too_many or (len(left) > 1 and _disagreeing(evidence, left)):
         looks = find_offset(views, posed.as_read())
         raise _disagree(capture, looks) if looks else _unexplained(capture, compared[kept], evidence)
@@ -217,9 +215,15 @@ def _enough_judged(agreement: Agreement) -> np.ndarray:
 
 
 def _disagreeing(evidence: Evidence, left: np.ndarray) -> bool:
-    """Whether frames, without those that are blamed, contradict each other about what stands on the plane."""
+    """Whether frames, without those that are blamed, contradict each other about what stands on the plane.
+
+    All of them do, or those from one frame on contradict those before.
+    """
     standing = evidence.standing.of_frames(left)
-    return standing.judged >= FEWEST_JUDGED and 1 - standing.share > CONTRADICTED_IN_ALL
+    if standing.judged >= FEWEST_JUDGED and 1 - standing.share > CONTRADICTED_IN_ALL:
+        return True
+    first = _break(standing)
+    return first > 0 and 1 - _across(standing, first).share > CONTRADICTED_IN_ALL
 
 
 def _unexplained(capture: Capture, compared: np.ndarray, evidence: Evidence) -> DatasetError:
@@ -242,7 +246,7 @@ def _break(agreement: Agreement) -> int:
     largest = 0.0
     for first in range(2, count - 1):
         later = np.arange(count) >= first
-        across = agreement.among(later[:, None] != later)
+        across = _across(agreement, first)
         within = agreement.among(later[:, None] == later)
         if min(across.judged, within.judged) < FEWEST_JUDGED:
             continue
@@ -252,6 +256,12 @@ def _break(agreement: Agreement) -> int:
             largest = wrong_across - wrong_within
             best = first
     return best
+
+
+def _across(agreement: Agreement, first: int) -> Agreement:
+    """That of the frames from one on with those before."""
+    later = np.arange(len(agreement.confirmed)) >= first
+    return agreement.among(later[:, None] != later)
 
 
 def _late_frames(capture: Capture, compared: np.ndarray, shifts: Sequence[Shift]) -> dict[str, str]:

@@ -7,6 +7,7 @@ table leaves the table where it is, so only what stands on it is judged.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,7 @@ LEAST_OF_ALL = 0.1  # part of all contradictions that each further part has to e
 LEAST_SHARE = 0.01  # ... and the share of the points that it concerns
 LEAST_OVERLAP = 0.5  # part of these points that can still be judged without it
 SAME_EXPLAINED = 1e-3  # contradictions that one more frame in a part has to explain
-EARLY_BEGINNING = 0.9  # what explains as much as a part at the beginning of a capture, at least, is preferred to it
-LONG_BEGINNING = 0.5  # the same of one that takes up most of the capture: the few frames after it are wrong
+AS_GOOD = 0.5  # part of what parts explain that the same parts explain where the first frames are taken to be right
 SAME_POSE = 1e-3  # metres, and parts of a rotation, up to which two poses are the same
 
 
@@ -122,6 +122,12 @@ def find_shifts(views: Sequence[SurfaceView], indices: Index, poses: Float) -> l
             break
         late = late.copy()
         late[found.first : found.end] += found.frames
+
+    # On a steady way around a thing only differences between shifts show. Then the first frames are taken to be right.
+    others = late - late[1]
+    others[0] = min(others[0], 0, key=abs)
+    if _explained(shifted, as_read, others) >= AS_GOOD * _explained(shifted, as_read, late):
+        late = others
     return _parts(late) if _is_explained(shifted, as_read, late) else []
 
 
@@ -176,11 +182,9 @@ def _explained_by_parts(shifted: Shifted, late: Index, later: Index) -> Float:
                 + _sum(sums_into, slice(0, count), part)
                 - _sum(sums_into, part, part)
             )
-    # Of parts that explain the same, the shortest is right, and rather a late end than an early beginning.
+    # Of parts that explain the same, the shortest is right.
     length = np.arange(count)[None] - np.arange(count)[:, None]
     found -= SAME_EXPLAINED * np.maximum(length, 0)
-    found[0, :-1] *= EARLY_BEGINNING
-    found[0, count // 2 : -1] *= LONG_BEGINNING
     return found
 
 
@@ -194,6 +198,15 @@ def _sum(sums: Float, rows: slice, columns: slice) -> float:
     low, high = rows.start, rows.stop
     left, right = columns.start, columns.stop
     return float(sums[high, right] - sums[low, right] - sums[high, left] + sums[low, left])
+
+
+def _explained(shifted: Shifted, late: Index, later: Index) -> float:
+    """How many contradictions vanish if the frames have later poses, of those that have such poses."""
+    usable = shifted.has_pose(later)
+    pairs = usable[:, None] & usable
+    before = shifted.agreement(late, late).contradicted[pairs]
+    after = shifted.agreement(later, later).contradicted[pairs]
+    return float(before.sum() - after.sum())
 
 
 def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
@@ -223,7 +236,7 @@ def _parts(late: Index) -> list[Shift]:
     """Neighbouring frames with the same shift, but for those without one."""
     ends = [0, *(np.flatnonzero(np.diff(late)) + 1), len(late)]
     found = []
-    for first, end in zip(ends[:-1], ends[1:], strict=True):
+    for first, end in pairwise(ends):
         if late[first]:
             found.append(Shift(int(first), int(end), int(late[first])))
     return found
