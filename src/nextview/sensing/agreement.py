@@ -280,7 +280,7 @@ def _is_smooth(grid: NDArray[np.float32]) -> Mask:
 def _blockwise(image: NDArray, side: int, choose: np.ufunc) -> NDArray:
     """Minimum or maximum of each square of ``side`` pixels; rows and columns that fill none are left out.
 
-    ``choose`` is ``np.minimum`` or ``np.maximum``. Rows first, as that is several times as fast as a reduction over two axes.
+    ``choose`` is ``np.minimum`` or ``np.maximum``. Rows come first: that is faster than a reduction over two axes.
     """
     height, width = (size // side * side for size in image.shape)
     of_rows = image[0:height:side, :width]
