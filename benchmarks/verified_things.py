@@ -78,6 +78,7 @@ COLUMNS = (
     "ms of CPU: median, worst",
 )
 ORDERS = (1, 2, 3, 4, 5, 6, 7, 8)  # of symmetries about the vertical
+ROUND = 6  # order from which a thing looks the same from all azimuths: fruit is not exactly round
 
 
 @dataclass(frozen=True)
@@ -208,9 +209,8 @@ def symmetry_order(surface: Surface, points: Float) -> int:
         turn = rotation_about_z(np.array([2 * np.pi / order]))[0]
         distance = np.quantile(tree.query(centred @ turn.T)[0], 0.99) - apart
         same.append(distance < SYMMETRIC * surface.diameter)
-    if same[ORDERS.index(5)] and same[ORDERS.index(7)]:
-        return 0
-    return max(order for order, alike in zip(ORDERS, same, strict=True) if alike or order == 1)
+    highest = max(order for order, alike in zip(ORDERS, same, strict=True) if alike or order == 1)
+    return 0 if highest >= ROUND else highest
 
 
 def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: Setting) -> Episode:

@@ -85,8 +85,8 @@ def likelihood(
     match = np.log(np.exp(-squared / 2) + np.exp(model.outlier)) - np.log1p(np.exp(model.outlier))
 
     # Mismatches at an outline cost less, the nearer to it they are.
-    deep = np.clip(np.abs(view.edge) / model.edge, 0.1, 1)
-    deep = np.where(view.level, 0.1, deep)  # of the ground, more likely
+    inner = np.clip(np.abs(view.edge) / model.edge, 0.1, 1)
+    deep = np.where(view.level, 0.1, inner)  # of the ground, more likely
     thing = view.kind == THING
     through = shows & (view.kind == ELSEWHERE) & (~rendered.hidden(view) | rendered.sunk(view))
     hole = shows & (view.kind == NOT_MEASURED)
@@ -102,8 +102,9 @@ def likelihood(
     # Depths tell best whether a thing was taught. Outlines depend on how well it was segmented.
     missing = np.where(~shows & thing, deep, 0).sum(1) / max(1, int(thing.sum()))
     seen_through = np.where(through, deep, 0).sum(1) / np.maximum(shows.sum(1), 1)
-    both = (shows & thing).sum(1)
-    mismatch = -np.where(shows & thing, match, 0).sum(1) / np.maximum(both, 1)
-    mismatch = np.where(both, mismatch, -model.outlier)
+    # Real sensors round off edges.
+    both = np.where(shows & thing, inner, 0)
+    mismatch = -(both * match).sum(1) / np.maximum(both.sum(1), 1e-9)
+    mismatch = np.where(both.any(1), mismatch, -model.outlier)
     misfit = mismatch - model.outlier * (model.missing * missing + model.through * seen_through)
     return ViewLikelihood(judged.sum(1), counted.sum(1).astype(np.float64), explained, misfit)
