@@ -80,7 +80,7 @@ class Recognition:
     @property
     def why_unknown(self) -> str:
         """What an object is called unknown for, in words."""
-        if self._explained is not None:
+        if self._explained is not None and self._joint_poses:
             return f"{100 * self._explained:.2g} % of taught things are explained as badly by their scans"
         if self.most_like in self.impossible:
             return f"a radius of {self.radius:.2g} m is that of no {self.most_like}"

@@ -1,7 +1,7 @@
 """The front door: a recogniser, maps, a policy, candidate viewpoints and a stopping rule that belong together."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -16,12 +16,13 @@ from nextview.geometry.mesh import Mesh, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera
 from nextview.geometry.viewsphere import LAYOUTS, Viewpoints, ViewSphere, viewpoints_of
 from nextview.policies.base import Policy
+from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.registry import make_policy_anywhere, with_cards
 from nextview.recognition.belief import Stopping
 from nextview.recognition.inference import MapNetwork, Models, open_maps
 from nextview.recognition.map_names import SPHERE
-from nextview.recognition.model_card import DISCRIMINATE, find_models
+from nextview.recognition.model_card import DISCRIMINATE, Collection, find_models
 from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.own_stopping import Rule, own_stopping
 from nextview.recognition.protocol import Recogniser, tells_unknown
@@ -29,6 +30,7 @@ from nextview.session.limits import Limits
 from nextview.session.recognition import Recognition
 from nextview.session.session import FrameCamera, Session
 from nextview.things.recogniser import open_recogniser
+from nextview.things.several import SeveralRecognisers
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
@@ -170,7 +172,7 @@ def simulated(mesh: Mesh, sensor: "str | Sensor | None" = None, seed: int = 0) -
 
 
 def load(
-    models: str | Path = DEFAULT,
+    models: str | Path | Sequence[str | Path] = DEFAULT,
     policy: str | None = None,
     threshold: float = 0.97,
     risk: float | None = None,
@@ -185,7 +187,9 @@ def load(
 
     Args:
         models: the name of bundled models, or a folder with the card of a recogniser, and of maps and policies of its
-            own if there are any. Maps that it lacks are the bundled ones, which know no classes.
+            own if there are any. Maps that it lacks are the bundled ones, which know no classes. Or several of these:
+            memories of things with their geometry, and at most one network. A thing is named if its geometry explains
+            what is seen; else a class.
         policy: how the next view is chosen; "gain" by default, where one was learned for these classes, else "spread".
             Names are those of ``nextview.policies.registry``, of policy cards in the folder, or "MODULE:CLASS".
         threshold: stop when the belief in one class reaches this after one view, and less after several.
@@ -208,19 +212,19 @@ def load(
         RiskError: the error rate cannot be promised.
         UsageError: a threshold, a rate or a number of views makes no sense.
     """
-    given = locals() | {"models": str(models)}
-    _check_options(models, policy, threads, risk, unknown)
+    given = dict(locals())
+    names = _names_of(models)
+    given["models"] = names if len(names) > 1 else names[0]
+    _check_options(policy, threads, risk, unknown)
     Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
 
-    found = find_models(models)
+    collections = {name: find_models(name) for name in names}
+    found = collections[names[-1]]
     sphere = viewpoints_of(viewpoints)
-    if recogniser is None:
-        knows: Recogniser = open_recogniser(found.recogniser, threads)
-        policies = found.policies
-    else:
-        knows = own_recogniser(recogniser)
-        # The policy of a memory belongs to its things.
-        policies = {name: card for name, card in found.policies.items() if name != DISCRIMINATE}
+    knows = _opened(collections, threads) if recogniser is None else own_recogniser(recogniser)
+    policies = found.policies
+    if recogniser is not None or len(names) > 1:  # the policy of a memory belongs to its things alone
+        policies = {name: card for name, card in policies.items() if name != DISCRIMINATE}
 
     share = _unknown_share(unknown, knows, str(found.recogniser) if recogniser is None else knows.name)
     if not share:
@@ -240,17 +244,35 @@ def load(
     return System(opened, made, name, sphere, rule, share, given)
 
 
-def _check_options(models: Any, policy: Any, threads: int, risk: float | None, unknown: float | None) -> None:
+def _check_options(policy: Any, threads: int, risk: float | None, unknown: float | None) -> None:
     """Refuse arguments of ``load`` that make no sense, before anything is opened; UsageError."""
-    named = {"models are": models, "a policy is": DEFAULT if policy is None else policy}
-    for what, value in named.items():
-        if not isinstance(value, str | Path):
-            raise UsageError(f"{what} given by name or path, not {one_line(repr(value))}")
+    if policy is not None and not isinstance(policy, str | Path):
+        raise UsageError(f"a policy is given by name or path, not {one_line(repr(policy))}")
     whole(threads, "the number of threads", 0, MOST_THREADS)
     if risk is not None:
         number(risk, "the risk")
     if unknown is not None and number(unknown, "the share of known objects called unknown", 0) >= 1:
         raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
+
+
+def _names_of(models: Any) -> list[str]:
+    """Names or paths of collections, one or several; UsageError if they are none, or one is there twice."""
+    given = list(models) if isinstance(models, list | tuple) else [models]
+    for name in given or [models]:
+        if not isinstance(name, str | Path):
+            raise UsageError(f"models are given by name or path, not {one_line(repr(name))}")
+    names = [str(name) for name in given]
+    if len(set(names)) < len(names):
+        raise UsageError(f"one of the models is there twice: {', '.join(names)}")
+    return names
+
+
+def _opened(collections: dict[str, Collection], threads: int) -> Recogniser:
+    """The recogniser of one collection, or that of several together."""
+    opened = {name: open_recogniser(found.recogniser, threads) for name, found in collections.items()}
+    if len(opened) > 1:
+        return SeveralRecognisers(opened)
+    return next(iter(opened.values()))
 
 
 def _unknown_share(asked: float | None, recogniser: Recogniser, called: str) -> float:
@@ -291,6 +313,8 @@ def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> "Ca
 
 def _default_policy(own: dict[str, Path], sphere: Viewpoints, recogniser: Recogniser) -> tuple[str, Policy]:
     """For taught things "discriminate"; "gain", where one fits, else "spread", which asks for nothing."""
+    if isinstance(recogniser, SeveralRecognisers):
+        return DISCRIMINATE, DiscriminateGeometry(sphere)
     if (memory := own.get(DISCRIMINATE)) is not None:
         return DISCRIMINATE, make_policy_anywhere(str(memory), sphere, (), recogniser.classes)
     try:

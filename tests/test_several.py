@@ -1,0 +1,110 @@
+"""Several collections at once: a thing by its geometry, else a class, else none of them."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from pipeline import box
+from test_poses import known, meshes, metric_scans  # noqa: F401  (fixtures)
+
+import nextview
+from nextview.data.samples import sample_mesh
+from nextview.errors import ModelError, UsageError
+from nextview.geometry.mesh import make_mesh
+from nextview.recognition.inference import Models, NetworkRecogniser
+from nextview.things.memory import TaughtRecogniser
+from nextview.things.recogniser import VerifiedRecogniser
+from nextview.things.several import SeveralRecognisers
+from nextview.things.unknown import KnownResiduals
+
+
+def memory_of(folder) -> VerifiedRecogniser:
+    memory = VerifiedRecogniser(folder / "memory.json", 1)
+    things = len(memory.things.names)
+    memory.things.residuals = KnownResiduals(np.full(things, 0.3), (np.linspace(-0.3, 0.3, 99),))
+    return memory
+
+
+@pytest.fixture(scope="module")
+def several(known):  # noqa: F811
+    return SeveralRecognisers({"modelnet10": NetworkRecogniser(threads=1), "mine": memory_of(known)})
+
+
+@pytest.fixture(scope="module")
+def system(several):
+    return replace(nextview.load(threads=1, policy="spread", unknown=0.02), models=Models(several, {}))
+
+
+def test_memories_come_first_and_names_that_two_know_are_told_apart(several, known):  # noqa: F811
+    assert several.classes[:4] == ("block", "bottle", "carton", "mug")
+    assert several.classes[4:] == NetworkRecogniser(threads=1).classes
+    twice = SeveralRecognisers({"mine": memory_of(known), "theirs": memory_of(known)})
+    assert twice.classes[0] == "block (mine)"
+    assert twice.classes[4] == "block (theirs)"
+
+
+@pytest.mark.parametrize("name", ["mug", "block"])
+def test_a_thing_is_named_with_its_pose(system, meshes, name):  # noqa: F811
+    result = system.recognise(meshes[name], seed=2)
+    assert result.answer == name
+    assert result.confident
+    assert result.pose_of == name
+    assert result.beliefs[name] > 0.9
+
+
+@pytest.mark.parametrize("name", ["chair", "table", "monitor"])
+@pytest.mark.parametrize("unit", ["cm", None])
+def test_a_class_is_named_where_no_thing_explains_what_is_seen(system, name, unit):
+    shown = replace(sample_mesh(name), unit=unit)
+    result = system.recognise(shown, start=12, seed=2)
+    assert result.answer == name
+    assert result.pose is None
+    assert result.why_no_pose
+    alone = nextview.load(threads=1, policy="spread").recognise(shown, start=12, seed=2)
+    ours = result.views[0].belief[4:]
+    np.testing.assert_allclose(ours / ours.sum(), alone.views[0].belief, atol=0.02 if unit else 1e-6)
+
+
+def test_what_is_neither_is_unknown(system):
+    ring = trimesh.creation.torus(0.09, 0.008)
+    stranger = trimesh.util.concatenate([ring, box((0.01, 0.01, 0.14), (0.09, 0, 0.07))])
+    result = system.recognise(make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1)
+    assert result.unknown
+    assert (result.answer, result.pose) == (None, None)
+
+
+def test_a_session_of_several_can_be_pickled(system, meshes):  # noqa: F811
+    session = replace(system, stopping=nextview.Stopping(1.0, 2)).session(start=3)
+    camera = nextview.SimulatedCamera(meshes["mug"])
+    session.update(camera.observe(session.pose))
+    other = pickle.loads(pickle.dumps(session))
+    other.update(camera.observe(other.pose))  # what was said of the first view is asked anew
+    assert len(other.views) == 2
+    assert len(session.views) == 1
+
+
+def test_what_cannot_be_put_together_is_refused(known):  # noqa: F811
+    network, memory = NetworkRecogniser(threads=1), memory_of(known)
+    with pytest.raises(ModelError, match="a, b: several collections are memories of things and at most one network"):
+        SeveralRecognisers({"a": network, "b": network})
+    with pytest.raises(ModelError, match="mine: knows no geometry of its things"):
+        SeveralRecognisers({"a": network, "mine": TaughtRecogniser(known / "memory.json", 1)})
+    memory.things.residuals = None
+    with pytest.raises(ModelError, match="mine: does not say how well its things are usually explained"):
+        SeveralRecognisers({"a": network, "mine": memory})
+
+
+@pytest.mark.parametrize(
+    ("models", "sentence"),
+    [
+        (["ycb", "ycb"], "one of the models is there twice: ycb, ycb"),
+        ([], r"models are given by name or path, not \[\]"),
+        (["ycb", 3], "models are given by name or path, not 3"),
+        (3, "models are given by name or path, not 3"),
+    ],
+)
+def test_what_names_no_models_is_refused(models, sentence):
+    with pytest.raises(UsageError, match=sentence):
+        nextview.load(models=models)
