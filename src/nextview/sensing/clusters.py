@@ -7,7 +7,9 @@ under its top; things that stand side by side lie apart.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -30,6 +32,10 @@ BRIDGE = 0.25  # share of the smaller of two clusters that a piece which joins t
 FEWEST = 0.15  # share of the pixels of a level cell that a piece shows over it, at least
 LIES_OVER = 0.5  # share of the cells of a piece that lie over, or beside, one of another frame, from which they are one
 BESIDE = 2  # cells up to which two pieces stand side by side
+WITHIN = 0.8  # share of the cells of a piece that lie within the outline of another one, from which they are one
+ON_OUTLINE = 0.5  # cells up to which one outside of an outline lies on it
+OUTLINED = 25  # cells of a piece with an outline, at least
+MOST_COMPARED = 200  # cells of a piece that are compared with those of another one
 TWO = 0.25  # share of the cells of an object that a part of it has which may be another thing
 OVER_PLANE = 0.1  # share of a thing's pixels over what is seen of the plane, at least: it may hide most of it
 BOTTOM_ROWS = 2  # rows of that picture that are its lower edge
@@ -53,6 +59,16 @@ class Footprint:
     pieces: Pieces
     area: Float
     pixels: NDArray[np.int64]
+
+    @cached_property
+    def outlines(self) -> dict[int, Float]:
+        """The convex outline of each larger piece: lines a x + b y + c <= 0 inside, in cells, (K, 3)."""
+        found = {}
+        many = np.bincount(self.piece, minlength=1)
+        for piece in np.flatnonzero(many >= OUTLINED):
+            with suppress(QhullError):  # all in a line
+                found[int(piece)] = ConvexHull(self.cells[self.piece == piece]).equations
+        return found
 
     def pixels_of(self, chosen: Mask) -> Mask:
         """Pixels of the pieces that have one of the chosen pairs, (H, W) bool."""
@@ -125,7 +141,8 @@ def clusters(footprints: Sequence[Footprint], joins: Joins = "by their border") 
     here, around = _cells_over(cells[near], node[near], int(first[-1]))
     size = np.maximum(here.sum(1), 1)
     shared, beside = here @ here.T / np.minimum.outer(size, size), around @ here.T > 0
-    strength, apart, either = _links(footprints, shared, beside, joins)
+    within = _within_outlines(footprints)
+    strength, apart, either = _links(footprints, shared, beside, within, joins)
     cluster, doubtful = _joined(strength, apart, size)
     for a, b in np.argwhere(np.triu(either)):  # in doubt until a frame shows which
         if cluster[a] != cluster[b] and not apart[np.ix_(cluster == cluster[a], cluster == cluster[b])].any():
@@ -152,13 +169,48 @@ def _cells_over(cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int) -
     return here[:, :-1], around[:, :-1]
 
 
-def _links(footprints: Sequence[Footprint], shared: Float, beside: Mask, joins: Joins) -> tuple[Float, Mask, Mask]:
+def _within_outlines(footprints: Sequence[Footprint]) -> Mask:
+    """Which pieces lie within the outline, seen from above, of which other one, (N, N) bool.
+
+    The bottom of a bathtub lies within its sides, the foot of a table under its top, and the knob of a lid within its
+    rim, with nothing but their plane between them. What lies farther from it than it is wide is another thing, in a
+    corner for instance.
+    """
+    cells = [foot.cells.astype(np.float64) for foot in footprints]
+    first = np.cumsum([0, *(len(foot.pieces.stands) for foot in footprints)])
+    within = np.zeros((first[-1], first[-1]), bool)
+    for foot, own, start in zip(footprints, cells, first, strict=False):
+        for piece, outline in foot.outlines.items():
+            its_cells = own[foot.piece == piece]
+            for other, there, at in zip(footprints, cells, first, strict=False):
+                inside = (there @ outline[:, :2].T + outline[:, 2] <= ON_OUTLINE).all(1)
+                count = np.bincount(other.piece, minlength=len(other.pieces.stands))
+                share = np.bincount(other.piece, inside, minlength=len(count)) / np.maximum(count, 1)
+                for inner in np.flatnonzero(share >= WITHIN):
+                    if at + inner != start + piece:
+                        inner_cells = there[other.piece == inner]
+                        within[at + inner, start + piece] = _is_close(inner_cells, its_cells)
+    return within
+
+
+def _is_close(inner: Float, outer: Float) -> bool:
+    """Whether some cells, (N, 2), are nearer to others, (M, 2), than they are wide."""
+    width = float(np.linalg.norm(np.ptp(inner, axis=0))) + 1
+    few, many = inner[:: max(1, len(inner) // MOST_COMPARED)], outer[:: max(1, len(outer) // MOST_COMPARED)]
+    gap = np.linalg.norm(few[:, None] - many, axis=2).min()
+    return bool(gap <= width)
+
+
+def _links(
+    footprints: Sequence[Footprint], shared: Float, beside: Mask, within: Mask, joins: Joins
+) -> tuple[Float, Mask, Mask]:
     """How strongly each two pieces are linked, 0 for not, which stand apart and which may, (N, N) each."""
     every = [f.pieces for f in footprints]
     same, stands = block_diag(*(np.ones_like(p.touch) for p in every)) > 0, np.concatenate([p.stands for p in every])
     names = "touch", "low", "inside", "hangs"
     touch, low, inside, hangs = (block_diag(*(getattr(p, name) for p in every)) > 0 for name in names)
-    inside |= inside.T | hangs | hangs.T
+    inside |= within | hangs
+    inside |= inside.T
     both, neither = np.logical_and.outer(stands, stands), ~np.logical_or.outer(stands, stands)
     strength = np.where(shared >= np.where(same, OVERLAP, LIES_OVER), shared, 0)
     touch &= ~(both & low) if joins == "by their border" else joins == "always"

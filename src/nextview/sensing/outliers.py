@@ -23,6 +23,8 @@ STEEPEST_SLOPE = 4.0  # of a surface towards the ray, between neighbours
 NOISE_GAP = 4.0  # standard deviations of depth that neighbours may differ by
 SMALLEST_GROUP = 0.01  # share of all points that a group away from the others has at least
 GAP_PIXELS = 6  # pixels that two groups are apart
+TRIMMED_BY_NOISE = 0.1  # share of the nearest and the farthest points left out, by the noise as a part of the size
+MOST_TRIMMED = 0.01
 
 
 def without_outliers(facets: Facets, noise: Noise, coarse: int) -> Facets:
@@ -52,7 +54,23 @@ def without_outliers(facets: Facets, noise: Noise, coarse: int) -> Facets:
     group = _groups(rows[kept] // GAP_PIXELS, columns[kept] // GAP_PIXELS, layer)
     share = np.bincount(group) / len(kept)
     kept = kept[share[group] >= SMALLEST_GROUP]
+    kept = kept[_within_its_depths(facets.points[kept], error[kept] / NOISE_GAP)]
     return facets.some(kept) if 0 < len(kept) < len(depth) else facets
+
+
+def _within_its_depths(points: Float, error: Float) -> Mask:
+    """Which points, (N, 3), are not the nearest or the farthest few, (N,) bool.
+
+    Where the noise is a large part of an object's size no neighbour tells a flying pixel, which lies before or behind
+    the object, from noise. So the more noise there is for its size, the more of its outermost depths are left out.
+    """
+    if not len(points):
+        return np.zeros(0, bool)
+    depth = points[:, 2]
+    size = float(np.ptp(points[:, :2], axis=0).max())
+    share = min(MOST_TRIMMED, TRIMMED_BY_NOISE * float(np.median(error)) / max(size, 1e-9))
+    nearest, farthest = np.quantile(depth, [share, 1 - share])
+    return np.asarray((depth >= nearest) & (depth <= farthest))
 
 
 def _enough_neighbours(rows: Index, columns: Index, depth: Float, slope: Float, error: Float) -> Mask:
