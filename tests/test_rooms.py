@@ -208,6 +208,53 @@ def test_flying_pixels_say_nothing_of_the_size(flying):
     assert radius_of(without_outliers(facets, EXACT, 1), pose) == pytest.approx(clean, rel=0.03)
 
 
+RIM = trimesh.creation.annulus(0.11, 0.13, 0.03).apply_translation((0, 0, 0.015))
+KNOB = box((0.05, 0.03, 0.05), (0, 0, 0.025))
+TROUGH = trimesh.util.concatenate(
+    [box((0.7, 0.04, 0.5), (0, y, 0.25)) for y in (-0.38, 0.38)]
+    + [box((0.04, 0.8, 0.5), (x, 0, 0.25)) for x in (-0.35, 0.35)]
+    + [box((0.2, 0.2, 0.12), (0, 0, 0.06))]
+)
+
+
+@pytest.mark.parametrize("asked", ["aim", "point"])
+@pytest.mark.parametrize("name", ["lid", "trough"])
+def test_what_lies_within_the_outline_of_a_thing_is_a_part_of_it(name, asked):
+    mesh = {"lid": trimesh.util.concatenate([RIM, KNOB]), "trough": TROUGH}[name]
+    ground = TABLE if name == "lid" else FLOOR
+    pose = pose_at(50, 30, 0.5 if name == "lid" else 2.0, middle_of(mesh))
+    thing = ObservedObject(point=middle_of(mesh) if asked == "point" else None)
+    thing.add(frame([mesh, ground], pose))
+    assert_is(thing, mesh)
+
+
+@pytest.mark.parametrize("azimuth", [-60, -45, -30])
+def test_what_stands_in_a_corner_is_no_part_of_it(azimuth):
+    corner = [box((0.06, 1.2, 0.9), (-0.6, 0, 0.45)), box((1.2, 0.06, 0.9), (0, 0.6, 0.45))]
+    crate = box((0.2, 0.2, 0.25), (-0.15, 0.15, 0.125))
+    thing = ObservedObject(point=middle_of(crate))
+    thing.add(frame([crate, trimesh.util.concatenate(corner), FLOOR], pose_at(30, azimuth, 2.2, middle_of(crate))))
+    assert_is(thing, crate)
+
+
+@pytest.mark.parametrize("shift", [-0.8, 0.8])
+@pytest.mark.parametrize("share", [0.0, 0.004])
+def test_where_noise_is_large_few_pixels_before_and_behind_a_thing_say_nothing_of_its_size(share, shift):
+    crate = box((0.4, 0.5, 0.5), (0, 0, 0.25))
+    pose = pose_at(20, 30, 3.0, middle_of(crate))
+    seen = frame([crate, FLOOR], pose, sigma=0.008, mask_of=0)
+    # Small groups of pixels, which no look at their neighbours tells from the noise.
+    rows, columns = np.nonzero(seen.mask)
+    chosen = np.random.default_rng(1).choice(len(rows), int(share * len(rows) / 4), replace=False)
+    depth = seen.depth.copy()
+    for down in (0, 1):
+        for right in (0, 1):
+            depth[rows[chosen] + down, columns[chosen] + right] += shift
+    thing = ObservedObject()
+    thing.add(Frame(depth, INTRINSICS, pose, mask=seen.mask, pixel_centre=0.5))
+    assert_is(thing, crate, radius=0.12)
+
+
 def radius_of(facets, pose) -> float:
     return enclose(facets.points @ pose[:3, :3].T + pose[:3, 3], np.eye(3), 0.0).radius
 

@@ -35,7 +35,9 @@ BESIDE = 2  # cells up to which two pieces stand side by side
 WITHIN = 0.8  # share of the cells of a piece that lie within the outline of another one, from which they are one
 ON_OUTLINE = 0.5  # cells up to which one outside of an outline lies on it
 OUTLINED = 25  # cells of a piece with an outline, at least
-MOST_COMPARED = 200  # cells of a piece that are compared with those of another one
+MOST_COMPARED = 50  # cells of a piece that are compared with those of another one
+DIRECTIONS = 24
+SURROUNDED = 0.85  # share of the directions from what lies within a piece in which it has cells
 TWO = 0.25  # share of the cells of an object that a part of it has which may be another thing
 OVER_PLANE = 0.1  # share of a thing's pixels over what is seen of the plane, at least: it may hide most of it
 BOTTOM_ROWS = 2  # rows of that picture that are its lower edge
@@ -141,7 +143,7 @@ def clusters(footprints: Sequence[Footprint], joins: Joins = "by their border") 
     here, around = _cells_over(cells[near], node[near], int(first[-1]))
     size = np.maximum(here.sum(1), 1)
     shared, beside = here @ here.T / np.minimum.outer(size, size), around @ here.T > 0
-    within = _within_outlines(footprints)
+    within = _within_outlines(footprints, shared)
     strength, apart, either = _links(footprints, shared, beside, within, joins)
     cluster, doubtful = _joined(strength, apart, size)
     for a, b in np.argwhere(np.triu(either)):  # in doubt until a frame shows which
@@ -169,36 +171,47 @@ def _cells_over(cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int) -
     return here[:, :-1], around[:, :-1]
 
 
-def _within_outlines(footprints: Sequence[Footprint]) -> Mask:
-    """Which pieces lie within the outline, seen from above, of which other one, (N, N) bool.
+def _within_outlines(footprints: Sequence[Footprint], shared: Float) -> Mask:
+    """Which pieces lie within the outline, seen from above, of which other one that is the same thing, (N, N) bool.
 
-    The bottom of a bathtub lies within its sides, the foot of a table under its top, and the knob of a lid within its
-    rim, with nothing but their plane between them. What lies farther from it than it is wide is another thing, in a
-    corner for instance.
+    Of one frame that is one which surrounds them: the sides of a bathtub its bottom, the top of a table its foot, and
+    the rim of a lid its knob, with nothing but the plane between them; what stands in a corner is not surrounded. Of
+    another frame it may also be one beside which they lie: other sides of a box. Those that share cells anyway, by a
+    share of the cells of the smaller one, (N, N), are not looked at.
     """
-    cells = [foot.cells.astype(np.float64) for foot in footprints]
     first = np.cumsum([0, *(len(foot.pieces.stands) for foot in footprints)])
+    node = np.concatenate([foot.piece + start for foot, start in zip(footprints, first, strict=False)])
+    cells = np.concatenate([foot.cells for foot in footprints]).astype(np.float64)
+    many = np.maximum(np.bincount(node, minlength=first[-1]), 1)
+
     within = np.zeros((first[-1], first[-1]), bool)
-    for foot, own, start in zip(footprints, cells, first, strict=False):
+    for k, foot in enumerate(footprints):
         for piece, outline in foot.outlines.items():
-            its_cells = own[foot.piece == piece]
-            for other, there, at in zip(footprints, cells, first, strict=False):
-                inside = (there @ outline[:, :2].T + outline[:, 2] <= ON_OUTLINE).all(1)
-                count = np.bincount(other.piece, minlength=len(other.pieces.stands))
-                share = np.bincount(other.piece, inside, minlength=len(count)) / np.maximum(count, 1)
-                for inner in np.flatnonzero(share >= WITHIN):
-                    if at + inner != start + piece:
-                        inner_cells = there[other.piece == inner]
-                        within[at + inner, start + piece] = _is_close(inner_cells, its_cells)
+            its_node = first[k] + piece
+            outer = cells[node == its_node]
+            near = np.flatnonzero(((cells >= outer.min(0)) & (cells <= outer.max(0))).all(1))
+            inside = (cells[near] @ outline[:, :2].T + outline[:, 2] <= ON_OUTLINE).all(1)
+            share = np.bincount(node[near], inside, minlength=first[-1]) / many
+            share[its_node] = 0  # of itself all
+            for inner in np.flatnonzero((share >= WITHIN) & (shared[its_node] < LIES_OVER)):
+                own = cells[node == inner]
+                other_frame = not first[k] <= inner < first[k + 1]
+                within[inner, its_node] = _surrounds(outer, own) or (other_frame and _lie_beside(own, outer))
     return within
 
 
-def _is_close(inner: Float, outer: Float) -> bool:
-    """Whether some cells, (N, 2), are nearer to others, (M, 2), than they are wide."""
-    width = float(np.linalg.norm(np.ptp(inner, axis=0))) + 1
-    few, many = inner[:: max(1, len(inner) // MOST_COMPARED)], outer[:: max(1, len(outer) // MOST_COMPARED)]
-    gap = np.linalg.norm(few[:, None] - many, axis=2).min()
-    return bool(gap <= width)
+def _surrounds(outer: Float, inner: Float) -> bool:
+    """Whether some cells, (N, 2), lie in most directions from the middle of others, (M, 2)."""
+    away = outer - np.median(inner, 0)
+    direction = np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) + 0.5) * DIRECTIONS).astype(np.int64)
+    seen = np.bincount(np.minimum(direction, DIRECTIONS - 1), minlength=DIRECTIONS) > 0
+    return bool(seen.mean() >= SURROUNDED)
+
+
+def _lie_beside(some: Float, others: Float) -> bool:
+    """Whether half of some cells, (N, 2), lie on others, (M, 2), or beside them."""
+    gap = np.abs(some[:: max(1, len(some) // MOST_COMPARED), None] - others).max(2).min(1)
+    return bool((gap <= BESIDE).mean() >= LIES_OVER)
 
 
 def _links(
