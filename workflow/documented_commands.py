@@ -24,7 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
@@ -225,9 +225,7 @@ def _in_table(page: str, number: int, line: str) -> Iterator[Step]:
 
 def make_inputs(folder: Path) -> None:
     """What the commands of the pages find in their working folder."""
-    from pipeline import FURNITURE, boxes_mesh, write_off
-
-    from nextview.data.samples import SAMPLES
+    from nextview.data.samples import SAMPLES, boxes_mesh
     from nextview.recognition.model_card import find_card
 
     for name in ("samples", "benchmarks", "research", "examples", "docs", "workflow"):
@@ -235,7 +233,7 @@ def make_inputs(folder: Path) -> None:
     held_out = find_card("recogniser-modelnet10").held_out
     rng = np.random.default_rng(0)
     test = {"chair": ("chair_0890", "chair_0917"), "table": ("table_0399", "table_0400")}
-    for label in FURNITURE:
+    for label in SAMPLES:
         learned = [name for name in held_out if name.rpartition("_")[0] == label][:3]
         names = [(name, "train") for name in (*learned, f"{label}_0001", f"{label}_0002")]
         names += [(name, "test") for name in test.get(label, (f"{label}_0470", f"{label}_0471"))]
@@ -243,11 +241,13 @@ def make_inputs(folder: Path) -> None:
             scale = rng.uniform(0.8, 1.25, 3)
             boxes = [tuple(tuple(np.multiply(corner, scale)) for corner in box) for box in SAMPLES[label]()]
             mesh = boxes_mesh(boxes, label)
-            inches = rng.uniform(15, 30) * mesh.vertices
-            write_off(folder / "data/ModelNet10" / label / split / f"{name}.off", replace(mesh, vertices=inches))
+            inches = trimesh.Trimesh(rng.uniform(15, 30) * mesh.vertices, mesh.faces, process=False)
+            path = folder / "data/ModelNet10" / label / split / f"{name}.off"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            inches.export(path)
     for copy in ("ModelNet10", "DATASET/ModelNet10"):
         shutil.copytree(folder / "data/ModelNet10", folder / copy)
-    for label in FURNITURE:  # of classes that no recogniser knows
+    for label in SAMPLES:  # of classes that no recogniser knows
         shutil.copytree(folder / "data/ModelNet10" / label / "test", folder / "PSB" / f"strange_{label}")
     shutil.copytree(folder / "data/ModelNet10/chair/test", folder / "chairs")
     shutil.copy(folder / "samples/chair.off", folder)
@@ -336,9 +336,12 @@ class Environments:
 
     Attributes:
         folder: in which they lie.
+        base: the folder of the programs of a base installation that is there already, to be used instead; if it is
+            given, there are no others.
     """
 
     folder: Path
+    base: Path | None = None
     _made: dict[frozenset[str], Path] = field(default_factory=dict)
 
     def programs(self, needs: frozenset[str]) -> Path:
@@ -347,6 +350,8 @@ class Environments:
         Args:
             needs: what is installed besides the base installation, as pip is told: "nextview[train]", "research".
         """
+        if self.base is not None:
+            return self.base
         from linked_environment import installation
 
         if needs not in self._made:
@@ -391,8 +396,11 @@ def run_page(page: str, environments: Environments, folder: Path, beside: Path |
     needs_of_python: frozenset[str] = frozenset()
     for step in steps_of(page):
         where = f"{step.page}:{step.line}"
-        if step.why_not is not None:
-            print(f"  not run  {where}  {step.text}  ({step.why_not})", flush=True)
+        why_not = step.why_not
+        if environments.base is not None and step.needs and why_not is None:
+            why_not = f"needs {', '.join(sorted(step.needs))}"
+        if why_not is not None:
+            print(f"  not run  {where}  {step.text}  ({why_not})", flush=True)
             continue
 
         command = step.command
@@ -416,11 +424,12 @@ def run_page(page: str, environments: Environments, folder: Path, beside: Path |
     return failed
 
 
-def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), only_list: bool = False) -> None:
+def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), base: Path | None = None, only_list: bool = False) -> None:
     """Run the commands of pages.
 
     Args:
         pages: of the repository; all that have commands by default.
+        base: the folder of the programs of a base installation: all that needs no more is run there, and nothing else.
         only_list: only show what would be run, and what not and why.
     """
     chosen = pages or PAGES
@@ -431,7 +440,7 @@ def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), only_list: bool = Fa
 
     failed = []
     with tempfile.TemporaryDirectory(prefix="documented-") as place:
-        environments = Environments(Path(place) / "environments")
+        environments = Environments(Path(place) / "environments", base)
         inputs = Path(place) / "inputs"
         inputs.mkdir()
         make_inputs(inputs)
