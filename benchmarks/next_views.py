@@ -477,15 +477,20 @@ def _row(cells: list[str]) -> str:
 
 
 def load_things(models: str, scans: Path) -> tuple[TaughtThings, list[Mesh]]:
-    """A memory joined with the scans of its things."""
+    """A memory's things of known geometry, and their scans; a memory without geometry takes it from the scans."""
     recogniser = TaughtRecogniser(models, threads=1)
     assert recogniser.card.memory is not None
     names = [thing.name for thing in recogniser.card.memory.things]
+    known = TaughtThings.of(recogniser)
+    if known is not None:
+        names = list(known.names)
     files = {path.stem: path for path in scans.iterdir() if path.is_file()}
     missing = [name for name in names if name not in files]
     if missing:
         raise UsageError(f"{scans}: holds no scan of {missing[0]}")
     meshes = [load_mesh(files[name], unit="m") for name in track(names, "scans")]
+    if known is not None:
+        return known, meshes
     surfaces = [Surface.from_mesh(mesh, name).simplified() for mesh, name in zip(meshes, names, strict=True)]
     return TaughtThings(recogniser, surfaces), meshes
 
