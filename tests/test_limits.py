@@ -8,7 +8,7 @@ from pipeline import TABLE, box, cast, pose_at
 
 import nextview
 from nextview import Session, Stopping, ViewSphere
-from nextview.errors import UsageError
+from nextview.errors import SessionError, UsageError
 from nextview.policies.registry import make_policy
 from nextview.sensing import Frame, ObservedObject
 from nextview.session.limits import BEHIND_WALL, HIDDEN, TOO_HIGH, TOO_LOW, TOO_NEAR, Limits
@@ -245,7 +245,7 @@ def test_a_session_for_a_robot_takes_the_limits_at_its_beginning():
     ],
 )
 def test_limits_that_make_no_sense_are_refused(wrong):
-    with pytest.raises(UsageError, match="metres, is a number"):
+    with pytest.raises(UsageError, match=r"metres,.* is a number"):
         Limits(**wrong)
 
 
@@ -268,3 +268,52 @@ def test_the_values_of_a_view_rank_the_candidates():
     taken = {earlier.index for earlier in session.views}
     left = [k for k in range(40) if not session.left_out[k] and k not in taken and np.isfinite(view.values[k])]
     assert session.view == max(left, key=lambda k: view.values[k])
+
+
+# What is set by hand
+
+
+@pytest.mark.parametrize("wrong", [np.nan, -0.3, 0, "0.5", np.inf, True])
+def test_a_distance_that_is_none_is_refused_and_the_last_one_stays(tiny, wrong):
+    session = begin(tiny)
+    with pytest.raises(UsageError, match="the distance, in metres"):
+        session.distance = wrong
+    assert session.distance == 0.5
+
+
+def test_a_distance_inside_the_object_is_refused_once_its_size_is_known(tiny):
+    session = begin(tiny)
+    session.update(look(FROM, BRICK, TABLE))
+    with pytest.raises(UsageError, match="from the centre of an object"):
+        session.distance = 0.03
+    session.distance = 0.7
+    centre = session.object.object_frame.centre
+    np.testing.assert_allclose(np.linalg.norm(places(session) - centre, axis=1), 0.7)
+
+
+def test_before_the_first_frame_no_view_has_failed(tiny):
+    session = begin(tiny)
+    with pytest.raises(SessionError, match="the first frame comes from wherever the camera stands"):
+        session.failed()
+    session.failed(3)
+    session.update(look(FROM, BRICK, TABLE))
+    assert session.left_out[3] == "failed"
+
+
+@pytest.mark.parametrize("wrong", [{"min_height": 100}, {"clearance": 50}, {"max_height": 1400}])
+def test_limits_in_another_unit_are_refused(wrong):
+    with pytest.raises(UsageError, match=r"metres.* of at most 10"):
+        Limits(**wrong)
+
+
+def test_what_a_masked_array_hides_is_out_of_reach(tiny):
+    session = begin(tiny)
+    hidden = np.arange(40) % 2 == 0
+    session.reachable = np.ma.array(np.ones(40, bool), mask=hidden)
+    np.testing.assert_array_equal(session.reachable, ~hidden)
+
+    ways = np.zeros((40, 40), bool)
+    ways[:, hidden] = True
+    session.travel_cost = np.ma.array(np.ones((40, 40), int), mask=ways)
+    assert np.isinf(session.travel_cost[ways]).all()
+    assert (session.travel_cost[~ways] == 1).all()

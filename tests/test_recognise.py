@@ -18,7 +18,7 @@ from pipeline import SAMPLE_FILES, refused, run_python
 import nextview
 from nextview import ViewSphere
 from nextview.cli.main import main
-from nextview.errors import ModelError, UsageError
+from nextview.errors import ModelError, NextviewError, ResultsError, UsageError
 from nextview.policies.policy_card import bundled_policies
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import BUNDLED, RECOGNISER, bundled_cards
@@ -229,3 +229,39 @@ def test_plain_names_look_at_no_other_font(caplog, monkeypatch):
     _, text = drawn("night stand, 45° um $2")
     assert text.get_text() == "night stand, 45° um $2"
     assert not caplog.records
+
+
+# Names
+
+
+@pytest.mark.parametrize("name", ["", "  "])
+def test_an_empty_name_is_refused(name):
+    with pytest.raises(UsageError, match="empty name"):
+        nextview.recognise(name)
+
+
+@pytest.mark.parametrize("end", ["", ".off", ".ply"])
+def test_a_name_that_is_too_long_for_the_system_is_no_file(end):
+    with pytest.raises(NextviewError) as found:
+        nextview.recognise(5000 * "a" + end)
+    assert len(str(found.value)) < 6000
+    assert "\n" not in str(found.value)
+
+
+def test_a_plot_is_written_as_every_output_is(chair, tmp_path):
+    result = nextview.recognise(chair, start=3)
+    target = tmp_path / "kept.png"
+    target.write_bytes(b"kept")
+    (tmp_path / "link.png").symlink_to(target)
+    (tmp_path / "folder.png").mkdir()
+    for name in ("link.png", "folder.png"):
+        with pytest.raises(ResultsError, match=name):
+            result.plot(tmp_path / name)
+    for name in ("episode", "episode.docx"):
+        with pytest.raises(UsageError, match="a figure is written as"):
+            result.plot(tmp_path / name)
+    assert target.read_bytes() == b"kept"
+    for _ in range(2):  # the second one replaces the first
+        result.plot(str(tmp_path / "episode.png"))
+    assert (tmp_path / "episode.png").read_bytes().startswith(b"\x89PNG")
+    assert len(list(tmp_path.iterdir())) == 4

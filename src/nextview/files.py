@@ -22,6 +22,7 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 import numpy as np
 
+from nextview.checks import one_line
 from nextview.errors import DatasetError, ModelError, NextviewError, ResultsError
 
 T = TypeVar("T")
@@ -29,6 +30,7 @@ Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]  # a field of a 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a full disk
 MARKER = "nextview-unfinished.json"  # in each temporary folder: an ``Unfinished`` record
 LONGEST_NAME = 40  # letters of an output's name that the name of its temporary folder holds
+LONGEST_PATH = 300  # letters of a path that a sentence shows
 LARGEST_RECORD = 64 * 2**20  # bytes of a JSON record; a card takes some hundred thousand
 
 
@@ -300,8 +302,9 @@ def regular_file(path: Path, what: str, error: type[NextviewError], largest: int
 
     Else it is an ``error``, which says ``what`` it should be ("a model card"); ``largest`` is a size in bytes.
     """
-    if not path.exists():
-        raise error(f"{path}: no such file")
+    # Not Path.exists, which raises where a name is too long.
+    if not os.path.exists(path):
+        raise error(f"{one_line(str(path), LONGEST_PATH)}: no such file")
     if not path.is_file():
         raise error(f"{path}: is no file, so not {what}")
     if largest is not None and path.stat().st_size > largest:

@@ -15,8 +15,11 @@ ARGUMENTS = {
     "models": ("modelnet10", "bundled models, or a folder"),
     "policy": ("", "how the next view is chosen; empty for what goes with the models"),
     "life_size": ("false", "the objects are as large as their kind is in life"),
+    "min_height": ("nan", "metres of the camera above the support plane, at least; nan for the usual limit"),
+    "max_height": ("nan", "metres of the camera above the support plane, at most; nan for the usual limit"),
+    "clearance": ("nan", "metres between the camera and what the frames show; nan for the usual limit"),
 }
-TYPES = {"rectified": bool, "life_size": bool}
+TYPES = {"rectified": bool, "life_size": bool, "min_height": float, "max_height": float, "clearance": float}
 
 
 def generate_launch_description():

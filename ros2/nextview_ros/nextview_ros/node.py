@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import replace
 
@@ -35,6 +36,9 @@ PARAMETERS = {
     "rectified": True,
     "axes": "opencv",
     "life_size": False,
+    "min_height": math.nan,  # metres; where it is NaN the limit is that of nextview's sessions
+    "max_height": math.nan,
+    "clearance": math.nan,
     "patience": 2.0,  # seconds to wait for an image that was taken after a look was asked for
 }
 
@@ -76,6 +80,11 @@ class RecogniseNode(Node):
     def value(self, name: str):
         """A parameter."""
         return self.get_parameter(name).value
+
+    def limit(self, name: str) -> float | None:
+        """A limit of the views that are asked for, metres; None for the usual one."""
+        given = self.value(name)
+        return None if math.isnan(given) else given
 
     # Images
 
@@ -162,7 +171,8 @@ class RecogniseNode(Node):
         # Things are as large as they were taught, and known by it.
         life_size = self.value("life_size") or isinstance(self.system.models.recogniser, JudgesTogether)
         thing = ObservedObject(point=near[0] if near else None, life_size=life_size)
-        return replace(self.system, stopping=stopping).session(object=thing, distance=asked.distance or None)
+        limits = {name: self.limit(name) for name in ("min_height", "max_height", "clearance")}
+        return replace(self.system, stopping=stopping).session(object=thing, distance=asked.distance or None, **limits)
 
     # The services
 

@@ -1,5 +1,6 @@
 """Read a mesh file and bring it into the object frame."""
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -154,7 +155,7 @@ def load_mesh(
         raise MeshError(f"{path}: the up axis is y or z, not {one_line(repr(up))}")
     if unit is not None and unit not in UNITS:
         raise MeshError(f"{path}: the unit is one of {', '.join(UNITS)}, not {one_line(repr(unit))}")
-    if suffix not in FORMATS and not path.is_dir():
+    if suffix not in FORMATS and not os.path.isdir(path):
         raise MeshError(f"{path}: not a mesh format nextview reads ({', '.join(FORMATS)})")
     regular_file(path, "a mesh", MeshError)
     most = BYTES_PER_FACE * whole(max_faces, "the largest number of faces", 1)

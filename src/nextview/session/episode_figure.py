@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from nextview.errors import UsageError
+from nextview.files import new_file
 from nextview.geometry.ray_caster import RayCaster, Triangles, pixel_rays
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere, great_circle, look_at_origin
 from nextview.recognition.belief import Stopping
@@ -25,6 +26,7 @@ from nextview.session.view import View
 
 WIDE, GAP, LARGE = 2.2, 0.3, 6.0  # inches: of a column, between two, and of the large picture at most
 SHOWN = 4  # classes
+FIGURE_FORMATS = (".png", ".pdf", ".svg")
 RING, RIM = "#cdbfa6", "#a8977a"  # of the dome: its lines, its candidate views
 VALUES = LinearSegmentedColormap.from_list("value", ["#f1e9da", "#9cc3dc", BLUE])
 DOME, AWAY = 1.35, 10.0  # how far from the object its candidate views are drawn, and the eye is, object radii
@@ -32,11 +34,19 @@ NUMBER: dict[str, Any] = {"ha": "center", "va": "center_baseline", "color": "whi
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure into a PNG, PDF or SVG file."""
-    try:
-        figure.savefig(path, dpi=120)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path}: the figure cannot be written ({error})") from None
+    """Write a figure into a PNG, PDF or SVG file, whole or not at all; one of that name is replaced.
+
+    Raises:
+        UsageError: it is another format.
+        ResultsError: the path is a link or a folder, or cannot be written.
+    """
+    if path.suffix.lower() not in FIGURE_FORMATS:
+        raise UsageError(f"{path}: a figure is written as {', '.join(FIGURE_FORMATS)}")
+    with new_file(path, overwrite=True) as part:
+        try:
+            figure.savefig(part, dpi=120)
+        except ValueError as error:
+            raise UsageError(f"{path}: the figure cannot be written ({error})") from None
 
 
 @matplotlib.rc_context(STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER})

@@ -21,6 +21,8 @@ GRAZING = 0.1
 """Height over the support plane in parts of the distance to the object, 6 degrees: from lower the plane is a line."""
 HIGHEST = 2.0
 """Metres above the support plane that no camera of a robot reaches."""
+MOST_METRES = 10.0
+"""Heights and clearances beyond are of another unit: no candidate view would be left."""
 CLEARANCE = 0.1  # metres between the camera and what the frames show
 TOO_LOW = "too low"
 TOO_HIGH = "too high"
@@ -53,11 +55,12 @@ class Limits:
 
     def __post_init__(self) -> None:
         if self.min_height is not None:
-            number(self.min_height, "the least height of a camera, metres,")
+            number(self.min_height, "the least height of a camera, metres,", most=MOST_METRES)
         if self.max_height is not None and self.max_height != np.inf:
-            number(self.max_height, "the greatest height of a camera, metres,", above=self.min_height or 0.0)
+            what = "the greatest height of a camera, metres, or infinity for none,"
+            number(self.max_height, what, most=MOST_METRES, above=self.min_height or 0.0)
         if self.clearance is not None:
-            number(self.clearance, "the clearance of a camera, metres,", 0)
+            number(self.clearance, "the clearance of a camera, metres,", 0, MOST_METRES)
 
     @classmethod
     def none(cls) -> "Limits":

@@ -14,10 +14,12 @@ from nextview.policies.base import EpisodeState, travel_from
 
 Float = NDArray[np.float64]
 Reachable = NDArray[np.bool_] | Callable[[Float], bool]
-"""Which candidate views the camera can be brought to: (V,) bool; or a function of a pose of ``Session.poses``."""
+"""Which candidate views the camera can be brought to: (V,) bool; or a function of a pose of ``Session.poses``. What a
+masked array hides cannot be reached."""
 TravelCost = Float | Callable[[Float, Float], float]
 """What it costs to go from one view to another, in any unit: (V, V), row from, column to; or a function of two poses in
-the frame of ``Session.poses``, the first that where the camera stands. Infinity where there is no way."""
+the frame of ``Session.poses``, the first that where the camera stands. Infinity, or masked out, where there is no
+way."""
 Poses = Callable[[], Float]  # gives the candidate poses, (V, 4, 4); called only where a function has to be asked
 
 
@@ -86,6 +88,8 @@ def as_reachable(given: ArrayLike | Callable[[Float], bool] | None, views: int) 
     if given is None or callable(given):
         return given
     mask = np.asarray(given)
+    if np.ma.isMaskedArray(given):  # what is masked out is not known to be reachable
+        mask = np.ma.filled(given, False)
     if mask.shape != (views,) or mask.dtype != bool:
         wanted = f"reachable is a mask, ({views},) bool, or a callable on poses"
         raise UsageError(f"{wanted}, not {mask.dtype} {mask.shape}")
@@ -97,6 +101,8 @@ def as_travel_cost(given: ArrayLike | Callable[[Float, Float], float] | None, vi
     if given is None or callable(given):
         return given
     costs = np.asarray(given)
+    if np.ma.isMaskedArray(given) and costs.dtype.kind in "fiu":  # for a way that is masked out no cost is known
+        costs = np.ma.filled(np.ma.asarray(given, np.float64), np.inf)
     if costs.dtype.kind not in "fiu" or costs.shape != (views, views) or not (costs >= 0).all():
         raise UsageError(f"a travel cost is a matrix, ({views}, {views}) of numbers from 0 on, or a callable on poses")
     return costs.astype(np.float64)

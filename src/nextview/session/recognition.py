@@ -251,7 +251,8 @@ class Recognition:
         """Draw the episode: images, what the policy valued the views at, beliefs and the path on the sphere.
 
         The outline of the scan of the thing that was named, in its pose, is drawn over the images.
-        With a path it is written to that file too, PNG, PDF or SVG; UsageError if it cannot be.
+        With a path it is written to that file too, PNG, PDF or SVG, and replaces one of that name. UsageError: it is
+        another format. ResultsError: the path is a link or a folder, or cannot be written.
         """
         from nextview.session.episode_figure import draw_episode, save_figure
 

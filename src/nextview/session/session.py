@@ -130,9 +130,8 @@ class Session:
             raise UsageError(f"{wanted}, not {one_line(repr(object))}")
         if number(unknown, "the share of known objects called unknown", 0) >= 1:
             raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
-        if distance is not None:
-            number(distance, "the distance, in metres,", above=0)
-        self.models, self.policy, self.sphere, self.distance = models, policy, sphere, distance
+        self.models, self.policy, self.sphere = models, policy, sphere
+        self._distance = _checked_distance(distance)
         self.object = _new_object() if object is None and distance is not None else object
         self.stopping, self.unknown = stopping or Stopping.of(models.recogniser.calibration), unknown
         self.views: list[View] = []
@@ -251,6 +250,27 @@ class Session:
         left[[view.index for view in self.views]] = False
         return left & ~self._reach.failed & (self._reasons(self.object) == "")
 
+    @property
+    def distance(self) -> float | None:
+        """How far from the object's centre the camera shall stand, metres; None for ``sphere.distance`` object radii.
+
+        What is set here counts from the next pose on.
+        """
+        return self._distance
+
+    @distance.setter
+    def distance(self, given: float | None) -> None:
+        with self._lock:
+            checked = _checked_distance(given)
+            before = self._distance
+            self._distance = checked
+            if self.object is not None and self.object.sightings:
+                try:
+                    self._check_distance(self.object.object_frame.radius)
+                except UsageError:
+                    self._distance = before
+                    raise
+
     # What the robot can do
 
     @property
@@ -328,6 +348,10 @@ class Session:
         with self._lock:
             if self.done:
                 raise SessionError("this session has ended; begin another one")
+            known = self.object is None or self.object.sightings or self.object.known is not None
+            if view is None and not known:
+                what = "no view was asked for yet, so none has failed"
+                raise SessionError(f"{what}: the first frame comes from wherever the camera stands")
             view = self.view if view is None else whole(view, "a view", 0, len(self.sphere) - 1)
             self._set_reach(replace(self._reach, failed=self._reach.failed | (np.arange(len(self.sphere)) == view)))
 
@@ -635,6 +659,11 @@ class Session:
 
 def _next_of(step: Step) -> int | None:
     return None if step.stopped[0] else int(step.next_views[0])
+
+
+def _checked_distance(given: float | None) -> float | None:
+    """A distance of the camera, metres, above 0; or None."""
+    return None if given is None else number(given, "the distance, in metres,", above=0)
 
 
 def _new_object() -> ObservedObject:

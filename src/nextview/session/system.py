@@ -1,5 +1,6 @@
 """The front door: a recogniser, maps, a policy, candidate viewpoints and a stopping rule that belong together."""
 
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -132,10 +133,12 @@ class System:
             UsageError: there is no such sensor, or ``what`` is nothing to look at.
             ObservationError: the object is found in none of the captured views.
         """
-        if largest_part and not (isinstance(what, str | Path) and not Path(what).is_dir()):
+        if largest_part and not (isinstance(what, str | Path) and not os.path.isdir(what)):
             raise UsageError("the largest part is taken of a mesh file while it is read")
+        if isinstance(what, str) and not what.strip():
+            raise UsageError("what is looked at has an empty name; give a mesh file or a folder of views")
         if isinstance(what, str | Path):
-            if Path(what).is_dir():
+            if os.path.isdir(what):  # not Path.is_dir, which raises where a name is too long
                 what = _camera_of(Path(what), up)
             elif up is None or isinstance(up, str):
                 what = load_mesh(what, up, unit, largest_part=largest_part)
