@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -44,7 +44,6 @@ from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.simulation.scene import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
-from nextview.simulation.sensor import sensor_named
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.registration import rotation_about_z
 from nextview.things.surface import Surface
@@ -56,9 +55,6 @@ from nextview.things.weighing import JudgedEpisode, fit_weights
 Float = NDArray[np.float64]
 
 SPHERE = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
-NEAREST = 0.25  # metres between the camera and the surface, at least
-USUAL = 0.45  # metres between the camera and the centre, at most
-RADII_AWAY = 5.0
 CONFIDENT = 0.97
 REJECTED = 0.02  # p-value below which a thing is called unknown
 POINTS = 1000  # of a surface, for symmetries and ADD-S
@@ -222,15 +218,10 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: 
         poses = np.random.default_rng([thing, draw, 1])
         turn = turn @ poses.choice(taught.resting_poses(thing))
     standing = rotated(mesh, turn)
-    radius = standing.metres
-    assert radius is not None
-
-    distance = max(NEAREST + radius, min(USUAL, RADII_AWAY * radius))
-    sensor = replace(sensor_named(setting.sensor), radius=radius, distance=distance)
     around = None
     if setting.clutter:
         around = boxes_around(standing.vertices, setting.clutter, np.random.default_rng([thing, draw, 2]))
-    camera = SensedCamera(standing, sensor, np.random.default_rng([thing, draw, 7]), around=around)
+    camera = SensedCamera(standing, setting.sensor, np.random.default_rng([thing, draw, 7]), around=around)
     observations = []
     cameras = []
     for view in rng.permutation(len(SPHERE)):

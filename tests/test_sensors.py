@@ -10,10 +10,11 @@ from scipy.stats import norm
 
 import nextview
 from nextview import SimulatedCamera, ViewSphere
-from nextview.data.rendering import RenderOptions, render
+from nextview.data.rendering import Deform, RenderOptions, render
 from nextview.data.samples import sample_mesh
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError
+from nextview.geometry.mesh import make_mesh
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import ERRORS, SENSORS, Sensor, SensorMix, sensor_named
 
@@ -283,3 +284,45 @@ def test_a_store_of_a_sensor_resumes_to_the_bit_and_with_no_other(furniture, tmp
         np.testing.assert_array_equal(a.group[name][:], b.group[name][:], err_msg=name)
     list(rendered(furniture, clean))
     assert "sensor" not in ViewStore.open(clean).group.attrs
+
+
+@pytest.mark.parametrize("name", ["none", "stereo", "kinect"])
+@pytest.mark.parametrize("radius", [0.02, 0.08, 0.3, 1.1])
+def test_a_mesh_of_known_unit_is_looked_at_in_its_true_size(name, radius):
+    ball = make_mesh(BALL.vertices * radius * 1000 + 40, BALL.faces, unit="mm")
+    camera = SensedCamera(ball, name, rng(30))
+    assert camera.sensor.radius == pytest.approx(radius)
+    clear = radius + max(0.25, camera.sensor.nearest)
+    assert camera.sensor.distance >= clear - 1e-9
+    assert camera.sensor.distance <= max(0.45, clear, 3 * radius)
+
+    frame = camera.frame(SPHERE.poses[13])
+    border = [frame.mask[0], frame.mask[-1], frame.mask[:, 0], frame.mask[:, -1]]
+    assert not any(edge.any() for edge in border)
+    nearest = frame.depth[frame.mask].min()
+    assert nearest == pytest.approx(camera.sensor.distance - radius, abs=0.03 * camera.sensor.distance)
+    assert camera.observe(SPHERE.poses[13]).radius == pytest.approx(radius)
+
+
+def test_what_has_no_unit_and_what_a_mix_looks_at_is_as_large_as_the_sensor_says():
+    ball = replace(BALL, unit="m")
+    assert SensedCamera(BALL, "wrist", rng(31)).sensor == SENSORS["wrist"]
+    assert SensedCamera(ball, "wrist", rng(31), true_size=False).sensor == SENSORS["wrist"]
+    assert SensedCamera(ball, "mix", rng(31)).sensor == SensedCamera(BALL, "mix", rng(31)).sensor
+
+
+def test_a_store_of_a_sensor_shows_true_sizes_and_resumes_with_no_other_unit(furniture, tmp_path):
+    store = tmp_path / "sized.zarr"
+
+    def sized(unit, sensor="wrist"):
+        options = RenderOptions(split="test", sensor=sensor, unit=unit, deform=Deform(stretch=0.1))
+        return list(render(furniture, store, FEW, workers=0, options=options))
+
+    sized("mm")
+    small = ViewStore.open(store).group["depth"][:]
+    for other in ("cm", None):
+        with pytest.raises(DatasetError, match="begun with other unit"):
+            sized(other)
+    store.rename(tmp_path / "small.zarr")
+    sized("m")
+    assert (ViewStore.open(store).group["depth"][:] != small).any()

@@ -57,7 +57,7 @@ class Deform:
         """The new object, normalised again."""
         factors, angle = self.draw(seed, name)
         stretched = mesh.vertices * mesh.radius * factors
-        return make_mesh(stretched @ rotation_z(angle).T, mesh.faces, mesh.name)
+        return make_mesh(stretched @ rotation_z(angle).T, mesh.faces, mesh.name, mesh.unit)
 
 
 def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np.ndarray]:
@@ -216,8 +216,9 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
         raise DatasetError(f"{path}: is there, and is no view store; give another name")
     store = ViewStore.open(path)
     there = store.attributes
+    noted = ["unit"] if wanted.sensor is None or wanted.scene is not None else []  # what decides no view
     for key in wanted.__struct_fields__:
-        if key in ("unit", "dataset", "failures", "commands") or (key == "sha256" and there.sha256 is None):
+        if key in (*noted, "dataset", "failures", "commands") or (key == "sha256" and there.sha256 is None):
             continue
         if getattr(there, key) != getattr(wanted, key):
             if overwrite:
@@ -263,7 +264,8 @@ def _rendered(
     rng = np.random.default_rng([seed, SENSING, *entry.name.encode()])
     camera: Camera
     if options.meshes is None:
-        read = load_mesh(entry.path, max_faces=options.max_faces, largest_part=options.largest_part)
+        unit = None if sensor is None else options.unit  # a sensor looks at a mesh of known unit in its true size
+        read = load_mesh(entry.path, unit=unit, max_faces=options.max_faces, largest_part=options.largest_part)
         doubts = mesh_warnings(replace(read, unit=options.unit))
         mesh = deformed(store, read, entry.name)
         camera = SimulatedCamera(mesh, size, sphere.distance) if sensor is None else SensedCamera(mesh, sensor, rng)

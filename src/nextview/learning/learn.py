@@ -3,6 +3,7 @@
 import glob
 import hashlib
 import os
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,8 +24,18 @@ from nextview.files import check_new, command, new_file, new_folder, only_one, s
 from nextview.learning.learned_picture import draw_learned
 from nextview.learning.memory_fit import VIEWS, Fit, fit_memory, size_evidence
 from nextview.learning.sizes import check_sizes
-from nextview.learning.teaching import FACES, LEFT_OUT, VERTICES, Arrays, How, teach
+from nextview.learning.teaching import FACES, LEFT_OUT, SYMMETRIES, VERTICES, Arrays, How, teach
 from nextview.learning.things import Found, Source, find_things
+from nextview.learning.verification_fit import (
+    GROWTH,
+    Shown,
+    VerifiedFit,
+    class_of_things,
+    fit_verification,
+    show,
+    to_be_shown,
+    with_new_things,
+)
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import Features
 from nextview.recognition.model_card import (
@@ -32,21 +43,44 @@ from nextview.recognition.model_card import (
     MEMORY_SUFFIX,
     SHORT_HASH,
     ModelCard,
+    Symmetry,
     Taught,
     Thing,
     Training,
     find_card,
     memory_path,
+    read_card,
     write_card,
 )
-from nextview.things.memory import AZIMUTHS, Memory, check_features, open_memory
+from nextview.things.memory import AZIMUTHS, Memory, TaughtRecogniser, check_features, open_memory
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import Surface
+from nextview.things.taught import TaughtThings
 
 NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
 CARD, WEIGHTS, PICTURE = f"{NAME}.json", f"{NAME}{MEMORY_SUFFIX}", "learned.png"
+JUDGED = "judged"  # folder beside these things, of the memory that things are shown to before it is finished
 PARTS = "things"  # the key of the things that a run that was stopped has taught, see ``files.unfinished``
 Pair = tuple[Source, Arrays]  # a thing, and what is remembered of it
+
+
+@dataclass(frozen=True)
+class Work:
+    """How the work is done.
+
+    Attributes:
+        how: how things are looked at.
+        part: folder of what is not finished.
+        workers: see ``pool.each``.
+        scheduler: see ``pool.each``.
+        track: follows the work.
+    """
+
+    how: How
+    part: Path
+    workers: int | None
+    scheduler: str | None
+    track: Track
 
 
 @dataclass(frozen=True)
@@ -56,24 +90,40 @@ class Learned:
     out: Path  # the folder
     things: int  # how many, of so many ``classes``
     classes: int
-    # share of the cases in which held-out views are named right after 1, 2, 3 and 5 of them; things of a class of
-    # several by the others of that class
+    # share of the cases in which views are named right after 1, 2 and 3 of them, by geometry where it is known, with
+    # weights that were fitted to other things, else after 1, 2, 3 and 5 held-out views by features and size; things of
+    # a class of several by the others of that class
     accuracy: tuple[float, ...]
     # pairs of things that are most often taken for each other, with the share of the cases
     confused: tuple[tuple[str, str, float], ...]
     notes: tuple[str, ...]  # what there is to know, a sentence each
     left_out: tuple[str, ...]  # what could not be learned and why, a phrase each
+    by_features: tuple[float, ...] = ()  # where ``accuracy`` is by geometry: the same cases by features and size alone
+    judged: int = 0  # how many things were shown to tell it by geometry
 
     def __str__(self) -> str:
         """In words."""
         classes = "" if self.classes == self.things else f" of {self.classes} classes"
-        one, two, three, _ = (f"{share:.0%}" for share in self.accuracy)
         thing = "thing" if self.things == 1 else "things"
-        lines = [f"{self.things} {thing}{classes} learned; named right after 1, 2, 3 views: {one}, {two}, {three}"]
+        lines = [f"{self.things} {thing}{classes} learned; {self._how_often()}"]
         lines += [f"confused: {a} and {b} ({share:.0%} of the cases)" for a, b, share in self.confused[:5]]
         if len(self.confused) > 5:
             lines.append(f"and {len(self.confused) - 5} pairs less often")
         return "\n".join(lines + [*self.notes] + [f"left out: {phrase}" for phrase in self.left_out])
+
+    def _how_often(self) -> str:
+        """How often views are named right, in words."""
+        shown = self.accuracy[:3]
+        views = ", ".join(str(k) for k in VIEWS[: len(shown)])
+        named = f"named right after {views} views: {_percent(shown)}"
+        if not self.by_features:
+            return named
+        of_some = "" if self.judged == self.things else f", of {self.judged} of them"
+        return f"{named} (by features and size alone {_percent(self.by_features)}{of_some})"
+
+
+def _percent(shares: Sequence[float]) -> str:
+    return ", ".join(f"{share:.0%}" for share in shares)
 
 
 def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
@@ -122,7 +172,8 @@ def learn_things(
         taught = [] if old is None else _known(*old, remove)
         _check_names(found.things, taught)
 
-        track(_teach(found.things, how, part, taught, left_out, workers, scheduler), len(found.things), "things")
+        work = Work(how, part, workers, scheduler, track)
+        track(_teach(found.things, work, taught, left_out), len(found.things), "things")
         if not taught and nothing_new:
             raise UsageError(f"{out}: would know nothing any more; delete it instead")
         if not taught:
@@ -131,7 +182,7 @@ def learn_things(
         if not how.any_size:
             radii = np.concatenate([arrays["radii"] for _, arrays in taught])
             check_sizes([source.path for source, _ in taught], radii, how.unit)
-        learned = _write(out, taught, left_out, () if old is None else old[0].training.commands)
+        learned = _write(out, taught, left_out, None if old is None else old[0], work)
     return replace(learned, notes=found.notes + learned.notes)
 
 
@@ -186,7 +237,8 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
         arrays["radii"] = arrays["radii"].reshape(1)
         surface = memory.surfaces.surface(index, thing.name)
         if surface is not None:
-            arrays |= {VERTICES: surface.vertices, FACES: surface.faces}
+            symmetries = np.array([(*one.axis, one.order) for one in thing.symmetries], np.float64)
+            arrays |= {VERTICES: surface.vertices, FACES: surface.faces, SYMMETRIES: symmetries.reshape(-1, 4)}
         kept.append((Source(thing.name, label, Path(thing.source)), arrays))
     return kept
 
@@ -194,30 +246,24 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
 PER_THING = ("held_out", "held_out_views", "radii", "pictures")
 
 
-def _teach(
-    sources: Sequence[Source],
-    how: How,
-    part: Path,
-    taught: list[Pair],
-    left_out: list[str],
-    workers: int | None,
-    scheduler: str | None,
-) -> Iterator[int]:
+def _teach(sources: Sequence[Source], work: Work, taught: list[Pair], left_out: list[str]) -> Iterator[int]:
     """Teach things side by side, each into a file of its own; what is there from a run that was stopped is taken."""
     waiting = []
     for source in sources:
-        stamp = _stamp(source, how)
-        arrays = _finished(_part_of(part, source), stamp)
+        stamp = _stamp(source, work.how)
+        arrays = _finished(_part_of(work.part, source), stamp)
         if arrays is not None:
             taught.append((source, _without_phrase(source, arrays, left_out)))
         else:
             waiting.append((source, stamp))
     waiting.sort(key=lambda item: -item[0].path.stat().st_size)  # the longest first: none is left alone at the end
     # A thing alone takes all cores.
-    threads = 1 if scheduler else max(1, count_workers(workers) // max(1, len(waiting)))
-    work = partial(_teach_one, how, part, threads)
-    before, results = len(sources) - len(waiting), each(work, waiting, workers, scheduler)
+    threads = 1 if work.scheduler else max(1, count_workers(work.workers) // max(1, len(waiting)))
+    teach_one = partial(_teach_one, work.how, work.part, threads)
+
+    before = len(sources) - len(waiting)
     yield before
+    results = each(teach_one, waiting, work.workers, work.scheduler)
     for count, ((source, _), result) in enumerate(results, before + 1):
         if isinstance(result, str | WorkerDied):
             left_out.append(f"{source.name}: {result}")
@@ -299,7 +345,7 @@ def _teach_one(how: How, part: Path, threads: int, item: tuple[Source, str]) -> 
     return arrays
 
 
-def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], commands: tuple[str, ...]) -> Learned:
+def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: ModelCard | None, work: Work) -> Learned:
     """Fit what is fitted to all things together, and write memory and card.
 
     The new memory gets a name of its own, with its hash. The card's renaming is what makes it the one that counts: a
@@ -308,21 +354,105 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], commands:
     classes = tuple(dict.fromkeys(source.label for source, _ in taught))
     label = np.array([classes.index(source.label) for source, _ in taught])
     memory, fit = _fitted(taught, label)
-    card = _card(taught, classes, label, memory, fit, commands)
+    card = _card(taught, classes, label, memory, fit, () if old is None else old.training.commands)
+    verified = _verified(card, memory, old, work)
+    if verified is not None:
+        card = _with_verification(card, memory, verified)
+        if verified.accuracy:
+            first = [int(np.flatnonzero(label == c)[0]) for c in range(len(classes))]
+            confused = tuple((first[a], first[b], share) for a, b, share in verified.confused)
+            fit = replace(fit, accuracy=verified.accuracy, confused=confused)
 
     with new_folder(out, overwrite=True, last=CARD) as part:
-        sha256 = memory.save(part / WEIGHTS)
-        weights = memory_path(part / CARD, sha256)
-        (part / WEIGHTS).rename(weights)
-        write_card(part / CARD, replace_record(card, sha256=sha256))
+        weights = _save(part, card, memory)
         draw_learned(part / PICTURE, {source.name: arrays["pictures"] for source, arrays in taught}, fit)
-        if _is_intact(out / weights.name, sha256):  # the very same memory again
+        if _is_intact(out / weights.name, read_card(part / CARD).sha256):  # the very same memory again
             weights.unlink()
     _remove_old(out, weights.name)
 
     names = [source.name for source, _ in taught]
-    confused = tuple((names[a], names[b], share) for a, b, share in fit.confused)
-    return Learned(out, len(taught), len(classes), fit.accuracy, confused, _notes(taught), tuple(left_out))
+    confused_names = tuple((names[a], names[b], share) for a, b, share in fit.confused)
+    learned = Learned(out, len(taught), len(classes), fit.accuracy, confused_names, _notes(taught), tuple(left_out))
+    if verified is None:
+        return learned
+    return replace(learned, by_features=verified.by_features, judged=verified.things)
+
+
+def _save(folder: Path, card: ModelCard, memory: Memory) -> Path:
+    """Write a memory and its card, which gets its hash; returns the path of the memory."""
+    sha256 = memory.save(folder / WEIGHTS)
+    weights = memory_path(folder / CARD, sha256)
+    (folder / WEIGHTS).rename(weights)
+    write_card(folder / CARD, replace_record(card, sha256=sha256))
+    return weights
+
+
+def _verified(card: ModelCard, memory: Memory, old: ModelCard | None, work: Work) -> VerifiedFit | None:
+    """Show things of known geometry, and fit to what is found; None if there are none.
+
+    All are shown, or a drawn part of very many. Where things are added to more than there were before, the new ones
+    alone: the weights stay, until there are GROWTH times as many things as they were fitted to.
+    """
+    if not memory.surfaces.counts.any():
+        return None
+
+    folder = work.part / JUDGED
+    shutil.rmtree(folder, ignore_errors=True)  # what an earlier run has left
+    folder.mkdir()
+    _save(folder, card, memory)
+    recogniser = TaughtRecogniser(folder / CARD, threads=1)
+    known = TaughtThings.of(recogniser)
+    assert known is not None
+    labels = class_of_things(recogniser, known)
+    before = None if old is None or old.memory is None else old.memory.verification
+    rng = np.random.default_rng(work.how.seed)
+    if old is None or old.memory is None or before is None or len(labels) >= GROWTH * before.things:
+        return fit_verification(_shown(folder, range(len(labels)), len(labels), rng, work), labels)
+
+    names = [thing.name for thing in old.memory.things]
+    carried = np.array([names.index(name) if name in names else -1 for name in known.names])
+    new = np.flatnonzero(carried < 0).tolist()
+    return with_new_things(before, _shown(folder, new, len(labels), rng, work), labels, carried)
+
+
+def _shown(folder: Path, things: Sequence[int], known: int, rng: np.random.Generator, work: Work) -> list[Shown]:
+    """Show things to the memory in a folder, side by side; sorted, so that nothing depends on who is done first."""
+    items = to_be_shown(things, known, rng)
+    found = dict[tuple[int, int], list[Shown]]()
+
+    def watched() -> Iterator[int]:
+        show_one = partial(show, folder / CARD, work.how.sensor, work.how.seed)
+        for count, (item, result) in enumerate(each(show_one, items, work.workers, work.scheduler), 1):
+            if isinstance(result, WorkerDied):
+                raise DatasetError(f"{folder}: its things could not be shown ({result})")
+            found[item] = result
+            yield count
+
+    if items:
+        work.track(watched(), len(items), "things shown")
+    return [one for item in sorted(found) for one in found[item]]
+
+
+def _with_verification(card: ModelCard, memory: Memory, verified: VerifiedFit) -> ModelCard:
+    """A card that says what was fitted to the surfaces; its residuals are of all things, 0 without geometry."""
+    about = card.memory
+    assert about is not None
+    verification = verified.verification
+    if verification.usual:
+        usual = np.zeros(len(about.things))
+        usual[memory.surfaces.counts[:, 0] > 0] = verification.usual
+        verification = replace_record(verification, usual=tuple(usual.tolist()))
+
+    scores = dict(card.scores)
+    if verified.accuracy:
+        scores["verified by geometry"] = _by_views(verified.accuracy)
+        scores["the same by features"] = _by_views(verified.by_features)
+    return replace_record(card, memory=replace_record(about, verification=verification), scores=scores)
+
+
+def _by_views(shares: Sequence[float]) -> dict[str, float]:
+    """Shares after 1, 2, ... views, as a card holds them."""
+    return {str(k): round(share, 4) for k, share in zip(VIEWS, shares, strict=False)}
 
 
 def _fitted(taught: Sequence[Pair], label: NDArray[np.int64]) -> tuple[Memory, Fit]:
@@ -355,7 +485,10 @@ def _card(
 ) -> ModelCard:
     """The card of a memory, still without the hash of its file; ``commands`` made what it held before."""
     poses = np.bincount(memory.thing)
-    things = tuple(Thing(s.name, str(s.path), int(n)) for (s, _), n in zip(taught, poses, strict=True))
+    things = tuple(
+        Thing(source.name, str(source.path), int(count), _symmetries_of(arrays))
+        for (source, arrays), count in zip(taught, poses, strict=True)
+    )
     features = find_card(FEATURES)
     novelty, usual = (tuple(map(tuple, np.round(rows, 4).tolist())) for rows in (fit.quantiles, fit.usual))
     return ModelCard(
@@ -372,6 +505,12 @@ def _card(
         scores={"held-out views": {str(k): round(a, 4) for k, a in zip(VIEWS, fit.accuracy, strict=True)}},
         memory=Taught(things, features.sha256, fit.weight, novelty=novelty, usual=usual),
     ).made_by(command())
+
+
+def _symmetries_of(arrays: Arrays) -> tuple[Symmetry, ...]:
+    """The symmetries of a thing; () where its geometry is not known."""
+    rows = arrays.get(SYMMETRIES, np.zeros((0, 4))).tolist()
+    return tuple(Symmetry((x, y, z), int(order)) for x, y, z, order in rows)
 
 
 def _is_intact(weights: Path, sha256: str) -> bool:

@@ -90,7 +90,8 @@ def _draw_bars(figure: Figure, fit: Fit, height: float) -> None:
     width = PAGE_WIDTH - MARGIN - left
     axes = figure.add_axes((left / PAGE_WIDTH, bottom / height, width / PAGE_WIDTH, size / height))
 
-    bars = axes.bar([str(k) for k in VIEWS], [100 * a for a in fit.accuracy], color=BAR, width=0.6)
+    views = [str(k) for k in VIEWS[: len(fit.accuracy)]]
+    bars = axes.bar(views, [100 * a for a in fit.accuracy], color=BAR, width=0.6)
     axes.bar_label(bars, fmt="%.0f", color=INK, size=11)
     axes.set_ylim(0, 110)
     axes.set_yticks([])

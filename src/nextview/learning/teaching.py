@@ -3,7 +3,7 @@
 import zlib
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal
@@ -30,6 +30,7 @@ from nextview.simulation.simulated import SimulatedCamera
 from nextview.simulation.turntable import read_turntable
 from nextview.things.memory import AZIMUTHS, RINGS, joined
 from nextview.things.surface import FINEST_ERROR, Surface
+from nextview.things.symmetry import find_symmetries
 
 Arrays = dict[str, NDArray]
 HELD_OUT = 8  # views of each thing that are not remembered
@@ -40,6 +41,7 @@ GRID = ViewSphere(RINGS, AZIMUTHS)
 SENSED = GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4, 4)  # poses of views through the sensor
 LEFT_OUT = "left_out"  # of a thing's arrays: a phrase about the frames that were not used; it is not remembered
 VERTICES, FACES = "vertices", "faces"  # of a thing's arrays: its surface, if its size is known
+SYMMETRIES = "symmetries"  # and the axis and order of each of its symmetries, (S, 4)
 COARSER = 0.002  # of the radius: a camera stands farther from a large thing, and measures it less exactly
 Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
 
@@ -84,8 +86,8 @@ def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
 
     Returns:
         Arrays by the names of the fields of ``things.memory.Memory``. If its size is known, also its surface in the
-        frame of its file, metres: VERTICES, (V, 3) float32, and FACES, (F, 3) int32. Where some of the frames were not
-        used, a phrase about them under LEFT_OUT.
+        frame of its file, metres: VERTICES, (V, 3) float32, FACES, (F, 3) int32, and SYMMETRIES. Where some of the
+        frames were not used, a phrase about them under LEFT_OUT.
 
     Raises:
         MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
@@ -125,8 +127,19 @@ def _surface(mesh: Mesh, to_mesh: NDArray[np.float64]) -> Arrays:
     if mesh.metres is None:
         return {}
 
-    surface = Surface.from_mesh(mesh, mesh.name).simplified(max(FINEST_ERROR, COARSER * mesh.metres))
-    return {VERTICES: (surface.vertices @ to_mesh).astype(np.float32), FACES: surface.faces}
+    whole = Surface.from_mesh(mesh, mesh.name)
+    in_file = replace(whole, vertices=(whole.vertices @ to_mesh).astype(np.float32))
+    return of_surface(in_file.simplified(max(FINEST_ERROR, COARSER * mesh.metres)))
+
+
+def of_surface(surface: Surface) -> Arrays:
+    """What is remembered of a surface: itself and its symmetries."""
+    symmetries = [(*one.axis, one.order) for one in find_symmetries(surface)]
+    return {
+        VERTICES: surface.vertices,
+        FACES: surface.faces,
+        SYMMETRIES: np.array(symmetries, np.float64).reshape(-1, 4),
+    }
 
 
 def _around(clean: Parts, sensed: Parts) -> NDArray[np.float32]:

@@ -24,7 +24,7 @@ def sensed_camera(scene: Scene, sensor: Sensor | SensorMix | str, rng: np.random
     """A ``SensedCamera`` before a scene's target, three radii away; what hides it is told from it exactly."""
     drawn = sensor_named(sensor).draw(rng.spawn(1)[0])
     drawn = replace(drawn, radius=drawn.distance / DISTANCE, boxes=0.0)
-    return SensedCamera(scene.target, drawn, rng, around=scene.around, table=TABLE)
+    return SensedCamera(scene.target, drawn, rng, around=scene.around, table=TABLE, true_size=False)
 
 
 class RobotCamera:

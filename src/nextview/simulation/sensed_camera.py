@@ -35,6 +35,9 @@ class SensedCamera:
     boxes and most of the table. A mix of sensors is drawn from now, as are the errors of the object's frame and the
     boxes. ``around`` hides parts of the object instead of these boxes, object frame; ``table`` is a radius, object
     radii.
+
+    A mesh of known unit is looked at in its true size, see ``Sensor.before``, unless ``true_size`` is false. Any other
+    is as large as the sensor says, as is what a mix looks at, which networks are trained with.
     """
 
     def __init__(
@@ -45,9 +48,15 @@ class SensedCamera:
         denoise: bool = True,
         around: Mesh | None = None,
         table: float = TABLE,
+        true_size: bool = True,
     ) -> None:
         known = sensor_named(sensor)
-        self.sensor = known.draw(rng.spawn(1)[0]) if isinstance(known, SensorMix) else known
+        if isinstance(known, SensorMix):
+            self.sensor = known.draw(rng.spawn(1)[0])
+        elif true_size and mesh.metres is not None:
+            self.sensor = known.before(mesh.metres)
+        else:
+            self.sensor = known
         self.denoise, self._rng, self._reach, self._metres = denoise, rng, table, mesh.metres
         self._camera, self._floor = self._looking_at(mesh), float(mesh.vertices[:, 2].min())
         self._truth = ObjectFrame(np.zeros(3), self.sensor.radius, np.eye(3))

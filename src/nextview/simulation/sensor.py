@@ -23,6 +23,8 @@ NO_GRAIN, NARROWEST = 0.1, 1.0  # pixels: a window that holds one pixel; the nar
 WIDEST = 8  # projector columns that two neighbouring pixels of one surface may lie apart
 LARGEST, SIDE, GRAIN, STRONGEST = 10_000, 4096, 100, 100  # limits of numbers, sides of pictures, grain and strength
 MARGIN = 16  # how far beside what there is a pixel may show it, pixels
+CLEARANCE = 0.25  # metres that a camera keeps from an object of known size
+ARM_LENGTH = 0.45  # metres from its centre at which it usually stands at most
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,21 @@ class Sensor:
     def to_dict(self) -> dict[str, Any]:
         """Its name and all its numbers, for JSON."""
         return asdict(self)
+
+    def before(self, radius: float) -> "Sensor":
+        """The same sensor before an object of a known size, as a robot would hold it.
+
+        It stands as many object radii away as otherwise, but ARM_LENGTH at most. Farther only where the object does not
+        fit into its picture, is nearer than what it can measure, or comes closer than CLEARANCE.
+
+        Args:
+            radius: of the object, metres.
+        """
+        usual = min(self.distance / self.radius * radius, ARM_LENGTH)
+        half_picture = np.arctan(min(self.shape) / 2 / self.focal)
+        whole_object = radius / np.sin(half_picture)
+        clear = radius + max(CLEARANCE, self.nearest)
+        return replace(self, radius=radius, distance=float(max(usual, whole_object, clear)))
 
     def draw(self, rng: np.random.Generator) -> "Sensor":
         """Itself: what ``SensorMix`` draws anew for every object."""

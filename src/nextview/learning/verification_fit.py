@@ -1,0 +1,315 @@
+"""What is fitted to the surfaces of taught things: how much geometry counts, and how well known things fit."""
+
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from nextview.errors import ObservationError
+from nextview.geometry.mesh import make_mesh
+from nextview.geometry.observation import Observation
+from nextview.geometry.viewsphere import look_at_origin
+from nextview.recognition.model_card import Verification
+from nextview.simulation.sensed_camera import SensedCamera
+from nextview.things.memory import RINGS, TaughtRecogniser
+from nextview.things.registration import rotation_about_z
+from nextview.things.taught import TaughtThings
+from nextview.things.unknown import SHRINKAGE, KnownResiduals
+from nextview.things.weighing import LEAST_BELIEF, EvidenceWeights, JudgedEpisode, fit_weights
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+VIEWS = (1, 2, 3)  # after so many views things are judged
+TRIES = 6  # views that are taken at most, until so many show the thing
+MOST_THINGS = 150  # that are shown: a drawn part of more
+EPISODES = 2  # for each of many things
+ENOUGH_EPISODES = 24  # for each of few things as if all of them had so many together
+GROWTH = 2  # weights are fitted anew when there are so many times as many things
+DEFAULT_THINGS = 10.0  # things that the default weights count for, beside those that others are fitted to
+WEIGHTS_COST = 5.0  # by which weights of five numbers have to raise the log-likelihood (Akaike, 1974)
+MOST_RESIDUALS = 400  # for a number of views; of more their quantiles are kept
+DECIMALS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What was found of a thing that was shown for a while.
+
+    Attributes:
+        thing: its number among those of known geometry.
+        views: after how many views.
+        named: number of the thing that explains the views best.
+        residual: how badly it does.
+        judged: its belief is in classes.
+    """
+
+    thing: int
+    views: int
+    named: int
+    residual: float
+    judged: JudgedEpisode
+
+
+@dataclass(frozen=True)
+class VerifiedFit:
+    """What was fitted to things that were shown.
+
+    Attributes:
+        verification: for the card, of the things of known geometry alone.
+        accuracy: share of the cases that are named right after 1, 2 and 3 views, with weights that were fitted to other
+            things; () if nothing was shown.
+        by_features: the same by features and size alone.
+        confused: pairs of a class and the one that it was named, with the share of its cases, after two views.
+        things: how many were shown.
+    """
+
+    verification: Verification
+    accuracy: tuple[float, ...] = ()
+    by_features: tuple[float, ...] = ()
+    confused: tuple[tuple[int, int, float], ...] = ()
+    things: int = 0
+
+
+def to_be_shown(things: Sequence[int], known: int, rng: Generator) -> list[tuple[int, int]]:
+    """Which things are shown how often: (thing, draw) each.
+
+    Args:
+        things: numbers of those that may be shown.
+        known: how many there are in all.
+        rng: draws a part of very many.
+    """
+    some = np.sort(rng.permutation(things)[:MOST_THINGS])
+    episodes = max(EPISODES, ENOUGH_EPISODES // known)
+    return [(int(thing), draw) for thing in some for draw in range(episodes)]
+
+
+def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Shown]:
+    """Show a thing through a sensor, in any of its resting poses, and recognise it by its geometry.
+
+    A thing that has others of its class is recognised by these alone: whoever teaches a class will meet other things of
+    it.
+
+    Args:
+        card: of a memory; its weights are not used.
+        sensor: see ``sensor_named``.
+        seed: of all draws.
+        item: number of the thing among those of known geometry, and of the draw.
+
+    Returns:
+        What was found after one and more views; empty where nothing is seen, or no other thing of the class is known.
+    """
+    thing, draw = item
+    known, labels = _opened(card)
+    others = np.arange(len(labels))
+    if (labels == labels[thing]).sum() > 1:
+        others = np.delete(others, thing)
+        known = TaughtThings(known.recogniser, [known.verifier.caster.surfaces[k] for k in others])
+
+    rng = np.random.default_rng([seed, thing, draw])
+    observations = _views(_opened(card)[0], thing, sensor, rng)
+    if not observations:
+        return []
+    evidence = known.log_evidence(observations)
+
+    found = []
+    for count in VIEWS[: len(observations)]:
+        try:
+            verified = known.verify(observations[:count], evidence[:count])
+        except ObservationError:  # what was seen is too little to be compared with surfaces
+            continue
+        judged = _of_classes(verified.judged(0), int(labels[thing]), labels[others])
+        named = int(others[verified.things[0]])
+        found.append(Shown(thing, count, named, verified.residual, judged))
+    return found
+
+
+@lru_cache(maxsize=1)
+def _opened(card: Path) -> tuple[TaughtThings, Index]:
+    """The things of known geometry of a memory, and the class of each."""
+    recogniser = TaughtRecogniser(card, threads=1)
+    known = TaughtThings.of(recogniser)
+    assert known is not None
+    return known, class_of_things(recogniser, known)
+
+
+def class_of_things(recogniser: TaughtRecogniser, known: TaughtThings) -> Index:
+    """The class of each thing of known geometry."""
+    about = recogniser.card.memory
+    assert about is not None
+    names = [thing.name for thing in about.things]
+    first = np.unique(recogniser.memory.thing, return_index=True)[1]
+    of_all = np.array(recogniser.calibration.hypotheses)[first]
+    return of_all[[names.index(name) for name in known.names]]
+
+
+def _views(known: TaughtThings, thing: int, sensor: str, rng: Generator) -> list[Observation]:
+    """Some random views of a thing that show it."""
+    surface = known.verifier.caster.surfaces[thing]
+    resting = known.verifier.rotations[rng.choice(np.flatnonzero(known.verifier.owners == thing))]
+    turn = rotation_about_z(rng.uniform(0, 2 * np.pi, 1))[0] @ resting
+    mesh = make_mesh(surface.vertices.astype(np.float64) @ turn.T, surface.faces, surface.name, "m")
+    camera = SensedCamera(mesh, sensor, rng.spawn(1)[0])
+
+    elevations = np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), TRIES))
+    observations = []
+    for pose in look_at_origin(elevations, rng.uniform(0, 2 * np.pi, TRIES)):
+        observation = camera.observe(pose)
+        if observation.seen:
+            observations.append(observation)
+        if len(observations) == max(VIEWS):
+            break
+    return observations
+
+
+def _of_classes(judged: JudgedEpisode, truth: int, labels: Index) -> JudgedEpisode:
+    """The same in classes, by the class of each thing; ``truth`` is the class that is right."""
+    by_features = np.zeros(max(int(labels.max()), truth) + 1)
+    np.add.at(by_features, labels, judged.by_features)
+    return JudgedEpisode(truth, labels[judged.things], judged.mean, judged.camera_costs, judged.log_belief, by_features)
+
+
+def fit_verification(shown: Sequence[Shown], labels: Index) -> VerifiedFit:
+    """Fit weights and residuals to things that were shown.
+
+    Args:
+        shown: all of them.
+        labels: class of each thing of known geometry, (T,).
+
+    Returns:
+        What was fitted. With few things the weights are near their defaults.
+    """
+    things = np.array([one.thing for one in shown], np.int64)
+    weights = _weights(shown)
+    half = {thing: k % 2 for k, thing in enumerate(np.unique(things).tolist())}
+    halves = [[one for one in shown if half[one.thing] == k] for k in (0, 1)]
+    beliefs = dict[int, Float]()
+    for own, other in (halves, halves[::-1]):
+        fitted_elsewhere = _weights(other)
+        beliefs |= {id(one): one.judged.belief(fitted_elsewhere) for one in own}
+
+    residuals = _residuals(shown, labels)
+    verification = as_stored(weights, residuals, len(labels))
+    answers = [int(beliefs[id(one)].argmax()) for one in shown]
+    by_features = [int(one.judged.by_features.argmax()) for one in shown]
+    return VerifiedFit(
+        verification,
+        _accuracy(shown, answers),
+        _accuracy(shown, by_features),
+        _confused(shown, answers),
+        len(half),
+    )
+
+
+def _weights(shown: Sequence[Shown]) -> EvidenceWeights:
+    """The weights that suit what was shown, drawn towards the defaults: few things do not tell much."""
+    count = len({one.judged.truth for one in shown})
+    if count < 2:  # whatever the weights are, a thing alone is named right
+        return EvidenceWeights()
+
+    episodes = [one.judged for one in shown]
+    fitted = fit_weights(episodes)
+    if _log_likelihood(fitted, episodes) < _log_likelihood(EvidenceWeights(), episodes) + WEIGHTS_COST:
+        return EvidenceWeights()
+
+    share = count / (count + DEFAULT_THINGS)
+    found = []
+    for default, value in zip(astuple(EvidenceWeights()), astuple(fitted), strict=True):
+        if min(default, value) > 0:
+            found.append(default ** (1 - share) * value**share)
+        else:
+            found.append((1 - share) * default + share * value)
+    return EvidenceWeights(*found)
+
+
+def _log_likelihood(weights: EvidenceWeights, episodes: Sequence[JudgedEpisode]) -> float:
+    """Sum of the logarithms of the belief in the truth."""
+    believed = [episode.belief(weights)[episode.truth] for episode in episodes]
+    return float(np.log(np.maximum(believed, LEAST_BELIEF)).sum())
+
+
+def _residuals(shown: Sequence[Shown], labels: Index) -> KnownResiduals | None:
+    """How badly known things are explained; None if none was named right."""
+    right = [one for one in shown if labels[one.named] == one.judged.truth]
+    if not right:
+        return None
+    named = np.array([one.named for one in right])
+    values = np.array([one.residual for one in right])
+    views = np.array([one.views for one in right])
+    return KnownResiduals.fit(named, values, views, len(labels))
+
+
+def with_new_things(before: Verification, shown: Sequence[Shown], labels: Index, carried: Index) -> VerifiedFit:
+    """Add what was found of new things to what was fitted before.
+
+    Args:
+        before: what was fitted to all things that there were.
+        shown: the new ones; the weights stay as they are.
+        labels: class of each thing of known geometry, (T,).
+        carried: number that each of these things had before, -1 for a new one, (T,).
+    """
+    weights = EvidenceWeights(**before.weights)
+    answers = [int(one.judged.belief(weights).argmax()) for one in shown]
+    by_features = [int(one.judged.by_features.argmax()) for one in shown]
+
+    residuals = None
+    if before.usual:
+        usual = np.array(before.usual)[carried]
+        mean = float(np.mean(before.usual))
+        right = [one for one in shown if labels[one.named] == one.judged.truth]
+        for thing in np.flatnonzero(carried < 0):
+            own = [one.residual - mean for one in right if one.named == thing]
+            usual[thing] = mean + np.sum(own) / (len(own) + SHRINKAGE)
+
+        excess = []
+        for number, row in enumerate(before.excess, 1):
+            new = [one.residual - usual[one.named] for one in right if one.views == number]
+            excess.append(np.sort([*row, *new]))
+        residuals = KnownResiduals(usual, tuple(excess))
+
+    verification = as_stored(weights, residuals, before.things)
+    return VerifiedFit(
+        verification,
+        _accuracy(shown, answers),
+        _accuracy(shown, by_features),
+        _confused(shown, answers),
+        len({one.thing for one in shown}),
+    )
+
+
+def as_stored(weights: EvidenceWeights, residuals: KnownResiduals | None, things: int) -> Verification:
+    """What a card holds of weights and residuals, rounded; ``things`` is how many they are fitted to."""
+    named = {field.name: float(f"{getattr(weights, field.name):.4g}") for field in fields(weights)}
+    if residuals is None:
+        return Verification(named, things)
+    excess = []
+    for row in residuals.excess:
+        if len(row) > MOST_RESIDUALS:
+            row = np.quantile(row, np.linspace(0, 1, MOST_RESIDUALS))
+        excess.append(tuple(np.round(row, DECIMALS).tolist()))
+    return Verification(named, things, tuple(np.round(residuals.usual, DECIMALS).tolist()), tuple(excess))
+
+
+def _accuracy(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[float, ...]:
+    """Share of the cases that are right after each number of views."""
+    if not shown:
+        return ()
+    right = np.array([one.judged.truth for one in shown]) == answers
+    views = np.array([one.views for one in shown])
+    return tuple(float(right[views == count].mean()) for count in VIEWS if (views == count).any())
+
+
+def _confused(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[tuple[int, int, float], ...]:
+    """Pairs of classes by the share of the cases in which one is named as the other, the worst first."""
+    truths = [one.judged.truth for one in shown if one.views == 2]
+    named = [answer for one, answer in zip(shown, answers, strict=True) if one.views == 2]
+    pairs = dict[tuple[int, int], float]()
+    for truth, answer in zip(truths, named, strict=True):
+        if truth != answer:
+            pair = min(truth, answer), max(truth, answer)
+            pairs[pair] = pairs.get(pair, 0) + 0.5 / truths.count(truth)
+    return tuple((a, b, share) for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1]))

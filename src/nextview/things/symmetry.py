@@ -1,0 +1,139 @@
+"""Symmetries of a surface: axes about which it can be turned and stays the same.
+
+A turn is a symmetry where the surface and its turned copy are nowhere farther apart than a
+tolerance, as in the BOP toolkit (Hodan et al., "BOP Challenge 2020 on 6D Object Localization",
+ECCV workshops 2020: the Hausdorff distance is below the larger of 15 mm and a tenth of the
+diameter). Its tolerance is that of people who look at pictures; the one here is what a depth camera
+can tell apart.
+"""
+
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import QhullError, cKDTree
+
+from nextview.recognition.model_card import Symmetry
+from nextview.things.surface import Surface
+
+Float = NDArray[np.float64]
+
+LEAST_TOLERANCE = (
+    0.005  # metres: three deviations of edges that a stereo camera sees at arm's length
+)
+TOLERANCE = 0.02  # of the diameter: a camera stands farther from a large thing
+COMPARED = 0.95  # share of the surface that has to be that near: scans have spurs
+HIGHEST_ORDER = 8
+ANY_TURNS = np.arange(1, 24, 2) / 48  # of a full turn, that are tried for a symmetry of any angle
+SURFACE_POINTS = 20_000  # of the surface that is compared with
+TURNED_POINTS = 500  # of its turned copy
+SAME_AXIS = np.radians(20)  # axes within this angle are one
+
+
+def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
+    """Find the axes and orders of a surface's symmetries.
+
+    Axes through the centre of its box are tried: those of its file, its principal axes, and those
+    of the smallest box around it. A symmetry of any angle leaves out all but one of the axes across
+    it, as they follow from each other.
+
+    Args:
+        surface: of a thing.
+
+    Returns:
+        Its symmetries, those of any angle first, then by their order.
+    """
+    rng = np.random.default_rng(0)
+    centre = surface.centre.astype(np.float64)
+    tree = cKDTree(surface.sample(SURFACE_POINTS, rng) - centre)
+    points = surface.sample(TURNED_POINTS, rng) - centre
+    tolerance = max(LEAST_TOLERANCE, TOLERANCE * surface.diameter)
+
+    found = []
+    for axis in _axes(surface, points):
+        order, deviation = _order(tree, points, axis, tolerance)
+        if order != 1:
+            found.append((order, deviation, axis))
+    if _is_ball([axis for order, _, axis in found if order == 0]):
+        return tuple(_symmetry(axis, 0) for axis in np.eye(3))
+
+    found.sort(key=lambda item: (item[0] != 0, -item[0], item[1]))
+    return tuple(_distinct((axis, order) for order, _, axis in found))
+
+
+def _is_ball(axes: Sequence[Float]) -> bool:
+    """Whether some axes of symmetries of any angle are not all one."""
+    return any(abs(axis @ axes[0]) < np.cos(SAME_AXIS) for axis in axes)
+
+
+def _axes(surface: Surface, points: Float) -> Float:
+    """Unit vectors that are tried, (N, 3)."""
+    axes = [np.eye(3), np.linalg.eigh(np.cov(points.T))[1].T]
+    try:
+        axes.append(_box_axes(surface))
+    except QhullError:  # a flat surface has no hull
+        pass
+    return np.concatenate(axes)
+
+
+def _box_axes(surface: Surface) -> Float:
+    """The axes of the smallest box around a surface, (3, 3), one a row."""
+    from trimesh.bounds import oriented_bounds
+
+    return np.asarray(oriented_bounds(surface.vertices)[0], np.float64)[:3, :3]
+
+
+def _order(tree: cKDTree, points: Float, axis: Float, tolerance: float) -> tuple[int, float]:
+    """The highest order of a symmetry about an axis, and how exact it is, metres.
+
+    The order is 0 for any angle, and 1 for none.
+    """
+    deviations: dict[Fraction, float] = {}
+    found = (1, np.inf)
+    for order in range(2, HIGHEST_ORDER + 1):
+        # A turn back is as good as one forth.
+        turns = [Fraction(k, order) for k in range(1, order // 2 + 1)]
+        for turn in turns:
+            if turn not in deviations:
+                deviations[turn] = _deviation(tree, points, axis, float(turn))
+        worst = max(deviations[turn] for turn in turns)
+        if worst < tolerance:
+            found = (order, worst)
+
+    if max(deviations.values()) < tolerance:
+        worst = max(_deviation(tree, points, axis, turn) for turn in ANY_TURNS)
+        if worst < tolerance:
+            return 0, worst
+    return found
+
+
+def _deviation(tree: cKDTree, points: Float, axis: Float, turn: float) -> float:
+    """How far a surface and its copy, by a part of a full turn, are apart, metres."""
+    from scipy.spatial.transform import Rotation
+
+    rotation = Rotation.from_rotvec(2 * np.pi * turn * axis).as_matrix()
+    return float(np.quantile(tree.query(points @ rotation.T)[0], COMPARED))
+
+
+def _distinct(found: Iterable[tuple[Float, int]]) -> list[Symmetry]:
+    """The symmetries about different axes, of those that are sorted by what they tell."""
+    kept: list[Symmetry] = []
+    across = False  # whether an axis across one of any angle is there already
+    for axis, order in found:
+        alike = np.abs([axis @ np.array(other.axis) for other in kept])
+        if (alike > np.cos(SAME_AXIS)).any():
+            continue
+        if order and any(other.order == 0 for other in kept):
+            if across:
+                continue
+            across = True
+        kept.append(_symmetry(axis, order))
+    return kept
+
+
+def _symmetry(axis: Float, order: int) -> Symmetry:
+    """A symmetry as cards hold it; its axis has a positive longest component."""
+    longest = axis[np.abs(axis).argmax()]
+    x, y, z = np.round(axis * np.sign(longest) / np.linalg.norm(axis), 6).tolist()
+    return Symmetry((x, y, z), order)
