@@ -304,6 +304,12 @@ def test_a_mesh_of_known_unit_is_looked_at_in_its_true_size(name, radius):
     assert camera.observe(SPHERE.poses[13]).radius == pytest.approx(radius)
 
 
+def test_of_a_thing_of_a_millimetre_nothing_is_seen():
+    speck = make_mesh(BALL.vertices, BALL.faces, unit="mm")
+    camera = SensedCamera(speck, "wrist", rng(30))
+    assert not camera.observe(SPHERE.poses[0]).seen
+
+
 def test_what_has_no_unit_and_what_a_mix_looks_at_is_as_large_as_the_sensor_says():
     ball = replace(BALL, unit="m")
     assert SensedCamera(BALL, "wrist", rng(31)).sensor == SENSORS["wrist"]
@@ -318,9 +324,9 @@ def test_a_store_of_a_sensor_shows_true_sizes_and_resumes_with_no_other_unit(fur
         options = RenderOptions(split="test", sensor=sensor, unit=unit, deform=Deform(stretch=0.1))
         return list(render(furniture, store, FEW, workers=0, options=options))
 
-    sized("mm")
+    sized("cm")
     small = ViewStore.open(store).group["depth"][:]
-    for other in ("cm", None):
+    for other in ("mm", None):
         with pytest.raises(DatasetError, match="begun with other unit"):
             sized(other)
     store.rename(tmp_path / "small.zarr")

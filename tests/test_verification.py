@@ -30,6 +30,7 @@ from nextview.things.registration import (
     start,
 )
 from nextview.things.surface import Surface, SurfaceCaster
+from nextview.things.symmetry import find_symmetries
 from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verification import likelihood
@@ -535,3 +536,72 @@ def test_a_memory_and_scans_name_a_thing_and_tell_its_pose(taught, scans):
         TaughtThings(recogniser, [Surface.from_mesh(meshes["chair"], "sofa")])
     with pytest.raises(ObservationError, match="nothing can be recognised"):
         things([])
+
+
+# Symmetries
+
+
+def turned_about(mesh_vertices, faces, seed, name="thing"):
+    """A surface with its axes and its origin anywhere."""
+    rotation = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    return rotation, Surface(
+        name, (mesh_vertices @ rotation.T + (0.4, -0.2, 0.1)).astype(np.float32), faces.astype(np.int32)
+    )
+
+
+def prism(sides, radius=0.04, height=0.1):
+    return trimesh.creation.cylinder(radius, height, sections=sides)
+
+
+SYMMETRIC = {
+    "can": (trimesh.creation.cylinder(0.03, 0.12, sections=64), [0, 2]),
+    "cone": (trimesh.creation.cone(0.04, 0.1, sections=64), [0]),
+    "ball": (trimesh.creation.icosphere(4, 0.04), [0, 0, 0]),
+    "box": (trimesh.creation.box((0.05, 0.09, 0.16)), [2, 2, 2]),
+    "square block": (trimesh.creation.box((0.08, 0.08, 0.2)), [4, 2, 2]),
+    "cube": (trimesh.creation.box((0.06, 0.06, 0.06)), [4, 4, 4]),
+    "prism of three": (prism(3), [3, 2]),
+    "prism of five": (prism(5, 0.08), [5, 2]),
+    "two arms": (
+        trimesh.util.concatenate([trimesh.creation.box((0.16, 0.03, 0.03)), prism(48, 0.03, 0.06)]),
+        [2, 2, 2],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SYMMETRIC)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_symmetries_are_found_about_any_axis(name, seed):
+    mesh, expected = SYMMETRIC[name]
+    rotation, surface = turned_about(mesh.vertices, mesh.faces, seed)
+    found = find_symmetries(surface)
+    orders = [one.order for one in found]
+    if expected[0] % 2:  # several axes across an odd one are alike: one of them is enough
+        orders = orders[:1] + sorted(set(orders[1:]))
+    assert orders == expected
+    if len(set(expected)) > 1 or expected == [0]:
+        assert abs(rotation[:, 2] @ found[0].axis) > 0.998  # the axis of what is made here is z
+
+
+def with_handle(size):
+    """A can with a handle so many metres wide."""
+    body = trimesh.creation.cylinder(0.04, 0.1, sections=64)
+    handle = trimesh.creation.box((size, 0.01, 0.06))
+    handle.apply_translation((0.04 + size / 2, 0, 0))
+    return trimesh.util.concatenate([body, handle])
+
+
+@pytest.mark.parametrize(("handle", "symmetric"), [(0.001, True), (0.03, False)])
+def test_what_a_camera_cannot_tell_is_symmetric_and_a_handle_is_not(handle, symmetric):
+    mesh = with_handle(handle)
+    found = find_symmetries(turned_about(mesh.vertices, mesh.faces, 3)[1])
+    assert any(one.order == 0 for one in found) == symmetric
+
+
+@pytest.mark.parametrize("thickness", [0.0, 0.004])
+def test_a_sheet_has_the_symmetries_of_its_outline(thickness):
+    sheet = trimesh.creation.box((0.1, 0.2, thickness or 1e-9))
+    found = find_symmetries(turned_about(sheet.vertices, sheet.faces, 4)[1])
+    assert {one.order for one in found} == {2}
+    irregular = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [-0.1, 0.2, 0]], [[0, 1, 2]], process=False)
+    assert find_symmetries(turned_about(irregular.vertices, irregular.faces, 5)[1]) == ()

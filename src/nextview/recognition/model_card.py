@@ -40,9 +40,7 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Symmetry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One symmetry of a thing: turned about an axis through its centre, it is the same.
-
-    The centre is that of the bounding box in the frame of the scan file.
+    """One symmetry of a thing: turned about an axis through the centroid of its surface, it is the same.
 
     Attributes:
         axis: Unit vector in the frame of the scan file.

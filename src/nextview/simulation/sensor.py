@@ -24,6 +24,8 @@ WIDEST = 8  # projector columns that two neighbouring pixels of one surface may 
 LARGEST, SIDE, GRAIN, STRONGEST = 10_000, 4096, 100, 100  # limits of numbers, sides of pictures, grain and strength
 MARGIN = 16  # how far beside what there is a pixel may show it, pixels
 CLEARANCE = 0.25  # metres that a camera keeps from an object of known size
+FRAMED = 1.1  # so many times as far as where an object just fits into the picture
+MOST_RADII = 40.0  # object radii from which an object is looked at at most
 ARM_LENGTH = 0.45  # metres from its centre at which it usually stands at most
 
 
@@ -102,16 +104,18 @@ class Sensor:
         """The same sensor before an object of a known size, as a robot would hold it.
 
         It stands as many object radii away as otherwise, but ARM_LENGTH at most. Farther only where the object does not
-        fit into its picture, is nearer than what it can measure, or comes closer than CLEARANCE.
+        fit into its picture, is nearer than what it can measure, or comes closer than CLEARANCE. Of what is smaller
+        than a few millimetres it measures nothing.
 
         Args:
             radius: of the object, metres.
         """
         usual = min(self.distance / self.radius * radius, ARM_LENGTH)
         half_picture = np.arctan(min(self.shape) / 2 / self.focal)
-        whole_object = radius / np.sin(half_picture)
+        whole_object = FRAMED * radius / np.sin(half_picture)
         clear = radius + max(CLEARANCE, self.nearest)
-        return replace(self, radius=radius, distance=float(max(usual, whole_object, clear)))
+        distance = min(max(usual, whole_object, clear), MOST_RADII * radius)
+        return replace(self, radius=radius, distance=float(distance))
 
     def draw(self, rng: np.random.Generator) -> "Sensor":
         """Itself: what ``SensorMix`` draws anew for every object."""

@@ -28,15 +28,16 @@ HIGHEST_ORDER = 8
 ANY_TURNS = np.arange(1, 24, 2) / 48  # of a full turn, that are tried for a symmetry of any angle
 SURFACE_POINTS = 20_000  # of the surface that is compared with
 TURNED_POINTS = 500  # of its turned copy
+STEP_ACROSS = np.radians(5)  # between axes that are tried across one of a symmetry
 SAME_AXIS = np.radians(20)  # axes within this angle are one
 
 
 def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
     """Find the axes and orders of a surface's symmetries.
 
-    Axes through the centre of its box are tried: those of its file, its principal axes, and those
-    of the smallest box around it. A symmetry of any angle leaves out all but one of the axes across
-    it, as they follow from each other.
+    Axes through the centroid of the surface, which every symmetry keeps in its place, are tried:
+    those of its file, its principal axes, and those of the smallest box around it. A symmetry of
+    any angle leaves out all but one of the axes across it, as they follow from each other.
 
     Args:
         surface: of a thing.
@@ -45,13 +46,15 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
         Its symmetries, those of any angle first, then by their order.
     """
     rng = np.random.default_rng(0)
-    centre = surface.centre.astype(np.float64)
-    tree = cKDTree(surface.sample(SURFACE_POINTS, rng) - centre)
-    points = surface.sample(TURNED_POINTS, rng) - centre
+    whole = surface.sample(SURFACE_POINTS, rng)
+    centroid = whole.mean(0)
+    whole -= centroid
+    tree = cKDTree(whole)
+    points = surface.sample(TURNED_POINTS, rng) - centroid
     tolerance = max(LEAST_TOLERANCE, TOLERANCE * surface.diameter)
 
     found = []
-    for axis in _axes(surface, points):
+    for axis in _axes(surface, whole):
         order, deviation = _order(tree, points, axis, tolerance)
         if order != 1:
             found.append((order, deviation, axis))
@@ -59,7 +62,24 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
         return tuple(_symmetry(axis, 0) for axis in np.eye(3))
 
     found.sort(key=lambda item: (item[0] != 0, -item[0], item[1]))
-    return tuple(_distinct((axis, order) for order, _, axis in found))
+    symmetries = _distinct((axis, order) for order, _, axis in found)
+    if len(symmetries) == 1:
+        symmetries += _half_turn_across(tree, points, np.array(symmetries[0].axis), tolerance)
+    return tuple(symmetries)
+
+
+def _half_turn_across(
+    tree: cKDTree, points: Float, axis: Float, tolerance: float
+) -> list[Symmetry]:
+    """A symmetry of half a turn about an axis across another one; its direction may be any."""
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    first /= np.linalg.norm(first)
+    angles = np.arange(0, np.pi, STEP_ACROSS)[:, None]
+    across = np.cos(angles) * first + np.sin(angles) * np.cross(axis, first)
+    deviations = [_deviation(tree, points, direction, 0.5) for direction in across]
+
+    best = int(np.argmin(deviations))
+    return [_symmetry(across[best], 2)] if deviations[best] < tolerance else []
 
 
 def _is_ball(axes: Sequence[Float]) -> bool:
@@ -69,19 +89,19 @@ def _is_ball(axes: Sequence[Float]) -> bool:
 
 def _axes(surface: Surface, points: Float) -> Float:
     """Unit vectors that are tried, (N, 3)."""
-    axes = [np.eye(3), np.linalg.eigh(np.cov(points.T))[1].T]
-    try:
-        axes.append(_box_axes(surface))
-    except QhullError:  # a flat surface has no hull
-        pass
-    return np.concatenate(axes)
+    principal = np.linalg.eigh(np.cov(points.T))[1].T
+    return np.concatenate([np.eye(3), principal, _box_axes(surface)])
 
 
 def _box_axes(surface: Surface) -> Float:
-    """The axes of the smallest box around a surface, (3, 3), one a row."""
+    """The axes of the smallest box around a surface, (N, 3); none of a flat surface."""
     from trimesh.bounds import oriented_bounds
 
-    return np.asarray(oriented_bounds(surface.vertices)[0], np.float64)[:3, :3]
+    try:
+        to_box = oriented_bounds(surface.vertices)[0]
+    except (QhullError, ValueError):  # of points in one plane, and of such that nearly are
+        return np.zeros((0, 3))
+    return np.asarray(to_box, np.float64)[:3, :3]
 
 
 def _order(tree: cKDTree, points: Float, axis: Float, tolerance: float) -> tuple[int, float]:
