@@ -28,11 +28,12 @@ VIEWS = (1, 2, 3)  # after so many views things are judged
 TRIES = 6  # views that are taken at most, until so many show the thing
 MOST_THINGS = 150  # that are shown: a drawn part of more
 EPISODES = 2  # for each of many things
-ENOUGH_EPISODES = 24  # for each of few things as if all of them had so many together
+ENOUGH_EPISODES = 16  # for each of few things as if all of them had so many together
 GROWTH = 2  # weights are fitted anew when there are so many times as many things
 DEFAULT_THINGS = 10.0  # things that the default weights count for, beside those that others are fitted to
 WEIGHTS_COST = 5.0  # by which weights of five numbers have to raise the log-likelihood (Akaike, 1974)
 MOST_RESIDUALS = 400  # for a number of views; of more their quantiles are kept
+FEW_RESIDUALS = 100  # of fewer, what further ones are likely to be is kept: a p-value of 0.01 needs so many
 DECIMALS = 4
 
 
@@ -240,7 +241,33 @@ def _residuals(shown: Sequence[Shown], labels: Index) -> KnownResiduals | None:
     named = np.array([one.named for one in right])
     values = np.array([one.residual for one in right])
     views = np.array([one.views for one in right])
-    return KnownResiduals.fit(named, values, views, len(labels))
+    fitted = KnownResiduals.fit(named, values, views, len(labels))
+    return KnownResiduals(fitted.usual, tuple(likely_excess(row) for row in fitted.excess))
+
+
+def likely_excess(found: Float) -> Float:
+    """What known things are likely to exceed their usual residuals by, from what some did.
+
+    Few of them do not tell how rare larger ones are. Of fewer than FEW_RESIDUALS the quantiles are kept that a further
+    one of a normal distribution would have (Student's t, as of a prediction interval), or those that were found where
+    these are larger.
+
+    Args:
+        found: by how much they were exceeded, ascending, (N,).
+
+    Returns:
+        The same, or FEW_RESIDUALS quantiles, ascending.
+    """
+    count = len(found)
+    if not 1 < count < FEW_RESIDUALS:
+        return found
+
+    from scipy.stats import t as student
+
+    levels = (np.arange(FEW_RESIDUALS) + 0.5) / FEW_RESIDUALS
+    scale = found.std(ddof=1) * np.sqrt(1 + 1 / count)
+    predicted = found.mean() + scale * student.ppf(levels, count - 1)
+    return np.maximum(predicted, np.quantile(found, levels))
 
 
 def with_new_things(before: Verification, shown: Sequence[Shown], labels: Index, carried: Index) -> VerifiedFit:
